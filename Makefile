@@ -71,7 +71,10 @@ calibrate: .venv/.test  ## do the bounds hold as often as they say? Writes docs/
 	$(BIN)/python benchmarks/calibrate.py --campaigns $(CAMPAIGNS)
 	$(BIN)/python benchmarks/calibrate_verdicts.py
 	$(BIN)/python benchmarks/dynamics_truths.py
+	$(BIN)/python benchmarks/strangers_truths.py
 	$(BIN)/python benchmarks/calibrate_dynamics.py
+	$(BIN)/python benchmarks/calibrate_strangers.py development
+	$(BIN)/python benchmarks/calibrate_strangers.py reporting
 	$(BIN)/python benchmarks/study_interval.py
 	$(BIN)/python benchmarks/study_time_varying.py
 	$(BIN)/python benchmarks/study_retrain.py

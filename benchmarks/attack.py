@@ -393,8 +393,8 @@ def _warm() -> None:
     import rosbags.rosbag2
     import rosbags.typesys
 
-    import ctxval.plot
-    import ctxval.reproduce
+    import ctxval.campaign.plot
+    import ctxval.paper.reproduce
     from ctxval.cli.commands import MODULES
 
     for module in MODULES.values():

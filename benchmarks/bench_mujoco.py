@@ -13,8 +13,8 @@ import numpy as np
 
 from ctxval import Task, Trajectory, systems
 from ctxval._util.arrays import Array
-from ctxval.cases import arm
 from ctxval.controllers import AffineFeedback
+from ctxval.paper.cases import arm
 
 HORIZON = 100
 REPEATS = 5

@@ -24,7 +24,7 @@ from ctxval._util.json_lines import JsonLines
 from ctxval.certificates import Sample, certify_posterior, draw_maxima
 from ctxval.errors import CertificateError
 from ctxval.gp.hyperposterior import Prior
-from ctxval.reproduce.jobs import Job, Results
+from ctxval.paper.reproduce.jobs import Job, Results
 from ctxval.searches import GPUCB
 
 ROOT = Path(__file__).parents[1]

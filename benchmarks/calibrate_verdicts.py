@@ -22,7 +22,7 @@ from ctxval._util.arrays import Array, single_threaded
 from ctxval._util.json_lines import JsonLines
 from ctxval.certificates import RESOLUTION, CertificateOptions, StoppingRule, covering
 from ctxval.certificates.verdict import counterexample
-from ctxval.reproduce.jobs import Job, Results
+from ctxval.paper.reproduce.jobs import Job, Results
 
 RULE = 2
 """Of coverage, by which campaigns are run now."""

@@ -148,7 +148,7 @@ def search(found: Experiment, samples: int = SAMPLES) -> dict[str, Any]:
 
     deep = DeepSearch(values, validation.space.dimension, samples // len(noisy))
     tops: list[tuple[float, Array]] = []
-    while len(tops) < LEAST or (_difference(tops) > AGREEMENT and len(tops) < MOST):
+    while len(tops) < LEAST or (difference(tops) > AGREEMENT and len(tops) < MOST):
         tops.append(deep.repeat(len(tops)))
     point = max(tops, key=lambda top: top[0])[1]
     record = {
@@ -163,7 +163,7 @@ def search(found: Experiment, samples: int = SAMPLES) -> dict[str, Any]:
     return {**record, **({"quantile": _quantile(validation, point)} if len(noisy) > 1 else {})}
 
 
-def _difference(tops: list[tuple[float, Array]]) -> float:
+def difference(tops: list[tuple[float, Array]]) -> float:
     """Return the relative difference of the best and the third-best value."""
     values = sorted((value for value, _ in tops), reverse=True)
     return (values[0] - values[LEAST - 1]) / values[0]
@@ -212,7 +212,7 @@ def row(entry: Entry, records: list[dict[str, Any]]) -> str:
     """Return the row of a table."""
     dimension, pairs, horizon = entry.dimensions()
     ratios = [record["distance"] / record["median"] for record in records]
-    spread = max(_difference([(value, np.empty(0)) for value in record["repeats"]]) for record in records)
+    spread = max(difference([(value, np.empty(0)) for value in record["repeats"]]) for record in records)
     cells = [
         entry.name, entry.family, dimension, pairs, horizon, len(records), f"{min(ratios):.1f} to {max(ratios):.1f}",
         f"{spread:.2%}", f"{np.mean([record['evaluations'] for record in records]):,.0f}",

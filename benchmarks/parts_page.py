@@ -9,7 +9,7 @@ from typing import Any
 
 from ctxval import cases, certificates, controllers, distances, models, searches, systems
 from ctxval._util.registry import Declaration, Registry, declaration_of
-from ctxval.config.experiments import plain_options
+from ctxval.cli.config.parts import plain_options
 
 PAGE = Path(__file__).parents[1] / "docs" / "parts.md"
 

@@ -38,7 +38,7 @@ import rig_command  # noqa: E402
 from conftest import make_validation  # noqa: E402
 from ctxval import Campaign, Store, searches  # noqa: E402
 from ctxval._util.json_lines import JsonLines  # noqa: E402
-from ctxval.storage.recovery import recover  # noqa: E402
+from ctxval.campaign.storage.recovery import recover  # noqa: E402
 from rig_workers import campaign as logged  # noqa: E402
 
 STORED = JsonLines(ROOT / "benchmarks" / "results" / "reliability.jsonl", ("fault",))

@@ -20,7 +20,7 @@ import numpy as np
 
 from ctxval import Campaign, Experiment, Truth, Validation, cached_truth, cases, grid_truth, search_truth, searches
 from ctxval._util.json_lines import JsonLines
-from ctxval.reproduce.revision import AUTO, provenance
+from ctxval.paper.reproduce.revision import AUTO, provenance
 
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "benchmarks" / "results"

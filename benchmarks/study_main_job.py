@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 
 from ctxval._util.arrays import Array
-from ctxval.reproduce import FULL
-from ctxval.reproduce.jobs import Results
-from ctxval.reproduce.pendulum import Techniques
-from ctxval.reproduce.revision import measured_with
-from ctxval.reproduce.study import TECHNIQUES
+from ctxval.paper.reproduce import FULL
+from ctxval.paper.reproduce.jobs import Results
+from ctxval.paper.reproduce.pendulum import Techniques
+from ctxval.paper.reproduce.revision import measured_with
+from ctxval.paper.reproduce.study import TECHNIQUES
 
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "main-job.md"

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from ctxval import searches
 from ctxval._util.json_lines import JsonLines
-from ctxval.reproduce.revision import AUTO, provenance
+from ctxval.paper.reproduce.revision import AUTO, provenance
 from plants import PLANTS
 from plants.truths import TRUTHS, require_known, truth
 from study_auto import RESULTS, Result, campaign, print_table

@@ -21,10 +21,10 @@ import numpy as np
 from ctxval import Campaign, Trajectory, Validation, cases, grid_truth, models, refine, search_truth, searches, systems
 from ctxval._util.arrays import Array
 from ctxval._util.json_lines import JsonLines
-from ctxval.cases import pendulum
 from ctxval.certificates import CertificateOptions
-from ctxval.refinement import Method, ParameterFit, Records
-from ctxval.reproduce.revision import AUTO, measured_with, provenance
+from ctxval.paper.cases import pendulum
+from ctxval.paper.reproduce.revision import AUTO, measured_with, provenance
+from ctxval.studies.refinement import Method, ParameterFit, Records
 
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "refinement.md"

@@ -43,11 +43,11 @@ from ctxval.campaign.choices import Choice
 from ctxval.campaign.execution import RetryPolicy, Schedule, execute_schedule
 from ctxval.campaign.interval_search import IntervalSearch
 from ctxval.campaign.workers import ExecutionResult, WorkerPool, execute_task
-from ctxval.cases.linear import Feedback, LinearSystem, Settings, draw
 from ctxval.certificates import CertificateOptions
 from ctxval.core.plan import Plan
 from ctxval.core.trial import Trial
-from ctxval.reproduce.revision import AUTO, provenance
+from ctxval.paper.cases.linear import Feedback, LinearSystem, Settings, draw
+from ctxval.paper.reproduce.revision import AUTO, provenance
 from dynamics_systems import PartlySeen, RandomFunction
 from study_auto import ROOT, results_of
 from study_auto import experiment as of_search_study

@@ -30,7 +30,7 @@ API = "reference/api"
 FIRST = ("systems", "models", "controllers", "distances", "searches", "certificates")
 MODULES = (
     "ctxval",
-    *(f"ctxval.{name}" for name in dict.fromkeys((*FIRST, *dir(ctxval))) if name in ctxval._SUBMODULES),
+    *(f"ctxval.{ctxval._MODULES[name]}" for name in dict.fromkeys((*FIRST, *ctxval._MODULES))),
 )
 """The public modules, in the order of the reference."""
 

@@ -3,7 +3,7 @@
 import numpy as np
 
 import ctxval
-from ctxval import controllers, distances, models, searches, systems
+from ctxval import controllers, distances, models, systems
 
 DT = 0.05  # s
 
@@ -30,7 +30,7 @@ validation = ctxval.Validation(
     synthesizer=controllers.LQR(Q=[10.0, 1.0], R=[0.1]),
     distance=distances.WholeTrajectory(norm=np.inf, components=[0]),  # the largest gap between the positions, in m
 )
-campaign = ctxval.Campaign(validation, search=searches.GPUCB(), seed=0).run(budget=12)
+campaign = ctxval.Campaign(validation, seed=0).run(budget=25, threshold=0.5)
 
 worst = campaign.worst
 print(f"{campaign.executions} executions of the cart. The worst task: go to {worst.parameters['goal']:.2f} m.")

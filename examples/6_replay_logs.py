@@ -13,7 +13,7 @@ from mcap.writer import Writer
 
 from ctxval import models
 from ctxval.data import LogMapping, read_recordings
-from ctxval.replay import replay
+from ctxval.studies.replay import replay
 
 PENDULUM = """
 <mujoco><option timestep="0.02"/><worldbody><body>

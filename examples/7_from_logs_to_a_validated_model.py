@@ -11,7 +11,7 @@ import numpy as np
 import ctxval
 from ctxval import controllers, distances, models, report, searches, systems
 from ctxval.data import read_recordings
-from ctxval.replay import replay
+from ctxval.studies.replay import replay
 
 DT, THRESHOLD = 0.1, 0.1  # s, rad
 

@@ -20,7 +20,6 @@ import pytest
 from hypothesis import settings
 
 from ctxval import Task, TaskSpace, Validation, controllers, distances, models, systems
-from ctxval.cases import pendulum
 from ctxval.certificates import (
     CheckedPrediction,
     DynamicsEvidence,
@@ -29,6 +28,7 @@ from ctxval.certificates import (
 )
 from ctxval.core.controller import Controller
 from ctxval.core.model import Model
+from ctxval.paper.cases import pendulum
 from small_searches import run_few_loops, take_few_draws
 
 # A shell starts what is in the background deaf to Ctrl-C, and tests may run there.
@@ -115,7 +115,10 @@ class Predicted:
         rng = np.random.default_rng(4)
         gap = StateInputGap(0.01, ("x[0]",), {"x[0]": 0.0})
         covered = StateInputCoverage(gap, gap, gap, {"x[0]": 0.1}, rng.random(self.dimension), 99)
-        checked = tuple(CheckedPrediction(k, 0.5, 1.0, 1.2, 1.0) for k in range(3))
+        tasks = [(k / 9,) * self.dimension for k in range(1, 9)]
+        checked = tuple(
+            CheckedPrediction(k, 0.5, 1.0, 1.2, 1.0, origin="spread", point=task) for k, task in enumerate(tasks)
+        )
         draws, elites = rng.random((2000, self.dimension)), rng.random((3, self.dimension))
         return DynamicsEvidence(np.linspace(2, 3, 2000), draws, 1.9, elites, 999, 5, 0.0, 0.0, checked, covered)
 

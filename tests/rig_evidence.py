@@ -27,4 +27,5 @@ GOOD = DynamicsEvidence(
     noise=1e-6,
     predictions=tuple(prediction(k) for k in range(1, 4)),
     coverage=COVERED,
+    tests=0,
 )

@@ -170,8 +170,9 @@ def serving(folder: Path, *arguments: str, port: int = 0) -> Iterator[Server]:
                 stream.close()
 
 
-def new_store(folder: Path, reference: str = "my_rig:experiment") -> None:
-    """Make a store with one open trial."""
+def new_store(folder: Path, reference: str = "rig.toml") -> None:
+    """Make a store with one open trial; the experiment of the file needs no tests of predictions."""
+    (folder / "rig.toml").write_text('experiment = "my_rig:experiment"\n\n[certificate]\ntests = 0\n')
     ctxval("ask", reference, "--store", "a.sqlite", folder=folder)
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ctxval import Campaign, Task, TaskSpace, Transitions, Validation, controllers, distances, models, searches, systems
-from ctxval.refinement import Refinement, refine
+from ctxval.studies.refinement import Refinement, refine
 
 THRESHOLD, BUDGET = 0.05, 14
 FIRST = models.Linear([[1.0, 0.1], [0.0, 1.0]], [[0.0], [0.1]])

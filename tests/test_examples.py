@@ -11,7 +11,7 @@ import pytest
 EXAMPLES = Path(__file__).parents[1] / "examples"
 PRINTED = {
     "1_first_verdict": [
-        "12 executions of the cart",
+        "11 executions of the cart",
         "falsified: trial",
         "validated: by a prior on the dynamics",
     ],

@@ -81,7 +81,7 @@ def broken_links(pages: dict[Path, Page]) -> Iterator[str]:
 
 def names_without_description(manual: Path, pages: dict[Path, Page]) -> Iterator[str]:
     anchors = set().union(*(page.anchors for page in pages.values()))
-    for module in ("ctxval", *(f"ctxval.{name}" for name in ctxval._SUBMODULES)):
+    for module in ("ctxval", *(f"ctxval.{module}" for module in ctxval._MODULES.values())):
         assert (manual / "reference" / "api" / f"{module}.html").exists()
         described = {name.rpartition(".")[2] for name in anchors if name.startswith("ctxval.")}
         yield from (name for name in getattr(importlib.import_module(module), "__all__", ()) if name not in described)

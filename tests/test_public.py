@@ -16,8 +16,8 @@ import ctxval
 from ctxval import errors
 
 ROOT = Path(__file__).parents[1]
-PACKAGES = ["", *(f".{name}" for name in ctxval._SUBMODULES)]
-COMPLETE = [".cases", ".certificates", ".controllers", ".distances", ".models", ".searches", ".systems"]
+PACKAGES = ["", *(f".{module}" for module in ctxval._MODULES.values())]
+COMPLETE = [".paper.cases", ".certificates", ".controllers", ".distances", ".models", ".searches", ".systems"]
 
 
 @pytest.mark.parametrize("package", PACKAGES)
@@ -43,8 +43,9 @@ def test_all_is_complete(package: str) -> None:
 @pytest.mark.slow
 def test_the_part_packages_are_usable_after_importing_ctxval_alone() -> None:
     code = (
-        "import sys, ctxval; light = [m for m in ctxval._SUBMODULES if f'ctxval.{m}' not in sys.modules]; "
-        "assert set(ctxval._SUBMODULES) <= set(dir(ctxval)); "
+        "import sys, ctxval; "
+        "light = [name for name, m in ctxval._MODULES.items() if f'ctxval.{m}' not in sys.modules]; "
+        "assert set(ctxval._MODULES) <= set(dir(ctxval)); "
         "[getattr(ctxval, name) for name in dir(ctxval)]; "
         "print(ctxval.controllers.LQR.__name__, ctxval.testing.check_search.__name__, *light)"
     )
@@ -58,14 +59,15 @@ def test_the_part_packages_are_usable_after_importing_ctxval_alone() -> None:
 def test_a_type_checker_sees_the_same_names() -> None:
     tree = ast.parse((ROOT / "src" / "ctxval" / "__init__.py").read_text())
     guarded = [node for node in tree.body if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"]
-    seen = {
-        alias.name: each.module.removeprefix("ctxval").lstrip(".")  # type: ignore[attr-defined]
+    imported = {
+        (alias.name, alias.asname): each.module.removeprefix("ctxval").lstrip(".")  # type: ignore[attr-defined]
         for node in guarded
         for each in node.body
         for alias in each.names  # type: ignore[attr-defined]
     }
-    assert tuple(name for name, module in seen.items() if not module) == ctxval._SUBMODULES
-    assert {name: module for name, module in seen.items() if module} == ctxval._LAZY
+    modules = {name: f"{module}.{name}".lstrip(".") for (name, asname), module in imported.items() if asname}
+    assert modules == ctxval._MODULES
+    assert {name: module for (name, asname), module in imported.items() if not asname} == ctxval._LAZY
     assert list(ctxval._LAZY) == ctxval.__all__
 
 

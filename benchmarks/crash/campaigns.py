@@ -20,11 +20,11 @@ sys.path[:0] = [str(ROOT / "tests"), str(ROOT / "benchmarks")]
 
 from conftest import make_validation  # noqa: E402
 from ctxval import Campaign, Store, Trajectory, searches  # noqa: E402
+from ctxval.campaign.storage.database import Database  # noqa: E402
 from ctxval.core.controller import Controller  # noqa: E402
 from ctxval.core.task import Task  # noqa: E402
 from ctxval.core.trial import Trial  # noqa: E402
 from ctxval.errors import CtxvalError, DistanceError, ExecutionError, StoreAccessError  # noqa: E402
-from ctxval.storage.database import Database  # noqa: E402
 
 STORE = "runs/a.sqlite"
 BUDGET = 6

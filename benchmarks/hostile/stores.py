@@ -11,7 +11,7 @@ from collections.abc import Callable
 from contextlib import closing, suppress
 from pathlib import Path
 
-from ctxval.storage.rows import COLUMNS, checksum_of
+from ctxval.campaign.storage.rows import COLUMNS, checksum_of
 from hostile import archives
 from hostile.values import (
     ESCAPES,

@@ -108,7 +108,7 @@ REFERENCES = (
     "shutil:rmtree",
     "pathlib:Path",
     "ctxval.cli:main",
-    "ctxval.cases.pendulum:experiment",
+    "ctxval.paper.cases.pendulum:experiment",
     "importlib:import_module",
     "os.path:join",
     "pwned",

@@ -16,7 +16,7 @@ from mcap.writer import Writer
 
 from ctxval import models, systems
 from ctxval.data import LogMapping, read_recordings
-from ctxval.replay import replay
+from ctxval.studies.replay import replay
 
 DT = 0.02
 step = systems.rk4(lambda x, u: np.stack([x[..., 1], -9.8 * np.sin(x[..., 0]) - 0.3 * x[..., 1] + u[..., 0]], -1), DT)

@@ -11,7 +11,7 @@ from matplotlib import pyplot
 
 from ctxval.data import recordings_of
 from ctxval.data.log import MemoryTable
-from ctxval.fitting import fit
+from ctxval.studies.fitting import fit
 
 DT = 0.05
 

@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib import pyplot
 
 from ctxval import Task, TaskSpace, Transitions, Validation, controllers, distances, models, systems
-from ctxval.fitting import Excitation
+from ctxval.studies.fitting import Excitation
 
 DT = 0.05
 

@@ -9,33 +9,26 @@ All names, and the part packages, such as ``ctxval.controllers``, are imported w
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from ctxval.version import VERSION
+from ctxval._util.version import VERSION
 
 if TYPE_CHECKING:
-    from ctxval import aspect1 as aspect1
-    from ctxval import cases as cases
     from ctxval import certificates as certificates
-    from ctxval import comparison as comparison
     from ctxval import controllers as controllers
     from ctxval import data as data
     from ctxval import distances as distances
     from ctxval import errors as errors
-    from ctxval import fitting as fitting
     from ctxval import gp as gp
     from ctxval import models as models
-    from ctxval import plot as plot
-    from ctxval import refinement as refinement
-    from ctxval import replay as replay
     from ctxval import report as report
-    from ctxval import reproduce as reproduce
     from ctxval import searches as searches
     from ctxval import systems as systems
     from ctxval import testing as testing
     from ctxval._util.arrays import Array
     from ctxval._util.registry import part
-    from ctxval.campaign import Campaign, OpenTrial
+    from ctxval.campaign import plot as plot
+    from ctxval.campaign.campaign import Campaign, OpenTrial
+    from ctxval.campaign.storage.store import Store
     from ctxval.certificates.verdict import Verdict
-    from ctxval.comparison import Comparison, compare
     from ctxval.core.experiment import Experiment
     from ctxval.core.labels import Labels
     from ctxval.core.plan import Outcome, Plan
@@ -47,8 +40,15 @@ if TYPE_CHECKING:
     from ctxval.core.trial import Trial
     from ctxval.core.truth import Truth, cached_truth, grid_truth, search_truth
     from ctxval.core.validation import Validation
-    from ctxval.refinement import refine
-    from ctxval.storage.store import Store
+    from ctxval.paper import cases as cases
+    from ctxval.paper import reproduce as reproduce
+    from ctxval.studies import aspect1 as aspect1
+    from ctxval.studies import comparison as comparison
+    from ctxval.studies import fitting as fitting
+    from ctxval.studies import refinement as refinement
+    from ctxval.studies import replay as replay
+    from ctxval.studies.comparison import Comparison, compare
+    from ctxval.studies.refinement import refine
 
 __version__ = VERSION
 
@@ -81,41 +81,41 @@ __all__ = [
     "search_truth",
 ]
 
-_SUBMODULES = (
-    "aspect1",
-    "cases",
-    "certificates",
-    "comparison",
-    "controllers",
-    "data",
-    "distances",
-    "errors",
-    "fitting",
-    "gp",
-    "models",
-    "plot",
-    "refinement",
-    "replay",
-    "report",
-    "reproduce",
-    "searches",
-    "systems",
-    "testing",
-)
+_MODULES = {
+    "aspect1": "studies.aspect1",
+    "cases": "paper.cases",
+    "certificates": "certificates",
+    "comparison": "studies.comparison",
+    "controllers": "controllers",
+    "data": "data",
+    "distances": "distances",
+    "errors": "errors",
+    "fitting": "studies.fitting",
+    "gp": "gp",
+    "models": "models",
+    "plot": "campaign.plot",
+    "refinement": "studies.refinement",
+    "replay": "studies.replay",
+    "report": "report",
+    "reproduce": "paper.reproduce",
+    "searches": "searches",
+    "systems": "systems",
+    "testing": "testing",
+}
 """The public modules, which ``import ctxval`` alone makes usable: each is imported when it is first used."""
 
 _LAZY = {
     "Array": "_util.arrays",
-    "Campaign": "campaign",
-    "Comparison": "comparison",
+    "Campaign": "campaign.campaign",
+    "Comparison": "studies.comparison",
     "Experiment": "core.experiment",
     "Labels": "core.labels",
     "Normal": "core.task_distribution",
-    "OpenTrial": "campaign",
+    "OpenTrial": "campaign.campaign",
     "Outcome": "core.plan",
     "Parameters": "core.space",
     "Plan": "core.plan",
-    "Store": "storage.store",
+    "Store": "campaign.storage.store",
     "Task": "core.task",
     "TaskSpace": "core.space",
     "Trajectory": "core.trajectory",
@@ -125,10 +125,10 @@ _LAZY = {
     "Validation": "core.validation",
     "Verdict": "certificates.verdict",
     "cached_truth": "core.truth",
-    "compare": "comparison",
+    "compare": "studies.comparison",
     "grid_truth": "core.truth",
     "part": "_util.registry",
-    "refine": "refinement",
+    "refine": "studies.refinement",
     "rollout": "core.rollout",
     "search_truth": "core.truth",
 }
@@ -138,8 +138,8 @@ _LAZY = {
 if not TYPE_CHECKING:  # a type checker, which reads the imports above, would take any name for granted
 
     def __getattr__(name: str) -> Any:
-        if name in _SUBMODULES:
-            return importlib.import_module(f"{__name__}.{name}")
+        if name in _MODULES:
+            return importlib.import_module(f"{__name__}.{_MODULES[name]}")
         if name in _LAZY:
             value = globals()[name] = getattr(importlib.import_module(f"{__name__}.{_LAZY[name]}"), name)
             return value
@@ -147,4 +147,4 @@ if not TYPE_CHECKING:  # a type checker, which reads the imports above, would ta
 
 
 def __dir__() -> list[str]:
-    return sorted({*__all__, *_SUBMODULES, "__version__"})
+    return sorted({*__all__, *_MODULES, "__version__"})

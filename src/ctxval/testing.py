@@ -15,7 +15,7 @@ from ctxval._util.arrays import Array, Mask
 from ctxval._util.representation import ShortRepr
 from ctxval.core.controller import Controller, Synthesizer, converged_of
 from ctxval.core.distance import Distance
-from ctxval.core.model import Model, linearize
+from ctxval.core.model import Model, central_differences, linearize
 from ctxval.core.rollout import rollout
 from ctxval.core.system import System
 from ctxval.core.task import Task
@@ -45,7 +45,7 @@ def check_model(
     _require_close("step of a batch", batch, "the steps one by one", single, tolerance)
     if hasattr(model, "jacobian"):
         A, B = linearize(model, x, u)
-        A_numeric, B_numeric = linearize(_WithoutJacobian(model), x, u)
+        A_numeric, B_numeric = central_differences(model.step, x, u)
         # Central differences with steps of about 6e-6 magnify rounding errors by this factor.
         allowed = max(1e-5, 2e5 * tolerance)
         for name, own, numeric in (("A", A, A_numeric), ("B", B, B_numeric)):
@@ -57,12 +57,8 @@ def check_system(system: System, controller: Controller, task: Task, *, toleranc
 
     The check executes the system twice, and once more if it is ``batched``.
 
-    Args:
-        system: the system; it has ``execute``.
-        controller: the controller for this task.
-        task: one task, not a batch.
-        tolerance: largest difference between two executions, relative to the larger of 1 and the state; set it to the
-            noise that you expect.
+    The controller is for this task, which is no batch. The tolerance is the largest difference between two executions,
+    relative to the larger of 1 and the state; set it to the noise that you expect.
     """
     first, second = system.execute(controller, task), system.execute(controller, task)
     for trajectory in (first, second):
@@ -124,9 +120,7 @@ def check_distance(distance: Distance, model_trajectory: Trajectory, system_traj
 def check_search(search: Search, *, dimension: int = 2, seed: int = 3, budget: int = 12) -> None:
     """Check that a search stays in the unit cube, resumes from its history, and never repeats a failed point.
 
-    Args:
-        dimension: dimension of the unit cube in the test run.
-        budget: number of points in the test run; every fourth evaluation fails.
+    The test run has so many points of a unit cube of this dimension; every fourth evaluation fails.
     """
     history = _trial_run(search, dimension, seed, budget)
     again = _trial_run(search, dimension, seed, budget)
@@ -164,7 +158,6 @@ class FaultyRig(ShortRepr):
     """A system that runs another one and fails at chosen executions, for tests of how a campaign handles failures.
 
     Args:
-        system: the system that runs every execution.
         faults: the fault of each execution that fails, by its number from 0: ``"raise"``, ``"nan"`` (all states are
             NaN), ``"short"`` (the last step is missing) or ``"wrong shape"`` (all states but the first are missing).
         delay: seconds to wait before each execution.
@@ -191,16 +184,6 @@ class FaultyRig(ShortRepr):
         if fault == "wrong shape":
             return Trajectory(whole.times, whole.states[:, :1], whole.inputs)
         return whole
-
-
-class _WithoutJacobian:
-    """A model without its own Jacobian, so that ``linearize`` takes central differences."""
-
-    def __init__(self, model: Model) -> None:
-        self._model = model
-
-    def step(self, x: Array, u: Array) -> Array:
-        return self._model.step(x, u)
 
 
 def _require(condition: bool, sentence: str) -> None:

@@ -25,7 +25,7 @@ from ctxval._util.checked import (
     checked,
     require,
 )
-from ctxval.config.parts import REGISTRIES
+from ctxval.cli.config.parts import REGISTRIES
 from ctxval.errors import CtxvalError, InputError, UnknownNameError
 
 INFINITY, NAN = float("inf"), float("nan")

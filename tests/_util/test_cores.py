@@ -4,7 +4,6 @@ import os
 
 import pytest
 
-from ctxval._util import cores
 from ctxval._util.cores import on_all_cores
 
 
@@ -15,20 +14,20 @@ def test_results_come_in_the_order_of_the_parts_and_nothing_need_be_picklable() 
 
 
 def test_it_is_other_processes_that_compute(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cores, "_cores", lambda: 2)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda process: set(range(2)))
     assert os.getpid() not in on_all_cores(lambda _: os.getpid(), range(4))
-    monkeypatch.setattr(cores, "_cores", lambda: 1)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda process: set(range(1)))
     assert set(on_all_cores(lambda _: os.getpid(), range(4))) == {os.getpid()}
 
 
 def test_what_a_function_raises_is_raised(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cores, "_cores", lambda: 2)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda process: set(range(2)))
     with pytest.raises(ZeroDivisionError):
         on_all_cores(lambda part: 1 / part, [1, 0])
 
 
 def test_what_ends_a_process_is_computed_here_in_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cores, "_cores", lambda: 2)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda process: set(range(2)))
     here = os.getpid()
 
     def elsewhere_it_dies(part: int) -> int:

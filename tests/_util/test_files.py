@@ -13,7 +13,7 @@ from ctxval import Trajectory
 from ctxval._util import files
 from ctxval._util.csv_table import CsvTable
 from ctxval._util.files import open_regular, read_bytes, read_json, require_regular_file, written_whole
-from ctxval.config.parts import recorded
+from ctxval.cli.config.parts import recorded
 from ctxval.core.exchange import read_task
 from ctxval.errors import InputError
 

@@ -169,7 +169,7 @@ def test_damaged_metadata_breaks_no_built_in_name(tmp_path: Path, monkeypatch: p
 def test_an_installed_package_is_found_by_a_new_process(site: Path) -> None:
     code = (
         "import ctxval, sys; assert 'their_parts' not in sys.modules; "
-        "print(ctxval.distances.by_name('Speed').weight, *ctxval.cases.REGISTRY)"
+        "print(ctxval.distances.by_name('Speed').weight, *ctxval.paper.cases.REGISTRY)"
     )
     environment = {"PYTHONPATH": f"{site}:{Path(distances.__file__).parents[2]}", "OMP_NUM_THREADS": "1"}
     result = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)

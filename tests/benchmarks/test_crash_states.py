@@ -16,7 +16,7 @@ sys.path.insert(0, str(BENCHMARKS))
 from crash.disk import SECTOR, Disk, Mode  # noqa: E402
 from crash.recorder import Event  # noqa: E402
 from crash_states import count, recorded  # noqa: E402
-from ctxval.storage import disks  # noqa: E402
+from ctxval.campaign.storage import disks  # noqa: E402
 
 needs_strace = pytest.mark.skipif(shutil.which("strace") is None, reason="writes are recorded with strace")
 

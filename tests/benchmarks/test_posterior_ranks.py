@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from ctxval.learning.hyperparameters import Hyperparameters
-from ctxval.learning.residual_kernel import ResidualKernel
+from ctxval.learning.hyperparameters import Hyperparameters, ResidualKernel
 
 BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
 sys.path.insert(0, str(BENCHMARKS))

@@ -6,9 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from ctxval.reproduce import FULL, STUDIES
-from ctxval.reproduce.jobs import Results
-from ctxval.reproduce.table import table_text
+from ctxval.paper.reproduce import FULL, STUDIES, table_text
+from ctxval.paper.reproduce.jobs import Results
 
 RESULTS = Path("benchmarks/results/reproduce")
 """Seen from the folder of the repository, as the page names it."""

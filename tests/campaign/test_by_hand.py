@@ -18,13 +18,13 @@ from typer.testing import CliRunner, Result
 
 from ctxval import Campaign, Store, TaskSpace, Trajectory, searches
 from ctxval.campaign.by_hand import parameters_from
+from ctxval.campaign.storage.database import Database
 from ctxval.certificates import Sample
 from ctxval.cli import app
 from ctxval.controllers import read_controller
 from ctxval.core.exchange import read_task
 from ctxval.core.rollout import rollout
 from ctxval.errors import ExecutionError, InputError, StoreAccessError
-from ctxval.storage.database import Database
 
 MODULE = """
 from ctxval import Experiment, Task, TaskSpace, Validation, controllers, distances, models, systems

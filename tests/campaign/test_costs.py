@@ -9,7 +9,7 @@ import pytest
 from conftest import make_validation
 from ctxval import Campaign, Experiment, Task, Validation, controllers, distances, searches
 from ctxval.campaign.costs import ThinkingCosts
-from ctxval.config.check import check_experiment
+from ctxval.cli.config.check import check_experiment
 from ctxval.core.controller import Controller
 from ctxval.core.model import Model
 from ctxval.gp.ascent import usual_effort

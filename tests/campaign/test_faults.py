@@ -24,11 +24,11 @@ from typer.testing import CliRunner
 
 from conftest import make_validation
 from ctxval import Campaign, Store, Trajectory, searches
+from ctxval.campaign.storage.disks import StoreWarning, file_system
+from ctxval.campaign.storage.recovery import recover
+from ctxval.campaign.storage.store import Side
 from ctxval.cli import app
 from ctxval.errors import CtxvalError, ForeignStoreError, InputError, StoreAccessError
-from ctxval.storage.disks import StoreWarning, file_system
-from ctxval.storage.recovery import recover
-from ctxval.storage.store import Side
 
 HERE = Path(__file__).parents[1]
 SEARCH = searches.Random
@@ -290,7 +290,7 @@ def test_a_network_file_system_is_warned_of(tmp_path: Path, monkeypatch: pytest.
     assert file_system(Path("/home/all of us/x/a.sqlite"), mounts) == "nfs4"
     assert file_system(Path("/home/x/a.sqlite"), mounts) == "ext4"
     assert file_system(Path("/a.sqlite"), "") == ""
-    monkeypatch.setattr("ctxval.storage.disks.file_system", lambda path, mounts: "nfs4")
+    monkeypatch.setattr("ctxval.campaign.storage.disks.file_system", lambda path, mounts: "nfs4")
     with pytest.warns(StoreWarning, match=r"is on a network file system \(nfs4\)"):
         Store(tmp_path / "a.sqlite")
 
@@ -300,7 +300,7 @@ def test_a_network_file_system_is_warned_of(tmp_path: Path, monkeypatch: pytest.
 
 def test_a_clock_that_is_set_back_changes_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     years = iter(range(2040, 1970, -1))
-    monkeypatch.setattr("ctxval.storage.store.now", lambda: f"{next(years)}-01-01T00:00:00.000+00:00")
+    monkeypatch.setattr("ctxval.campaign.storage.store.now", lambda: f"{next(years)}-01-01T00:00:00.000+00:00")
     store = tmp_path / "a.sqlite"
     for budget in (3, 6, 8):
         campaign = Campaign(make_validation(), search=SEARCH(), store=store, seed=2).run(budget)

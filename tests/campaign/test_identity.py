@@ -14,7 +14,7 @@ from ctxval import Campaign, Store, TaskSpace, Validation, distances, searches
 from ctxval._util.arrays import Array
 from ctxval._util.describe import describe
 from ctxval.cli import app
-from ctxval.config.settings import read_settings
+from ctxval.cli.config.settings import read_settings
 from ctxval.errors import DistanceError, InputError, StoreMismatchError
 from ctxval.gp.kernels import Matern
 from ctxval.testing import FaultyRig

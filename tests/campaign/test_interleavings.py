@@ -16,8 +16,8 @@ from typing import Any
 import pytest
 
 from ctxval import Campaign, Store, Task, TaskSpace, Validation, controllers, distances, models, searches, systems
+from ctxval.campaign.storage import database, schema
 from ctxval.errors import CtxvalError
-from ctxval.storage import database, schema
 
 BUDGET = 2
 MODEL = models.Linear([[1.0]], [[0.1]])

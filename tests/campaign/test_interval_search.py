@@ -12,7 +12,7 @@ import pytest
 
 from conftest import interrupt_at_once, make_validation, make_validation_without_inputs
 from ctxval import Campaign, cases, searches
-from ctxval.campaign.dynamics import AUDIT, NEAR, PREDICTION
+from ctxval.campaign.dynamics import NEAR, PREDICTION
 from ctxval.campaign.interval_search import IntervalSearch, next_task
 from ctxval.certificates import (
     AnytimeAudit,
@@ -26,7 +26,8 @@ from ctxval.certificates import (
     StateInputGap,
     UntriedParameter,
 )
-from ctxval.certificates.dynamics_diagnostics import AUDITED
+from ctxval.certificates.automatic import Automatic
+from ctxval.certificates.prediction_tests import DRAWN, TESTS
 from ctxval.errors import InputError
 from ctxval.learning import dynamics_study
 from ctxval.learning.dynamics_posterior import condition
@@ -45,14 +46,14 @@ def linear(dim: int = 1, seed: int = 0):  # type: ignore[no-untyped-def]
 @pytest.mark.slow
 def test_a_linear_system_is_validated_in_few_executions_by_a_bound_that_is_true() -> None:
     validation, largest = linear(2)
-    campaign = Campaign(validation).run(12, 1.1 * largest)
+    campaign = Campaign(validation).run(16, 1.1 * largest)
     verdict = campaign.verdict(1.1 * largest)
     assert verdict.answer == "validated"
     assert "by a prior on the dynamics" in verdict.reason
     assert verdict.certificate is not None
     assert verdict.certificate.upper_bound >= largest * (1 - 1e-6)
-    assert campaign.executions <= 8
-    low, high = IntervalSearch(campaign.recorder, CertificateOptions(), 12, 1.1 * largest).interval
+    assert campaign.executions <= 16
+    low, high = IntervalSearch(campaign.recorder, CertificateOptions(), 16, 1.1 * largest).interval
     assert campaign.worst is not None
     assert low == campaign.worst.distance
     assert high == verdict.certificate.upper_bound  # the store keeps the evidence of the end
@@ -88,7 +89,7 @@ def test_a_threshold_below_the_maximum_is_falsified() -> None:
 def test_a_system_without_inputs_is_validated(batched: bool) -> None:
     validation = make_validation_without_inputs(batched)
     campaign = Campaign(validation)
-    verdict = campaign.run(6, 1.0).verdict(1.0)
+    verdict = campaign.run(20, 1.0).verdict(1.0)
     assert verdict.answer == "validated"
     assert verdict.certificate is not None
     assert verdict.certificate.kind == "dynamics"
@@ -159,16 +160,17 @@ def test_an_anytime_audit_ends_as_soon_as_its_volume_is_small_enough() -> None:
 
 
 @pytest.mark.slow
-def test_a_prediction_audit_executes_eight_fresh_tasks() -> None:
+def test_eight_drawn_tasks_are_executed_before_a_model_is_validated() -> None:
     validation, largest = linear()
-    plain = Campaign(validation, seed=2).run(12, 1.1 * largest)
-    audited = Campaign(validation, seed=2).run(30, 1.1 * largest, audited=True)
-    assert audited.executions == plain.executions + AUDITED
-    assert sum(AUDIT in (trial.note or {}) for trial in audited.trials) == AUDITED
-    verdict = audited.verdict(1.1 * largest)
-    assert verdict.answer == "validated"
-    assert verdict.certificate is not None
-    assert verdict.certificate.details["predictions"]["audited"] == AUDITED
+    untested = CertificateOptions(Automatic(tests=0))
+    plain = Campaign(validation, seed=2).run(12, 1.1 * largest, certificate=untested)
+    tested = Campaign(validation, seed=2).run(30, 1.1 * largest)
+    assert tested.executions <= plain.executions + TESTS
+    assert sum(trial.origin in DRAWN for trial in tested.trials) == TESTS
+    assert all(PREDICTION in (trial.note or {}) for trial in tested.trials if trial.origin in DRAWN)
+    assert tested.verdict(1.1 * largest).answer == "validated"
+    assert plain.verdict(1.1 * largest, certificate=untested).answer == "validated"
+    assert "must be predicted beforehand" in plain.verdict(1.1 * largest).reason
 
 
 @pytest.mark.slow
@@ -176,7 +178,7 @@ def test_a_prediction_audit_executes_eight_fresh_tasks() -> None:
 def test_the_posterior_bound_predicts_nothing() -> None:
     campaign = Campaign(make_validation(), seed=1)
     campaign.run(20, 1e3, certificate=CertificateOptions(Posterior()))
-    assert campaign.verdict(1e3).answer == "validated"
+    assert campaign.verdict(1e3, certificate=CertificateOptions(Posterior())).answer == "validated"
     assert not any(PREDICTION in (trial.note or {}) for trial in campaign.trials)
 
 
@@ -247,13 +249,13 @@ def asked(found: DynamicsEvidence, known: np.ndarray, threshold: float, best: fl
 @pytest.mark.slow
 def test_without_a_threshold_it_ends_when_the_interval_is_narrow() -> None:
     validation, largest = linear(2)
-    campaign = Campaign(validation).run(12)
+    campaign = Campaign(validation).run(20)
     bound = campaign.certify().upper_bound
-    assert campaign.executions < 12
+    assert campaign.executions < 20
     assert campaign.estimate is not None
     assert campaign.estimate <= largest * (1 + 1e-6)
     assert largest * (1 - 1e-6) <= bound <= 1.05 * campaign.estimate
-    assert Campaign(validation).run(12, within=10.0).executions <= campaign.executions
+    assert Campaign(validation).run(20, within=10.0).executions <= campaign.executions
 
 
 def test_another_search_spends_its_budget_unless_a_threshold_is_stated() -> None:
@@ -273,7 +275,7 @@ def test_what_is_learned_of_the_same_executions_is_learned_once(monkeypatch: pyt
 
     monkeypatch.setattr(dynamics_study, "condition", counted)
     validation, largest = linear(2)
-    campaign = Campaign(validation).run(12, 1.1 * largest)
+    campaign = Campaign(validation).run(18, 1.1 * largest)
     assert campaign.verdict(1.1 * largest).answer == "validated"
     assert campaign.ask() is not None  # the search predicts by the same posterior
     assert len(conditioned) >= campaign.executions
@@ -298,10 +300,10 @@ def test_before_a_bound_is_possible_nothing_but_the_mean_is_searched() -> None:
 def test_a_decided_campaign_that_is_run_again_computes_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     validation, largest = linear()
     store = tmp_path / "a.sqlite"
-    first = Campaign(validation, store=store).run(12, 1.1 * largest)
+    first = Campaign(validation, store=store).run(24, 1.1 * largest)
     verdict = first.verdict(1.1 * largest)
     monkeypatch.setattr(dynamics_study.DynamicsStudy, "learn", lambda *_: pytest.fail("it learned again"))
-    again = Campaign(linear()[0], store=store).run(12, 1.1 * largest)
+    again = Campaign(linear()[0], store=store).run(24, 1.1 * largest)
     assert facts(again) == facts(first)
     assert again.verdict(1.1 * largest).to_json() == verdict.to_json()
 

@@ -32,8 +32,8 @@ def test_people_execute_the_same_tasks_as_a_campaign_that_runs_by_itself(share: 
     case = cases.by_name("linear", 0, dim=1)
     assert case.truth is not None
     threshold = share * case.truth().distance
-    by_itself = Campaign(case.validation).run(8, threshold)
-    by_people = operate(Campaign(case.validation, store=tmp_path / "people.sqlite"), threshold, 8)
+    by_itself = Campaign(case.validation).run(20, threshold)
+    by_people = operate(Campaign(case.validation, store=tmp_path / "people.sqlite"), threshold, 20)
     assert facts(by_people) == facts(by_itself)
     answers = {campaign.verdict(threshold).answer for campaign in (by_people, by_itself)}
     assert answers == {"falsified" if share < 1 else "validated"}
@@ -44,17 +44,17 @@ def test_each_task_is_predicted_beforehand_and_a_reopened_store_goes_on(tmp_path
     case = cases.by_name("linear", 1, dim=1)
     assert case.truth is not None
     threshold, path = 1.1 * case.truth().distance, tmp_path / "people.sqlite"
-    for _ in range(8):
+    for _ in range(20):
         # A new process for each task, as people have it.
         campaign = Campaign(case.validation, store=path)
-        opened = campaign.ask_for_verdict(threshold, 8)
+        opened = campaign.ask_for_verdict(threshold, 20)
         if opened is None:
             break
         campaign.tell(opened, case.validation.system.execute(opened.plan.controller, opened.plan.task))
         campaign.store.close()
     assert campaign.verdict(threshold).answer == "validated"
     assert all(trial.note is not None for trial in campaign.trials)
-    assert facts(campaign) == facts(Campaign(case.validation).run(8, threshold))
+    assert facts(campaign) == facts(Campaign(case.validation).run(20, threshold))
 
 
 def test_the_budget_counts_open_trials() -> None:

@@ -12,7 +12,7 @@ from typer.testing import CliRunner, Result
 
 from ctxval import Store
 from ctxval.cli import app
-from ctxval.config.settings import read_settings
+from ctxval.cli.config.settings import read_settings
 from ctxval.core.rollout import rollout
 
 RIG = """

@@ -22,8 +22,8 @@ from ctxval.certificates import (
     Scenario,
 )
 from ctxval.cli import app
-from ctxval.config.settings import read_settings
-from ctxval.config.signatures import code_named
+from ctxval.cli.config.settings import read_settings
+from ctxval.cli.config.signatures import code_named
 from ctxval.core.space import DISTRIBUTION
 from ctxval.core.task_distribution import distribution_text
 from ctxval.errors import CtxvalError, InputError, StoreMismatchError, UnknownNameError

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from ctxval import Trial
+from ctxval._util.version import VERSION
 from ctxval.certificates import Audit, CertificateOptions, Provenance, SamplingDiscarding, Scenario, assess
 from ctxval.errors import CertificateError, InputError
-from ctxval.version import VERSION
 
 DRAWN = [
     Trial(k, "iid", "completed", np.array([x]), {"x": x}, 1, True, 0.5 * x)

@@ -115,11 +115,11 @@ def test_a_prediction_that_failed_matters_by_the_margin_to_the_threshold() -> No
 
 def test_an_undecided_verdict_says_how_many_executions_are_needed_and_what_the_samples_say() -> None:
     fewer = replace(sample(), learned=Learned(replace(GOOD, predictions=GOOD.predictions[:1])))
-    certificate, expected = Dynamics().certify_against(fewer, 1.2)
+    certificate, expected = Dynamics(tests=0).certify_against(fewer, 1.2)
     assert certificate.doubt is not None
     assert expected == Forecast(2, 1.0, 0.0, fewest=True)
     assert "at least 2 more executions are needed, and 100 % of the posterior samples" in str(expected)
-    assert Dynamics().certify_against(sample(), 1.2)[1] is None
+    assert Dynamics(tests=0).certify_against(sample(), 1.2)[1] is None
 
 
 def test_a_draw_that_diverges_leaves_no_bound() -> None:
@@ -168,28 +168,31 @@ def test_it_needs_the_model_and_executions_that_did_not_fail() -> None:
 
 def test_the_verdict_names_its_evidence() -> None:
     known = Provenance(learned=Learned(GOOD))
-    verdict = judge(trials(), 1.1, CertificateOptions(Dynamics()), known)
-    assert str(verdict).startswith("validated: by a prior on the dynamics, the dynamics bound of 4 trials is ")
+    verdict = judge(trials(), 1.1, CertificateOptions(Dynamics(tests=0)), known)
+    assert str(verdict).startswith(
+        "validated: no prediction was tested where nobody chose to look (tests = 0); by a prior on the dynamics, the "
+        "dynamics bound of 4 trials is "
+    )
     assert verdict.rests_on is not None
     assert "the recorded state being complete" in verdict.rests_on
 
 
 def test_a_gate_that_passes_only_in_part_is_support_and_no_validation() -> None:
     part = Learned(replace(GOOD, coverage=replace(COVERED, marginal=gap(0.4))))
-    verdict = judge(trials(), 1.1, CertificateOptions(Dynamics()), Provenance(learned=part))
+    verdict = judge(trials(), 1.1, CertificateOptions(Dynamics(tests=0)), Provenance(learned=part))
     assert verdict.answer == "undecided"
     assert verdict.reason.startswith(
         "supported by the model: no posterior sample of the dynamics exceeds 1.1 in a search of 9000 closed loops; 3 "
         "of the last 3 predictions held; but predicted runs enter a gap in the records of u[0] by 40 %"
     )
-    above = judge(trials(), 0.95, CertificateOptions(Dynamics()), Provenance(learned=Learned(GOOD)))
+    above = judge(trials(), 0.95, CertificateOptions(Dynamics(tests=0)), Provenance(learned=Learned(GOOD)))
     assert above.answer == "undecided"
     assert "d* may be up to" in above.reason
 
 
 @pytest.mark.usefixtures("few_draws")
 def test_auto_uses_the_dynamics_if_they_decide_and_the_distance_otherwise() -> None:
-    chosen = CertificateOptions(Automatic())
+    chosen = CertificateOptions(Automatic(tests=0))
     assert judge(trials(), 1.1, chosen, Provenance(learned=Learned(GOOD))).certificate.kind == "dynamics"  # type: ignore[union-attr]
     noisy = Provenance(learned=Learned(replace(GOOD, noise=0.5, maxima=GOOD.maxima + 1)))
     assert judge(trials(9), 1.1, chosen, noisy).certificate.kind == "posterior"  # type: ignore[union-attr]
@@ -213,4 +216,4 @@ def test_the_text_is_complete_and_json_has_every_prediction() -> None:
     assert "x[0] 0.1, u[0] 0.2" in str(found)
     stored = json.loads(json.dumps(found.to_json(), allow_nan=False))["details"]
     assert [one["trial"] for one in stored["checked"]] == [1, 2, 3]
-    assert stored["predictions"] == {"made": 3, "stored_beforehand": 3, "last_ones": 3, "held": 3, "audited": 0}
+    assert stored["predictions"] == {"made": 3, "stored_beforehand": 3, "last_ones": 3, "held": 3}

@@ -25,10 +25,10 @@ from ctxval.certificates.dynamics_diagnostics import (
     PAIR_GAP,
     SHARP,
     TESTED,
-    TOLERATED,
     doubt_of,
     failed,
     fewest_missing,
+    missing_tests,
     raised,
     uncovered,
     untested,
@@ -42,11 +42,10 @@ def doubt(evidence: DynamicsEvidence = GOOD, **changed: Any) -> str | None:
     return doubt_of(replace(evidence, **changed), BEST, BOUND)
 
 
-AUDITED = replace(prediction(4, 0.5, 0.55 + 1.1 * TOLERATED), audit=True)
+TESTS = tuple(replace(prediction(k + 3), origin="spread", point=(k / 9, 1 - k / 9)) for k in range(1, 9))
 BAD: list[tuple[dict[str, Any], str]] = [
     ({"executions": FEWEST - 1}, "needs at least 3"),
     ({"unplanned": 0.01}, "for 1 % of the tasks no controller can be designed"),
-    ({"predictions": (*GOOD.predictions, AUDITED)}, "audit failed: the distance of trial 4"),
     ({"predictions": GOOD.predictions[:2]}, "2 executions of different tasks were predicted"),
     ({"noise": 2 * NOISE}, "2 % of the variance of the residual"),
     ({"left_out": 1.1 * LEFT_OUT}, "leave out 55 % of the largest variance"),
@@ -62,6 +61,10 @@ BAD: list[tuple[dict[str, Any], str]] = [
     ({"untried": UntriedParameter("load", 1.1 * GAP, np.zeros(2))}, "the parameter load hardly changes"),
     ({"highest": 1.1 * BEST / TESTED}, "predicted to be 1.1, but the largest executed one is 0.8"),
     ({"predictions": (prediction(1, 0.9 * MATTERS, 0.9 * MATTERS),) * 3}, "small distances hardly test it"),
+    (
+        {"tests": 8, "predictions": (*GOOD.predictions, *TESTS[:7])},
+        "at least 1 more execution must be predicted beforehand",
+    ),
     ({"sharpness": 1.4 * SHARP}, "one of the largest predicted distances falls by 7 %"),
     ({"jump": 2 * JUMP}, "the predicted distance jumps by up to 2 % of the bound"),
     ({"dense": True, "missed": 1 + 1.4 * AGREE}, "largest distances that differ by 7 %"),
@@ -96,7 +99,7 @@ def test_the_first_sentence_wins() -> None:
 
 def test_predictions_that_could_not_fail_do_not_count() -> None:
     same = replace(prediction(4), new=False)
-    imported = replace(prediction(4), chosen=True, stored=False)
+    imported = replace(prediction(4), origin="manual", stored=False)
     for one in (same, imported):
         said = doubt(predictions=(*GOOD.predictions[:2], one)) or ""
         assert "2 executions of different tasks were predicted" in said
@@ -143,12 +146,25 @@ def test_the_fewest_executions_that_can_decide(evidence: DynamicsEvidence, fewes
     assert fewest_missing(evidence, BEST, BOUND) == fewest
 
 
-def test_an_audited_distance_above_its_prediction_withdraws_the_bound() -> None:
-    fresh = tuple(replace(prediction(k, 0.5, 0.54), audit=True) for k in range(4, 8))
-    assert doubt(predictions=(*GOOD.predictions, *fresh)) is None
-    worse = (*GOOD.predictions, replace(prediction(4, 0.5, 0.6), audit=True), *fresh)
-    said = "the prediction audit failed: the distance of trial 4 is 0.6, and at most 0.55 was predicted"
-    assert said in (doubt(predictions=worse) or "")
+def test_a_failed_test_raises_the_bound_until_later_tests_are_complete_without_it() -> None:
+    tested = replace(GOOD, tests=8, predictions=TESTS)
+    assert doubt(tested) is None
+    assert raised(tested, BOUND) == BOUND
+    failing = (*TESTS[:3], replace(TESTS[3], distance=0.6), *TESTS[4:])
+    assert raised(replace(tested, predictions=failing), BOUND) == pytest.approx(BOUND + 0.1 / ACCURATE)
+    assert raised(replace(tested, predictions=(*failing, *TESTS[:3])), BOUND) > BOUND
+    assert raised(replace(tested, predictions=(*failing, *TESTS[:4])), BOUND) == BOUND
+
+
+def test_only_tests_matter_for_so_long() -> None:
+    chosen = replace(TESTS[0], origin="covering", distance=0.6)
+    assert raised(replace(GOOD, tests=7, predictions=(chosen, *TESTS[1:])), BOUND) == BOUND
+
+
+def test_a_chosen_task_fills_a_gap_but_counts_as_no_test() -> None:
+    chosen = (replace(TESTS[0], origin="covering"), *TESTS[1:])
+    assert missing_tests(chosen, 8) == 1
+    assert missing_tests(chosen, 7) == 0
 
 
 def test_a_failure_long_ago_is_forgiven() -> None:

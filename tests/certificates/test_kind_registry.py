@@ -92,6 +92,7 @@ def test_the_kinds_of_this_package_are_listed_by_name() -> None:
 def test_which_kinds_have_a_use_for_an_option_follows_from_their_fields() -> None:
     assert certificates.USES == {
         "stochastic": ("auto", "dynamics", "posterior"),
+        "tests": ("auto", "dynamics"),
         "resolution": ("auto", "posterior"),
         "volume": ("anytime", "audit", "region", "sampling-discarding", "scenario"),
         "discard": ("region", "sampling-discarding"),

@@ -24,13 +24,14 @@ def test_a_corner_that_a_trial_is_only_near_to_is_executed_before_anything_is_va
     assert not now.decided
     assert now.next_point is not None
     assert now.next_point.tolist() == [1.0]
-    verdict = judge(known, 0.9)
+    by_distance = CertificateOptions.posterior()
+    verdict = judge(known, 0.9, by_distance)
     assert verdict.answer == "undecided"
     assert "1 of the 2 ends of the task parameter's range" in verdict.reason
     # What rises towards the end, and nowhere else, is found there.
     assert StoppingRule(0.9).decide([*known, trial(9, 1.0, 1.0)], left=4).decided
     assert judge([*known, trial(9, 1.0, 1.0)], 0.9).answer == "falsified"
-    assert judge([*known, trial(9, 1.0, 0.01)], 0.9).answer == "validated"
+    assert judge([*known, trial(9, 1.0, 0.01)], 0.9, by_distance).answer == "validated"
 
 
 @pytest.mark.slow

@@ -159,7 +159,7 @@ def test_scenario_and_audit_bounds_judge_too() -> None:
 
 
 def test_the_posterior_bound_validates_what_is_far_above_it() -> None:
-    verdict = judge(trials(), 50.0)
+    verdict = judge(trials(), 50.0, posterior())
     assert verdict.answer == "validated"
     assert verdict.certificate is not None
     assert verdict.certificate.kind == "posterior"
@@ -281,10 +281,11 @@ def test_a_failure_that_was_made_good_counts_no_more() -> None:
     failed_later = [*known, replace(again, number=len(known)), replace(failed, number=99)]
     for not_made_good in ([*known, failed], failed_later):
         assert "executions failed" in judge(not_made_good, 1e3).reason
-    made_good, never_failed = judge([*known, failed, again], 1e3), judge([*known, again], 1e3)
+    by = posterior()
+    made_good, never_failed = judge([*known, failed, again], 1e3, by), judge([*known, again], 1e3, by)
     assert (made_good.answer, never_failed.answer) == ("undecided", "validated")
     assert "for no stated reason" in made_good.reason
-    explained = judge([*known, failed, replace(again, because="fuse replaced")], 1e3)
+    explained = judge([*known, failed, replace(again, because="fuse replaced")], 1e3, by)
     assert explained.answer == "validated"
     assert explained.rests_on is not None
     assert "your word that what made trial 8 fail is removed for good" in explained.rests_on
@@ -342,7 +343,7 @@ def test_a_quarter_of_the_diagonal_is_39_percent_of_a_plane() -> None:
 
 
 def test_a_validation_names_what_it_rests_on() -> None:
-    verdict = judge(trials(), 50.0, provenance=IN_SPACE)
+    verdict = judge(trials(), 50.0, posterior(), IN_SPACE)
     assert verdict.rests_on == (
         "It rests on the distance being as smooth between the trials as at them, to a resolution of 0.25 rad in goal "
         "(a peak inside a gap of that radius, 25 % of the task space, may be missed); on each task having one "

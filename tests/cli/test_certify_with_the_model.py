@@ -11,7 +11,7 @@ from typer.testing import CliRunner, Result
 
 from ctxval import Store
 from ctxval.cli import app
-from ctxval.config import signatures
+from ctxval.cli.config import signatures
 from small_searches import run_few_loops, take_few_draws
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("few_loops")]

@@ -18,7 +18,7 @@ from typer.testing import CliRunner, Result
 from conftest import make_validation
 from ctxval import Campaign, Store, TaskSpace, Validation, __version__, searches
 from ctxval.cli import app
-from ctxval.cli.commands import MODULES, PANELS
+from ctxval.cli.commands import MODULES, PANELS, TEXTS
 
 EXPERIMENT = """
 import sys
@@ -87,7 +87,20 @@ def test_the_default_search_learns_from_trajectories(invoke) -> None:  # type: i
 
 @pytest.mark.slow
 def test_json_is_one_object_with_everything_asked_for(invoke) -> None:  # type: ignore[no-untyped-def]
-    asked = ("--budget", "8", "--seed", "3", "--truth", "--threshold", "9", "--resolution", "1", "--json")
+    asked = (
+        "--budget",
+        "8",
+        "--seed",
+        "3",
+        "--truth",
+        "--threshold",
+        "9",
+        "--resolution",
+        "1",
+        "--tests",
+        "0",
+        "--json",
+    )
     result = invoke("run", "rig:experiment", *asked)
     report = json.loads(result.stdout)
     assert result.exit_code == 0
@@ -120,7 +133,7 @@ def test_a_falsified_model_exits_with_1(invoke) -> None:  # type: ignore[no-unty
 
 
 def test_the_human_report_names_the_worst_task_and_the_verdict(invoke) -> None:  # type: ignore[no-untyped-def]
-    result = invoke("run", "rig:validation", "--budget", "6", "--threshold", "5", "--resolution", "1")
+    result = invoke("run", "rig:validation", "--budget", "6", "--threshold", "5", "--resolution", "1", "--tests", "0")
     assert result.exit_code == 0
     assert "goal =" in result.stdout
     assert "VALIDATED against 5" in result.stdout
@@ -265,7 +278,7 @@ def test_a_campaign_stops_as_soon_as_its_verdict_is_reached(invoke) -> None:  # 
     given = ("run", "rig:experiment", "--budget", "30", "--decide", "--no-report", "--json")
     validated = json.loads(invoke(*given, "--threshold", "9").stdout)
     assert validated["verdict"] == "validated"
-    assert 4 <= validated["executions"] < 14
+    assert 4 <= validated["executions"] < 22
     falsified = invoke(*given, "--threshold", "0.001", "--seed", "1")
     assert falsified.exit_code == 1
     assert json.loads(falsified.stdout)["executions"] == 1
@@ -451,7 +464,7 @@ def test_an_audit_that_is_extended_counts_what_was_decided_on_last(invoke, campa
 @pytest.mark.slow
 def test_draws_that_ended_with_the_verdict_have_no_number_chosen_beforehand(invoke) -> None:  # type: ignore[no-untyped-def]
     arguments = ("run", "rig:experiment", "--search", "random", "--store", "a.sqlite")
-    invoke(*arguments, "--threshold", "90", "--resolution", "1", "--decide", "--budget", "12")
+    invoke(*arguments, "--threshold", "90", "--resolution", "1", "--tests", "0", "--decide", "--budget", "12")
     for kind, sentence in (("scenario", "the draws ended with the verdict"), ("audit", "none counts")):
         result = invoke("certify", "a.sqlite", "--kind", kind)
         assert result.exit_code == 2
@@ -469,7 +482,7 @@ def test_a_scenario_bound_of_a_budget_that_was_raised_is_refused(invoke) -> None
 
 @pytest.mark.slow
 def test_a_run_names_what_its_verdict_rests_on_and_the_other_campaigns(invoke) -> None:  # type: ignore[no-untyped-def]
-    arguments = ("run", "rig:experiment", "--budget", "12", "--threshold", "90", "--resolution", "0.6")
+    arguments = ("run", "rig:experiment", "--budget", "12", "--threshold", "90", "--resolution", "0.6", "--tests", "0")
     arguments += ("--decide",)
     alone = invoke(*arguments)
     text = " ".join(alone.stdout.split())
@@ -605,6 +618,14 @@ def test_the_help_says_of_each_command_what_its_module_says() -> None:
         for name, (module, sentence) in names.items():
             assert commands[name].callback.__module__ == f"ctxval.cli.{module}"
             assert commands[name].help.split("\n\n")[0] == sentence
+
+
+def test_every_text_of_an_option_is_shown() -> None:
+    shown = {name: {each.name for each in command.params} for name, command in every_command().items()}
+    for command, texts in TEXTS.items():
+        if command != "groups":
+            named = set().union(*shown.values()) if command == "options" else shown[command]
+            assert set(texts) <= named, command
 
 
 def test_every_command_has_an_example() -> None:

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from ctxval import models
-from ctxval.config.parts import part
-from ctxval.config.settings import read_settings
+from ctxval.cli.config.parts import part
+from ctxval.cli.config.settings import read_settings
 from ctxval.errors import InputError
 from rig_cli import Invoke, calling, report
 from rig_logs import DT, run, write_mcap_json

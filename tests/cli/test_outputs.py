@@ -10,10 +10,10 @@ import pytest
 
 from ctxval import models, plot
 from ctxval._util.files import MADE_BY, write_text, written_whole
-from ctxval.cli.outputs import require_folder, require_outputs
+from ctxval.cli.options import require_folder, require_outputs
 from ctxval.core.trajectory import Transitions
 from ctxval.errors import InputError
-from ctxval.fitting.model_file import write_model_file
+from ctxval.studies.fitting.model_file import write_model_file
 from rig_cli import calling
 from rig_logs import run
 

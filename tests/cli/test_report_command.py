@@ -47,7 +47,17 @@ def invoke(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
 @pytest.fixture
 def store(invoke: Any) -> Path:
     done = invoke(
-        "run", "short_rig:experiment", "--search", "gp-ucb", "--resolution", "1", "--store", "a.sqlite", "--no-report"
+        "run",
+        "short_rig:experiment",
+        "--search",
+        "gp-ucb",
+        "--resolution",
+        "1",
+        "--tests",
+        "0",
+        "--store",
+        "a.sqlite",
+        "--no-report",
     )
     assert done.exit_code == 0, done.output
     assert not Path("a.report.html").exists()
@@ -59,7 +69,7 @@ def store(invoke: Any) -> Path:
     [
         [],
         ["--search", "gp-ucb", "--decide", "--threshold", "5", "--confidence", "0.9", "--budget", "6"],
-        ["--search", "gp-ucb", "--decide", "--audited", "--budget", "3"],
+        ["--search", "gp-ucb", "--decide", "--tests", "3", "--budget", "3"],
         ["--search", "gp-ucb", "--resolution", "1", "--budget", "3", "--stochastic"],
     ],
     ids=" ".join,
@@ -79,7 +89,7 @@ def test_the_command_of_a_report_repeats_the_campaign(invoke: Any, options: list
 
 
 def test_run_writes_a_report_next_to_the_store(invoke: Any) -> None:
-    done = invoke("run", "short_rig:experiment", "--search", "gp-ucb", "--resolution", "1", "--json")
+    done = invoke("run", "short_rig:experiment", "--search", "gp-ucb", "--resolution", "1", "--tests", "0", "--json")
     report = json.loads(done.stdout)
     assert report["report"] == "runs/short-gp-ucb-seed0.report.html"
     page = Path(report["report"]).read_text(encoding="utf-8")

@@ -98,16 +98,10 @@ def test_limits_are_given_as_numbers_tables_or_rows(given: Any, low: list[float]
 
 
 @pytest.mark.parametrize("kind", [list, tuple, np.array])
-def test_a_flat_list_is_refused_with_what_may_be_meant(kind: Any) -> None:
-    two_ways = r"\[1\.0, 8\.0\] can be read in two ways: write \{ low = 1\.0, high = 8\.0 \} for 1 to 8 .*"
-    with pytest.raises(InputError, match=two_ways + r"or \[\[-1\.0, 1\.0\], \[-8\.0, 8\.0\]\] for one row"):
-        Limits.of(kind([1.0, 8.0]), 2)
-    with pytest.raises(InputError, match=r"flat list, got \[-1\.0, 8\.0\]: write \{ low = -1\.0, high = 8\.0 \}"):
-        Limits.of(kind([-1.0, 8.0]), 2)
-    with pytest.raises(InputError, match=r"flat list, got \[3\.0\]: write \[\[-3\.0, 3\.0\]\] for one row"):
-        Limits.of(kind([3.0]), 1)
-    with pytest.raises(InputError, match=r"flat list, .* write one number h for -h to h"):
-        Limits.of(kind([3.0, -3.0]), 2)
+def test_a_flat_list_is_refused(kind: Any) -> None:
+    for flat in ([1.0, 8.0], [3.0], [3.0, -3.0]):
+        with pytest.raises(InputError, match=r"flat list, got .* write one number h for -h to h"):
+            Limits.of(kind(flat), len(flat))
 
 
 @pytest.mark.parametrize(

@@ -111,7 +111,7 @@ def test_a_task_comes_back_bit_for_bit(tmp_path: Path) -> None:
 
 def test_only_affine_feedback_of_one_task_can_be_written(tmp_path: Path) -> None:
     path = tmp_path / "controller.json"
-    with pytest.raises(InputError, match="only affine feedback, such as that of LQR and iLQR"):
+    with pytest.raises(InputError, match="only affine feedback, as of LQR and iLQR"):
         write_controller(path, lambda t, x: x, dt=0.1)
     batch = controllers.LQR([1.0, 0.1], [0.01]).design(Task(np.zeros((3, 2)), horizon=4, dt=0.1), MODEL)
     with pytest.raises(ShapeError, match="controller must be for one task"):

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from ctxval.data import LogMapping, read_logs, read_recordings
-from ctxval.data.decoders import ros2_decoder
+from ctxval.data.messages import ros2_decoder
 from ctxval.errors import InputError
 from rig_logs import run, write_bag1
 

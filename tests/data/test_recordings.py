@@ -13,7 +13,7 @@ import pytest
 
 from ctxval import Trajectory
 from ctxval.data import LogMapping, Recordings, read_logs, read_recordings
-from ctxval.data.decoders import ros1_decoder
+from ctxval.data.messages import ros1_decoder
 from ctxval.errors import InputError
 from rig_logs import (
     DT,

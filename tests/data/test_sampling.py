@@ -161,7 +161,7 @@ def test_too_many_steps_are_refused() -> None:
 
 def test_inputs_that_change_between_samples_are_averaged() -> None:
     from ctxval import models
-    from ctxval.replay import replay
+    from ctxval.studies.replay import replay
 
     rng, dt, logs = np.random.default_rng(0), 0.05, []
     for number in range(4):

@@ -31,17 +31,6 @@ def test_everything_agrees_with_dense_linear_algebra() -> None:
     assert (sign, 2 * factor.half_log_determinant()) == pytest.approx((1.0, log_determinant), rel=1e-12)
 
 
-def test_each_observation_left_out_is_predicted_from_the_others() -> None:
-    K, Y = covariance(), np.random.default_rng(1).normal(size=(7, 2))
-    factor = factorise(K, 0.5)
-    errors = factor.left_out_errors(factor.solve(Y))
-    for i in range(7):
-        rest = np.arange(7) != i
-        predicted = K[i, rest] @ np.linalg.solve((K + 0.5 * np.eye(7))[np.ix_(rest, rest)], Y[rest])
-        np.testing.assert_allclose(Y[i] - errors[i], predicted, rtol=1e-9)
-    np.testing.assert_allclose(factor.left_out_errors(factor.solve(Y[:, 0])), errors[:, 0], rtol=1e-12)
-
-
 def test_the_covariance_is_not_changed() -> None:
     K = covariance()
     before = K.copy()

@@ -10,8 +10,7 @@ from ctxval._util.arrays import Array
 from ctxval.gp.cholesky import factorise
 from ctxval.learning.component import Component, draw_functions
 from ctxval.learning.dynamics_posterior import DynamicsPosterior, PosteriorSettings, learn_posterior
-from ctxval.learning.hyperparameters import FAMILIES, Hyperparameters
-from ctxval.learning.residual_kernel import ResidualKernel
+from ctxval.learning.hyperparameters import FAMILIES, Hyperparameters, ResidualKernel
 
 MODEL = models.Linear([[1.0, 0.1], [0.0, 0.9]], [[0.0], [0.1]])
 OTHER = models.Linear([[1.02, 0.05], [0.1, 0.9]], [[0.05], [0.08]], [0.01, -0.02])

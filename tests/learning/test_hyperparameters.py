@@ -14,12 +14,12 @@ from ctxval.learning.hyperparameters import (
     NOISE,
     HyperparameterPosterior,
     Hyperparameters,
+    ResidualKernel,
     _resampled,
     draw_prior,
     learning_rows,
     log_posterior,
 )
-from ctxval.learning.residual_kernel import ResidualKernel
 
 KERNEL = ResidualKernel(2.5, 1.0, 1)
 PARAMETERS = np.log([1.5, 0.7, 2.0, 0.3, 0.01])

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from ctxval._util.arrays import Array
-from ctxval.learning.hyperparameters import Hyperparameters
+from ctxval.learning.hyperparameters import Hyperparameters, ResidualKernel
 from ctxval.learning.kernel_expansion import KernelExpansion
-from ctxval.learning.residual_kernel import ResidualKernel
 
 
 def expansion(nu: float, growth: float, functions: int, inputs: int = 1) -> KernelExpansion:

@@ -10,10 +10,10 @@ from conftest import make_validation
 from ctxval import Task, TaskSpace, Validation, controllers, distances, models, systems
 from ctxval._util.arrays import Array
 from ctxval._util.progress import Progress, listening, stage
-from ctxval.cases import linear
 from ctxval.core.controller import Controller, Synthesizer
 from ctxval.core.trajectory import Trajectory
 from ctxval.learning import DynamicsStudy, dynamics_study
+from ctxval.paper.cases import linear
 from ctxval.searches import Prediction
 
 MODEL = models.Linear([[1.0, 0.1], [0.0, 0.9]], [[0.0], [0.1]])

@@ -14,7 +14,8 @@ from ctxval._util.arrays import Array
 from ctxval.core.controller import Controller
 from ctxval.core.rollout import rollout
 from ctxval.errors import DesignError
-from ctxval.learning.recorded import affordable_centres, closed_loops_on_model, recorded_transitions
+from ctxval.learning import PosteriorSettings
+from ctxval.learning.recorded import closed_loops_on_model, recorded_transitions
 
 A, B = [[1.0, 0.1], [0.0, 0.9]], [[0.0], [0.1]]
 LQR = controllers.LQR([1.0, 0.1], [0.1])
@@ -188,4 +189,5 @@ def test_of_long_logs_the_steps_near_the_tasks_are_kept() -> None:
 
 
 def test_long_loops_have_fewer_centres_within_limits() -> None:
-    assert [affordable_centres(horizon, 100, 450) for horizon in (10, 100, 200, 1000)] == [450, 300, 150, 100]
+    centres = [PosteriorSettings.for_horizon(horizon).centres for horizon in (10, 100, 1000)]
+    assert centres == [400, 300, 150]

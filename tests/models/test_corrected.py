@@ -14,9 +14,9 @@ from hypothesis import strategies as st
 from ctxval import Transitions, models
 from ctxval.core.model import central_differences
 from ctxval.errors import InputError, ShapeError
-from ctxval.fitting.onnx_file import write_onnx
 from ctxval.models.corrected import before_refinement
 from ctxval.models.saved import is_savable, read_note
+from ctxval.studies.fitting.model_file import write_onnx
 
 LINEAR = models.Linear([[1.0, 0.1], [0.0, 0.9]], [[0.0], [0.1]], [0.1, 0.0])
 

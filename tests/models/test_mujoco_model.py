@@ -13,11 +13,11 @@ from typer.testing import CliRunner
 
 from ctxval import Campaign, Task, TaskSpace, Trajectory, Validation, controllers, distances, models, systems, testing
 from ctxval.cli import app
-from ctxval.config.parts import part
+from ctxval.cli.config.parts import part
 from ctxval.data import recordings_of
 from ctxval.data.log import MemoryTable
 from ctxval.errors import InputError, ModelError, ShapeError
-from ctxval.fitting import fit
+from ctxval.studies.fitting import fit
 
 mujoco = pytest.importorskip("mujoco")
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from ctxval import models, testing
-from ctxval.config.parts import part
+from ctxval.cli.config.parts import part
 from ctxval.errors import InputError
 
 

@@ -11,7 +11,15 @@ from sklearn.compose import TransformedTargetRegressor
 from sklearn.decomposition import PCA
 from sklearn.ensemble import RandomForestRegressor
 from sklearn.gaussian_process import GaussianProcessRegressor
-from sklearn.gaussian_process.kernels import RBF, ConstantKernel, DotProduct, ExpSineSquared, Matern, WhiteKernel
+from sklearn.gaussian_process.kernels import (
+    RBF,
+    ConstantKernel,
+    DotProduct,
+    ExpSineSquared,
+    Matern,
+    RationalQuadratic,
+    WhiteKernel,
+)
 from sklearn.kernel_ridge import KernelRidge
 from sklearn.linear_model import BayesianRidge, LinearRegression, PoissonRegressor, Ridge
 from sklearn.multioutput import MultiOutputRegressor
@@ -50,6 +58,9 @@ KNOWN = [
     process(None),
     process(ConstantKernel(2.0) * RBF([1.0, 3.0, 0.5]) + WhiteKernel(0.1), normalize_y=True),
     process(Matern(2.0, nu=2.5) + ConstantKernel(0.5) * DotProduct(), normalize_y=True),
+    process(ConstantKernel(1e-4) * DotProduct(0.5) ** 3),
+    *(process(kernel) for kernel in (Matern(2.0, nu=0.5), Matern(2.0, nu=1.5), Matern(2.0, nu=np.inf))),
+    process(RBF([1.0, 2.0, 0.7]) * (RationalQuadratic(0.8, 1.7) + DotProduct())),
     *(
         KernelRidge(alpha=0.1, kernel=kernel, gamma=0.3)
         for kernel in ("rbf", "linear", "poly", "polynomial", "sigmoid")
@@ -87,6 +98,13 @@ def test_a_formula_predicts_as_its_regressor_with_its_derivatives(regressor: Any
     moves = h * np.eye(3)
     differences = [(regressor.predict(ROWS + move) - regressor.predict(ROWS - move)) / (2 * h) for move in moves]
     np.testing.assert_allclose(smooth.jacobian(ROWS), np.stack(differences, axis=-1), rtol=1e-6, atol=1e-6)
+
+
+def test_at_a_centre_the_derivatives_are_finite() -> None:
+    for nu in (0.5, 1.5, np.inf):
+        smooth = smooth_map(fitted(process(Matern(1.0, nu=nu))))
+        assert smooth is not None
+        assert np.isfinite(smooth.jacobian(X)).all()
 
 
 def test_a_single_target_is_one_column() -> None:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from ctxval import Transitions, models
-from ctxval.config.parts import part
+from ctxval.cli.config.parts import part
 from ctxval.errors import InputError
 
 RNG = np.random.default_rng(0)

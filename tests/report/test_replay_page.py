@@ -16,8 +16,8 @@ from ctxval.data.log import MemoryTable
 from ctxval.data.sampling import Break
 from ctxval.errors import InputError
 from ctxval.models import Linear
-from ctxval.replay import PredictedTask, PredictedTasks, ReplayReport, replay
 from ctxval.report.replay_page import replay_page, write_replay_page
+from ctxval.studies.replay import PredictedTask, PredictedTasks, ReplayReport, replay
 from rig_logs import run
 
 LARGEST = 300_000

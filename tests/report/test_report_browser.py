@@ -40,7 +40,7 @@ def case(name: str, executions: int) -> ReportContext:
 
 def arm() -> ReportContext:
     pytest.importorskip("mujoco")
-    return case("arm", 8)
+    return case("arm", 4)
 
 
 def by_hand(tmp_path: Path) -> ReportContext:
@@ -54,7 +54,7 @@ def by_hand(tmp_path: Path) -> ReportContext:
 
 
 REPORTS: dict[str, Callable[[Path], ReportContext]] = {
-    "pendulum": lambda folder: case("pendulum", 15),
+    "pendulum": lambda folder: case("pendulum", 8),
     "many parameters": lambda folder: context_of_campaign(plane(8), threshold=0.1),
     "arm": lambda folder: arm(),
     "by hand": by_hand,

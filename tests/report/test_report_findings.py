@@ -12,9 +12,8 @@ from ctxval import Campaign, Task, TaskSpace, Trajectory, Validation, controller
 from ctxval._util.arrays import Array
 from ctxval.certificates import CertificateOptions
 from ctxval.report import ReportContext, context_of_campaign
-from ctxval.report.diagnostics import diagnostics, not_tested, share_far_from_trials
+from ctxval.report.diagnostics import Finding, diagnostics, findings_of, not_tested, share_far_from_trials
 from ctxval.report.distance_model import DistanceModel
-from ctxval.report.findings import Finding, findings_of
 from ctxval.report.insights import (
     bias,
     components,

@@ -19,9 +19,9 @@ from ctxval import Campaign, Trial, report
 from ctxval.certificates import CertificateOptions, Region
 from ctxval.errors import InputError
 from ctxval.report import ReportContext, context_of_campaign, context_of_store, sections
-from ctxval.report.recorded_lines import packed, recorded_lines
 from ctxval.report.sections import appendix
 from ctxval.report.sections.repeat import command_of, identity, python_snippet
+from ctxval.report.sections.trials import packed, recorded_lines
 
 POSTERIOR = CertificateOptions.posterior()
 

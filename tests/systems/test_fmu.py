@@ -387,20 +387,22 @@ def test_an_initial_state_that_is_not_taken_is_an_error(path: Path) -> None:
         system.execute(feedback, TASK)
 
 
-def test_start_values_that_are_refused_are_an_error(fmi2: Path) -> None:
+def test_start_values_that_are_refused_are_an_error(fmi2: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     # In this process, and with an FMU that refuses everything: those that are built here refuse no start value.
     unit = fmu_process.Unit(str(unpacked(fmi2)), "a.fmu", [0, 1], [2], ["position", "speed"], {})
 
     class Refusing:
-        def __getattr__(self, name: str) -> Any:
+        def refuse(self, *arguments: object, **options: object) -> None:
             raise RuntimeError("calculated")
 
-    unit.fmu, unit._set = Refusing(), lambda references, values: Refusing().anything
+        setReal = getReal = setupExperiment = refuse  # noqa: N815
+
+    monkeypatch.setattr("fmpy.simulation.instantiate_fmu", lambda *arguments, **options: Refusing())
     with pytest.raises(fmu_process.Refused, match="start values of position, speed be set: calculated") as caught:
-        unit._set_start([1.0, 2.0])
+        unit.begin([1.0, 2.0], 0.1, 1)
     assert caught.value.input_is_wrong
     with pytest.raises(fmu_process.Refused, match=r"a\.fmu cannot be initialised: calculated"):
-        unit._initialise()
+        unit.begin(None, 0.1, 1)
 
 
 def unpacked(path: Path) -> Path:

@@ -16,7 +16,6 @@ from ctxval import Campaign, Task, TaskSpace, Validation, controllers, distances
 from ctxval._util.arrays import Array
 from ctxval._util.describe import describe, first_difference
 from ctxval.errors import InputError, ShapeError, UnknownNameError
-from ctxval.systems import mujoco as adapter
 
 ARM = """
 <mujoco>
@@ -88,14 +87,6 @@ def bare_loop(xml: str, substeps: int, controller: Any, task: Task, sites: tuple
     return np.array(states)
 
 
-@pytest.fixture(params=["batch", "loop"])
-def engine(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
-    """Run a test on both: MuJoCo's batch, and the loop for versions without one."""
-    if request.param == "loop":
-        monkeypatch.setattr(adapter, "_simulations", lambda model, count, threads: adapter._Loop(model, count))
-    return str(request.param)
-
-
 @pytest.fixture
 def arm() -> systems.MuJoCo:
     return systems.MuJoCo(ARM, substeps=2, sites=("tip",))
@@ -111,7 +102,6 @@ def arm_task(arm: systems.MuJoCo, count: int = 5, horizon: int = 40) -> Task:
 # Against MuJoCo's own integrator
 
 
-@pytest.mark.usefixtures("engine")
 def test_one_closed_loop_is_what_a_plain_loop_of_mj_step_does(arm: systems.MuJoCo) -> None:
     for index in range(5):
         task = arm_task(arm)[index]
@@ -120,7 +110,6 @@ def test_one_closed_loop_is_what_a_plain_loop_of_mj_step_does(arm: systems.MuJoC
         np.testing.assert_allclose(trajectory.states, bare_loop(ARM, 2, feedback, task, ("tip",)), rtol=0, atol=1e-12)
 
 
-@pytest.mark.usefixtures("engine")
 def test_contacts_and_actuator_states_are_carried_over_from_step_to_step() -> None:
     system = systems.MuJoCo(BALL, substeps=4, sites=("hand",))
     task = Task(system.state([0, 0, 0.12, 1, 0, 0, 0, 0]), horizon=40, dt=0.02)
@@ -129,7 +118,6 @@ def test_contacts_and_actuator_states_are_carried_over_from_step_to_step() -> No
     np.testing.assert_allclose(system.execute(push, task).states, expected, rtol=0, atol=1e-12)
 
 
-@pytest.mark.usefixtures("engine")
 def test_a_batch_does_what_its_tasks_do_alone(arm: systems.MuJoCo) -> None:
     task = arm_task(arm)
     batch = arm.execute(feedback, task)
@@ -137,16 +125,6 @@ def test_a_batch_does_what_its_tasks_do_alone(arm: systems.MuJoCo) -> None:
     assert batch.inputs.shape == (5, 40, 2)
     for index in range(5):
         np.testing.assert_array_equal(batch[index].states, arm.execute(feedback, task[index]).states)
-
-
-def test_the_loop_for_older_versions_gives_the_same_bits(arm: systems.MuJoCo, monkeypatch: pytest.MonkeyPatch) -> None:
-    ball = systems.MuJoCo(BALL, substeps=4)
-    ball_task = Task(ball.state([0, 0, 0.12, 1, 0, 0, 0, 0]), horizon=40, dt=0.02)
-    runs = [(arm, feedback, arm_task(arm)), (ball, push, ball_task)]
-    batches = [system.execute(controller, task).states for system, controller, task in runs]
-    monkeypatch.setattr(adapter, "_simulations", lambda model, count, threads: adapter._Loop(model, count))
-    for (system, controller, task), batch in zip(runs, batches, strict=True):
-        np.testing.assert_array_equal(system.execute(controller, task).states, batch)
 
 
 def test_threads_change_nothing(arm: systems.MuJoCo) -> None:
@@ -170,7 +148,6 @@ def test_it_keeps_the_contract_of_a_system(arm: systems.MuJoCo) -> None:
 # Kinematics and physics
 
 
-@pytest.mark.usefixtures("engine")
 def test_sites_are_where_the_forward_kinematics_puts_them() -> None:
     system = systems.MuJoCo(ARM, substeps=2, sites=("tip", "elbow"), axes="xyz")
     rng = np.random.default_rng(1)
@@ -201,7 +178,6 @@ def test_a_frictionless_pendulum_keeps_its_energy_and_falls_as_the_ode_says() ->
 # Failures
 
 
-@pytest.mark.usefixtures("engine")
 def test_a_diverging_simulation_is_told_from_a_healthy_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)  # MuJoCo logs its warnings into the working directory
     system = systems.MuJoCo(UNSTABLE)
@@ -215,7 +191,6 @@ def test_a_diverging_simulation_is_told_from_a_healthy_one(tmp_path: Path, monke
     assert system.execute(lambda t, x: np.zeros(1), task[0]).ended == "complete"
 
 
-@pytest.mark.usefixtures("engine")
 def test_an_input_that_is_not_finite_never_becomes_zero(arm: systems.MuJoCo) -> None:
     task = arm_task(arm)
 

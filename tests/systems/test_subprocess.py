@@ -154,7 +154,7 @@ def test_no_damage_of_a_trajectory_gives_anything_but_a_failed_execution(kind: s
             broken[position] = rng.integers(256)
         path.write_bytes(bytes(broken[: rng.integers(1, len(whole) + 1)] if rng.random() < 0.3 else broken))
         with contextlib.suppress(ExecutionError):
-            adapter._of_task(adapter._trajectory(tmp_path, TASK), TASK)
+            adapter._trajectory(tmp_path, TASK)
 
 
 def test_executions_run_side_by_side(tmp_path: Path) -> None:

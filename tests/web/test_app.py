@@ -13,8 +13,8 @@ from urllib.parse import urlencode
 
 import pytest
 
+from ctxval.campaign.storage.store import Store
 from ctxval.core.trial import Trial
-from ctxval.storage.store import Store
 from ctxval.web.security import HEADERS, MOST_UPLOAD
 from rig_page import Response, Server, ctxval, new_store, record, serving
 

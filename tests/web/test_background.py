@@ -10,8 +10,9 @@ from typing import Any
 
 import pytest
 
+from ctxval._util.progress import Progress, advance, stage
 from ctxval.errors import CampaignError, InputError
-from ctxval.web.background import BackgroundProcess, Stage, TellStage
+from ctxval.web.background import BackgroundProcess
 
 pytestmark = pytest.mark.slow
 
@@ -27,43 +28,44 @@ def refuse() -> Any:
     raise InputError("there is no such experiment.")
 
 
-def own_process(served: Any, tell: TellStage, *arguments: Any) -> tuple[Any, ...]:
-    tell(Stage("working", 1, 2))
+def own_process(served: Any, *arguments: Any) -> tuple[Any, ...]:
+    with stage("working", 2):
+        advance(1)
     return served, os.getpid(), *arguments
 
 
-def fail(served: Any, tell: TellStage) -> None:
+def fail(served: Any) -> None:
     raise KeyboardInterrupt
 
 
-def die(served: Any, tell: TellStage) -> None:
+def die(served: Any) -> None:
     os.kill(os.getpid(), signal.SIGKILL)
 
 
-def wait(served: Any, tell: TellStage) -> None:
-    tell(Stage("waiting"))
-    time.sleep(60)
+def wait(served: Any) -> None:
+    with stage("waiting"):
+        time.sleep(60)
 
 
 @pytest.fixture
-def stages() -> list[Stage]:
+def stages() -> list[Progress]:
     return []
 
 
 @pytest.fixture
-def process(stages: list[Stage]) -> Iterator[BackgroundProcess]:
+def process(stages: list[Progress]) -> Iterator[BackgroundProcess]:
     made = BackgroundProcess(open_nothing, stages.append)
     yield made
     made.close()
 
 
-def test_jobs_run_one_after_the_other_in_one_other_process(process: BackgroundProcess, stages: list[Stage]) -> None:
+def test_jobs_run_one_after_the_other_in_one_other_process(process: BackgroundProcess, stages: list[Progress]) -> None:
     first, second = (process.submit(own_process, number) for number in (1, 2))
     served, child, number = first.result(WAIT)
     assert (served, number) == ("opened", 1)
     assert child != os.getpid()
     assert second.result(WAIT) == ("opened", child, 2)
-    assert stages[:2] == [Stage("loading the experiment"), Stage("working", 1, 2)]
+    assert [each.stage for each in stages[:2]] == ["loading the experiment", "working"]
 
 
 def test_a_job_that_fails_is_an_error_and_the_next_one_runs(process: BackgroundProcess) -> None:
@@ -86,10 +88,10 @@ def test_a_campaign_that_cannot_be_opened_is_an_error_of_the_job() -> None:
     process.close()
 
 
-def test_closing_ends_the_process_at_once(process: BackgroundProcess, stages: list[Stage]) -> None:
+def test_closing_ends_the_process_at_once(process: BackgroundProcess, stages: list[Progress]) -> None:
     child = process.submit(own_process).result(WAIT)[1]
     waiting = process.submit(wait)
-    while Stage("waiting") not in stages:
+    while "waiting" not in [each.stage for each in stages]:
         time.sleep(0.01)
     process.close()
     assert waiting.exception(10) is not None

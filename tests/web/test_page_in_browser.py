@@ -11,8 +11,8 @@ from typing import Any
 import pytest
 
 from browser import accessibility_findings
+from ctxval.campaign.storage.store import Store
 from ctxval.core.trial import Trial
-from ctxval.storage.store import Store
 from rig_cli import SMALL
 from rig_page import ctxval, new_store, record, serving
 

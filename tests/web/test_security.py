@@ -10,8 +10,7 @@ pytest.importorskip("starlette", reason="starlette is not installed")
 
 from starlette.datastructures import Headers
 
-from ctxval.web.access import Access
-from ctxval.web.security import POLICY, Guard, Hosts, is_address, is_loopback, refusal
+from ctxval.web.security import POLICY, Access, Guard, Hosts, is_address, is_loopback, refusal
 
 LOCAL = Hosts.of("127.0.0.1")
 NETWORK = Hosts.of("0.0.0.0", ["Rig.Example"])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from ctxval.campaign.dynamics import PREDICTION
 from ctxval.core.trial import Origin, Trial
 from ctxval.learning import ExecutionPrediction
-from ctxval.web.words import in_words, why
+from ctxval.web.page import in_words, why
 
 PREDICTED = ExecutionPrediction(4, tuple(np.linspace(0.1, 0.3, 21)), 0.05, (1,), ((0.0,),), ((0.1,),), 0.0)
 
@@ -66,7 +66,11 @@ def test_numbers_of_a_note_may_be_too_large(note: dict[str, Any]) -> None:
     assert why(trial("acquisition", note), "m")
 
 
-@given(st.dictionaries(KEYS, JSON), st.text(), st.sampled_from(["iid", "initial", "acquisition", "covering", "manual"]))
+@given(
+    st.dictionaries(KEYS, JSON),
+    st.text(),
+    st.sampled_from(get_args(Origin)),
+)
 def test_no_note_is_too_odd(note: dict[str, Any], units: str, origin: Origin) -> None:
     for sentence in why(trial(origin, note), units):
         assert sentence.endswith(".")

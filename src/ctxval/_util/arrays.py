@@ -29,7 +29,6 @@ _SHOWN.maxstring = _SHOWN.maxother = 200
 
 
 def as_floats(name: str, value: ArrayLike) -> Array:
-    """Return ``value`` as a float64 array."""
     if _is_masked(value):
         raise InputError(
             f"{name} must be numbers without masked entries; fill in the masked entries, or replace them with NaN."
@@ -50,7 +49,6 @@ def _is_masked(value: object) -> bool:
 
 
 def as_finite(name: str, value: ArrayLike) -> Array:
-    """Return ``value`` as a float64 array without NaN and infinity."""
     array = as_floats(name, value)
     finite = np.isfinite(array)
     if not finite.all():
@@ -90,7 +88,6 @@ def rows_of(array: Array) -> Array:
 
 
 def vector_norm(vectors: Array, order: float) -> Array:
-    """Return the ``order``-norm (1, 2 or infinity) over the last axis."""
     magnitudes = np.abs(vectors)
     if order == 1:
         return np.asarray(magnitudes.sum(axis=-1))
@@ -109,10 +106,9 @@ def single_threaded() -> AbstractContextManager[Any]:
 
 
 def held_means(times: Array, values: Array, edges: Array, slack: float) -> Array:
-    """Return the means ``(K, m)`` of values ``(N, m)`` that hold until the next one, between edges ``(K + 1,)``.
+    """Return the means ``(K, m)`` of values ``(N, m)`` that hold from their times on, between edges ``(K + 1,)``.
 
-    The times ``(N,)`` at which values begin increase, and the first value also holds before. A time within the slack of
-    an edge is that of the edge.
+    The times increase, and the first value also holds before. A time within the slack of an edge is that of the edge.
     """
     first = np.maximum(np.searchsorted(times, edges[:-1] + slack, side="right") - 1, 0)
     last = np.maximum(np.searchsorted(times, edges[1:] - slack) - 1, first)

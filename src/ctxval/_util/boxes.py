@@ -23,14 +23,10 @@ def climb(
     iterations: int | None = None,
     evaluations: int | None = None,
 ) -> tuple[Array, float]:
-    """Climb from all starts at once with L-BFGS-B; return the points reached and the sum of their values.
+    """Climb from starts ``(..., d)`` with L-BFGS-B; return the points reached and the sum of their values.
 
-    The sum of the values is separable, so one quasi-Newton search serves all starts.
-
-    Args:
-        starts: shape ``(..., d)``, which is the shape of the points that the function is asked about.
-        scale: the size of the sum, to which the tolerances of L-BFGS-B refer.
-        iterations, evaluations: the most of L-BFGS-B; its defaults if None.
+    The sum of the values is separable, so one quasi-Newton search serves all starts. The tolerances of L-BFGS-B refer
+    to the scale, which is the size of the sum; iterations and evaluations are its limits.
     """
 
     def negative(flat: Array) -> tuple[float, Array]:
@@ -48,10 +44,7 @@ def climb(
 
 
 def moves_to_bounds(points: Array, low: Array, high: Array) -> Array:
-    """Return each point ``(..., d)`` with one coordinate moved to a bound, shape ``(..., 2 d, d)``.
-
-    The d moves to lower bounds come first.
-    """
+    """Return points ``(..., d)`` with one coordinate moved to a bound, ``(..., 2 d, d)``, lower bounds first."""
     d = len(low)
     moves = np.tile(np.eye(d, dtype=bool), (2, 1))
     ends = np.repeat([low, high], d, axis=0)
@@ -78,10 +71,8 @@ def farthest_rows(
 ) -> list[int]:
     """Return rows of points ``(n, d)``, each farthest from all points chosen before it (Gonzalez 1985).
 
-    Args:
-        gaps: the distance of each point to the nearest one that is chosen already, shape ``(n,)``; minus infinity if
-            the point is one of them, so that no row is taken twice even among copies of one point.
-        reach: the choice ends where no point is farther than this from the chosen ones.
+    The gaps ``(n,)`` are the distances of the points to the nearest one that is chosen already; minus infinity if the
+    point is one of them. The choice ends where no point is farther than the reach from the chosen ones.
     """
     left = np.array(gaps, dtype=np.float64)
     rows: list[int] = []

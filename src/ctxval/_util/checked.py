@@ -12,8 +12,7 @@ import reprlib
 import sys
 import types
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
-from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
+from typing import Annotated, Any, Literal, NamedTuple, TypeVar, Union, get_args, get_origin
 
 import numpy as np
 
@@ -22,14 +21,8 @@ from ctxval.errors import InputError, UnknownNameError
 Checkable = TypeVar("Checkable", bound=Callable[..., Any])
 
 
-@dataclass(frozen=True)
-class Must:
-    """The range of a number, in an annotation ``Annotated[float, Must(...)]``.
-
-    Attributes:
-        be: what the number must be, for the message.
-        hold: whether a number is in the range.
-    """
+class Must(NamedTuple):
+    """The range of a number, ``Annotated[float, Must(...)]``: what it must be, for the message, and whether it is."""
 
     be: str
     hold: Callable[[Any], bool]
@@ -88,7 +81,6 @@ def checked(made: Checkable) -> Checkable:
 
 
 def require(name: str, annotation: Any, value: Any) -> Any:
-    """Return a value that is what an annotation says."""
     if get_origin(annotation) is Literal and isinstance(value, str) and value not in get_args(annotation):
         raise UnknownNameError.among(name, value, get_args(annotation))
     wanted = _missed(annotation, value)
@@ -139,7 +131,6 @@ def _missed(annotation: Any, value: Any) -> str:
 
 
 def _missed_class(cls: type, arguments: tuple[Any, ...], value: Any) -> str:
-    """Return what a value must be to be of a class, with the right items if it is a collection."""
     if issubclass(cls, Mapping):
         if not isinstance(value, Mapping):
             return "a table of names and values"

@@ -51,13 +51,17 @@ def source_digest(value: Any) -> str | None:
         if isinstance(item, _Global):
             digests.update(_hashed(_plain(node)) for node in _source_of(item.module).assigned.get(item.name, ()))
         elif isinstance(item, types.FunctionType | type) and not is_library(item):
-            digests.add(_code_digest(item))
+            node = _class_node(item) if isinstance(item, type) else _function_node(item.__code__)
+            if node is not None:
+                digests.add(_hashed(_plain(node, top=True)))
+            else:  # its constants, because instructions differ between versions of Python
+                digests.add("" if isinstance(item, type) else _constants(item.__code__))
     return _hashed(sorted(digests)) if digests else None
 
 
 def module_digest(source: str) -> str:
     """Return a digest of a module's syntax tree, without its imports, docstrings, annotations and layout."""
-    return _hashed(_plain(_WithoutImports().visit(ast.parse(source))))
+    return _hashed(_plain(ast.parse(source), bare=True))
 
 
 def is_own(value: Any) -> bool:
@@ -96,7 +100,6 @@ def enclosed(function: types.FunctionType) -> list[Any]:
 
 
 def _reached_from(item: Any) -> list[Any]:
-    """Return what the source of an object may use: definitions, classes, functions, and objects that may hold some."""
     if type(item) in (list, tuple, dict):
         items = list(item.values() if isinstance(item, dict) else item)
         return items if len(items) <= 100 else []  # a longer one holds data
@@ -154,7 +157,7 @@ def _globals(module: types.ModuleType | None, names: set[str]) -> list[_Global]:
     if module is None:
         return []
     used = [_Global(module, name) for name in sorted(names & vars(module).keys())]
-    values = [vars(module)[item.name] for item in used]
+    values = (vars(module)[item.name] for item in used)
     modules = [value for value in values if inspect.ismodule(value) and not is_library(value)]
     return [*used, *(_Global(inner, name) for inner in modules for name in sorted(names & vars(inner).keys()))]
 
@@ -179,23 +182,20 @@ def _loaded(nodes: Iterable[ast.AST]) -> set[str]:
 
 @dataclass
 class _Source:
-    """The definitions in one source file, by name."""
-
     functions: dict[str, list[_Function]] = field(default_factory=dict)
     classes: dict[str, ast.AST] = field(default_factory=dict)
     assigned: dict[str, list[ast.stmt]] = field(default_factory=dict)
     imports: dict[str, tuple[str, str]] = field(default_factory=dict)
 
     def imported(self, item: _Global) -> list[_Global]:
-        """Return the definition in another module of a name that a module imports from there."""
         source, name = self.imports.get(item.name, ("", ""))
         package = item.module.__package__ or item.module.__name__
         module = sys.modules.get(importlib.util.resolve_name(source, package)) if source else None
         return [_Global(module, name)] if module is not None and name in vars(module) else []
 
 
-def _source_of(module: types.ModuleType | None) -> _Source:
-    return _read(None if module is None or is_library(module) else getattr(module, "__file__", None))
+def _source_of(module: types.ModuleType) -> _Source:
+    return _read(None if is_library(module) else getattr(module, "__file__", None))
 
 
 def _read(file: str | None) -> _Source:
@@ -225,15 +225,6 @@ def _parsed(source: str) -> _Source:
                     definitions.assigned.setdefault(name.id, []).append(node)
     definitions.classes.update(_classes(tree, ""))
     return definitions
-
-
-def _code_digest(value: Any) -> str:
-    """Return the digest of the syntax tree of a function or class, or of its constants if it has no source."""
-    node = _class_node(value) if isinstance(value, type) else _function_node(value.__code__)
-    if node is not None:
-        return _hashed(_plain(node, top=True))
-    # The instructions differ between versions of Python.
-    return "" if isinstance(value, type) else _constants(value.__code__)
 
 
 def _constants(code: types.CodeType) -> str:
@@ -284,41 +275,33 @@ def _covers(node: ast.expr, place: tuple[int | None, int | None, int | None, int
     return (node.lineno, node.col_offset) <= (line, column) and (last_line, last_column) <= end
 
 
-class _WithoutImports(ast.NodeTransformer):
-    """Removes imports and the texts that stand alone as statements, which document what is beside them."""
-
-    def visit_Import(self, node: ast.AST) -> None:
-        """Remove an import."""
-
-    visit_ImportFrom = visit_Import  # noqa: N815
-
-    def visit_Expr(self, node: ast.Expr) -> ast.Expr | None:
-        """Remove a docstring."""
-        return None if isinstance(node.value, ast.Constant) else node
+def _is_text(node: ast.AST) -> bool:
+    """Return whether a statement is a constant that stands alone, which documents what is beside it."""
+    return isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant)
 
 
 def _hashed(tree: Any) -> str:
     return hashlib.sha256(repr(tree).encode()).hexdigest()[:16]
 
 
-def _plain(node: Any, *, top: bool = False) -> Any:
-    """Return a tree as tuples. Empty fields are left out, so that every version of Python gives the same tuples."""
+def _plain(node: Any, *, top: bool = False, bare: bool = False) -> Any:
+    """Return a tree as tuples, without docstrings, and if it is bare without imports and any text that stands alone.
+
+    Empty fields are left out, so that every version of Python gives the same tuples.
+    """
     if isinstance(node, list):
-        return [_plain(item) for item in node]
+        return [_plain(item, bare=bare) for item in node]
     if not isinstance(node, ast.AST):
         return (type(node).__name__, repr(node))
     documented = isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef)
     fields = []
     for name, value in ast.iter_fields(node):
+        if bare and isinstance(value, list):
+            value = [part for part in value if not (isinstance(part, ast.Import | ast.ImportFrom) or _is_text(part))]
         empty = value == [] or (value is None and not isinstance(node, ast.Constant))
         if empty or name in _SKIPPED or (top and name == "name"):
             continue
-        if (
-            documented
-            and name == "body"
-            and isinstance(value[0], ast.Expr)
-            and isinstance(value[0].value, ast.Constant)
-        ):
-            value = value[1:]  # without the docstring
-        fields.append((name, _plain(value)))
+        if documented and name == "body" and _is_text(value[0]):
+            value = value[1:]
+        fields.append((name, _plain(value, bare=bare)))
     return (type(node).__name__, *fields)

@@ -33,7 +33,7 @@ def require_distinct(source: str, names: Sequence[str]) -> None:
 def column_of(source: str, names: Sequence[str], field: str) -> tuple[str, str] | None:
     """Return the column that a field means, and its unit; None if there is none.
 
-    A field is the name of a column with or without its unit, or with a unit in brackets that the column does not state.
+    A field is a column's name with or without its unit, or with a unit in brackets that the column does not state.
     """
     plain, unit, weak = named_unit(field)
     if field in names:
@@ -89,9 +89,7 @@ def unit_advice(period: float, dt: float) -> str:
 def sentinels(values: Array, factor: float = 1.0) -> list[float]:
     """Return the values that stand for a missing one, such as -999, -9999 or 1e9, and are far outside all others.
 
-    Args:
-        values: recorded values.
-        factor: to the unit before a conversion of the table, which converted marks such as -999 too.
+    The factor is that to the unit before a conversion of the table, which converted marks such as -999 too.
     """
     marks, rest = list[float](), np.asarray(values[np.isfinite(values)])
     while len(rest):

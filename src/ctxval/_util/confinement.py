@@ -13,8 +13,7 @@ import sys
 from collections.abc import Iterable
 from pathlib import Path
 
-MOST_MEMORY = 4 * 2**30
-"""Largest size of the memory of a confined process in bytes; libraries reserve more than they use."""
+MOST_MEMORY = 4 * 2**30  # bytes of a confined process; libraries reserve more than they use
 
 _CREATE, _ADD, _RESTRICT = 444, 445, 446  # system calls, with the same numbers on all processors
 _NO_NEW_PRIVILEGES = 38
@@ -39,10 +38,7 @@ def may_confine() -> bool:
 
 
 def read_only(paths: Iterable[Path]) -> None:
-    """Let this process open nothing but these files, those in these folders and the libraries, and only for reading.
-
-    Nothing is done on a system that cannot do it.
-    """
+    """Let this process open nothing but these files, those in these folders and the libraries, only for reading."""
     if not may_confine():
         return
     libc, version = _libc(), _libc().syscall(_CREATE, None, 0, 1)
@@ -50,7 +46,12 @@ def read_only(paths: Iterable[Path]) -> None:
     network = 3 if version >= 4 else 0
     rules = (ctypes.c_uint64 * 2)(every_right, network)
     ruleset = libc.syscall(_CREATE, rules, 16 if network else 8, 0)
-    for path in {path.resolve() for path in (*paths, *_libraries()) if path.exists()}:
+    # Python's and the system's libraries; never a folder that contains the user's home.
+    system = ("/usr", "/lib", "/lib64", "/nix/store", "/etc/ld.so.cache", "/dev/null", "/dev/urandom", "/proc/cpuinfo")
+    home = Path(os.path.expanduser("~")).resolve()
+    libraries = (Path(name).resolve() for name in (*system, sys.prefix, sys.base_prefix, *sys.path))
+    readable = (*paths, *(path for path in libraries if not home.is_relative_to(path)))
+    for path in {path.resolve() for path in readable if path.exists()}:
         file = os.open(path, os.O_PATH)
         rights = _EXECUTE | _READ_FILE | (_READ_FOLDER if path.is_dir() else 0)
         rule = rights.to_bytes(8, sys.byteorder) + file.to_bytes(4, sys.byteorder)
@@ -60,14 +61,6 @@ def read_only(paths: Iterable[Path]) -> None:
     if ruleset < 0 or libc.syscall(_RESTRICT, ruleset, 0):
         raise OSError(ctypes.get_errno(), "the rights of the process cannot be taken away")
     os.close(ruleset)
-
-
-def _libraries() -> list[Path]:
-    """Return the folders of Python and of the system's libraries; never one that contains the user's home."""
-    system = ("/usr", "/lib", "/lib64", "/nix/store", "/etc/ld.so.cache", "/dev/null", "/dev/urandom", "/proc/cpuinfo")
-    home = Path(os.path.expanduser("~")).resolve()
-    found = (Path(name).resolve() for name in (*system, sys.prefix, sys.base_prefix, *sys.path))
-    return [path for path in found if not home.is_relative_to(path)]
 
 
 def _libc() -> ctypes.CDLL:

@@ -26,7 +26,8 @@ def on_all_cores(function: Callable[[Part], Result], parts: Sequence[Part]) -> l
 
     The child processes inherit the function, so it need not be picklable; the parts and the results must be.
     """
-    workers = min(_cores(), len(parts))
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    workers = min(cores, len(parts))
     if workers < 2 or not can_fork():
         return [function(part) for part in parts]
     pool = ProcessPoolExecutor(workers, multiprocessing.get_context("fork"), _inherit, (function,))
@@ -52,10 +53,6 @@ def forking() -> Iterator[None]:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)
         yield
-
-
-def _cores() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _inherit(function: Callable[[Any], Any]) -> None:

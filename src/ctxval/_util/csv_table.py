@@ -26,13 +26,10 @@ MOST_ROW = 2**20  # largest number of characters in a row
 
 
 class CsvTable:
-    """The cells of a CSV file.
+    """The cells of a CSV file of at most so many bytes.
 
     Attributes:
         names: the names of the columns; a column without a name has an empty one.
-
-    Args:
-        most: largest size of the file in bytes.
     """
 
     def __init__(self, path: str | Path, most: int = MOST_BYTES) -> None:
@@ -87,12 +84,10 @@ class CsvTable:
         return {name: np.array(numbers) for name, numbers in columns.items()}
 
     def texts(self, name: str) -> Array:
-        """Return the texts in a column."""
         place = self.names.index(name)
         return np.array([row[place].strip() for _, row in self.rows()])
 
     def number(self, line: int, name: str, cell: str) -> float:
-        """Return the number in a cell."""
         text = cell
         if self._separator != ",":
             mark = "," if "," in cell else "." if "." in cell else ""

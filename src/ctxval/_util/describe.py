@@ -22,8 +22,8 @@ from ctxval._util.code_digest import enclosed, is_library, is_own, source_digest
 def describe(value: Any, depth: int = 6) -> Any:
     """Return the identity of an object as JSON.
 
-    An object of this package is described by its type and its public values, or by the result of its ``describe()``,
-    and any other object by its type and the digest of its source.
+    An object of this package has its type and its public values, or the result of its ``describe()``; any other object
+    has its type and the digest of its source.
     """
     if isinstance(value, str | int | bool | type(None)):
         return value
@@ -86,7 +86,7 @@ def without_numbers(description: Any) -> Any:
 
 
 def first_difference(stored: Any, present: Any, path: str = "") -> str | None:
-    """Return a sentence about the first difference of two descriptions. Returns None if they agree.
+    """Return a sentence about the first difference of two descriptions; None if they agree.
 
     The name of a function does not matter if the digest of its source is known.
     """
@@ -94,29 +94,23 @@ def first_difference(stored: Any, present: Any, path: str = "") -> str | None:
 
 
 def differences(stored: Any, present: Any, path: str = "") -> Iterator[tuple[str, str]]:
-    """Yield the path and a sentence for each difference of two descriptions; see :func:`first_difference`."""
+    """Yield the path and a sentence for each difference of two descriptions."""
     if isinstance(stored, dict) and isinstance(present, dict):
+        sourced = "source" in stored and "source" in present
         for key in [*stored, *(key for key in present if key not in stored)]:
-            yield from _at_key(stored, present, key, path)
+            here = f"{path}.{key}" if path else key
+            if sourced and key in ("source", "function"):
+                if key == "source" and stored[key] != present[key]:
+                    yield path, f"the source of {path or 'it'} has changed"
+            elif (key in stored) != (key in present):
+                yield here, f"{here} is {'missing now' if key in stored else 'new'}"
+            else:
+                yield from differences(stored[key], present[key], here)
     elif isinstance(stored, list) and isinstance(present, list) and len(stored) == len(present):
         for i, (a, b) in enumerate(zip(stored, present, strict=True)):
             yield from differences(a, b, f"{path}[{i}]")
     elif not (_close(stored, present) if {type(stored), type(present)} <= {int, float, bool} else stored == present):
         yield path, f"{path} was {_short(stored)} and is now {_short(present)}"
-
-
-def _at_key(stored: dict[str, Any], present: dict[str, Any], key: str, path: str) -> Iterator[tuple[str, str]]:
-    here = f"{path}.{key}" if path else key
-    sourced = "source" in stored and "source" in present
-    if sourced and key == "source":
-        if stored[key] != present[key]:
-            yield path, f"the source of {path or 'it'} has changed"
-    elif sourced and key == "function":
-        return
-    elif (key in stored) != (key in present):
-        yield here, f"{here} is {'missing now' if key in stored else 'new'}"
-    else:
-        yield from differences(stored[key], present[key], here)
 
 
 def _close(stored: float, present: float) -> bool:

@@ -9,7 +9,6 @@ from ctxval.errors import InputError
 
 
 def require_extra(module: str, extra: str, purpose: str) -> Any:
-    """Return a module of an extra."""
     try:
         return importlib.import_module(module)
     except ImportError as error:

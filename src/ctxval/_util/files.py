@@ -61,12 +61,10 @@ def open_regular(path: str | Path, most: int = MOST_BYTES) -> BinaryIO:
 
 
 def require_regular_file(path: str | Path) -> None:
-    """Check that a path names a regular file that can be opened."""
     open_regular(path).close()
 
 
 def read_bytes(path: str | Path, most: int = MOST_BYTES) -> bytes:
-    """Return the content of a regular file."""
     with open_regular(path, most) as file:
         try:
             size = os.fstat(file.fileno()).st_size
@@ -79,7 +77,6 @@ def read_bytes(path: str | Path, most: int = MOST_BYTES) -> bytes:
 
 
 def read_json(path: str | Path) -> Any:
-    """Return the content of a JSON file."""
     content = read_bytes(path, MOST_JSON)
     try:
         return json.loads(content.decode("utf-8"))
@@ -102,7 +99,6 @@ def require_made_by_us(path: Path, mark: bytes = MADE_BY.encode()) -> None:
 
 
 def make_folder_of(path: str | Path) -> None:
-    """Make the folder of a file that will be written, if there is none."""
     try:
         Path(path).parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:

@@ -16,10 +16,8 @@ from typing import NoReturn
 class Interrupts:
     """A context in which the first SIGINT waits for the end of shielded code, and a second one stops at once.
 
-    It has an effect only in the main thread, and only if no other handler of SIGINT is installed.
-
-    Attributes:
-        asked: whether SIGINT was received, so that the running executions are the last ones.
+    It has an effect only in the main thread, and only if no other handler of SIGINT is installed. After the first
+    SIGINT it is ``asked``: the running executions are the last ones.
     """
 
     def __init__(self) -> None:
@@ -46,7 +44,6 @@ class Interrupts:
         self.announce()
 
     def announce(self) -> None:
-        """Print that the campaign ends after the running executions."""
         sys.stderr.write("\nending after the running executions; press Ctrl-C again to stop at once\n")
 
     @contextmanager
@@ -59,7 +56,6 @@ class Interrupts:
             self._shielded = before
 
     def raise_if_asked(self) -> None:
-        """Stop here if SIGINT was received."""
         if self.asked:
             raise KeyboardInterrupt
 
@@ -67,8 +63,7 @@ class Interrupts:
 def raised_by_signal(error: BaseException) -> bool:
     """Return whether the handler of a signal that ends processes raised an exception, rather than the code itself.
 
-    For an ordinary exception this is false: a handler that raises one, for instance that of an alarm, belongs to the
-    code.
+    A handler that raises an ordinary exception, for instance that of an alarm, belongs to the code.
     """
     if isinstance(error, Exception):
         return False
@@ -93,10 +88,7 @@ def allow_exits() -> None:
 
 @contextmanager
 def exits_as_exceptions() -> Iterator[None]:
-    """Turn ``os._exit`` of this process into an exception; forked processes may exit.
-
-    The recursion limit is restored afterwards, because this package needs more than a small one.
-    """
+    """Turn ``os._exit`` of this process into an exception; forked processes may exit. Restore the recursion limit."""
     ours, leave, depth = os.getpid(), os._exit, sys.getrecursionlimit()
 
     def refuse(status: int) -> NoReturn:

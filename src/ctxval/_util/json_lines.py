@@ -18,11 +18,7 @@ class JsonLines(Mapping[Key, Record]):
 
     One process appends, and its workers hand it what they have computed. If that process is killed in the middle of a
     line, the incomplete last line is ignored, and it is removed before the next record is appended. The file is read
-    once, when it is first asked.
-
-    Args:
-        path: of the file; it is made, with its folder, by the first record.
-        key: the fields of a record that identify it. Their values are numbers, texts, booleans or null.
+    once, when it is first asked; it is made, with its folder, by the first record.
     """
 
     def __init__(self, path: Path, key: Sequence[str]) -> None:
@@ -50,7 +46,8 @@ class JsonLines(Mapping[Key, Record]):
         known = self._known()
         key = self._key_of(stored, "the record")
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        _mend_end(self.path)
+        if self.path.exists():
+            _mend_end(self.path)
         data = f"{line}\n".encode()
         # Without a buffer the line is written in one call, so that readers find the whole of it or nothing.
         with self.path.open("ab", buffering=0) as file:
@@ -61,7 +58,10 @@ class JsonLines(Mapping[Key, Record]):
     def _known(self) -> dict[Key, Record]:
         if self._records is None:
             self._records = {}
-            for number, line in enumerate(_lines(self.path), start=1):
+            *lines, last = self.path.read_bytes().split(b"\n") if self.path.exists() else [b""]
+            if _parsed(last) is not None:  # otherwise its end was never written
+                lines.append(last)
+            for number, line in enumerate(lines, start=1):
                 where = f"{self.path}, line {number}"
                 record = _parsed(line)
                 if record is None:
@@ -77,14 +77,6 @@ class JsonLines(Mapping[Key, Record]):
         return tuple(record[name] for name in self.key)
 
 
-def _lines(path: Path) -> list[bytes]:
-    """Return the lines of a file; without the last one if its end was never written."""
-    if not path.exists():
-        return []
-    *lines, last = path.read_bytes().split(b"\n")
-    return lines if _parsed(last) is None else [*lines, last]
-
-
 def _parsed(line: bytes) -> Record | None:
     try:
         record = json.loads(line)
@@ -95,8 +87,6 @@ def _parsed(line: bytes) -> Record | None:
 
 def _mend_end(path: Path) -> None:
     """Remove a last line whose end was never written; one that only lacks its newline is given it."""
-    if not path.exists():
-        return
     with path.open("r+b") as file:
         size = file.seek(0, 2)
         file.seek(max(0, size - 1))

@@ -15,7 +15,6 @@ from ctxval.errors import InputError
 
 
 def is_mjcf_text(mjcf: str | Path) -> bool:
-    """Return whether a model is given as its text, and not as the path of its file."""
     return isinstance(mjcf, str) and "<" in mjcf
 
 

@@ -21,15 +21,15 @@ from ctxval._util.files import MOST_BYTES
 from ctxval.errors import InputError
 
 _MOST_ARRAYS = 1000
+_Header = tuple[tuple[int, ...], bool, np.dtype[Any], int]
+"""The shape, the order and the type of an array, and the place of its numbers in its entry."""
 
 
 class Archive:
     """The arrays of an NPZ file. An array is read when it is requested, and nothing in the file is ever run.
 
-    The message of every error is only the reason; the caller puts the name of the file before it.
-
-    Args:
-        most: largest total size in bytes of the arrays that are read, with each number as a float64.
+    The message of every error is only the reason; the caller puts the name of the file before it. At most so many bytes
+    of arrays are read, with each number as a float64.
     """
 
     def __init__(self, content: bytes, most: int = MOST_BYTES) -> None:
@@ -40,23 +40,20 @@ class Archive:
         self._entries = {
             info.filename.removesuffix(".npy"): info for info in self._zip.infolist() if info.filename.endswith(".npy")
         }
-        self._headers: dict[str, tuple[tuple[int, ...], bool, np.dtype[Any], int]] = {}
+        self._headers: dict[str, _Header] = {}
         self._left = most
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The names of the arrays."""
         return tuple(self._entries)
 
     def __contains__(self, name: str) -> bool:
         return name in self._entries
 
     def shape(self, name: str) -> tuple[int, ...]:
-        """Return the shape of an array, without reading its numbers."""
         return self._header(name)[0]
 
     def numbers(self, name: str) -> npt.NDArray[np.float64]:
-        """Return an array of real numbers."""
         shape, fortran_order, dtype, _ = self._header(name)
         if dtype.kind not in "fiub" or dtype.itemsize > 8:
             raise InputError(f"its array {name} must be real numbers")
@@ -66,7 +63,6 @@ class Archive:
             return np.asarray(array, dtype=np.float64)
 
     def text(self, name: str) -> str:
-        """Return an array that is one text."""
         shape, _, dtype, _ = self._header(name)
         if dtype.kind not in "US" or math.prod(shape) != 1:
             raise InputError(f"its array {name} must be one text")
@@ -75,8 +71,7 @@ class Archive:
         encoding = "utf-8" if dtype.kind == "S" else f"utf-32-{order[0]}e"
         return self._content(name, 2 * dtype.itemsize).decode(encoding, "replace").rstrip("\0")
 
-    def _header(self, name: str) -> tuple[tuple[int, ...], bool, np.dtype[Any], int]:
-        """Return the shape, the order and the type of an array, and the place of its numbers in its entry."""
+    def _header(self, name: str) -> _Header:
         if name not in self._entries:
             raise InputError(f"it has no array {name}")
         if name not in self._headers:
@@ -103,8 +98,9 @@ class Archive:
             raise InputError(f"its array {name} of shape {shape} is too large: {self._left} bytes may be read")
         self._left -= size
         length, filled = math.prod(shape) * dtype.itemsize, 0
+        wrong = f"its array {name} is not as long as its header states"
         if self._entries[name].file_size != start + length:
-            raise InputError(f"its array {name} is not as long as its header states")
+            raise InputError(wrong)
         content = bytearray(length)
         with _damage(), self._zip.open(self._entries[name]) as file:
             file.read(start)
@@ -112,7 +108,7 @@ class Archive:
                 content[filled : filled + len(chunk)] = chunk
                 filled += len(chunk)
         if filled != length:
-            raise InputError(f"its array {name} is not as long as its header states")
+            raise InputError(wrong)
         return content
 
 

@@ -16,8 +16,7 @@ from ctxval.errors import InputError, ModelError, ShapeError
 
 _TYPES: dict[str, type[np.float32] | type[np.float64]] = {"tensor(float)": np.float32, "tensor(double)": np.float64}
 
-Width = int | None
-"""Number of values in one row; None if the file leaves it open."""
+Width = int | None  # number of values in one row; None if the file leaves it open
 
 
 class OnnxNetwork(ShortRepr):
@@ -52,7 +51,6 @@ class OnnxNetwork(ShortRepr):
         self.precision = max(float(np.finfo(_TYPES[node.type]).eps) for node in nodes)
 
     def describe(self) -> dict[str, Any]:
-        """Return what identifies this network in a store."""
         return {"onnx": self._digest}
 
     def __call__(self, *inputs: Array) -> Array:

@@ -18,10 +18,9 @@ class Progress:
 
     Attributes:
         stage: what is being done, such as "choosing a task".
-        done: how much of it is done, in units.
-        expected: how much there will be in all; None if it is not known. It is an estimate.
+        done, expected: how much of it is done, and an estimate of the whole; None if it is not known.
         unit: what is counted, such as "designs" or "s".
-        note: a sentence about what has just been done; empty if there is none.
+        note: a sentence about what has just been done.
         depth: the number of stages that this one is a part of.
         ended: whether this is the last report of the stage.
     """
@@ -39,10 +38,14 @@ Listener = Callable[[Progress], None]
 """Called with each report; it should return soon."""
 
 
+@dataclass
 class _Stage:
-    def __init__(self, listener: Listener, name: str, expected: float | None, unit: str, done: float, depth: int):
-        self.listener, self.name, self.unit, self.depth = listener, name, unit, depth
-        self.done, self.expected = done, expected
+    listener: Listener
+    name: str
+    expected: float | None
+    unit: str
+    done: float
+    depth: int
 
     def report(self, note: str = "", *, ended: bool = False) -> None:
         # An estimate that was too small is none any more.
@@ -55,7 +58,6 @@ _innermost: ContextVar[_Stage | None] = ContextVar("innermost", default=None)
 
 
 def is_heard() -> bool:
-    """Return whether somebody listens."""
     return _listener.get() is not None
 
 
@@ -72,7 +74,6 @@ def listening(listener: Listener | None) -> Iterator[None]:
 
 @contextmanager
 def also_listening(listener: Listener) -> Iterator[None]:
-    """Send all reports within this context to one more listener."""
     outer = _listener.get() or ignore
 
     def both(progress: Progress) -> None:

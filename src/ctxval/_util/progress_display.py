@@ -125,7 +125,6 @@ def amount(progress: Progress, elapsed: float) -> str:
 
 
 def duration(seconds: float) -> str:
-    """Return a duration in the largest unit that suits it."""
     if seconds < 100:
         return f"{seconds:.0f} s"
     return f"{seconds / 60:.0f} min" if seconds < 6000 else f"{seconds / 3600:.1f} h"

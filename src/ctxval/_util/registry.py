@@ -25,7 +25,6 @@ class Declaration:
     """What a registry must know of a part beyond its class.
 
     Attributes:
-        name: by which the part is found.
         runs_code: whether plain arguments, such as a text, can make the part run code: a program, a library, a module.
         files: arguments that are paths of files.
         folder: the argument that is a folder, which is the experiment's by default; None if there is none.
@@ -55,9 +54,8 @@ def part(
 ) -> Callable[[Part], Part]:
     """Declare a class, or a function that makes an object, as a part that is found by name; check its arguments.
 
-    A part of this package is found once its package exports it in ``__all__``.
-
-    It is found by the name of the class unless another name is given; :class:`Declaration` explains the arguments.
+    A part of this package is found once its package exports it in ``__all__``, by the name of the class unless another
+    name is given; :class:`Declaration` explains the arguments.
     """
 
     def declare(made: Part) -> Part:
@@ -85,24 +83,19 @@ class Registry(Mapping[str, Any], Generic[Made]):
 
     Args:
         kind: what a part is, in messages: system, model, synthesizer, distance, search, certificate, case.
-        package: the package that exports the parts; the group of the entry points has the same name.
+        package: the package that exports the parts, unless modules are given; the group of the entry points.
         method: the method that each part has; None if parts are plain functions.
         modules: built-in parts that are imported when they are asked for: name -> ``module:attr``.
     """
 
     def __init__(
-        self,
-        kind: str,
-        package: str,
-        *,
-        method: str | None = None,
-        modules: Mapping[str, str] | None = None,
+        self, kind: str, package: str, *, method: str | None = None, modules: Mapping[str, str] | None = None
     ) -> None:
         self.kind, self.group, self.method = kind, package, method
         self.aliases: dict[str, str] = {}
         self._built_in: dict[str, Any] = {}
         self._modules = dict(modules or {})
-        if "__all__" in vars(sys.modules[package]):
+        if modules is None and "__all__" in vars(sys.modules[package]):
             self.collect()
 
     def collect(self) -> None:
@@ -116,7 +109,6 @@ class Registry(Mapping[str, Any], Generic[Made]):
 
     @property
     def built_in(self) -> tuple[str, ...]:
-        """The names of the parts that this package has."""
         return (*self._built_in, *self._modules)
 
     @property
@@ -132,16 +124,11 @@ class Registry(Mapping[str, Any], Generic[Made]):
 
         No package is looked at, and nothing is imported.
         """
-        if not isinstance(name, str):
-            return False
-        present = self.aliases.get(name, name)
-        if present not in self.built_in:
-            return False
+        present = self.aliases.get(name, name) if isinstance(name, str) else ""
         declared = declaration_of(self._built_in.get(present))
-        return declared is None or not declared.runs_code
+        return present in self.built_in and (declared is None or not declared.runs_code)
 
     def find(self, name: str) -> Any:
-        """Return the class or the function that has a name."""
         present = self.aliases.get(name, name)
         if present in self._built_in:
             return self._built_in[present]
@@ -151,22 +138,29 @@ class Registry(Mapping[str, Any], Generic[Made]):
         points = [point for point in self._entry_points() if point.name == name]
         if not points:
             raise UnknownNameError.among(self.kind, name, [*self.built_in, *self.installed])
+        packages = sorted("of unknown name" if point.dist is None else str(point.dist.name) for point in points)
         if len(points) > 1:
-            packages = " and ".join(sorted(_package(point) for point in points))
-            raise InputError(f"two installed packages have a {self.kind} {name!r}: {packages}; uninstall one of them.")
-        return self._loaded(points[0])
+            raise InputError(
+                f"two installed packages have a {self.kind} {name!r}: {' and '.join(packages)}; uninstall one of them."
+            )
+        what, value = f"the {self.kind} {name!r} of the installed package {packages[0]}", points[0].value
+        try:
+            made = points[0].load()
+        except (Exception, SystemExit) as error:
+            raise InputError(f"{what} cannot be loaded from {value!r}: {reason_of(error)}.") from error
+        if not callable(made) or (isinstance(made, type) and not has_method(made, self.method)):
+            wanted = "a function" if self.method is None else f"a class with the method {self.method}"
+            raise InputError(f"{what} must be {wanted}, which {value!r} is not.")
+        return made
 
     def summary(self, name: str) -> str:
-        """Return the first line of a part's docstring, without its full stop."""
         lines = (inspect.getdoc(self.find(name)) or "").splitlines()
         return lines[0].removesuffix(".") if lines else ""
 
     def make(self, name: str, /, **arguments: Any) -> Made:
-        """Return a new part from its name and its arguments."""
         return self.require_made(name, construct(f"the {self.kind} {name}", self.find(name), arguments))
 
     def require_made(self, name: str, made: Any) -> Made:
-        """Return a part that was made if it has the method of its kind."""
         if self.method is not None and not callable(getattr(made, self.method, None)):
             got = type(made).__qualname__
             raise InputError(f"the {self.kind} {name} must have the method {self.method}; its class, {got}, has none.")
@@ -201,29 +195,13 @@ class Registry(Mapping[str, Any], Generic[Made]):
                 f"{reason_of(error)}."
             ) from error
 
-    def _loaded(self, point: EntryPoint) -> Any:
-        what = f"the {self.kind} {point.name!r} of the installed package {_package(point)}"
-        try:
-            made = point.load()
-        except (Exception, SystemExit) as error:
-            raise InputError(f"{what} cannot be loaded from {point.value!r}: {reason_of(error)}.") from error
-        if not callable(made) or (isinstance(made, type) and not has_method(made, self.method)):
-            wanted = "a function" if self.method is None else f"a class with the method {self.method}"
-            raise InputError(f"{what} must be {wanted}, which {point.value!r} is not.")
-        return made
-
 
 def has_method(cls: type, method: str | None) -> bool:
     """Return whether objects of a class have a method; True if there is none to have."""
     return method is None or any(callable(vars(base).get(method)) for base in cls.__mro__)
 
 
-def _package(point: EntryPoint) -> str:
-    return "of unknown name" if point.dist is None else str(point.dist.name)
-
-
 def construct(what: str, build: Any, arguments: Mapping[str, Any], *first: Any) -> Any:
-    """Call a class, or a function that makes a part."""
     try:
         taken = inspect.signature(build).parameters
         if not any(parameter.kind is parameter.VAR_KEYWORD for parameter in taken.values()):

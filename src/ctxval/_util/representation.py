@@ -27,12 +27,7 @@ LONGEST, LINES = 600, 5  # characters and lines of one object
 LINE = 150  # characters of one line of several
 _CALL = 240  # characters of an object in a single line
 _VALUE = 90  # characters of a value inside an object
-_NAME = 60  # characters of a name: of a class, a field, a parameter, a unit
-_ITEMS, _DEPTH = 6, 3  # items of a collection that are shown, and how deep collections in collections are
-_CELL, _ROWS = 500, 40  # characters of one cell of an HTML table, and its rows
-
-_UNREADABLE = re.compile(r" at 0x|\barray\(")
-"""What a representation has that tells a reader nothing: an address in memory, or raw numbers."""
+_ITEMS = 6  # items of a collection that are shown
 
 
 class Shown(str):
@@ -50,14 +45,14 @@ def line(text: object, longest: int = LINE) -> str:
 
 
 def cut(text: str, longest: int) -> str:
-    """Return the beginning of a text that is too long."""
     return text if len(text) <= longest else f"{text[: longest - 3]}..."
 
 
 def lines(head: str, *rows: str) -> str:
     """Return a first line, and indented ones below it."""
-    given = [cut(row, LINE) for row in (head, *(f"  {row}" for row in rows[: LINES - 1]))]
-    return "\n".join(given if len("\n".join(given)) <= LONGEST else [cut(row, LONGEST // LINES - 1) for row in given])
+    shortened_rows = [cut(row, LINE) for row in (head, *(f"  {row}" for row in rows[: LINES - 1]))]
+    text = "\n".join(shortened_rows)
+    return text if len(text) <= LONGEST else "\n".join(cut(row, LONGEST // LINES - 1) for row in shortened_rows)
 
 
 def call(owner: object, /, *items: object, **fields: object) -> str:
@@ -108,7 +103,7 @@ def options(owner: object) -> dict[str, Any]:
 # Values
 
 
-def shown(value: Any, depth: int = _DEPTH) -> str:
+def shown(value: Any, depth: int = 3) -> str:
     """Return any value as a short text: numbers to four digits, of arrays and collections the size."""
     if isinstance(value, Shown) or value is None or isinstance(value, bool | np.bool_):
         return str(value)
@@ -140,7 +135,6 @@ def number(value: Any) -> str:
 
 
 def array(values: Array) -> Shown:
-    """Return a short vector or diagonal matrix with its numbers, any other array with its shape and its range."""
     if values.ndim == 0:
         return Shown(shown(values.item()))
     if values.ndim == 1 and values.size <= _ITEMS and values.dtype.kind in "biuf":
@@ -149,25 +143,20 @@ def array(values: Array) -> Shown:
         diagonal = np.diagonal(values)
         if diagonal.any() and values.shape[0] == values.shape[1] and np.array_equal(values, np.diag(diagonal)):
             return Shown(f"diag({', '.join(map(number, diagonal.tolist()))})")
-    return Shown(f"{values.shape}{_range(values)}")
-
-
-def _range(values: Array) -> str:
     if values.dtype.kind not in "biuf" or not values.size:
-        return ""
+        return Shown(str(values.shape))
     finite = values[np.isfinite(values)]
     if not finite.size:
-        return ", not finite"
+        return Shown(f"{values.shape}, not finite")
     low, high = number(finite.min()), number(finite.max())
-    rest = "" if finite.size == values.size else ", partly not finite"
-    return (f" in [{low}, {high}]" if low != high else f" all {low}") + rest
+    extent = f" in [{low}, {high}]" if low != high else f" all {low}"
+    return Shown(f"{values.shape}{extent}{'' if finite.size == values.size else ', partly not finite'}")
 
 
 def named(values: Mapping[str, Any], units: Mapping[str, str] | None = None) -> Shown:
     """Return values by name with their units, such as ``goal=1.5 rad, offset=[0, 1] m``."""
-    known = {} if units is None else units
     items = [
-        f"{line(name, _NAME)}={shown(value)}" + (f" {line(unit, _NAME)}" if (unit := known.get(name, "")) else "")
+        f"{line(name, 60)}={shown(value)} {line((units or {}).get(name, ''), 60)}".rstrip()
         for name, value in list(values.items())[:_ITEMS]
     ]
     return Shown(", ".join([*items, *_rest(len(values))]))
@@ -179,7 +168,6 @@ def counted(count: int, singular: str, plural: str | None = None) -> Shown:
 
 
 def name_of(function: Any) -> Shown:
-    """Return the name of a function or a class."""
     if isinstance(function, partial):
         return Shown(f"partial({name_of(function.func)})")
     name = getattr(function, "__qualname__", None)
@@ -190,16 +178,13 @@ def _collection(values: Any, depth: int) -> str:
     if depth == 0:
         return f"{type(values).__name__} of {len(values)}"
     first = list(islice(values, _ITEMS))
+    texts = [shown(item, depth - 1) for item in first]
     if isinstance(values, Mapping):
-        texts = [f"{shown(key, depth - 1)}: {shown(values[key], depth - 1)}" for key in first]
-    else:
-        texts = [shown(item, depth - 1) for item in first]
+        texts = [f"{key}: {shown(values[name], depth - 1)}" for key, name in zip(texts, first, strict=True)]
     inside = ", ".join([*texts, *_rest(len(values))])
-    if isinstance(values, Mapping):
-        return cut(f"{{{inside}}}", 2 * _VALUE)
-    if isinstance(values, list):
-        return cut(f"[{inside}]", 2 * _VALUE)
-    return cut(f"({inside},)" if len(values) == 1 else f"({inside})", 2 * _VALUE)
+    opening, closing = "{}" if isinstance(values, Mapping) else "[]" if isinstance(values, list) else "()"
+    single = "," if opening == "(" and len(values) == 1 else ""
+    return cut(f"{opening}{inside}{single}{closing}", 2 * _VALUE)
 
 
 def _rest(count: int) -> list[str]:
@@ -219,7 +204,7 @@ def _object(value: Any) -> str:
         text = _called(kind.__name__, [], fields_of(value)) if short else plain(repr(value))
     except Exception:
         return name_of(kind)
-    if _UNREADABLE.search(text):
+    if re.search(r" at 0x|\barray\(", text):  # an address in memory, or raw numbers, which tell a reader nothing
         return name_of(kind)
     own = str(kind.__module__).partition(".")[0] == __name__.partition(".")[0]
     return cut(line(text.partition("\n")[0] if own else text, 4 * _VALUE), 2 * _VALUE)
@@ -233,22 +218,18 @@ def table(title: str, rows: Iterable[tuple[str, object]]) -> str:
 
     It sets no colours, so that it is legible on light and dark pages. Every text is escaped.
     """
+    style = "text-align:left;color:inherit;background:transparent"
+    cell = f"{style};vertical-align:top;padding:0.2em 0.8em 0.2em 0.2em;border-bottom:1px solid currentColor"
+
+    def escaped(value: object) -> str:
+        return html.escape(line(value if isinstance(value, str) else shown(value), 500), quote=True)
+
     given = [(name, value) for name, value in rows if value is not None]
-    body = "".join(_row(name, value) for name, value in given[:_ROWS])
-    if len(given) > _ROWS:
-        body += _row("...", Shown(f"{len(given) - _ROWS} more rows"))
-    caption = f'<caption style="{_TEXT};font-weight:bold">{_escaped(title)}</caption>'
+    if len(given) > 40:
+        given = [*given[:40], ("...", f"{len(given) - 40} more rows")]
+    body = "".join(
+        f'<tr><th scope="row" style="{cell}">{escaped(name)}</th><td style="{cell}">{escaped(value)}</td></tr>'
+        for name, value in given
+    )
+    caption = f'<caption style="{style};font-weight:bold">{escaped(title)}</caption>'
     return f'<table style="border-collapse:collapse;color:inherit">{caption}<tbody>{body}</tbody></table>'
-
-
-_TEXT = "text-align:left;color:inherit;background:transparent"
-_CSS = f"{_TEXT};vertical-align:top;padding:0.2em 0.8em 0.2em 0.2em;border-bottom:1px solid currentColor"
-
-
-def _row(name: str, value: object) -> str:
-    text = value if isinstance(value, str) else shown(value)
-    return f'<tr><th scope="row" style="{_CSS}">{_escaped(name)}</th><td style="{_CSS}">{_escaped(text)}</td></tr>'
-
-
-def _escaped(text: str) -> str:
-    return html.escape(line(text, _CELL), quote=True)

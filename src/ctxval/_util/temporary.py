@@ -24,12 +24,19 @@ class TemporaryFolder:
                 finally:
                     left.close()
         self._around = Path(tempfile.mkdtemp(prefix="ctxval-")).resolve()
-        self._lock = _owned(self._around)
+        # It marks the folder as in use as long as this process lives. It gets its name only after it is locked, so that
+        # no other process finds it unlocked. On a disk without locks there is none, and nobody else removes the folder.
+        self._lock: FileLock | None = None
+        with suppress(OSError):
+            held = FileLock(self._around / "new")
+            held.acquire()
+            self._lock = held
+        if self._lock is not None:
+            (self._around / "new").rename(self._around / "lock")
         self.path = self._around / "files"
         self.path.mkdir()
 
     def remove(self) -> None:
-        """Remove the folder with everything in it."""
         if self._lock is not None:
             self._lock.close()
         shutil.rmtree(self._around, ignore_errors=True)
@@ -37,25 +44,8 @@ class TemporaryFolder:
 
 @contextmanager
 def temporary_folder() -> Iterator[Path]:
-    """Yield the path of a new folder, which is removed at the end of the context."""
     folder = TemporaryFolder()
     try:
         yield folder.path
     finally:
         folder.remove()
-
-
-def _owned(folder: Path) -> FileLock | None:
-    """Return the lock that marks a folder as in use as long as this process lives.
-
-    Returns None on a disk without locks; no other process removes a folder that has no lock file.
-    """
-    unnamed = folder / "new"
-    try:
-        held = FileLock(unnamed)
-        held.acquire()
-    except OSError:
-        return None
-    # The file gets its name only after it is locked, so that no other process finds it unlocked.
-    unnamed.rename(folder / "lock")
-    return held

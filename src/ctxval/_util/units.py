@@ -53,7 +53,7 @@ def conversion(recorded: str, wanted: str) -> float:
 def named_unit(column: str) -> tuple[str, str, bool]:
     """Return the name and the unit that a column states, and whether the unit may be part of the name instead.
 
-    Without a unit, it is empty. ``x_m`` may be a measured x, so such endings are weak.
+    ``x_m`` may be a measured x, so such endings are weak.
     """
     if len(column) > 200:
         return column, "", False
@@ -76,24 +76,17 @@ def _parsed(unit: str) -> tuple[float, Powers] | None:
             return None  # m/s kg is ambiguous
         for name in names:
             matched = _FACTOR.fullmatch(name)
-            unit_of_name = None if matched is None else _single(matched[1])
-            if matched is None or unit_of_name is None:
+            if matched is None:
+                return None
+            base, prefix = _OTHER_NAMES.get(matched[1], matched[1]), 1.0
+            if base not in _UNITS and base[:1] in _PREFIXES and base[1:] in _WITH_PREFIX:
+                base, prefix = base[1:], _PREFIXES[base[:1]]
+            if base not in _UNITS:
                 return None
             power = sign * int(matched[2] or 1)
-            factor *= unit_of_name[0] ** power
-            powers = [total + power * single for total, single in zip(powers, unit_of_name[1], strict=True)]
+            factor *= (prefix * _UNITS[base][0]) ** power
+            powers = [total + power * single for total, single in zip(powers, _UNITS[base][1], strict=True)]
     return factor, tuple(powers)  # type: ignore[return-value]
-
-
-def _single(name: str) -> tuple[float, Powers] | None:
-    name = _OTHER_NAMES.get(name, name)
-    if name in _UNITS:
-        return _UNITS[name]
-    prefix, rest = name[:1], name[1:]
-    if prefix in _PREFIXES and rest in _WITH_PREFIX:
-        factor, powers = _UNITS[rest]
-        return _PREFIXES[prefix] * factor, powers
-    return None
 
 
 def _plain(unit: str) -> str:

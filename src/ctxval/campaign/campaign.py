@@ -14,6 +14,7 @@ from ctxval.campaign.execution import RetryPolicy, Schedule, execute_schedule
 from ctxval.campaign.identity import description_of, identify, search_of
 from ctxval.campaign.interval_search import IntervalSearch
 from ctxval.campaign.operated import OperatedCampaign
+from ctxval.campaign.storage.store import Store
 from ctxval.campaign.trials import TrialRecorder
 from ctxval.campaign.workers import WorkerPool, worker_pool
 from ctxval.certificates import RESOLUTION, CertificateOptions
@@ -23,7 +24,6 @@ from ctxval.core.trial import Trial
 from ctxval.core.validation import Validation
 from ctxval.errors import CertificateError, InputError
 from ctxval.searches import Auto, Search
-from ctxval.storage.store import Store
 
 __all__ = ["Campaign", "OpenTrial"]
 
@@ -87,7 +87,6 @@ class Campaign(OperatedCampaign):
         stochastic: bool = False,
         resolution: float = RESOLUTION,
         certificate: CertificateOptions | None = None,
-        audited: bool = False,
         until: Callable[[Campaign], bool] | None = None,
         workers: PositiveInt | None = None,
         executor: cf.Executor | None = None,
@@ -120,8 +119,6 @@ class Campaign(OperatedCampaign):
             confidence, stochastic, resolution, certificate: as in :meth:`verdict`; unless the campaign explores, the
                 kind of the certificate must be ``auto``, ``dynamics``, ``posterior`` or, with an acceptable volume,
                 ``anytime``.
-            audited: before the bound from learned dynamics decides, predict and execute eight fresh random tasks, half
-                of them with parameters at their bounds. If a distance exceeds its prediction, the bound is withdrawn.
             until: called before each execution; the campaign stops early if it returns True.
             workers: number of processes, each with its own copy of the system; with an executor, the number of
                 executions that it has at a time.
@@ -144,7 +141,7 @@ class Campaign(OperatedCampaign):
             explore = threshold is None and not isinstance(self.search, Auto)
         decides = None
         if not explore:
-            decides = IntervalSearch(self._recorder, options, budget, threshold, within, audited)
+            decides = IntervalSearch(self._recorder, options, budget, threshold, within)
         by_search = Choice(planned_draws=budget if until is None else 0)
 
         def rule() -> Choice | None:

@@ -14,6 +14,7 @@ from ctxval._util.arrays import Array
 from ctxval._util.progress import stage
 from ctxval._util.texts import reason_of
 from ctxval.campaign.history import executed_trials, for_known_values, largest_distance, waiting_points
+from ctxval.campaign.storage.store import Store
 from ctxval.certificates.dynamics import bound_of, draws_for
 from ctxval.certificates.dynamics_diagnostics import DENSE, FEWEST, PREDICTIONS, doubt_of, jumps
 from ctxval.certificates.dynamics_evidence import (
@@ -30,17 +31,13 @@ from ctxval.core.validation import Validation
 from ctxval.learning import DynamicsStudy, ExecutionPrediction, LearnedDynamics
 from ctxval.learning.closed_loops import LoopPlanner
 from ctxval.learning.coverage import Coverage, Gap
-from ctxval.learning.error_vectors import Executed
+from ctxval.learning.vector import Executed
 from ctxval.learning.worst_case import WorstCase
 from ctxval.searches import Prediction
 from ctxval.searches.base import Pending
-from ctxval.storage.store import Store
 
 PREDICTION = "prediction"
 """Key of the prediction of an execution in the note of its trial."""
-
-AUDIT = "prediction_audit"
-"""Key in the note of a trial that tests a prediction at a fresh random task."""
 
 NEAR = 0.02
 """A task that differs from an executed one by less than this in every coordinate is no new one."""
@@ -241,7 +238,7 @@ class CampaignDynamics:
             len(learned.executed),
             worst.left_out,
             0.0,
-            self._checked(trials),
+            self.checked(trials),
             _coverage(learned.coverage, self._coordinates(learned)),
             unplanned=worst.unplanned,
             untried=None if untried is None else UntriedParameter(names[untried[0]], *untried[1:]),
@@ -271,7 +268,7 @@ class CampaignDynamics:
         except Exception as error:  # the same
             return None, reason_of(error)
 
-    def _checked(self, trials: Sequence[Trial]) -> tuple[CheckedPrediction, ...]:
+    def checked(self, trials: Sequence[Trial]) -> tuple[CheckedPrediction, ...]:
         """Return the predictions of completed trials; of those without a stored one, of the last few only.
 
         The first trials, before which nothing could be learned, have no prediction.
@@ -295,11 +292,11 @@ class CampaignDynamics:
         self, trial: Trial, prediction: ExecutionPrediction | None, before: Sequence[Trial], stored: bool
     ) -> CheckedPrediction:
         known = np.array([one.unit_point for one in before]).reshape(-1, len(trial.unit_point))
-        how = {
+        how: dict[str, Any] = {
             "stored": stored,
-            "audit": AUDIT in (trial.note or {}),
             "new": not len(known) or float(np.abs(known - trial.unit_point).max(axis=1).min()) > NEAR,
-            "chosen": trial.origin == "manual",
+            "origin": trial.origin,
+            "point": tuple(trial.unit_point.tolist()),
         }
         distance = trial.distance or 0.0
         if prediction is None:

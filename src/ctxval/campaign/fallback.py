@@ -9,10 +9,10 @@ import tempfile
 from pathlib import Path
 from typing import IO
 
+from ctxval.campaign.storage.disks import sync_folder
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import Trial
 from ctxval.errors import CtxvalError
-from ctxval.storage.disks import sync_folder
 
 _MOST_FILES = 1000
 """Largest number of files of one trial in one folder."""

@@ -8,10 +8,10 @@ from dataclasses import replace
 import numpy as np
 
 from ctxval._util.arrays import Array, Rows
+from ctxval.campaign.storage.store import Store
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import Trial
 from ctxval.searches import Prediction
-from ctxval.storage.store import Store
 
 
 def history_of(trials: Sequence[Trial]) -> list[Trial]:

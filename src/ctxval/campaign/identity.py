@@ -10,13 +10,13 @@ import numpy as np
 
 from ctxval._util.arrays import Array
 from ctxval._util.describe import describe, differences
+from ctxval.campaign.storage.store import Store
 from ctxval.core.distance import Distance
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import Change, Trial
 from ctxval.core.validation import Validation
 from ctxval.errors import CtxvalError, DistanceError, InputError, StoreMismatchError
 from ctxval.searches import DEFAULT, NAMES, Repeated, Search, by_name
-from ctxval.storage.store import Store
 
 _RECOMPUTED = 1e-4
 """Largest difference between a recomputed and a stored closed loop on the model, as a fraction of each range."""

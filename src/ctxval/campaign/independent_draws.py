@@ -10,10 +10,10 @@ from contextlib import suppress
 import numpy as np
 
 from ctxval._util.arrays import Array
+from ctxval.campaign.storage.store import Store
 from ctxval.core.trial import Trial
 from ctxval.core.validation import Validation
 from ctxval.errors import CtxvalError
-from ctxval.storage.store import Store
 
 _AUDIT = 0x6175
 """Identifies the random stream of an audit; the streams of searches have small numbers."""
@@ -41,10 +41,13 @@ class IndependentDraws:
 
     def point(self, trials: Sequence[Trial]) -> Array:
         """Return the next draw from the distribution of tasks, a point of the unit cube ``(d,)``."""
-        entropy = [self._seed, len(trials), _AUDIT, self.of_model()]
-        rng = np.random.default_rng(np.random.SeedSequence(entropy))
         space = self._validation.space
-        return space.rounded(space.unit_draws(1, rng)[0])
+        return space.rounded(space.unit_draws(1, self.generator(trials))[0])
+
+    def generator(self, trials: Sequence[Trial]) -> np.random.Generator:
+        """Return the random numbers of the next draw."""
+        entropy = [self._seed, len(trials), _AUDIT, self.of_model()]
+        return np.random.default_rng(np.random.SeedSequence(entropy))
 
     def of_model(self) -> int:
         """Return the number of the model, which the store keeps, because another processor rounds differently."""

@@ -15,36 +15,41 @@ import numpy as np
 
 from ctxval._util.arrays import Array
 from ctxval.campaign.choices import Choice
-from ctxval.campaign.dynamics import AUDIT, NEAR
+from ctxval.campaign.dynamics import NEAR
 from ctxval.campaign.history import largest_distance, waiting_points
 from ctxval.campaign.steadiness import Steadiness
 from ctxval.campaign.trials import TrialRecorder
-from ctxval.certificates import CertificateOptions, DynamicsEvidence, Sample, StoppingRule
+from ctxval.certificates import CertificateOptions, CheckedPrediction, DynamicsEvidence, Sample, StoppingRule
 from ctxval.certificates.anytime import AnytimeAudit
 from ctxval.certificates.automatic import Automatic
 from ctxval.certificates.covering import RESOLUTION, covering
 from ctxval.certificates.dynamics import Dynamics, bound_of, certify_dynamics
 from ctxval.certificates.dynamics_diagnostics import (
-    AUDITED,
     FEWEST,
     doubt_of,
     held,
+    missing_tests,
+    only_tests_missing,
     raised,
+    tested,
     uncovered,
     untested,
     untried_parameter,
 )
 from ctxval.certificates.options import WITHIN
 from ctxval.certificates.posterior import Posterior
+from ctxval.certificates.prediction_tests import DRAWN, fewest_spread_tests, next_spread_test
 from ctxval.core.trial import Trial
 from ctxval.errors import CertificateError, InputError
 
 _FAILING = 6
 """Number of the last predictions, of which at least half must hold."""
 _PATIENCE = 16
-"""Number of executions after which ``auto`` uses the posterior bound if the dynamics have not decided."""
+"""Number of executions, besides tests, after which ``auto`` uses the posterior bound if the dynamics decide nothing."""
 _EXPLORE = 3
 """Every so many executions, the task that leads farthest from the records is executed in any case."""
+_CROSSED = 6
+"""Largest number of tasks that share a parameter with a test that failed and the others with the worst task."""
 _SPREAD = 256
 """Number of random tasks of which the one farthest from all known ones is taken."""
 
@@ -59,7 +64,6 @@ class IntervalSearch:
         budget: the largest total number of executions.
         threshold: tau, in the distance's units; None if there is none.
         within: without a threshold, the share by which the bound may exceed the largest executed distance at the end.
-        audited: whether the bound from learned dynamics must also pass a prediction audit.
         keeps: whether the store keeps the evidence that may decide.
 
     Raises:
@@ -71,7 +75,6 @@ class IntervalSearch:
     budget: int
     threshold: float | None = None
     within: float = WITHIN
-    audited: bool = False
     keeps: bool = True
 
     def __post_init__(self) -> None:
@@ -108,28 +111,39 @@ class IntervalSearch:
             return None
         if isinstance(self.options.kind, AnytimeAudit):
             return self._by_draws(trials, self.options.kind)
+        test = self._next_test(trials)
+        if test is not None:
+            return test
         evidence = self._evidence(trials)
+        if evidence is not None:
+            task = self._beside_a_failed_test(trials, evidence)
+            if task is not None:
+                return Choice(task, "covering", planned_draws=0, rejected=0)
         if evidence is None or self._fails(evidence):
             return self._by_distance(trials)
         if self._may_decide(trials, evidence):
-            evidence = self.recorder.dynamics.evidence(trials, self.options.confidence, keep=self.keeps)
-            if evidence is None:
+            whole = self.recorder.dynamics.evidence(trials, self.options.confidence, keep=self.keeps)
+            if whole is None:
                 return self._by_distance(trials)
+            evidence = replace(whole, tests=self.tests)
             if self._decides(trials, evidence):
-                return self._audit(evidence) if self.audited else None
+                return None
         if isinstance(self.options.kind, Automatic):
             known = _points(trials, self._dimension)
-            patient = self.recorder.executions < _PATIENCE
+            patient = sum(trial.origin not in DRAWN for trial in trials) < _PATIENCE
             # In few dimensions, executions soon cover the tasks, and the posterior bound of the distance may decide.
             if not patient or covering(known, self.options.kind.posterior.resolution, 0) is not None:
                 choice = self._by_distance(trials)
                 if not patient or choice is None:
                     return choice
+        best, limit, confidence = largest_distance(trials), self.limit, self.options.confidence
+        bound = bound_of(evidence, best, confidence)
+        if max(bound, evidence.highest) <= limit and only_tests_missing(evidence, best, bound):
+            return self._test(evidence.predictions, trials)
         learned = self.recorder.dynamics.learned(trials)
         steady = Steadiness(self.recorder.dynamics.planner, None if learned is None else learned.expected)
-        best, limit = largest_distance(trials), self.limit
         ended = _points([trial for trial in trials if trial.state != "open"], self._dimension)
-        point = next_task(evidence, ended, best, limit, self.options.confidence, steady)
+        point = next_task(evidence, ended, best, limit, confidence, steady)
         waiting = waiting_points(trials)
         if len(waiting) and (point is None or np.abs(waiting - point).max(axis=1).min() <= NEAR):
             # It is being executed already. Another worker prepares for the results that are expected.
@@ -138,8 +152,7 @@ class IntervalSearch:
                 best = max(best, float(expected[np.isfinite(expected)].max(initial=0.0)))
                 limit = (1 + self.within) * best if self.threshold is None else limit
             after = self.recorder.dynamics.screening(trials, pending=True) or evidence
-            point = next_task(after, _points(trials, self._dimension), best, limit, self.options.confidence, steady)
-        # The results decide when the campaign ends, so the number of independent draws is not planned.
+            point = next_task(after, _points(trials, self._dimension), best, limit, confidence, steady)
         return Choice(point, "covering", planned_draws=0, rejected=steady.rejected)
 
     def by_dynamics(self) -> Array | None:
@@ -147,6 +160,11 @@ class IntervalSearch:
         evidence = self._evidence(self.recorder.trials)
         choice = None if evidence is None or self._fails(evidence) else self.choose()
         return None if choice is None else choice.unit_point
+
+    @property
+    def tests(self) -> int:
+        """The number of tests that the certificate needs."""
+        return self.options.kind.tests if isinstance(self.options.kind, Automatic | Dynamics) else 0
 
     @property
     def _dimension(self) -> int:
@@ -160,7 +178,8 @@ class IntervalSearch:
         if not self.predicts or any(trial.state == "failed" for trial in trials):
             return None
         dynamics = self.recorder.dynamics
-        return dynamics.kept_evidence(trials, self.options.confidence) or dynamics.screening(trials)
+        found = dynamics.kept_evidence(trials, self.options.confidence) or dynamics.screening(trials)
+        return None if found is None else replace(found, tests=self.tests)
 
     def _fails(self, evidence: DynamicsEvidence) -> bool:
         """Return whether predictions fail so often that the dynamics cannot be learned."""
@@ -186,16 +205,55 @@ class IntervalSearch:
             return False
         return found.covers(self.limit)
 
-    def _audit(self, evidence: DynamicsEvidence) -> Choice | None:
-        """Return the next fresh task whose prediction is tested; None if there were enough."""
-        done = sum(one.audit for one in evidence.predictions)
-        if done >= AUDITED:
+    def _next_test(self, trials: Sequence[Trial]) -> Choice | None:
+        """Return the next test if the last one held and more are missing: nothing needs to be searched for that."""
+        if not self.tests or not self.predicts or any(trial.state != "completed" for trial in trials):
             return None
-        # Every second task has coordinates at bounds, where dynamics are most often other than within.
-        point = self.recorder.draw()
-        snapped = np.random.default_rng([done, len(self.recorder.trials)]).random(len(point)) < 0.5 * (done % 2)
-        task, note = np.where(snapped, np.round(point), point), {AUDIT: done + 1}
-        return Choice(task, "covering", planned_draws=0, note=note, rejected=0)
+        if not trials or trials[-1].origin not in DRAWN:
+            return None
+        predictions = self.recorder.dynamics.checked(trials)
+        if not predictions or not held(predictions[-1], largest_distance(trials)):
+            return None
+        return self._test(predictions, trials) if missing_tests(predictions, self.tests) else None
+
+    def _beside_a_failed_test(self, trials: Sequence[Trial], evidence: DynamicsEvidence) -> Array | None:
+        """Return a task where a test that failed may be worst; None if there is no such test, or all are executed.
+
+        A dynamics that depends on the task is large where the one parameter that it depends on is that of the test and
+        the others are those of the worst task. Parameters that M's loops do not depend on come first.
+        """
+        best = largest_distance(trials)
+        if raised(evidence, bound_of(evidence, best, self.options.confidence)) <= self.limit:
+            return None
+        tests = (one for one in reversed(evidence.predictions) if one.stored and one.origin in DRAWN)
+        failed = next((one for one in tests if not held(one, best)), None)
+        worst = next((trial.unit_point for trial in trials if trial.distance == best), None)
+        if failed is None or worst is None:
+            return None
+        known = _points(trials, self._dimension)
+        learned = self.recorder.dynamics.learned(trials)
+        unseen = [] if learned is None else learned.study.unseen_parameters
+        for j in [*unseen, *(j for j in range(self._dimension) if j not in unseen)][:_CROSSED]:
+            task = worst.copy()
+            task[j] = failed.point[j]
+            if np.abs(known - task).max(axis=1).min() > NEAR:
+                return task
+        return None
+
+    def _test(self, predictions: Sequence[CheckedPrediction] | None, trials: Sequence[Trial]) -> Choice:
+        """Return the next task that tests predictions where nobody chose to look; see ``prediction_tests``."""
+        if predictions is None:
+            tests = [(trial.unit_point, trial.origin) for trial in trials if trial.distance is not None]
+        else:
+            tests = [(np.array(one.point), one.origin) for one in tested(predictions, self.tests)]
+        tests += [(trial.unit_point, trial.origin) for trial in trials if trial.state == "open"]
+        points = np.array([point for point, _ in tests]).reshape(-1, self._dimension)
+        drawn = sum(origin in DRAWN for _, origin in tests)
+        if self.tests - drawn > fewest_spread_tests(points):
+            # The results decide when the campaign ends, so the number of independent draws is not planned.
+            return Choice(self.recorder.draw(), "iid", planned_draws=0, rejected=0)
+        task = next_spread_test(points, self.recorder.draws.generator(trials))
+        return Choice(task, "spread", planned_draws=0, rejected=0)
 
     def _by_draws(self, trials: Sequence[Trial], kind: AnytimeAudit) -> Choice | None:
         """Return the next independent draw of an anytime audit, which may end whenever its bound suffices."""
@@ -215,7 +273,11 @@ class IntervalSearch:
         posterior = kind.posterior if isinstance(kind, Automatic) else kind
         rule = StoppingRule(self.limit, replace(self.options, kind=posterior))
         now = rule.decide(trials, self.budget - self.recorder.executions)
-        return None if now.decided else Choice(now.next_point, "covering", planned_draws=0)
+        if not now.decided:
+            return Choice(now.next_point, "covering", planned_draws=0)
+        ended = [trial for trial in trials if trial.state != "open"]
+        missing = isinstance(kind, Automatic) and kind.missing_tests(Sample.of(ended))
+        return self._test(None, trials) if missing else None
 
 
 def is_decisive(options: CertificateOptions) -> bool:

@@ -74,7 +74,6 @@ class OperatedCampaign(CampaignResults):
         stochastic: bool = False,
         resolution: float = RESOLUTION,
         certificate: CertificateOptions | None = None,
-        audited: bool = False,
         wait: NonNegativeFloat = 0.0,
         progress: bool | None = None,
     ) -> OpenTrial | None:
@@ -84,7 +83,7 @@ class OperatedCampaign(CampaignResults):
         count for the budget.
 
         Args:
-            threshold, budget, confidence, stochastic, resolution, certificate, audited: as in
+            threshold, budget, confidence, stochastic, resolution, certificate: as in
                 :meth:`ctxval.Campaign.run`.
             wait, progress: as in :meth:`ask`.
 
@@ -95,7 +94,7 @@ class OperatedCampaign(CampaignResults):
         by = CertificateOptions.or_automatic(certificate, confidence, stochastic, resolution)
         with progress_shown(progress), self.store.sole_writer(wait):
             self._recorder.refresh()
-            search = IntervalSearch(self._recorder, by, budget, threshold, audited=audited)
+            search = IntervalSearch(self._recorder, by, budget, threshold)
             waiting = sum(trial.state == "open" for trial in self.trials)
             with self._recorder.predicting(search.predicts):
                 choice = search.choose() if self.executions + waiting < budget else None

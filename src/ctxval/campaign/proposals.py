@@ -15,7 +15,7 @@ from ctxval._util.progress import stage
 from ctxval._util.texts import enumerated, shortened
 from ctxval.campaign.choices import Choice
 from ctxval.campaign.costs import costs_of
-from ctxval.campaign.dynamics import AUDIT, PREDICTION, CampaignDynamics
+from ctxval.campaign.dynamics import PREDICTION, CampaignDynamics
 from ctxval.campaign.history import waiting_points
 from ctxval.campaign.steadiness import Steadiness
 from ctxval.core.trial import CONVERGED, UNSTEADY, Trial
@@ -129,7 +129,7 @@ def _with_rejected(note: dict[str, Any] | None, rejected: int) -> dict[str, Any]
 
 def _plain_note(note: Any) -> dict[str, Any] | None:
     """Return a search's note, which is stored as JSON."""
-    reserved = (PREDICTION, AUDIT, CONVERGED, UNSTEADY)
+    reserved = (PREDICTION, CONVERGED, UNSTEADY)
     if isinstance(note, dict) and set(reserved) & set(note):
         raise InputError(f"the note of a search must not have the keys {enumerated(reserved, 10)}.")
     try:

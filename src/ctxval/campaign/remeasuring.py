@@ -11,12 +11,12 @@ from ctxval._util.describe import differences
 from ctxval._util.progress import advance, stage
 from ctxval._util.texts import text_of
 from ctxval.campaign.identity import REMEASURED, with_distance
+from ctxval.campaign.storage.store import Store
 from ctxval.campaign.trials import TrialRecorder
 from ctxval.core.distance import Distance
 from ctxval.core.trial import REDEFINED, TOLD_ALONE, Change, Trial
 from ctxval.core.validation import Validation
 from ctxval.errors import DistanceError
-from ctxval.storage.store import Store
 
 
 def remeasure(recorder: TrialRecorder, distance: Distance | None = None) -> list[Trial]:

@@ -15,6 +15,8 @@ from ctxval.campaign import display
 from ctxval.campaign.history import executed_trials
 from ctxval.campaign.interval_search import IntervalSearch, is_decisive
 from ctxval.campaign.learned import LearnedFromTrials
+from ctxval.campaign.plot import overview
+from ctxval.campaign.storage.store import Store
 from ctxval.campaign.trials import TrialRecorder
 from ctxval.certificates import RESOLUTION, Certificate, CertificateOptions, Provenance, Verdict, assess, judge
 from ctxval.certificates.dynamics_evidence import with_units
@@ -24,8 +26,6 @@ from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import Trial
 from ctxval.core.validation import Validation
 from ctxval.gp.surrogate import Surrogate, fit_surrogate
-from ctxval.plot import overview
-from ctxval.storage.store import Store
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

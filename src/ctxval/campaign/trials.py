@@ -22,6 +22,7 @@ from ctxval.campaign.identity import identify
 from ctxval.campaign.independent_draws import IndependentDraws
 from ctxval.campaign.known import KnownExecution, is_execution_of
 from ctxval.campaign.proposals import Proposals
+from ctxval.campaign.storage.store import Store
 from ctxval.certificates import PLANNED
 from ctxval.core.controller import converged_of
 from ctxval.core.plan import Measurement, Plan
@@ -32,7 +33,6 @@ from ctxval.core.validation import Validation
 from ctxval.errors import CtxvalError, DistanceError, InputError, StoreAccessError, StoreError
 from ctxval.models import Refined
 from ctxval.searches import BaseSearch, Search, SequentialSearch
-from ctxval.storage.store import Store
 
 
 class TrialRecorder:

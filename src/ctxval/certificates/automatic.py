@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
-from ctxval._util.checked import PositiveFloat
+import numpy as np
+
+from ctxval._util.checked import NonNegativeInt, PositiveFloat
 from ctxval._util.registry import part
 from ctxval.certificates.base import Certificate, CertificateKind
 from ctxval.certificates.covering import RESOLUTION
@@ -13,6 +15,7 @@ from ctxval.certificates.dynamics import Dynamics
 from ctxval.certificates.dynamics_diagnostics import FEWEST
 from ctxval.certificates.forecast import Forecast
 from ctxval.certificates.posterior import Posterior
+from ctxval.certificates.prediction_tests import DRAWN, TESTS, fewest_missing_tests
 from ctxval.certificates.sample import Sample
 from ctxval.errors import CertificateError
 
@@ -30,6 +33,8 @@ class Automatic(CertificateKind):
 
     Attributes:
         stochastic, resolution: as for the posterior bound.
+        tests: the number of executions at tasks drawn over the task space, which must be predicted beforehand if the
+            bound is from learned dynamics.
     """
 
     name: ClassVar[str] = "auto"
@@ -37,6 +42,7 @@ class Automatic(CertificateKind):
 
     stochastic: bool = False
     resolution: PositiveFloat = RESOLUTION
+    tests: NonNegativeInt = TESTS
 
     @property
     def posterior(self) -> Posterior:
@@ -67,16 +73,40 @@ class Automatic(CertificateKind):
         return self._first(sample, threshold, confidence)
 
     def _first(self, sample: Sample, threshold: float | None, confidence: float) -> Found:
-        by_dynamics = _tried(Dynamics(), sample, threshold, confidence) if self.uses_dynamics(sample) else None
+        by_dynamics = None
+        if self.uses_dynamics(sample):
+            by_dynamics = _tried(Dynamics(tests=self.tests), sample, threshold, confidence)
         if isinstance(by_dynamics, tuple) and _decides(by_dynamics[0], threshold):
             return by_dynamics
-        by_distance = _tried(self.posterior, sample, threshold, confidence)
+        by_distance = self._tested(_tried(self.posterior, sample, threshold, confidence), sample)
         if not isinstance(by_dynamics, tuple):
             return _required(by_distance)
         if not isinstance(by_distance, tuple) or _decides(by_distance[0], threshold):
             return by_dynamics if not isinstance(by_distance, tuple) else by_distance
         supported = threshold is not None and Dynamics.support(by_dynamics[0], threshold)
         return by_dynamics if _is_sound(by_dynamics[0]) or supported else by_distance
+
+    def missing_tests(self, sample: Sample) -> int:
+        """Return the fewest executions after which the posterior bound has seen tasks of the whole space."""
+        known = np.isfinite(sample.distances)
+        drawn = sum(origin in DRAWN for origin, is_known in zip(sample.origins, known, strict=True) if is_known)
+        return fewest_missing_tests(sample.points[known], drawn, self.tests)
+
+    def _tested(self, found: Found | CertificateError, sample: Sample) -> Found | CertificateError:
+        """Return the posterior bound, withdrawn if tasks of the whole space have not been executed."""
+        if isinstance(found, CertificateError):
+            return found
+        origins = [origin for origin in sample.origins if self.tests and origin in DRAWN]
+        tests = {"drawn": len(origins), "independent": origins.count("iid"), "largest_error": None}
+        found = replace(found[0], details={**found[0].details, "tests": tests}), found[1]
+        missing = self.missing_tests(sample)
+        if found[0].doubt is not None or not missing:
+            return found
+        doubt = (
+            f"at least {missing} more {'task' if missing == 1 else 'tasks'} drawn over the whole task space must be "
+            "executed (`ctxval run` executes them; --tests 0 leaves them out)"
+        )
+        return replace(found[0], doubt=doubt), found[1]
 
 
 def _tried(

@@ -8,11 +8,11 @@ from dataclasses import asdict, dataclass, field, fields, replace
 from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 from ctxval._util.representation import ShortRepr, Shown, call, line, lines, table
+from ctxval._util.version import VERSION
 from ctxval.certificates.bounds import ERRORS, as_text, at_most, with_error
 from ctxval.certificates.sample import Sample
 from ctxval.core.space import TaskSpace
 from ctxval.core.trial import Origin
-from ctxval.version import VERSION
 
 if TYPE_CHECKING:
     from ctxval.certificates.forecast import Forecast

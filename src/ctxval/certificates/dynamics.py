@@ -14,12 +14,12 @@ predictions, and by far more if one of these predictions failed.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
 
-from ctxval._util.checked import Probability, checked
+from ctxval._util.checked import NonNegativeInt, Probability, checked
 from ctxval._util.registry import part
 from ctxval.certificates.base import ONE_CAMPAIGN, Certificate, CertificateKind
 from ctxval.certificates.bounds import with_error
@@ -31,11 +31,14 @@ from ctxval.certificates.dynamics_diagnostics import (
     fewest_missing,
     held,
     raised,
+    tested,
+    tests_missing,
 )
 from ctxval.certificates.dynamics_evidence import DynamicsEvidence, with_units
 from ctxval.certificates.forecast import Forecast
 from ctxval.certificates.learned import require_learned
 from ctxval.certificates.posterior import both_outcomes
+from ctxval.certificates.prediction_tests import DRAWN, TESTS
 from ctxval.certificates.sample import Sample, advice_to_remeasure, listed
 from ctxval.core.space import TaskSpace
 from ctxval.errors import CertificateError
@@ -54,6 +57,7 @@ class Dynamics(CertificateKind):
 
     Attributes:
         stochastic: whether two executions of one task may differ; it must be False.
+        tests: the number of executions that must have been predicted beforehand at tasks drawn over the task space.
 
     Raises:
         CertificateError: if the system is declared stochastic.
@@ -64,6 +68,7 @@ class Dynamics(CertificateKind):
     evidence: ClassVar[str] = "by a prior on the dynamics"
 
     stochastic: bool = False
+    tests: NonNegativeInt = TESTS
 
     def __post_init__(self) -> None:
         if self.stochastic:
@@ -93,10 +98,12 @@ class Dynamics(CertificateKind):
     ) -> tuple[Certificate, Forecast | None]:
         """Return the certificate and, if it does not keep the threshold, the fewest executions that can decide."""
         evidence = self._evidence(sample, confidence)
+        bound = bound_of(evidence, sample.best, confidence)
         certificate = certify_dynamics(sample, evidence, confidence)
         if certificate.covers(threshold):
             return certificate, None
-        bound = bound_of(evidence, sample.best, confidence)
+        if raised(evidence, bound) > threshold and certificate.doubt == tests_missing(evidence, sample.best, bound):
+            certificate = replace(certificate, doubt=None)  # missing tests matter only to a bound that suffices
         kept = float((evidence.maxima <= threshold).mean())
         return certificate, Forecast(fewest_missing(evidence, sample.best, bound), kept, 1 - kept, fewest=True)
 
@@ -109,7 +116,7 @@ class Dynamics(CertificateKind):
                 "no dynamics can be learned: there are no recorded trajectories, or M explains all of them, or no "
                 "controller can be designed."
             )
-        return evidence
+        return replace(evidence, tests=self.tests)
 
     @classmethod
     def rests_on(cls, certificate: Certificate, space: TaskSpace | None = None) -> list[str]:
@@ -117,8 +124,8 @@ class Dynamics(CertificateKind):
         resolution = with_units(certificate.details["resolution"])
         return [
             "the recorded state being complete",
-            "the system being deterministic and not changing with time",
-            f"its dynamics being like what was seen, to a resolution of {resolution}",
+            "the system being deterministic, and its dynamics not changing with time nor with the task",
+            f"its dynamics being, in gaps of the records of up to {resolution}, like what was seen",
         ]
 
     @classmethod
@@ -263,6 +270,15 @@ def _assumptions(evidence: DynamicsEvidence) -> tuple[str, ...]:
     )
 
 
+def _tests(evidence: DynamicsEvidence) -> dict[str, Any]:
+    drawn = [one for one in tested(evidence.predictions, evidence.tests) if one.origin in DRAWN]
+    return {
+        "drawn": len(drawn),
+        "independent": sum(one.origin == "iid" for one in drawn),
+        "largest_error": max((one.error for one in drawn), default=None),
+    }
+
+
 def _details(sample: Sample, evidence: DynamicsEvidence, bound: float, error: float) -> dict[str, Any]:
     finite, last = evidence.maxima[np.isfinite(evidence.maxima)], counted(evidence, bound)[-PREDICTIONS:]
     coverage, worst, upper = evidence.coverage, failed(evidence, bound), raised(evidence, bound)
@@ -282,8 +298,8 @@ def _details(sample: Sample, evidence: DynamicsEvidence, bound: float, error: fl
             "stored_beforehand": sum(one.stored for one in evidence.predictions),
             "last_ones": len(last),
             "held": sum(held(one, bound) for one in last),
-            "audited": sum(one.audit for one in evidence.predictions),
         },
+        "tests": _tests(evidence),
         "checked": [{**one.to_json(), "held": bool(held(one, bound))} for one in evidence.predictions],
         "coverage_gap": coverage.marginal.size,
         "beyond_the_records": coverage.beyond.size,

@@ -8,9 +8,12 @@ limits were chosen on development systems. Those of the posterior bound are in
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
+
+import numpy as np
 
 from ctxval.certificates.dynamics_evidence import CheckedPrediction, DynamicsEvidence, StateInputGap, with_units
+from ctxval.certificates.prediction_tests import DRAWN, fewest_missing_tests
 
 Diagnostic = Callable[[DynamicsEvidence, float, float], str | None]
 """Returns why a bound is withdrawn, from the evidence, the largest executed distance and the bound; None if it is not.
@@ -48,7 +51,20 @@ def untested(evidence: DynamicsEvidence, best: float, bound: float) -> str | Non
         bound: the bound.
     """
     # Executions are chosen for predictions that hold, not for a bound that their errors raise.
-    return _largest_untested(evidence, best, bound) or _no_large_one_held(evidence, bound, bound)
+    return _largest_untested(evidence, best, bound) or _no_large_one_tested(evidence, best, bound)
+
+
+def only_tests_missing(evidence: DynamicsEvidence, best: float, bound: float) -> bool:
+    """Return whether tests are missing, and executions of other tasks would not help.
+
+    Args:
+        evidence: what the learned dynamics say.
+        best: the largest executed distance.
+        bound: the bound before failed predictions raise it.
+    """
+    others = (*COVERAGE, _largest_untested, _no_large_one_tested)
+    needed = evidence.executions >= FEWEST and tests_missing(evidence, best, bound) is not None
+    return needed and _first(others, evidence, best, bound) is None
 
 
 def fewest_missing(evidence: DynamicsEvidence, best: float, bound: float) -> int:
@@ -62,7 +78,8 @@ def fewest_missing(evidence: DynamicsEvidence, best: float, bound: float) -> int
     checked = counted(evidence, bound)
     in_a_row = next((k for k, one in enumerate(reversed(checked)) if not held(one, bound)), len(checked))
     gaps = sum(one(evidence, best, bound) is not None for one in (*COVERAGE, _largest_untested, _only_small_distances))
-    return max(FEWEST - evidence.executions, PREDICTIONS - in_a_row, gaps, 1)
+    tests = missing_tests(evidence.predictions, evidence.tests)
+    return max(FEWEST - evidence.executions, PREDICTIONS - in_a_row, gaps, tests, 1)
 
 
 def _first(diagnostics: Iterable[Diagnostic], evidence: DynamicsEvidence, best: float, bound: float) -> str | None:
@@ -88,24 +105,6 @@ def _unplanned(evidence: DynamicsEvidence, best: float, bound: float) -> str | N
         return (
             f"for {100 * evidence.unplanned:.2g} % of the tasks no controller can be designed, or the model diverges: "
             "nothing is known there; make the task space smaller, so that every task can be executed"
-        )
-    return None
-
-
-AUDITED = 8
-"""Number of fresh random tasks of a prediction audit."""
-
-TOLERATED = 0.02
-"""Largest excess of an audited distance over the 0.95 quantile of its prediction, as a share of the bound."""
-
-
-def _audit_failed(evidence: DynamicsEvidence, best: float, bound: float) -> str | None:
-    exceeding = [one for one in evidence.predictions if one.audit and one.distance > one.upper + TOLERATED * bound]
-    if exceeding:
-        return (
-            f"the prediction audit failed: the distance of trial {exceeding[0].trial} is {exceeding[0].distance:.4g}, "
-            f"and at most {exceeding[0].upper:.4g} was predicted. A state that is not recorded or a jump is the likely "
-            "cause: record more states, or use --kind posterior or an audit"
         )
     return None
 
@@ -137,12 +136,34 @@ def counted(evidence: DynamicsEvidence, bound: float) -> list[CheckedPrediction]
     A prediction of a task like an earlier one tells nothing. Nor does one of a run that a person chose to import, if it
     was made afterwards.
     """
-    return [one for one in evidence.predictions if not held(one, bound) or (one.new and (one.stored or not one.chosen))]
+    return [
+        one
+        for one in evidence.predictions
+        if not held(one, bound) or (one.new and (one.stored or one.origin != "manual"))
+    ]
+
+
+def tested(predictions: Sequence[CheckedPrediction], tests: int) -> list[CheckedPrediction]:
+    """Return the latest predictions that complete the tests, or all that were stored beforehand if none complete them.
+
+    So a test that failed matters until later tests are complete without it.
+    """
+    stored = [one for one in predictions if one.stored and one.point]
+    first = range(len(stored) - 1, -1, -1) if tests else ()
+    return next((stored[k:] for k in first if not missing_tests(stored[k:], tests)), stored if tests else [])
+
+
+def missing_tests(predictions: Sequence[CheckedPrediction], tests: int) -> int:
+    """Return the fewest executions that complete the tests; those that were stored beforehand count."""
+    stored = [one for one in predictions if one.stored and one.point]
+    points = np.array([one.point for one in stored]) if stored else np.empty((0, 1))
+    return fewest_missing_tests(points, sum(one.origin in DRAWN for one in stored), tests)
 
 
 def failed(evidence: DynamicsEvidence, bound: float) -> CheckedPrediction | None:
-    """Return the one that failed most of the last predictions that count; None if all of them held."""
-    last = [one for one in counted(evidence, bound)[-PREDICTIONS:] if not held(one, bound)]
+    """Return the one that failed most of the tests and of the last predictions that count; None if all of them held."""
+    tests = [one for one in tested(evidence.predictions, evidence.tests) if one.origin in DRAWN]
+    last = [one for one in (*tests, *counted(evidence, bound)[-PREDICTIONS:]) if not held(one, bound)]
     return max(last, key=lambda one: one.error, default=None)
 
 
@@ -277,6 +298,10 @@ def _only_small_distances(evidence: DynamicsEvidence, best: float, bound: float)
     return _no_large_one_held(evidence, bound, raised(evidence, bound))
 
 
+def _no_large_one_tested(evidence: DynamicsEvidence, best: float, bound: float) -> str | None:
+    return _no_large_one_held(evidence, bound, bound)
+
+
 def _no_large_one_held(evidence: DynamicsEvidence, bound: float, allowed: float) -> str | None:
     """Return that no prediction held at a large distance, with errors as a bound of ``allowed`` permits."""
     if any(one.distance >= MATTERS * bound and held(one, allowed) for one in counted(evidence, bound)):
@@ -284,6 +309,23 @@ def _no_large_one_held(evidence: DynamicsEvidence, bound: float, allowed: float)
     return (
         f"no prediction held at a distance of at least {100 * MATTERS:g} % of the bound: small distances hardly "
         "test it; an execution of another task with a large distance helps (`ctxval run` executes it)"
+    )
+
+
+def tests_missing(evidence: DynamicsEvidence, best: float, bound: float) -> str | None:
+    """Return that predictions must be tested at drawn tasks; None if they were.
+
+    Args:
+        evidence: what the learned dynamics say.
+        best: the largest executed distance.
+        bound: the bound before failed predictions raise it.
+    """
+    missing = missing_tests(evidence.predictions, evidence.tests)
+    if not missing:
+        return None
+    return (
+        f"at least {missing} more {'execution' if missing == 1 else 'executions'} must be predicted beforehand, at "
+        "tasks drawn over the whole task space (`ctxval run` executes them; --tests 0 leaves them out)"
     )
 
 
@@ -345,13 +387,13 @@ COVERAGE: tuple[Diagnostic, ...] = (
 DIAGNOSTICS: tuple[Diagnostic, ...] = (
     _few_executions,
     _unplanned,
-    _audit_failed,
     _few_predictions,
     _noisy,
     _variance_left_out,
     *COVERAGE,
     _largest_untested,
     _only_small_distances,
+    tests_missing,
     _distance_jumps,
     _searches_disagree,
 )

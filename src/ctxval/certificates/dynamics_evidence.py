@@ -9,6 +9,8 @@ import numpy as np
 
 from ctxval._util.arrays import Array
 from ctxval._util.representation import ShortRepr
+from ctxval.certificates.prediction_tests import TESTS
+from ctxval.core.trial import Origin
 
 _RESAMPLES = 200
 """Number of bootstrap samples."""
@@ -26,9 +28,9 @@ class CheckedPrediction(ShortRepr):
         distance: the executed distance.
         z2: squared standardised error, the larger one of the trajectory and of the distance; NaN if it is not known.
         stored: whether the prediction was stored before the execution; if not, it was computed afterwards.
-        audit: whether the task was a fresh random one of a prediction audit.
         new: whether the task differs from those that were executed before.
-        chosen: whether a person chose the task or imported the run.
+        origin: the reason why the task was chosen.
+        point: the task, a point of the unit cube ``(d,)``.
     """
 
     trial: int
@@ -38,9 +40,9 @@ class CheckedPrediction(ShortRepr):
     distance: float
     z2: float = np.nan
     stored: bool = True
-    audit: bool = False
     new: bool = True
-    chosen: bool = False
+    origin: Origin = "acquisition"
+    point: tuple[float, ...] = ()
 
     @property
     def excess(self) -> float:
@@ -136,6 +138,7 @@ class DynamicsEvidence(ShortRepr):
         dense: whether there are so few task parameters that deeper searches can find what lies between jumps.
         missed: factor by which the largest distance on the mean is larger in two deeper searches; at least 1.
         disagreement: share by which the smaller result of these searches is below the larger one.
+        tests: the number of tests that a bound needs; see :mod:`~ctxval.certificates.prediction_tests`.
     """
 
     maxima: Array
@@ -157,6 +160,7 @@ class DynamicsEvidence(ShortRepr):
     dense: bool = False
     missed: float = 1.0
     disagreement: float = 0.0
+    tests: int = TESTS
 
     def rank(self, confidence: float) -> int:
         """Return the row, in ascending order, of the maximum that d* stays below with this probability."""
@@ -186,7 +190,9 @@ class DynamicsEvidence(ShortRepr):
             gaps = {name: _gap(coverage[name]) for name in ("marginal", "beyond", "pair")}
             arrays = {name: np.array(values[name], dtype=np.float64) for name in ("maxima", "points", "elites")}
             parts = {
-                "predictions": tuple(CheckedPrediction(**one) for one in values["predictions"]),
+                "predictions": tuple(
+                    CheckedPrediction(**{**one, "point": tuple(one["point"])}) for one in values["predictions"]
+                ),
                 "coverage": StateInputCoverage(**{**coverage, **gaps, "task": np.array(coverage["task"])}),
                 "untried": untried and UntriedParameter(**{**untried, "task": np.array(untried["task"])}),
             }

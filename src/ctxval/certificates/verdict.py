@@ -141,12 +141,13 @@ def judge_by(
         )
         upper, limit = _bound_and_limit(certificate, tau)
         kind = KINDS.of(certificate)
+        evidence = "audited" if certificate.volume else kind.evidence
         reason = (
-            f"{'audited' if certificate.volume else kind.evidence}, the {certificate.kind} bound of "
-            f"{certificate.trials} trials is {upper}, at most {limit}, with confidence {certificate.confidence}{but}"
-            f"{kind.qualification(certificate, space)}."
+            f"{_untested(certificate)}{evidence}, the {certificate.kind} bound of {certificate.trials} trials is "
+            f"{upper}, at most {limit}, with confidence {certificate.confidence}{but}"
+            f"{kind.qualification(certificate, space)}{_tested(certificate, tau)}."
         )
-        return Verdict("validated", tau, reason, certificate=certificate, rests_on=_rests_on(certificate, space))
+        return Verdict("validated", tau, reason, certificate=certificate, rests_on=_rests_on(certificate, space, tau))
     return Verdict("undecided", tau, _why_not(certificate, tau, volume), certificate=certificate)
 
 
@@ -179,14 +180,49 @@ def _why_not(certificate: Certificate, tau: float, volume: float) -> str:
     )
 
 
-def _rests_on(certificate: Certificate, space: TaskSpace | None) -> str:
+def _rests_on(certificate: Certificate, space: TaskSpace | None, tau: float) -> str:
     """Return what a validation rests on, in one sentence."""
     said = KINDS.of(certificate).rests_on(certificate, space)
     made_good = certificate.details.get("failures", {}).get("made_good", [])
     if made_good:
         numbers = ", ".join(str(one["trial"]) for one in made_good)
         said.append(f"your word that what made trial {numbers} fail is removed for good")
-    return f"It rests on {'; on '.join([*said, 'this campaign not being chosen among several'])}."
+    rests_on = f"It rests on {'; on '.join([*said, 'this campaign not being chosen among several'])}."
+    return f"{rests_on}{_without_assumptions(certificate, tau)}"
+
+
+def _untested(certificate: Certificate) -> str:
+    tests = certificate.details.get("tests")
+    if tests is None or tests["drawn"]:
+        return ""
+    return "no prediction was tested where nobody chose to look (tests = 0); "
+
+
+def _tested(certificate: Certificate, tau: float) -> str:
+    """Return what tests of predictions have shown, as the end of a sentence."""
+    tests = certificate.details.get("tests")
+    if tests is None or not tests["drawn"]:
+        return ""
+    where = f"{tests['drawn']} of them at tasks drawn over the whole task space"
+    if tests["largest_error"] is None:
+        return f"; {where}"
+    share = at_most(100 * tests["largest_error"] / tau, 2)
+    return f"; {where}, each predicted beforehand to {share} % of the threshold"
+
+
+def _without_assumptions(certificate: Certificate, tau: float) -> str:
+    """Return what independent draws say whatever the system is: none of them exceeds the threshold.
+
+    This holds at any time: a share of v is missed by the first n draws with probability (1 - v)^n.
+    """
+    draws = certificate.details.get("tests", {}).get("independent", 0)
+    if not draws:
+        return ""
+    share = at_most(100 * (1 - (1 - certificate.confidence) ** (1 / draws)), 2)
+    return (
+        f" Without any of this: with {100 * certificate.confidence:g} % confidence, at most {share} % "
+        f"{of_tasks(certificate.distribution)} exceeds {tau:.6g} (independent draws: {draws})."
+    )
 
 
 @checked

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-import importlib
+import inspect
 import io
 import os
 import sys
@@ -11,7 +11,7 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext, redirect_stdout, suppress
 from json import dumps  # code of users may replace what is in a module
-from typing import Any
+from typing import Any, TypeVar
 
 import typer
 from rich.table import Table
@@ -20,14 +20,16 @@ from ctxval._util.describe import describe
 from ctxval._util.progress_display import progress_shown
 from ctxval._util.texts import reason_of, shortened
 from ctxval.campaign.goals_of_model import GoalWarning
+from ctxval.campaign.storage.disks import StoreWarning
 from ctxval.certificates.bounds import as_text
 from ctxval.certificates.verdict import Verdict
+from ctxval.cli.commands import app
+from ctxval.cli.options import described
 from ctxval.cli.screen import Screen, line
 from ctxval.core.experiment import UnitsWarning
 from ctxval.core.preflight import CostWarning, DistanceWarning
 from ctxval.core.trial import Trial
 from ctxval.errors import CertificateError, CtxvalError, InputError, StoreError
-from ctxval.storage.disks import StoreWarning
 
 FALSIFIED, BAD_INPUT, CANNOT_GO_ON, INTERRUPTED, CUT_OFF = 1, 2, 3, 130, 141
 _BAD = (InputError, StoreError, CertificateError)
@@ -35,54 +37,72 @@ _BAD = (InputError, StoreError, CertificateError)
 RUN = "run"
 """Key under which a store keeps the verdict of its last run and the report that was written."""
 
-out = Screen()
-err = Screen(stderr=True)
+out, notes, err = Screen(), Screen(stderr=True), Screen(stderr=True)
+"""What ``--json`` silences, on stdout and on stderr, and what is always said, on stderr."""
+
+Command = TypeVar("Command", bound=Callable[..., Any])
 
 
-def command(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Let a command print its result as JSON, and turn its errors into one sentence and an exit status.
+def command(name: str | None = None, /, *, with_json: bool = True, **words: Any) -> Callable[[Command], Command]:
+    """Make a function a command of ``ctxval``, which ends with one sentence and an exit status if it fails.
 
-    The command returns the JSON object, or the object and the exit status. With ``--json``, an error is the object
-    ``{"error": sentence}``.
+    The command returns the JSON object, or the object and the exit status. With ``--json`` nothing else is printed, and
+    an error is the object ``{"error": sentence}``.
+
+    Args:
+        name: the name of the command; None for that of the function.
+        with_json: whether the command has the option ``--json``.
+        words: what replaces the words in braces in the texts of the options.
     """
 
-    @functools.wraps(function)
-    def wrapped(*args: Any, **kwargs: Any) -> Any:
-        warnings.showwarning = _show_warning
-        as_json = bool(kwargs.get("as_json"))
-        try:
-            with _stdout_to_stderr() if as_json else nullcontext() as stdout, progress_shown(not as_json, err):
-                result = function(*args, **kwargs)
-                report, status = result if isinstance(result, tuple) else (result, 0)
-                if stdout is not None:
-                    print(dumps(describe(report), allow_nan=False), file=stdout, flush=True)
-                if status:
-                    raise typer.Exit(status)
-                return
-        except CtxvalError as error:
-            say_error(str(error))
-            _print_failure(str(error), as_json)
-            raise typer.Exit(BAD_INPUT if isinstance(error, _BAD) else CANNOT_GO_ON) from None
-        except (typer.Exit, typer.Abort):
-            raise
-        except KeyboardInterrupt:
-            err.say(_STOPPED)
-            _print_failure(_STOPPED, as_json)
-            raise typer.Exit(INTERRUPTED) from None
-        except BaseException as error:  # users' code may raise anything
-            if isinstance(error.__context__, BrokenPipeError):
-                raise typer.Exit(CUT_OFF) from None  # the reader of the output has ended, as in `| head`
-            # Python's own exit status here would be 1, which means that a model is falsified.
-            say_error(reason_of(error))
-            _print_failure(reason_of(error), as_json)
-            raise typer.Exit(CANNOT_GO_ON) from None
+    def register(function: Command) -> Command:
+        @functools.wraps(function)
+        def wrapped(*, as_json: bool = False, **given: Any) -> None:
+            warnings.showwarning = _show_warning
+            failure, status = None, 0
+            out.quiet = notes.quiet = as_json
+            try:
+                with _stdout_to_stderr() if as_json else nullcontext() as stdout, progress_shown(not as_json, err):
+                    result = function(**given)
+                    report, status = result if isinstance(result, tuple) else (result, 0)
+                    if stdout is not None:
+                        print(dumps(describe(report), allow_nan=False), file=stdout, flush=True)
+            except CtxvalError as error:
+                failure, status = str(error), BAD_INPUT if isinstance(error, _BAD) else CANNOT_GO_ON
+            except (typer.Exit, typer.Abort):
+                raise
+            except KeyboardInterrupt:
+                failure, status = _STOPPED, INTERRUPTED
+            except BaseException as error:  # users' code may raise anything
+                if isinstance(error.__context__, BrokenPipeError):
+                    raise typer.Exit(CUT_OFF) from None  # the reader of the output has ended, as in `| head`
+                # Python's own exit status here would be 1, which means that a model is falsified.
+                failure, status = reason_of(error), CANNOT_GO_ON
+            finally:
+                out.quiet = notes.quiet = False
+            if failure is not None:
+                (err.say if status == INTERRUPTED else say_error)(failure)
+                if as_json:
+                    _print_failure(failure)
+            if status:
+                raise typer.Exit(status)
 
-    return wrapped
+        title = name or function.__name__
+        parameters = [*inspect.signature(function, eval_str=True).parameters.values(), _AS_JSON]
+        taken = parameters if with_json else parameters[:-1]
+        signature = inspect.Signature([described(each, title, words).replace(kind=each.KEYWORD_ONLY) for each in taken])
+        vars(wrapped)["__signature__"] = signature
+        app.command(title)(wrapped)
+        return function
+
+    return register
 
 
-def _print_failure(sentence: str, as_json: bool) -> None:
-    if not as_json:
-        return
+_AS_JSON = inspect.Parameter("as_json", inspect.Parameter.KEYWORD_ONLY, default=False, annotation=bool)
+_STOPPED = "stopped. All executions are stored; run the same command to resume."
+
+
+def _print_failure(sentence: str) -> None:
     try:
         print(dumps({"error": sentence}), flush=True)
     except OSError as error:
@@ -91,9 +111,6 @@ def _print_failure(sentence: str, as_json: bool) -> None:
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         if isinstance(error, BrokenPipeError):
             raise typer.Exit(CUT_OFF) from None
-
-
-_STOPPED = "stopped. All executions are stored; run the same command to resume."
 
 
 @contextmanager
@@ -116,27 +133,6 @@ def _stdout_to_stderr() -> Iterator[Any]:
         finally:
             sys.stdout.flush()
             os.dup2(ours.fileno(), number)
-
-
-@contextmanager
-def worker_options(workers: int | None, dask: str | None, timeout: float | None) -> Iterator[dict[str, Any]]:
-    """Yield the arguments of :meth:`ctxval.Campaign.run` for local processes or for the workers of a Dask scheduler."""
-    if dask is None:
-        yield {"workers": workers, "timeout": timeout}
-        return
-    try:
-        distributed: Any = importlib.import_module("distributed")
-    except ImportError as error:
-        raise InputError("--dask needs dask.distributed: pip install 'ctxval[dask]'.") from error
-    try:
-        client = distributed.Client(dask, timeout=10)
-    except (OSError, ValueError, TypeError) as error:
-        raise InputError(f"there is no Dask scheduler at {dask}: {type(error).__name__}: {error}.") from error
-    with client:
-        threads = sum(client.nthreads().values())
-        if not threads:
-            raise InputError(f"the Dask scheduler at {dask} has no workers.")
-        yield {"workers": workers or threads, "executor": client.get_executor(pure=False), "timeout": timeout}
 
 
 def _show_warning(message: Warning | str, category: type[Warning], *place: Any, **_: Any) -> None:
@@ -172,50 +168,41 @@ def print_failures(failures: list[dict[str, Any]]) -> None:
     for failure in failures[:3]:
         count = len(failure["trials"])
         which = f"trial {failure['trials'][0]}" if count == 1 else f"{count} trials"
-        err.say((f"{which} failed", "yellow"), f": {failure['reason']}")
+        notes.say((f"{which} failed", "yellow"), f": {failure['reason']}")
     if len(failures) > 3:
-        err.say(f"and {len(failures) - 3} other reasons; `ctxval export` lists them.")
+        notes.say(f"and {len(failures) - 3} other reasons; `ctxval export` lists them.")
 
 
 _COLOURS = {"validated": "green", "falsified": "red", "undecided": "yellow"}
 
 
 def print_table(rows: dict[str, Any], units: str = "") -> None:
-    """Print a table of names and values."""
+    """Print a table of names and values, of which a value may be a task with its distance."""
     table = Table(show_header=False, box=None, pad_edge=False)
     for key, value in rows.items():
-        table.add_row(line(key.replace("_", " ")), line(_text(value, units)))
+        match value:
+            case {"task": dict() as task, "distance": distance, **rest}:
+                # All digits: the task that is typed again must be the one that was executed.
+                at = ", ".join(f"{name} = {item}" for name, item in task.items())
+                how = f" ({rest['method']})" if "method" in rest else ""
+                text = f"{f'{distance:.4g} {units}'.rstrip()} at {at}{how}"
+            case _:
+                text = as_text(value) or "none"
+        table.add_row(line(key.replace("_", " ")), line(text))
     out.print(table)
 
 
-def print_columns(
-    left: Sequence[str], right: Sequence[str], rows: Iterable[Sequence[str]], title: str | None = None
-) -> None:
-    """Print a table with columns that are aligned on the left, then those on the right, below a title."""
-    if title is not None:
+def print_columns(columns: Sequence[str], rows: Iterable[Sequence[str]], title: str = "", *, left: int = 1) -> None:
+    """Print a table below a title; the first columns are aligned on the left, and the others on the right."""
+    if title:
         out.say("")
         out.say((title, "bold"))
-    table = Table(*map(line, left), box=None, pad_edge=False)
-    for name in right:
-        table.add_column(line(name), justify="right")
+    table = Table(box=None, pad_edge=False)
+    for place, name in enumerate(columns):
+        table.add_column(line(name), justify="left" if place < left else "right")
     for row in rows:
         table.add_row(*map(line, row))
     out.print(table)
-
-
-def _text(value: Any, units: str) -> str:
-    match value:
-        case list():
-            return ", ".join(_text(item, units) for item in value) or "none"
-        case {"task": dict() as task, "distance": distance, **rest}:
-            # All digits: the task that is typed again must be the one that was executed.
-            at = ", ".join(f"{name} = {item}" for name, item in task.items())
-            how = f" ({rest['method']})" if "method" in rest else ""
-            return f"{f'{distance:.4g} {units}'.rstrip()} at {at}{how}"
-        case dict():
-            return ", ".join(f"{name} {_text(item, '')}" for name, item in value.items())
-        case _:
-            return as_text(value)
 
 
 def print_other_stores(others: list[str]) -> None:

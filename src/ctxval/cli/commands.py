@@ -1,87 +1,25 @@
 """The commands, and which module has each. A module is loaded when one of its commands is called.
 
-The help of ``ctxval`` lists the commands without loading any of them, so their first sentences stand here, too.
+The help of ``ctxval`` lists the commands without loading any of them, so their first sentences stand among the texts.
 """
 
 from __future__ import annotations
 
 import importlib
+import tomllib
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 from typer.core import TyperCommand, TyperGroup
 
+from ctxval._util.version import VERSION
 from ctxval.cli.screen import Screen, line
-from ctxval.version import VERSION
 
-PANELS = {
-    "Run": {
-        "init": ("files", "Write an example experiment file and the Python module of its system."),
-        "check": (
-            "files",
-            "Check that the parts of an experiment fit together. The system is executed only if --execute is given.",
-        ),
-        "run": ("run", "Execute the tasks that decide whether the model can be trusted, and give the verdict."),
-        "compare": (
-            "compare",
-            "Compare models, controllers or distances on one system, with as few executions of it as possible.",
-        ),
-        "refine": (
-            "refine",
-            "Learn a better model from the executions that falsified one, and validate it, until it is validated.",
-        ),
-        "remeasure": (
-            "remeasure",
-            "Recompute the distances of all stored executions, after you changed the distance function.",
-        ),
-    },
-    "Recordings": {
-        "replay": (
-            "replay",
-            "Compare a model with recordings of its system. Nothing is executed, and no experiment file is needed.",
-        ),
-        "fit": ("fit", "Learn models from recordings, and compare their errors on recordings that were held out."),
-        "collect": (
-            "collect",
-            "Execute random tasks with a signal added to the inputs, and record them for `ctxval fit` and "
-            "`ctxval replay`.",
-        ),
-    },
-    "By hand": {
-        "ask": (
-            "hand",
-            "Open the next trial of a system that people operate, and write its task and controller to files.",
-        ),
-        "tell": (
-            "hand",
-            "Record the result of an open trial: exactly one of --trajectory, --npz, --distance and --failed.",
-        ),
-        "import": ("hand", "Import earlier executions into a store."),
-        "serve": ("serve", "Serve a page for the people who execute the tasks of a store by hand."),
-    },
-    "Inspect": {
-        "status": ("stores", "Summarise the trials in a store. Nothing is executed."),
-        "certify": (
-            "certify",
-            "Compute a certificate from the trials in a store. The system is executed only if --audit is given.",
-        ),
-        "report": (
-            "report",
-            "Write the report of a store: one HTML page with the verdict, insights, charts and trials.",
-        ),
-        "export": ("stores", "Write the trials of a store as CSV and JSON."),
-    },
-    "Paper": {
-        "cases": (
-            "paper",
-            "List the cases, with their options: the systems of the paper, and those of installed packages.",
-        ),
-        "reproduce": (
-            "paper",
-            "Run the experiments of the paper and write its figures, their data and a table of its claims.",
-        ),
-    },
-}
+TEXTS: dict[str, Any] = tomllib.loads(Path(__file__).with_name("texts.toml").read_text("utf-8"))
+"""Every text of the command line."""
+
+PANELS: dict[str, dict[str, tuple[str, str]]] = TEXTS["groups"]
 """For each group of the help, in order: the commands, the module of each, and its first sentence."""
 
 MODULES = {name: f"ctxval.cli.{module}" for names in PANELS.values() for name, (module, _) in names.items()}

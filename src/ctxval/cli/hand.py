@@ -1,115 +1,55 @@
-"""``ctxval ask``, ``ctxval tell`` and ``ctxval import``: tasks that people execute, and earlier runs."""
+"""``ctxval ask``, ``tell``, ``import`` and ``serve``: tasks that people execute, and earlier runs."""
 
 from __future__ import annotations
 
+import functools
+import importlib
 import shlex
 from pathlib import Path
-from typing import Annotated, Any
-
-import typer
+from typing import Any
 
 from ctxval._util.checked import NonNegativeFloat, require
 from ctxval._util.progress import advance, stage
 from ctxval._util.texts import enumerated
 from ctxval.campaign.by_hand import TRIAL_FILES, parameters_from, read_runs, write_files
-from ctxval.campaign.campaign import OpenTrial
 from ctxval.campaign.known import KnownExecution
+from ctxval.campaign.storage.other_stores import STORE_SUFFIXES
+from ctxval.campaign.storage.store import Store
 from ctxval.campaign.telling import ToldResult, parameters_of_trial, result_sentence, tell_result
 from ctxval.cli.base import FALSIFIED, command, out, print_verdict
-from ctxval.cli.commands import app
-from ctxval.cli.options import TARGET, AsJson, PartOptions, SearchName, StoreArgument, Threshold, named_values
-from ctxval.cli.outputs import Force, require_folder
-from ctxval.cli.trust import AcceptChange, Named, Opened, Trust, budget_of, limit_of, open_store, open_target
+from ctxval.cli.config.settings import Settings
+from ctxval.cli.config.stored_settings import trusted_settings
+from ctxval.cli.options import named_values, require_folder
+from ctxval.cli.trust import Opened, budget_of, limit_of, open_store, open_target
 from ctxval.core.exchange import TASK_FORMAT
 from ctxval.core.trial import CONVERGED, Trial
 from ctxval.errors import InputError
-from ctxval.storage.other_stores import STORE_SUFFIXES
-from ctxval.storage.store import Store
+from ctxval.web.served import ServedCampaign
 
 _WAIT = 60.0
 """Seconds to wait for other terminals: each of them locks the store while it chooses a task."""
 
-Target = Annotated[
-    str, typer.Argument(metavar=f"STORE|{TARGET}", help="Existing store, or the experiment of a store to create.")
-]
-StoreFile = Annotated[
-    Path | None, typer.Option(help="Store to create or to resume, if the first argument is an experiment.")
-]
-OutFolder = Annotated[
-    Path | None, typer.Option("--out", help="Folder for the files of the trial (default: a folder next to the store).")
-]
-Set = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--set",
-        metavar="NAME=VALUE",
-        help="Value of a task parameter. Repeat --set for each parameter. Examples: goal=1.5, goal='1.5 rad', "
-        "goal=[1.5, 0.5], goal[0]=1.5.",
-    ),
-]
-Draw = Annotated[bool, typer.Option("--draw", help="Choose the task by an independent random draw, for an audit.")]
-Again = Annotated[
-    int | None, typer.Option(metavar="TRIAL", help="Open a new trial with the task of this earlier trial.")
-]
-Because = Annotated[
-    str | None,
-    typer.Option(
-        metavar="REASON",
-        help='The change that was made to the system since the earlier trial, such as "fuse replaced". Only with '
-        "--again.",
-    ),
-]
-Explore = Annotated[
-    bool,
-    typer.Option(
-        "--explore",
-        help="Choose the task by the search alone. Without this option, and with a threshold, the task is the one that "
-        "`ctxval run` would execute to decide the verdict soonest; if the verdict is reached, no trial is opened and "
-        "the verdict is printed.",
-    ),
-]
-Budget = Annotated[
-    int | None,
-    typer.Option(
-        help="Maximum number of executions that may be planned for a verdict, including earlier ones (default: the "
-        "budget of the experiment)."
-    ),
-]
-Reopened = Annotated[int | None, typer.Option(help="Write the files of this open trial again.")]
-Seed = Annotated[int | None, typer.Option(help="Seed of the random numbers of a new store (default: 0).")]
-Resample = Annotated[bool, typer.Option("--resample", help="Interpolate a recording to the time steps of the task.")]
-StartTolerance = Annotated[
-    float | None,
-    typer.Option(
-        help="Largest permitted difference between the start of a recording and the initial state of its task, as a "
-        "fraction of the range of each state in the trajectory of the model (default: the value of the experiment, "
-        "which is 0.05 if it states none)."
-    ),
-]
 
-
-@app.command()
-@command
+@command()
 def ask(
-    target: Target,
-    store: StoreFile = None,
-    out_folder: OutFolder = None,
-    parameters: Set = None,
-    draw: Draw = False,
-    again: Again = None,
-    because: Because = None,
-    trial: Reopened = None,
-    explore: Explore = False,
-    threshold: Threshold = None,
-    budget: Budget = None,
-    search: SearchName = None,
-    seed: Seed = None,
-    force: Force = False,
-    experiment: Named = None,
-    trust: Trust = False,
-    accept_change: AcceptChange = None,
-    as_json: AsJson = False,
-    option: PartOptions = None,
+    target: str,
+    store: Path | None = None,
+    out_: Path | None = None,
+    parameters: list[str] | None = None,
+    draw: bool = False,
+    again: int | None = None,
+    because: str | None = None,
+    trial: int | None = None,
+    explore: bool = False,
+    threshold: float | None = None,
+    budget: int | None = None,
+    search: str | None = None,
+    seed: int | None = None,
+    force: bool = False,
+    experiment: str | None = None,
+    trust: bool = False,
+    accept_change: str | None = None,
+    option: list[str] | None = None,
 ) -> Any:
     """Open the next trial of a system that people operate, and write its task and controller to files."""
     stated = sum((bool(parameters), draw, again is not None, trial is not None, explore))
@@ -122,115 +62,105 @@ def ask(
         )
     if because is not None and again is None:
         raise InputError("--because needs --again TRIAL: it states why the task is executed again.")
-    if out_folder is not None:
-        require_folder(out_folder, TRIAL_FILES, TASK_FORMAT, force=force)
+    if out_ is not None:
+        require_folder(out_, TRIAL_FILES, TASK_FORMAT, force=force)
     if Path(target).suffix in STORE_SUFFIXES and not Path(target).exists():
         raise InputError(f"there is no store at {target}; `ctxval ask FILE.toml --store {target}` creates one.")
     overrides = {"store": store, "search": search, "seed": seed, "option": named_values(option) or None}
     opened = open_target(target, overrides, experiment, trust, accept_change)
-    limit = limit_of(opened.experiment, opened.settings, threshold)
+    made, settings, campaign, path = opened.experiment, opened.settings, opened.campaign, opened.path
+    limit = limit_of(made, settings, threshold)
     if trial is not None:
-        waiting = opened.campaign.reopen(trial)
-    elif limit is not None and not stated and (threshold is not None or not opened.settings.explores):
-        total = budget_of(opened.experiment, opened.settings, budget)
-        options = opened.settings.certificate_options
-        asked = opened.campaign.ask_for_verdict(limit, total, certificate=options, wait=_WAIT)
+        waiting = campaign.reopen(trial)
+    elif limit is not None and not stated and (threshold is not None or not settings.explores):
+        certificate, total = settings.certificate_options, budget_of(made, settings, budget)
+        asked = campaign.ask_for_verdict(limit, total, certificate=certificate, wait=_WAIT)
         if asked is None:
-            return _decided(opened, limit, as_json)
+            verdict = campaign.verdict(limit, certificate=certificate)
+            print_verdict(verdict)
+            if verdict.answer == "undecided":
+                out.say(
+                    "the budget is spent: --budget plans more executions, and --explore opens a trial without a "
+                    "verdict."
+                )
+            decided = {"verdict": verdict.answer, "reason": verdict.reason, "threshold": limit, "store": str(path)}
+            report = {"trial": None, "executions": campaign.executions, **decided}
+            return report, FALSIFIED if verdict.answer == "falsified" else 0
         waiting = asked
     else:
-        chosen = None if again is None else parameters_of_trial(opened.campaign, again)
+        chosen = None if again is None else parameters_of_trial(campaign, again)
         if parameters:
-            chosen = parameters_from(parameters, opened.experiment.validation.space)
-        waiting = opened.campaign.ask(chosen, draw=draw, because=because, wait=_WAIT)
-    folder = opened.path.with_suffix(".trials") / str(waiting.number) if out_folder is None else out_folder
-    if out_folder is None:
+            chosen = parameters_from(parameters, made.validation.space)
+        waiting = campaign.ask(chosen, draw=draw, because=because, wait=_WAIT)
+    folder = path.with_suffix(".trials") / str(waiting.number) if out_ is None else out_
+    if out_ is None:
         require_folder(folder, TRIAL_FILES, TASK_FORMAT, force=force)
-    report = {
+    files = write_files(folder, made, waiting)
+    others = [each.number for each in campaign.trials if each.state == "open" and each.number != waiting.number]
+    task = ", ".join(f"{name} = {value}" for name, value in waiting.trial.parameters.items())
+    out.say(f"trial {waiting.number}: {task}")
+    out.say(f"{', '.join(files)} in {folder}")
+    if "controller.json" not in files:
+        out.say("the controller cannot be written to a file: this is possible only for affine feedback (LQR and iLQR).")
+    if (waiting.trial.note or {}).get(CONVERGED) is False:
+        out.say("the design of the controller did not converge: nearly the same task may have another controller.")
+    if others:
+        trials = "trial is" if len(others) == 1 else "trials are"
+        out.say(f"{len(others)} other {trials} open: {enumerated(others, 10)}.")
+    out.say(f"next: ctxval tell {shlex.quote(str(path))} {waiting.number} --trajectory run.csv")
+    return {
         "trial": waiting.number,
         "task": waiting.trial.parameters,
         "origin": waiting.trial.origin,
-        "store": str(opened.path),
+        "store": str(path),
         "folder": str(folder),
-        "files": write_files(folder, opened.experiment, waiting),
-        "open": [t.number for t in opened.campaign.trials if t.state == "open" and t.number != waiting.number],
+        "files": files,
+        "open": others,
     }
-    if not as_json:
-        _print_asked(report, waiting)
-    return report
 
 
-@app.command()
-@command
+@command()
 def tell(
-    store: StoreArgument,
-    trial: Annotated[int, typer.Argument(metavar="TRIAL", help="Number of the trial, as printed by `ctxval ask`.")],
-    trajectory: Annotated[
-        Path | None,
-        typer.Option(
-            help="CSV file of the recorded trajectory, with named columns, or another log that `ctxval replay` reads."
-        ),
-    ] = None,
-    npz: Annotated[
-        Path | None, typer.Option(help="NPZ file of the recorded trajectory, with the arrays times, states and inputs.")
-    ] = None,
-    distance: Annotated[float | None, typer.Option(help="Distance of the trial, if there is no recording.")] = None,
-    failed: Annotated[
-        str | None, typer.Option(metavar="REASON", help="Reason why the execution has no usable result.")
-    ] = None,
-    resample: Resample = False,
-    start_tolerance: StartTolerance = None,
-    replace: Annotated[
-        str | None,
-        typer.Option(
-            metavar="REASON",
-            help='Replace the result that was told before, for a reason such as "wrong file". The store keeps the '
-            "earlier result in its history.",
-        ),
-    ] = None,
-    experiment: Named = None,
-    trust: Trust = False,
-    accept_change: AcceptChange = None,
-    as_json: AsJson = False,
+    store: Path,
+    trial: int,
+    trajectory: Path | None = None,
+    npz: Path | None = None,
+    distance: float | None = None,
+    failed: str | None = None,
+    resample: bool = False,
+    start_tolerance: float | None = None,
+    replace: str | None = None,
+    experiment: str | None = None,
+    trust: bool = False,
+    accept_change: str | None = None,
 ) -> Any:
     """Record the result of an open trial: exactly one of --trajectory, --npz, --distance and --failed."""
-    given = {"--trajectory": trajectory, "--npz": npz, "--distance": distance, "--failed": failed}
-    if sum(value is not None for value in given.values()) != 1:
-        raise InputError(f"exactly one of {', '.join(given)} must be given.")
+    stated = {"--trajectory": trajectory, "--npz": npz, "--distance": distance, "--failed": failed}
+    if sum(value is not None for value in stated.values()) != 1:
+        raise InputError(f"exactly one of {', '.join(stated)} must be given.")
     if failed is not None and not failed.strip():
         raise InputError('--failed needs a reason, such as "the motor cut out".')
     if trajectory is None and npz is None and (resample or start_tolerance is not None):
         raise InputError("--resample and --start-tolerance need a recording: give --trajectory or --npz.")
     require("--start-tolerance", NonNegativeFloat | None, start_tolerance)
     opened = open_store(Store.existing(store), store, experiment, trust, accept_change)
-    file, mapping = trajectory or npz, opened.settings.log_mapping
+    campaign, file, mapping = opened.campaign, trajectory or npz, opened.settings.log_mapping
     result = ToldResult(file, distance, failed, npz is not None, resample, start_tolerance, mapping, replace)
-    ended = tell_result(opened.campaign, opened.experiment, trial, result)
-    report = _ended(ended, opened, opened.campaign.executions)
-    if not as_json:
-        out.say(result_sentence(ended, opened.experiment.units, opened.campaign.start_offset(ended)))
-    return report
+    ended = tell_result(campaign, opened.experiment, trial, result)
+    out.say(result_sentence(ended, opened.experiment.units, campaign.start_offset(ended)))
+    return _ended(ended, campaign.executions, store)
 
 
-@app.command("import")
-@command
+@command("import")
 def import_runs(
-    store: StoreArgument,
-    files: Annotated[
-        list[Path],
-        typer.Argument(
-            metavar="FILE...",
-            help="CSV tables of earlier runs. Each row has the task parameters and a value in one of the columns "
-            "trajectory, distance and failed. With --set, the file is one recorded trajectory.",
-        ),
-    ],
-    parameters: Set = None,
-    resample: Resample = False,
-    start_tolerance: StartTolerance = None,
-    experiment: Named = None,
-    trust: Trust = False,
-    accept_change: AcceptChange = None,
-    as_json: AsJson = False,
+    store: Path,
+    files: list[Path],
+    parameters: list[str] | None = None,
+    resample: bool = False,
+    start_tolerance: float | None = None,
+    experiment: str | None = None,
+    trust: bool = False,
+    accept_change: str | None = None,
 ) -> Any:
     """Import earlier executions into a store.
 
@@ -238,55 +168,30 @@ def import_runs(
     """
     require("--start-tolerance", NonNegativeFloat | None, start_tolerance)
     opened = open_store(Store.existing(store), store, experiment, trust, accept_change)
-    space = opened.experiment.validation.space
+    campaign, made, mapping = opened.campaign, opened.experiment, opened.settings.log_mapping
+    space = made.validation.space
     runs = read_runs(files, parameters_from(parameters, space) if parameters else None, space)
     checked = list[KnownExecution]()
     with stage("checking", len(runs), "runs"):
-        validation, mapping = opened.campaign.validation, opened.settings.log_mapping
         for run in runs:  # all of them before any is stored
             try:
-                checked.append(run.checked(validation, opened.experiment, resample, start_tolerance, mapping))
+                checked.append(run.checked(campaign.validation, made, resample, start_tolerance, mapping))
             except InputError as error:
                 raise InputError(f"{run.where}: {error}") from error
             advance(1)
-    ended = opened.campaign.add_known(checked, _WAIT)
+    ended = campaign.add_known(checked, _WAIT)
     new = [trial for trial in ended if trial is not None]
-    executions = opened.campaign.executions
-    report = {
-        "imported": [_ended(trial, opened, executions) for trial in new],
-        "known": len(ended) - len(new),
-        "store": str(store),
-    }
-    if not as_json:
-        for trial in new[:10]:
-            out.say(result_sentence(trial, opened.experiment.units, opened.campaign.start_offset(trial)))
-        if len(new) > 10:
-            out.say(f"... and {len(new) - 10} other trials; --json lists them.")
-        out.say(f"{len(new)} runs imported, {len(ended) - len(new)} already in the store.")
-    return report
+    known = len(ended) - len(new)
+    for trial in new[:10]:
+        out.say(result_sentence(trial, made.units, campaign.start_offset(trial)))
+    if len(new) > 10:
+        out.say(f"... and {len(new) - 10} other trials; --json lists them.")
+    out.say(f"{len(new)} runs imported, {known} already in the store.")
+    imported = [_ended(trial, campaign.executions, store) for trial in new]
+    return {"imported": imported, "known": known, "store": str(store)}
 
 
-def _decided(opened: Opened, limit: float, as_json: bool) -> tuple[dict[str, Any], int]:
-    """Return the verdict of a campaign that needs no further trial, and the exit status."""
-    verdict = opened.campaign.verdict(limit, certificate=opened.settings.certificate_options)
-    if not as_json:
-        print_verdict(verdict)
-        if verdict.answer == "undecided":
-            out.say(
-                "the budget is spent: --budget plans more executions, and --explore opens a trial without a verdict."
-            )
-    report = {
-        "trial": None,
-        "executions": opened.campaign.executions,
-        "verdict": verdict.answer,
-        "reason": verdict.reason,
-        "threshold": limit,
-        "store": str(opened.path),
-    }
-    return report, FALSIFIED if verdict.answer == "falsified" else 0
-
-
-def _ended(trial: Trial, opened: Opened, executions: int) -> dict[str, Any]:
+def _ended(trial: Trial, executions: int, store: Path) -> dict[str, Any]:
     return {
         "trial": trial.number,
         "task": trial.parameters,
@@ -294,19 +199,59 @@ def _ended(trial: Trial, opened: Opened, executions: int) -> dict[str, Any]:
         "distance": trial.distance,
         "failure": trial.failure,
         "executions": executions,
-        "store": str(opened.path),
+        "store": str(store),
     }
 
 
-def _print_asked(report: dict[str, Any], opened: OpenTrial) -> None:
-    task = ", ".join(f"{name} = {value}" for name, value in report["task"].items())
-    out.say(f"trial {opened.number}: {task}")
-    out.say(f"{', '.join(report['files'])} in {report['folder']}")
-    if "controller.json" not in report["files"]:
-        out.say("the controller cannot be written to a file: this is possible only for affine feedback (LQR and iLQR).")
-    if (opened.trial.note or {}).get(CONVERGED) is False:
-        out.say("the design of the controller did not converge: nearly the same task may have another controller.")
-    if report["open"]:
-        count = len(report["open"])
-        out.say(f"{count} other {'trial is' if count == 1 else 'trials are'} open: {enumerated(report['open'], 10)}.")
-    out.say(f"next: ctxval tell {shlex.quote(report['store'])} {opened.number} --trajectory run.csv")
+@command(with_json=False)
+def serve(
+    store: Path,
+    host: str = "127.0.0.1",
+    port: int = 8765,
+    token: str | None = None,
+    allow_host: list[str] | None = None,
+    threshold: float | None = None,
+    budget: int | None = None,
+    experiment: str | None = None,
+    trust: bool = False,
+    accept_change: str | None = None,
+) -> Any:
+    """Serve a page for the people who execute the tasks of a store by hand.
+
+    The page shows the next task and its files. It takes recordings and failures, and shows the verdict. Ctrl-C stops
+    the server.
+    """
+    web = web_server()
+    settings = trusted_settings(Store.existing(store), experiment=experiment, trust=trust)
+
+    def first() -> ServedCampaign:
+        return _served(open_store(Store.existing(store), store, experiment, trust, accept_change), threshold, budget)
+
+    def say_started(place: str, secret: str | None) -> None:
+        out.say(f"the page is at {place}" + ("" if secret is None else f"?token={secret}"))
+        if secret is not None:
+            out.say("everybody who has this address can record results. It is sent without encryption.")
+        out.say("Ctrl-C stops the server; all results are stored.")
+
+    again = functools.partial(_reopened, settings, store, threshold, budget)
+    web.serve(first, again, say_started, host=host, port=port, token=token, names=allow_host or ())
+
+
+def _reopened(settings: Settings, path: Path, threshold: float | None, budget: int | None) -> ServedCampaign:
+    """Open a store by settings that the user has allowed to run here: those in it may have been changed since."""
+    made = settings.load()
+    return _served(Opened(settings, made, settings.campaign(made, Store.existing(path)), path), threshold, budget)
+
+
+def _served(opened: Opened, threshold: float | None, budget: int | None) -> ServedCampaign:
+    made, settings = opened.experiment, opened.settings
+    limit, total = limit_of(made, settings, threshold), budget_of(made, settings, budget)
+    return ServedCampaign(made, opened.campaign, limit, settings.certificate_options, total)
+
+
+def web_server() -> Any:
+    """Return the module of the server, which needs the extra ``web``."""
+    try:
+        return importlib.import_module("ctxval.web.server")
+    except ImportError as error:
+        raise InputError(f"the page needs {error.name}: pip install 'ctxval[web]'.") from error

@@ -1,88 +1,58 @@
-"""Arguments and options that several commands have, and the values of ``--option NAME=VALUE``."""
+"""Arguments and options with their texts, values of ``--option NAME=VALUE``, and files that commands write."""
 
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from inspect import Parameter
 from pathlib import Path
 from typing import Annotated, Any
 
-import typer
+from typer import Argument, Option
 
+from ctxval._util.files import make_folder_of, require_made_by_us
+from ctxval.certificates import KINDS
+from ctxval.cli.commands import TEXTS
 from ctxval.errors import InputError
 from ctxval.searches import REGISTRY as SEARCHES
 
 TARGET = "CASE|FILE.toml|module:attr"
 """The three ways to name an experiment."""
 
-SEARCH_METHODS = ", ".join(sorted(SEARCHES.built_in))
+_WORDS = {
+    "target": TARGET,
+    "searches": ", ".join(sorted(SEARCHES.built_in)),
+    "certificates": ", ".join(KINDS.built_in),
+}
 
-Target = Annotated[
-    str,
-    typer.Argument(
-        metavar=TARGET, help="Experiment: a case, an experiment file, or a reference to an object in Python."
-    ),
-]
-SearchName = Annotated[str | None, typer.Option(help=f"Search method: {SEARCH_METHODS} (default: auto).")]
-StoreArgument = Annotated[Path, typer.Argument(metavar="STORE", help="Store of a campaign (a .sqlite file).")]
-AsJson = Annotated[bool, typer.Option("--json", help="Print the result as one JSON object.")]
-Threshold = Annotated[
-    float | None, typer.Option(help="Largest acceptable distance. The verdict is given against this value.")
-]
-Confidence = Annotated[
-    float | None, typer.Option(help="Confidence level of the certificate, at least 0.5 (default: 0.95).")
-]
-Stochastic = Annotated[
-    bool | None,
-    typer.Option(
-        "--stochastic",
-        help="State that two executions of one task may differ. The certificate is then the posterior bound, and it "
-        "bounds the largest expected distance. The dynamics bound is not used.",
-    ),
-]
-Resolution = Annotated[
-    float | None,
-    typer.Option(
-        help="Largest distance between a task and its nearest trial with which the posterior certificate still "
-        "validates, in diagonals of the task space (default: 0.125). The dynamics certificate does not use it. False "
-        "validations are more frequent above the default: in a study with thresholds just below d*, 1 of 74 campaigns "
-        "was validated at 0.125, and 8 of 75 at 0.25. On narrow peaks in two dimensions, 11 of 48 were validated at "
-        "0.25."
-    ),
-]
-Workers = Annotated[
-    int | None, typer.Option(help="Number of parallel executions, each in its own process (default: 1).")
-]
-Dask = Annotated[
-    str | None, typer.Option(metavar="ADDRESS", help="Address of a Dask scheduler. Its workers execute the tasks.")
-]
-Timeout = Annotated[
-    float | None,
-    typer.Option(help="Time limit of one execution in seconds; a longer execution has failed (default: no limit)."),
-]
-PartOptions = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--option",
-        metavar="NAME=VALUE",
-        help="Option of a case, or of the function that makes the experiment. Repeat --option to set several. "
-        "`ctxval cases` lists the options of each case.",
-    ),
-]
+
+def described(parameter: Parameter, command: str, words: Mapping[str, Any]) -> Parameter:
+    """Return a parameter of a command as typer takes it, with its text; words replace those in braces."""
+    text = {**TEXTS["options"], **TEXTS.get(command, {})}[parameter.name]
+    table = {"help": text} if isinstance(text, str) else dict(text)
+    known: dict[str, Any] = {
+        key: value.format(**_WORDS, **words) if isinstance(value, str) else value for key, value in table.items()
+    }
+    if "argument" in known:
+        info = Argument(metavar=known.pop("argument"), **known)
+    else:
+        # Without its name, a flag would have a second option that switches it off.
+        info = Option(*known.pop("flags", [f"--{parameter.name.strip('_').replace('_', '-')}"]), **known)
+    return parameter.replace(annotation=Annotated[parameter.annotation, info])
 
 
 def named_values(given: Sequence[str] | None, flag: str = "--option", /, **named: Any) -> dict[str, Any]:
     """Return the options that a command line states, by name."""
-    found = {name: value for name, value in named.items() if value is not None}
+    values = {name: value for name, value in named.items() if value is not None}
     for text in given or ():
         name, equals, value = text.partition("=")
         name = name.strip()
         if not (equals and name):
             raise InputError(f"{flag} must be NAME=VALUE, such as {flag} dim=4, got {text!r}.")
-        if name in found:
-            raise InputError(f"the option {name} is given twice: as {found[name]!r} and as {value!r}.")
-        found[name] = parsed(value.strip())
-    return found
+        if name in values:
+            raise InputError(f"the option {name} is given twice: as {values[name]!r} and as {value!r}.")
+        values[name] = parsed(value.strip())
+    return values
 
 
 def parsed(text: str) -> Any:
@@ -93,3 +63,46 @@ def parsed(text: str) -> Any:
         return text
     value = content.get("value")
     return value if len(content) == 1 and isinstance(value, str | int | float | bool | list) else text
+
+
+# Files that options name: never onto an input, and never onto the work of others
+
+
+def require_outputs(outputs: Mapping[str, Path | None], inputs: Iterable[object], *, force: bool) -> None:
+    """Check the files that a command will write, before it does anything else."""
+    read = [Path(str(each)) for each in inputs if each is not None and "\0" not in str(each)]
+    named: dict[Path, str] = {}
+    for option, path in outputs.items():
+        if path is None:
+            continue
+        name, _, suffix = option.partition(" .")
+        suffix = suffix and f".{suffix}"
+        if suffix and path.suffix.lower() != suffix:
+            raise InputError(f"{name} must be a file that ends in {suffix}, got {str(path)!r}.")
+        make_folder_of(path)
+        try:
+            place, there = path.resolve(), path.exists()
+            is_input = there and any(each.exists() and each.samefile(path) for each in read)
+        except (OSError, RuntimeError, ValueError) as error:
+            raise InputError(f"{path} cannot be written: {error}.") from error
+        if place in named:
+            raise InputError(f"{named[place]} and {name} must be different files, and both are {path}.")
+        named[place] = name
+        if path.is_dir():
+            raise InputError(f"{path} cannot be written: it is a folder.")
+        if is_input and not force:
+            raise InputError(f"{path} is read by this command: give another name, or --force to replace it.")
+        if path.is_symlink() and not force:
+            raise InputError(f"{path} is a link to another file: give another name, or --force to replace it.")
+        if not force:
+            require_made_by_us(path)
+
+
+def require_folder(folder: Path, names: Iterable[str], mark: str, *, force: bool) -> None:
+    """Check that files may be written into a folder: none of them is there, or the first one is ours."""
+    first, *others = names
+    there = [name for name in (first, *others) if (folder / name).exists()]
+    if there and not force:
+        if first not in there:
+            raise InputError(f"{folder / there[0]} is there already: give another folder, or --force to replace it.")
+        require_made_by_us(folder / first, mark.encode())

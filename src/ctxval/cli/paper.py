@@ -3,72 +3,45 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
-import typer
 from rich.progress import Progress, TextColumn
 
 from ctxval import cases as known_cases
-from ctxval.cli.base import command, err, print_table
-from ctxval.cli.base import out as screen
-from ctxval.cli.commands import app
-from ctxval.cli.options import AsJson
-from ctxval.config.experiments import plain_options
+from ctxval.cli.base import command, err, out, print_table
+from ctxval.cli.config.parts import plain_options
 from ctxval.errors import InputError
 
 
-@app.command()
-@command
-def cases(
-    name: Annotated[
-        str | None, typer.Argument(metavar="CASE", help="Name of one case; the others are not listed.")
-    ] = None,
-    as_json: AsJson = False,
-) -> Any:
+@command()
+def cases(name: str | None = None) -> Any:
     """List the cases, with their options: the systems of the paper, and those of installed packages.
 
     A case is an experiment that `ctxval run` finds by its name. Set its options with `ctxval run CASE --option
     NAME=VALUE`.
     """
-    listed = list(known_cases.REGISTRY) if name is None else [name]
-    found = {each: _described(each, skip_broken=name is None) for each in listed}
-    if not as_json:
-        rows = {}
-        for each, (text, options) in found.items():
-            texts = [key if default is None else f"{key}={default}" for key, default in options.items()]
-            rows[each] = f"{text}; options: {', '.join(texts)}" if texts else text
-        print_table(rows)
+    listed: dict[str, tuple[str, dict[str, Any]]] = {}
+    for each in list(known_cases.REGISTRY) if name is None else [name]:
+        try:
+            listed[each] = known_cases.text_of(each), plain_options(each)
+        except InputError as error:
+            if name is not None:
+                raise
+            listed[each] = str(error), {}
+    rows = {}
+    for each, (text, options) in listed.items():
+        texts = [key if default is None else f"{key}={default}" for key, default in options.items()]
+        rows[each] = f"{text}; options: {', '.join(texts)}" if texts else text
+    print_table(rows)
     if name is None:
-        return {each: text for each, (text, _) in found.items()}
-    text, options = found[name]
+        return {each: text for each, (text, _) in listed.items()}
+    text, options = listed[name]
     return {"case": name, "text": text, "options": options}
 
 
-def _described(name: str, *, skip_broken: bool) -> tuple[str, dict[str, Any]]:
-    """Return the description and the options of a case; if it cannot be loaded and is skipped, the reason."""
-    try:
-        return known_cases.text_of(name), plain_options(name)
-    except InputError as error:
-        if not skip_broken:
-            raise
-        return str(error), {}
-
-
-@app.command()
-@command
+@command(with_json=False)
 def reproduce(
-    name: Annotated[str, typer.Argument(metavar="STUDY|all", help="Figure or study of the paper, or all.")],
-    quick: Annotated[bool, typer.Option("--quick", help="Use fewer trials and coarser grids.")] = False,
-    out: Annotated[
-        Path, typer.Option(help="Folder for the figures and their data. The table is written next to the folder.")
-    ] = Path("reproduction"),
-    results: Annotated[
-        Path | None,
-        typer.Option(
-            help="Folder of the stored runs. A run in it is not computed again (default: results in the --out folder)."
-        ),
-    ] = None,
-    workers: Annotated[int, typer.Option(help="Number of parallel processes.")] = 2,
+    name: str, quick: bool = False, out_: Path = Path("reproduction"), results: Path | None = None, workers: int = 2
 ) -> None:
     """Run the experiments of the paper and write its figures, their data and a table of its claims."""
     from ctxval import reproduce as paper  # imported here: the other commands do not need it
@@ -77,12 +50,12 @@ def reproduce(
         line = progress.add_task("")
         table = paper.reproduce(
             name,
-            out,
+            out_,
             stored=results,
             scale=paper.QUICK if quick else paper.FULL,
             workers=workers,
             on_start=lambda missing: progress.update(line, total=missing),
             on_done=lambda job: progress.update(line, advance=1, description=job.key),
         )
-    screen.say(f"table: {table}")
-    screen.say(f"figures and data: {out}")
+    out.say(f"table: {table}")
+    out.say(f"figures and data: {out_}")

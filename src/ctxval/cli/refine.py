@@ -4,108 +4,45 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any
-
-import typer
+from typing import Any
 
 from ctxval.campaign.campaign import Campaign
 from ctxval.certificates import CertificateOptions
 from ctxval.cli.base import FALSIFIED, command, out, print_columns
-from ctxval.cli.commands import app
-from ctxval.cli.model_options import (
-    Parameters,
-    StepFunction,
-    Vectorized,
-    print_parameters,
-    require_model_file,
-    step_function,
-)
-from ctxval.cli.options import (
-    TARGET,
-    AsJson,
-    Confidence,
-    PartOptions,
-    Stochastic,
-    Threshold,
-    Timeout,
-    Workers,
-    named_values,
-)
-from ctxval.cli.outputs import Force
-from ctxval.cli.trust import Named, Trust, budget_of, limit_of, open_target
-from ctxval.config.references import reference, require_function
-from ctxval.config.settings import Settings
+from ctxval.cli.config.references import reference, require_function
+from ctxval.cli.config.settings import Settings
+from ctxval.cli.options import named_values
+from ctxval.cli.recordings import print_parameters, require_model_file, step_function
+from ctxval.cli.trust import budget_of, limit_of, open_target
 from ctxval.core.experiment import Experiment
 from ctxval.core.validation import Validation
 from ctxval.errors import InputError
-from ctxval.refinement import Method, ParameterFit, Refinement, refine
-from ctxval.refinement.files import require_file_of, write_refined
-from ctxval.refinement.methods import NAMES, UserFit, method_of
-
-Target = Annotated[
-    str,
-    typer.Argument(
-        metavar=f"STORE|{TARGET}",
-        help="Store of the campaign that falsified the model (a .sqlite file), or an experiment, which is then run "
-        "first.",
-    ),
-]
-Budget = Annotated[
-    int | None,
-    typer.Option(
-        help="Largest total number of executions of all rounds, including those in STORE (default: the executions in "
-        "STORE and the budget of the experiment)."
-    ),
-]
-MethodName = Annotated[
-    str,
-    typer.Option(
-        help=f"How the model is learned again: {', '.join(NAMES)}. residual corrects the given model; linear, network "
-        "and gaussian-process replace it; parameters estimates those of --step, or of the given model if it is a "
-        "Parametric; fit calls the function of --fit."
-    ),
-]
-Fit = Annotated[
-    str | None,
-    typer.Option(
-        "--fit",
-        metavar="MODULE:ATTR",
-        help="Your function fit(data) -> model, for the method fit. It must return the same model for the same data.",
-    ),
-]
-Out = Annotated[
-    Path | None,
-    typer.Option(
-        "--out",
-        help="File for the last model: .onnx, which a robot can load without ctxval, .npz, or .toml for the parameters "
-        "of --step. Its measured residual is written next to it, as .residual.json and .residual.txt.",
-    ),
-]
-Seed = Annotated[int | None, typer.Option(min=0, help="Seed of an experiment that is run first (default: 0).")]
+from ctxval.studies.fitting.model_file import require_file_of
+from ctxval.studies.refinement import Method, ParameterFit, Refinement, refine
+from ctxval.studies.refinement.methods import NAMES, UserFit, method_of
+from ctxval.studies.refinement.rounds import write_refined
 
 
-@app.command("refine")
-@command
+@command("refine", methods=", ".join(NAMES))
 def refine_model(
-    target: Target,
-    threshold: Threshold = None,
-    budget: Budget = None,
-    method: MethodName = "residual",
-    fit: Fit = None,
-    step: StepFunction = None,
-    parameter: Parameters = None,
-    vectorized: Vectorized = False,
-    out_file: Out = None,
-    force: Force = False,
-    confidence: Confidence = None,
-    stochastic: Stochastic = None,
-    seed: Seed = None,
-    workers: Workers = None,
-    timeout: Timeout = None,
-    experiment: Named = None,
-    trust: Trust = False,
-    option: PartOptions = None,
-    as_json: AsJson = False,
+    target: str,
+    threshold: float | None = None,
+    budget: int | None = None,
+    method: str = "residual",
+    fit: str | None = None,
+    step: str | None = None,
+    parameter: list[str] | None = None,
+    vectorized: bool = False,
+    out_: Path | None = None,
+    force: bool = False,
+    confidence: float | None = None,
+    stochastic: bool | None = None,
+    seed: int | None = None,
+    workers: int | None = None,
+    timeout: float | None = None,
+    experiment: str | None = None,
+    trust: bool = False,
+    option: list[str] | None = None,
 ) -> Any:
     """Learn a better model from the executions that falsified one, and validate it, until it is validated.
 
@@ -114,7 +51,7 @@ def refine_model(
     was designed, and for no other one; what was recorded goes on teaching.
     """
     chosen = _method(method, fit, step, parameter, vectorized)
-    require_model_file(out_file, [target, experiment], force=force)
+    require_model_file(out_, [target, experiment], force=force)
     opened = open_target(target, {"seed": seed, "option": named_values(option) or None}, experiment, trust)
     settings = opened.settings.certified_as({"stochastic": stochastic})
     if confidence is not None:
@@ -122,24 +59,26 @@ def refine_model(
     limit = limit_of(opened.experiment, settings, threshold)
     if limit is None:
         raise InputError("a refinement needs a threshold: give --threshold.")
-    if out_file is not None:
-        require_file_of(out_file, chosen, opened.campaign.validation.model, step)
-    found = refine(
+    if out_ is not None:
+        require_file_of(out_, chosen.name, chosen.makes, opened.campaign.validation.model, step)
+    if budget is None:
+        budget = opened.campaign.executions + budget_of(opened.experiment, settings)
+    refinement = refine(
         opened.campaign,
         limit,
-        opened.campaign.executions + budget_of(opened.experiment, settings) if budget is None else budget,
+        budget,
         method=chosen,
         certificate=settings.certificate_options,
         open_round=_Rounds(settings, opened.experiment),
         workers=workers,
         timeout=timeout,
     )
-    if not as_json:
-        _print(found)  # before the files are written, which may fail
-    files = [] if out_file is None or not found.last.number else write_refined(out_file, found, step)
-    if files and not as_json:
-        out.say(f"the model of round {found.last.number} is in {' and '.join(files)}")
-    return {**found.to_dict(), "files": files}, FALSIFIED if found.answer == "falsified" else 0
+    _print(refinement)  # before the files are written, which may fail
+    number = refinement.last.number
+    files = [] if out_ is None or not number else write_refined(out_, refinement, step)
+    if files:
+        out.say(f"the model of round {number} is in {' and '.join(files)}")
+    return {**refinement.to_dict(), "files": files}, FALSIFIED if refinement.answer == "falsified" else 0
 
 
 def _method(name: str, fit: str | None, step: str | None, parameter: list[str] | None, vectorized: bool) -> Method:
@@ -175,17 +114,18 @@ class _Rounds:
         return settings.model_copy(update=known).campaign(experiment, store)
 
 
-def _print(found: Refinement) -> None:
-    rows = [(*each.cells, each.store.name if each.store else "-") for each in found.rounds]
-    print_columns((*found.head, "store"), (), rows)
-    for each in found.rounds:
+def _print(refinement: Refinement) -> None:
+    rows = [(*each.cells, each.store.name if each.store else "-") for each in refinement.rounds]
+    columns = (*refinement.head, "store")
+    print_columns(columns, rows, left=len(columns))
+    for each in refinement.rounds:
         for note in each.notes:
             out.say((f"round {each.number}: ", "bold"), note, wrap=True)
-    out.say((found.answer, "bold"), f" against {found.threshold:g}: {found.ended}.", wrap=True)
-    out.say(found.last.verdict.reason, wrap=True)
-    out.say(found.statement, wrap=True)
-    print_parameters(found.parameters)
-    if (residual := found.residual) is not None:
+    out.say((refinement.answer, "bold"), f" against {refinement.threshold:g}: {refinement.ended}.", wrap=True)
+    out.say(refinement.last.verdict.reason, wrap=True)
+    out.say(refinement.statement, wrap=True)
+    print_parameters(refinement.parameters)
+    if (residual := refinement.residual) is not None:
         out.say(("residual of one step", "bold"), ", measured on executions that the model was not learned from:")
         for row in residual.text.splitlines():
             out.say(row)

@@ -1,26 +1,22 @@
-"""``ctxval status`` and ``ctxval export``: the trials in a store."""
+"""``ctxval status``, ``ctxval export`` and ``ctxval remeasure``: the trials in a store."""
 
 from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any
-
-import typer
+from typing import Any
 
 from ctxval._util.files import MADE_BY
+from ctxval.campaign.storage.recovery import export, recover
+from ctxval.campaign.storage.store import Store
 from ctxval.cli.base import RUN, command, failures_of, out, print_failures, print_table, worst_of
-from ctxval.cli.commands import app
-from ctxval.cli.options import AsJson, StoreArgument
-from ctxval.cli.outputs import Force, require_folder
+from ctxval.cli.options import require_folder
+from ctxval.cli.trust import open_store
 from ctxval.errors import StoreAccessError
-from ctxval.storage.recovery import export, recover
-from ctxval.storage.store import Store
 
 
-@app.command()
-@command
-def status(store: StoreArgument, as_json: AsJson = False) -> Any:
+@command()
+def status(store: Path) -> Any:
     """Summarise the trials in a store. Nothing is executed."""
     opened = Store.existing(store)
     with opened.snapshot():
@@ -31,6 +27,7 @@ def status(store: StoreArgument, as_json: AsJson = False) -> Any:
         case {"verdict": {"verdict": str(answer), "threshold": float(threshold), "reason": str(reason)}}:
             verdict = f"{answer} against {threshold:g}: {reason}"
     search = description.get("search")
+    measured = [trial for trial in trials if trial.distance is not None]
     report: dict[str, Any] = {
         "case": description.get("name"),
         "search": search.get("type") if isinstance(search, dict) else None,
@@ -40,53 +37,65 @@ def status(store: StoreArgument, as_json: AsJson = False) -> Any:
         "failures": failures_of(trials),
         "unmeasured": [trial.number for trial in trials if trial.state == "unmeasured"],
         "open": [trial.number for trial in trials if trial.state == "open"],
-        "worst": worst_of(
-            max((t for t in trials if t.distance is not None), key=lambda t: t.distance or 0, default=None)
-        ),
+        "worst": worst_of(max(measured, key=lambda trial: trial.distance or 0, default=None)),
         "verdict": verdict,
         "changes": [asdict(change) for change in changes],
         "store": str(store),
     }
-    if not as_json:
-        print_table({key: value for key, value in report.items() if key not in ("failures", "changes")})
-        for change in report["changes"]:
-            out.say(f"{change['at'][:19]} {change['what']}: {change['why']}")
-        print_failures(report["failures"])
+    print_table({key: value for key, value in report.items() if key not in ("failures", "changes")})
+    for change in report["changes"]:
+        out.say(f"{change['at'][:19]} {change['what']}: {change['why']}")
+    print_failures(report["failures"])
     return report
 
 
-@app.command("export")
-@command
-def export_store(
-    store: Annotated[
-        Path, typer.Argument(metavar="STORE", help="Store of a campaign (a .sqlite file). It may be damaged.")
-    ],
-    folder: Annotated[
-        Path | None, typer.Option("--out", help="Output folder (default: a folder next to the store).")
-    ] = None,
-    force: Force = False,
-    as_json: AsJson = False,
-) -> Any:
+@command("export")
+def export_store(store: Path, out_: Path | None = None, force: bool = False) -> Any:
     """Write the trials of a store as CSV and JSON.
 
     If the store is damaged, everything that can be read is written.
     """
-    found = recover(store)
-    if found.damaged and not found.trials and not found.trajectories:
+    content = recover(store)
+    if content.damaged and not content.trials and not content.trajectories:
         raise StoreAccessError(f"nothing can be read from {store}: it is not a store, or it is damaged completely.")
-    target = store.with_suffix(".export") if folder is None else folder
+    target = store.with_suffix(".export") if out_ is None else out_
     require_folder(target, ("trials.json", "trials.csv", "trajectories"), MADE_BY, force=force)
-    export(found, target)
-    report = {
-        "trials": len(found.trials),
-        "trajectories": len(found.trajectories),
-        "damaged": found.damaged,
-        "folder": str(target),
+    export(content, target)
+    for sentence in content.damaged[:20]:
+        out.say(("cannot be read", "yellow"), f": {sentence}")
+    if len(content.damaged) > 20:
+        out.say(f"and {len(content.damaged) - 20} others; trials.json lists them.")
+    counts = {"trials": len(content.trials), "trajectories": len(content.trajectories)}
+    out.say(f"{counts['trials']} trials and {counts['trajectories']} trajectories in {target}")
+    return {**counts, "damaged": content.damaged, "folder": str(target)}
+
+
+@command()
+def remeasure(store: Path, experiment: str | None = None, trust: bool = False, accept_change: str | None = None) -> Any:
+    """Recompute the distances of all stored executions, after you changed the distance function.
+
+    Nothing is executed. If an experiment file defines the distance, name the file with --experiment. The history of the
+    store keeps the earlier values.
+    """
+    known = Store.existing(store)
+    before = {trial.number: trial.distance for trial in known.trials()}
+    campaign = open_store(known, store, experiment, trust, accept_change, remeasure=True).campaign
+    trials = campaign.trials
+    report: dict[str, Any] = {
+        "measured": sum(trial.state == "completed" for trial in trials),
+        "changed": [trial.number for trial in trials if trial.distance != before.get(trial.number)],
+        "unmeasured": [trial.number for trial in campaign.unmeasured],
+        "worst": worst_of(campaign.worst),
+        "store": str(store),
     }
-    if not as_json:
-        for sentence in found.damaged[:20]:
-            out.say(("cannot be read", "yellow"), f": {sentence}")
-        if len(found.damaged) > 20:
-            out.say(f"and {len(found.damaged) - 20} others; trials.json lists them.")
-        out.say(f"{len(found.trials)} trials and {len(found.trajectories)} trajectories in {target}")
+    if report["changed"]:
+        count = f"{len(report['changed'])} of {report['measured']}"
+        out.say(f"{count} distances have changed. The history of the store keeps the earlier values.")
+    else:
+        file = "If an experiment file defines the distance, name the file with --experiment."
+        out.say(f"no distance has changed. {file}")
+    if report["unmeasured"]:
+        out.say(f"trials without a distance: {', '.join(map(str, report['unmeasured']))}.")
+    if report["worst"] is not None:
+        print_table({"largest distance": report["worst"]})
     return report

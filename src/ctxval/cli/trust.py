@@ -4,46 +4,18 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
-
-import typer
+from typing import Any
 
 from ctxval._util.checked import PositiveFloat, PositiveInt, require
 from ctxval.campaign.campaign import Campaign
+from ctxval.campaign.storage.other_stores import STORE_SUFFIXES
+from ctxval.campaign.storage.store import Store
 from ctxval.cli.base import err
-from ctxval.cli.options import TARGET
-from ctxval.config.settings import Settings, not_an_experiment, read_settings
-from ctxval.config.signatures import code_named, verifies, why_no_key
-from ctxval.config.stored_settings import trusted_settings
+from ctxval.cli.config.settings import Settings, not_an_experiment, read_settings
+from ctxval.cli.config.signatures import code_named, verifies, why_no_key
+from ctxval.cli.config.stored_settings import trusted_settings
 from ctxval.core.experiment import Experiment
 from ctxval.errors import InputError
-from ctxval.storage.other_stores import STORE_SUFFIXES
-from ctxval.storage.store import Store
-
-Trust = Annotated[
-    bool,
-    typer.Option(
-        "--trust",
-        help="Allow the code that the store names to run, although you did not make the store on this computer.",
-    ),
-]
-AcceptChange = Annotated[
-    str | None,
-    typer.Option(
-        "--accept-change",
-        metavar="REASON",
-        help="Continue although the experiment differs from the stored one. Give the reason, for example that the "
-        "system was repaired or that the code still computes the same. The store keeps the reason.",
-    ),
-]
-Named = Annotated[
-    str | None,
-    typer.Option(
-        "--experiment",
-        metavar=TARGET,
-        help="Experiment of the store. Use this option if you do not trust the code that the store names.",
-    ),
-]
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,13 +40,6 @@ def budget_of(experiment: Experiment, settings: Settings, given: int | None = No
     return require("budget", PositiveInt, next(known))  # type: ignore[no-any-return]
 
 
-def settings_of(store: Store, experiment: str | None, trust: bool) -> Settings:
-    """Return the settings that the experiment of a store is built from."""
-    if experiment is not None and trust:
-        raise InputError("--trust and --experiment cannot be given together.")
-    return trusted_settings(store, experiment=experiment, trust=trust)
-
-
 def open_store(
     store: Store,
     path: Path,
@@ -85,7 +50,7 @@ def open_store(
     remeasure: bool = False,
 ) -> Opened:
     """Build the experiment of a store, and its campaign."""
-    settings = settings_of(store, experiment, trust)
+    settings = trusted_settings(store, experiment=experiment, trust=trust)
     asked = (trust or experiment is not None) and not verifies(store.settings())
     try:
         loaded = settings.load()
@@ -107,11 +72,7 @@ def open_store(
 
 
 def open_target(
-    target: str,
-    overrides: dict[str, Any],
-    experiment: str | None,
-    trust: bool,
-    accept_change: str | None = None,
+    target: str, overrides: dict[str, Any], experiment: str | None, trust: bool, accept_change: str | None = None
 ) -> Opened:
     """Open the store that an argument names, or the campaign of an experiment with options of the command line."""
     path = Path(target)

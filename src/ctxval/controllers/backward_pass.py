@@ -11,13 +11,8 @@ from typing import Any
 import numpy as np
 
 from ctxval._util.arrays import Array
-from ctxval.controllers.cost import QuadraticCost
-from ctxval.controllers.riccati import linear_gains
+from ctxval.controllers.cost import QuadraticCost, linear_gains
 from ctxval.core.controller import Limits
-
-_STEP_LENGTHS = 0.5 ** np.arange(12)  # of projected Newton steps
-_NEWTON_DECREASE = 0.1  # share of its linear decrease that a projected Newton step must reach
-_ADJUGATE = np.array([[1.0, -1.0], [-1.0, 1.0]])  # signs of the entries of the adjugate of a matrix of two rows
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,18 +23,14 @@ class Change:
     curvature: Array
 
     def at(self, length: float | Array) -> Array:
-        """Return the expected changes of steps of these lengths, shape ``(N,)``."""
         return length * self.slope + 0.5 * length**2 * self.curvature
 
 
 @dataclass(frozen=True, eq=False)
 class InputStep:
-    """A step of the inputs with its feedback, and what it is expected to change.
+    """A step of the inputs with its feedback, and the expected change of the cost.
 
-    Attributes:
-        K: the gains, shape ``(H, N, m, n)``, or ``(H, m, n)`` if all tasks share them.
-        k: the feedforward, shape ``(H, N, m)``.
-        change: the expected change of the cost.
+    The gains K have shape ``(H, N, m, n)``, or ``(H, m, n)`` if all tasks share them, the feedforward k ``(H, N, m)``.
     """
 
     K: Array
@@ -51,11 +42,8 @@ class InputStep:
 class Expansion:
     """What the cost is expanded around, time first: N tasks with n states and m inputs.
 
-    Attributes:
-        deviations: the states minus their references, shape ``(H + 1, N, n)``.
-        inputs: shape ``(H, N, m)``.
-        A: derivatives by the state, ``(H, N, n, n)``, or ``(n, n)`` if they are constant.
-        B: derivatives by the input, ``(H, N, n, m)``, or ``(n, m)`` if they are constant.
+    Deviations ``(H + 1, N, n)`` are states minus references, and inputs are ``(H, N, m)``. The derivatives A and B are
+    ``(H, N, n, n)`` and ``(H, N, n, m)``, or have no leading axes if they are constant.
     """
 
     deviations: Array
@@ -65,7 +53,6 @@ class Expansion:
 
     @property
     def linear(self) -> bool:
-        """Whether the model is linear."""
         return self.A.ndim == 2 and self.B.ndim == 2
 
 
@@ -142,19 +129,13 @@ def _joined(around: Expansion, shape: tuple[int, int]) -> tuple[Array, Array]:
 
 @dataclass(frozen=True, eq=False)
 class _Stage:
-    """The minimisation over the inputs of one step.
-
-    Attributes:
-        ridge: the damping, shape ``(N, m, m)``; None if there is none.
-        box: the lower and upper limits of k, shapes ``(H, N, m)``; None if there are none.
-    """
+    """The minimisation over the inputs of one step, with damping ``(N, m, m)`` and limits of k ``(H, N, m)``."""
 
     ridge: Array | None
     box: tuple[Array, Array] | None
 
     @property
     def exact(self) -> bool:
-        """Whether the step minimises the expansion itself, without damping."""
         return self.ridge is None
 
     def solve(self, t: int, Q_uu: Array, Q_u: Array, Q_ux: Array) -> tuple[Array, Array]:
@@ -196,13 +177,13 @@ def _within(box: tuple[Array, Array], best: Array, Q_uu: Array, Q_u: Array, Q_ux
 
 
 def _projected(k: Array, direction: Array, slope: Array, Q_uu: Array, box: tuple[Array, Array]) -> Array:
-    """Return for each row the longest of several steps, projected onto the box, that lowers its value enough."""
+    """Return for each row the longest of several steps, projected onto the box, with a tenth of its linear decrease."""
     whole = np.clip(k + direction, *box) - k
-    if (_value(whole, slope, Q_uu) <= _NEWTON_DECREASE * (whole * slope).sum(axis=-1)).all():
+    if (_value(whole, slope, Q_uu) <= 0.1 * (whole * slope).sum(axis=-1)).all():
         return k + whole
-    moves = np.clip(k + _STEP_LENGTHS[:, None, None] * direction, *box) - k
-    linear = (moves * slope).sum(axis=-1)
-    enough = _value(moves, slope, Q_uu) <= _NEWTON_DECREASE * linear
+    lengths = 0.5 ** np.arange(12)
+    moves = np.clip(k + lengths[:, None, None] * direction, *box) - k
+    enough = _value(moves, slope, Q_uu) <= 0.1 * (moves * slope).sum(axis=-1)
     chosen = moves[enough.argmax(axis=0), np.arange(len(k))]
     return k + np.where(enough.any(axis=0)[:, None], chosen, 0.0)
 
@@ -225,7 +206,7 @@ def _inverses(matrices: Array) -> Array:
     if m > 2 or matrices.size < 16:  # LAPACK inverts few matrices of two rows faster than the closed form
         return np.asarray(np.linalg.inv(matrices), dtype=np.float64)
     determinants = matrices[..., 0, 0] * matrices[..., 1, 1] - matrices[..., 0, 1] * matrices[..., 1, 0]
-    inverses = np.swapaxes(matrices[..., ::-1, ::-1], -1, -2) * _ADJUGATE
+    inverses = np.swapaxes(matrices[..., ::-1, ::-1], -1, -2) * np.array([[1.0, -1.0], [-1.0, 1.0]])
     inverses *= (1.0 / determinants)[..., None, None]
     return np.asarray(inverses)
 

@@ -24,14 +24,10 @@ _LEAST_DAMPING = 1e-6  # that is not zero
 
 @dataclass(frozen=True, eq=False)
 class ILQRSolution(ShortRepr):
-    """The solution of iLQR for one task or a batch.
+    """The solution of iLQR for one task or a batch: the feedback around the optimised trajectory, and its cost.
 
-    Attributes:
-        controller: the feedback around the optimised trajectory.
-        cost: the cost of the optimised trajectory, shape ``(...)``.
-        iterations: the number of accepted steps, integers of shape ``(...)``.
-        converged: whether the iteration converged, shape ``(...)``; it did not if the limit of iterations was reached
-            or no step improved the cost. The gains are those of an undamped step at the solution in any case.
+    The iterations are the accepted steps. A design has not converged if the limit of iterations was reached or no step
+    improved the cost; the gains are those of an undamped step at the solution in any case.
     """
 
     controller: AffineFeedback
@@ -75,28 +71,18 @@ class ILQR(ShortRepr):
         self.limits = None if limits is None else Limits.of(limits, len(self.cost.R))
 
     def describe(self) -> dict[str, Any]:
-        """Return what identifies this synthesizer in a store."""
         fields = {"cost": self.cost, "iterations": self.iterations, "tolerance": self.tolerance}
         return {**fields, **({} if self.limits is None else {"limits": self.limits})}
 
     def design(self, task: Task, model: Model) -> AffineFeedback:
-        """Return the feedback around the optimised trajectory of the model.
-
-        Raises:
-            DesignError: if the model diverges under zero input.
-        """
         return self.solve(task, model).controller
 
     def solve(self, task: Task, model: Model) -> ILQRSolution:
-        """Return the controller, and for each task the cost, the number of iterations and whether they converged.
-
-        Raises:
-            DesignError: if the model diverges under zero input.
-        """
+        """Return the controller, and for each task the cost, the number of iterations and whether they converged."""
         self.cost.require_task(task)
         with np.errstate(all="ignore"):
             descent = _Descent(self, task, model)
-            while len(rows := descent.active_rows()):
+            while len(rows := np.flatnonzero(descent.active)):
                 descent.advance(rows)
             descent.undamp(np.flatnonzero(~descent.converged))
         return descent.solution(task.batch_shape)
@@ -129,10 +115,10 @@ class _Descent:
         self.together = 4 if getattr(model, "vectorized", True) else 1
         self.latest: tuple[Rows, Array, Array] | None = None  # the latest derivatives, and their tasks
 
-    def active_rows(self) -> Rows:
-        """Return the tasks whose iteration continues."""
+    @property
+    def active(self) -> Mask:
         stuck = self.damping > 1e10  # no step improves the cost
-        return np.flatnonzero(~self.converged & ~stuck & (self.iterations < self.settings.iterations))
+        return ~self.converged & ~stuck & (self.iterations < self.settings.iterations)
 
     def advance(self, rows: Rows) -> None:
         """Take one step for these tasks, or mark them as converged."""
@@ -173,19 +159,15 @@ class _Descent:
     def _step(self, rows: Rows) -> tuple[Expansion, InputStep]:
         """Return the expansion at the iterates of these tasks, and the step that minimises it."""
         X, U = self.X[:, rows], self.U[:, rows]
-        around = Expansion(X - self.reference[:, rows], U, *self._linearised(rows, X, U))
+        known = self.latest  # the derivatives of unchanged iterates are kept
+        if known is None or not self.refused[rows].all() or not np.array_equal(known[0], rows):
+            known = self.latest = rows, *linearize(self.model, X[:-1], U)
+        around = Expansion(X - self.reference[:, rows], U, *known[1:])
         return around, minimise(self.cost, around, self.limits, self.damping[rows])
 
     def _keep(self, policy: InputStep, chosen: Rows, rows: Rows) -> None:
         """Keep the gains of some of the tasks of a step."""
         self.K[:, rows[chosen]] = policy.K[:, chosen] if policy.K.ndim == 4 else policy.K[:, None]
-
-    def _linearised(self, rows: Rows, X: Array, U: Array) -> tuple[Array, Array]:
-        """Return the derivatives along the iterates of these tasks; those of unchanged iterates are kept."""
-        known = self.latest
-        if known is None or not self.refused[rows].all() or not np.array_equal(known[0], rows):
-            known = self.latest = rows, *linearize(self.model, X[:-1], U)
-        return known[1:]
 
     def _line_search(self, rows: Rows, policy: InputStep, waiting: Rows) -> Rows:
         """Accept for each waiting task the longest step that lowers its cost; return the tasks with such a step.

@@ -9,8 +9,7 @@ import numpy as np
 from ctxval._util.arrays import Array, ArrayLike
 from ctxval._util.registry import part
 from ctxval._util.representation import ShortRepr
-from ctxval.controllers.cost import QuadraticCost
-from ctxval.controllers.riccati import LinearGains, linear_gains
+from ctxval.controllers.cost import LinearGains, QuadraticCost, linear_gains
 from ctxval.core.controller import AffineFeedback, Limits, LimitsLike
 from ctxval.core.model import Model, linearize
 from ctxval.core.task import Task
@@ -40,7 +39,6 @@ class LQR(ShortRepr):
         self.limits = None if limits is None else Limits.of(limits, len(self.cost.R))
 
     def design(self, task: Task, model: Model) -> AffineFeedback:
-        """Return the feedback ``u = K_t x + k_t`` that minimises the cost on the (linearised) model."""
         self.cost.require_task(task)
         x0 = task.initial_state
         u0 = np.zeros((*task.batch_shape, len(self.cost.R)))
@@ -55,7 +53,6 @@ class LQR(ShortRepr):
         return AffineFeedback(gains, feedforward, np.zeros_like(task.reference[..., :-1, :]), self.limits)
 
     def describe(self) -> dict[str, Any]:
-        """Return what identifies this synthesizer in a store."""
         return {"cost": self.cost, **({} if self.limits is None else {"limits": self.limits})}
 
 
@@ -81,11 +78,6 @@ class StationaryLQR(ShortRepr):
         self.limits = None if limits is None else Limits.of(limits, len(self.cost.R))
 
     def design(self, task: Task, model: Model) -> AffineFeedback:
-        """Return the stationary feedback around the reference.
-
-        Raises:
-            DesignError: if no feedback stabilises the model at the goal.
-        """
         self.cost.require_task(task)
         holding = np.zeros((*task.batch_shape, len(self.cost.R)))
         _, B = linearize(model, task.goal, holding)
@@ -99,7 +91,6 @@ class StationaryLQR(ShortRepr):
         return AffineFeedback(gains, inputs, task.reference[..., :-1, :], self.limits)
 
     def describe(self) -> dict[str, Any]:
-        """Return what identifies this synthesizer in a store."""
         return {"cost": self.cost, **({} if self.limits is None else {"limits": self.limits})}
 
 
@@ -139,8 +130,7 @@ def _stationary_gain(cost: QuadraticCost, A: Array, B: Array) -> Array:
 def _riccati(cost: QuadraticCost, A: Array, B: Array, offset: Array, reference: Array) -> tuple[Array, Array]:
     """Solve for K_t and k_t backwards, with the cost-to-go ``1/2 x'P x + p'x``."""
     A_t, B_t = np.swapaxes(A, -1, -2), np.swapaxes(B, -1, -2)
-    horizon = reference.shape[-2] - 1
-    P = cost.Q_final
+    horizon, P = reference.shape[-2] - 1, cost.Q_final
     p = -reference[..., -1, :] @ cost.Q_final
     gains, feedforward = [], []
     for t in reversed(range(horizon)):

@@ -18,11 +18,6 @@ from ctxval.core.model import Model, linearize
 from ctxval.core.task import Task
 from ctxval.errors import DesignError, ShapeError
 
-_SETTLED = 1e-9  # relative change of the cost at which the iteration stops
-_STEP_LENGTHS = 0.5 ** np.arange(10)
-_EXACT = 2.0  # the merit's weight of violations, in multiplicities of the largest multiplier
-_STRICT = 1e-6  # quadratic share of the cost of a violation, which keeps the problem strictly convex
-
 
 @part()
 class MPC(ShortRepr):
@@ -69,7 +64,6 @@ class MPC(ShortRepr):
         require_extra("casadi", "mpc", "MPC controllers")
 
     def design(self, task: Task, model: Model) -> RecedingHorizon:
-        """Return the controller, which solves an optimal control problem at every step."""
         self.cost.require_task(task)
         if task.batch_shape:
             raise ShapeError(f"MPC designs for one task at a time, got a batch of shape {task.batch_shape}.")
@@ -85,16 +79,11 @@ class RecedingHorizon(ShortRepr):
     model: Model
 
     def __call__(self, t: int, x: Array) -> Array:
-        """Return the input ``(m,)`` at step t."""
         first: Array = self.plan(t, x)[1][0]
         return first
 
     def plan(self, t: int, x: Array) -> tuple[Array, Array]:
-        """Return the predicted states ``(steps + 1, n)`` and the planned inputs ``(steps, m)``.
-
-        Raises:
-            DesignError: if no inputs keep the prediction within the state limits, or the prediction is not finite.
-        """
+        """Return the predicted states ``(steps + 1, n)`` and the planned inputs ``(steps, m)``."""
         steps = self.settings.steps
         rows = np.minimum(t + 1 + np.arange(steps), self.task.horizon)
         problem = _Problem(self.settings, self.model, as_floats("the state", x), self.task.reference[rows])
@@ -161,18 +150,18 @@ class _Problem:
         if solution is None:
             return None
         change, largest = solution
-        self.weight = max(self.weight, _EXACT * largest) if soft is None else soft
+        self.weight = max(self.weight, 2.0 * largest) if soft is None else soft
         return change[: steps * m].reshape(steps, m)
 
     def _line_search(self, X: Array, U: Array, change: Array) -> tuple[Array, Array, bool]:
         """Return states and inputs with a lower merit, and whether the iteration has converged."""
         before = self._merit(X, U)
-        for length in _STEP_LENGTHS:
+        for length in 0.5 ** np.arange(10):
             U_new = self.settings.limits.clip(U + length * change)
             X_new = self._predicted(U_new)
             after = self._merit(X_new, U_new)
             if after < before:
-                return X_new, U_new, before - after <= _SETTLED * (1 + abs(before))
+                return X_new, U_new, before - after <= 1e-9 * (1 + abs(before))
         return X, U, True
 
     def _merit(self, X: Array, U: Array) -> float:
@@ -207,7 +196,7 @@ def _softened(
     size, count = len(slope), len(rows)
     whole = np.zeros((size + steps, size + steps))
     whole[:size, :size] = hessian
-    whole[size:, size:] = _STRICT * cost * np.eye(steps)
+    whole[size:, size:] = 1e-6 * cost * np.eye(steps)  # keeps the problem strictly convex
     own = np.kron(np.eye(steps), np.ones((count // steps, 1)))
     unlimited = np.full(count, np.inf)
     return _quadratic_program(
@@ -224,7 +213,7 @@ def _quadratic_program(
 ) -> tuple[Array, float] | None:
     """Minimise ``1/2 z'Hz + g'z`` for z within a box and ``rows z`` within the gaps.
 
-    Returns z and the largest multiplier of a row, or None if there is no solution.
+    Return z and the largest multiplier of a row; None if there is no solution.
     """
     casadi = require_extra("casadi", "mpc", "MPC controllers")
     dense = casadi.Sparsity.dense

@@ -61,9 +61,7 @@ class OnnxPolicy(ShortRepr):
         return self.network(np.asarray(observations, dtype=np.float64)) * self.scale
 
     def design(self, task: Task, model: Model) -> BoundPolicy:
-        """Return the policy bound to the task."""
         return BoundPolicy(self.inputs, task, self.limits)
 
     def describe(self) -> dict[str, Any]:
-        """Return what identifies this synthesizer in a store."""
         return {name: getattr(self, name) for name in ("network", "observe", "scale", "limits")}

@@ -51,12 +51,6 @@ def converged_of(controller: object, batch_shape: tuple[int, ...] = ()) -> Mask 
     return np.broadcast_to(converged, batch_shape)
 
 
-_SPELLINGS = (
-    "write one number h for -h to h of every input, { low = 0.0, high = 8.0 } (in Python also Limits(low=0.0, "
-    "high=8.0)) with numbers or one for each input, or rows [[low, high], ...], one for each input"
-)
-
-
 @dataclass(frozen=True, eq=False, init=False)
 class Limits(ShortRepr):
     """Limits of the inputs, ``low <= u <= high``.
@@ -90,12 +84,11 @@ class Limits(ShortRepr):
     def of(cls, limits: LimitsLike, inputs: int | None = None) -> Limits:
         """Return limits from any form that users may give.
 
-        Args:
-            limits: one number h for ``-h`` to ``h`` of every input; ``Limits(low=, high=)`` or a mapping of low and
-                high, numbers or ``(m,)``; or rows ``[low, high]``, one for each input, shape ``(m, 2)``.
-            inputs: the number of inputs m, to which single numbers are expanded; None leaves them as they are.
+        It is one number h for ``-h`` to ``h`` of every input; ``Limits(low=, high=)`` or a mapping of low and high,
+        numbers or ``(m,)``; or rows ``[low, high]``, one for each input. Single numbers are expanded if the number of
+        inputs is given.
         """
-        box = limits if isinstance(limits, Limits) else _read_limits(limits)
+        box = limits if isinstance(limits, Limits) else cls._read(limits)
         if inputs is None:
             return box
         if any(bound.shape not in ((), (inputs,)) for bound in (box.low, box.high)):
@@ -103,6 +96,32 @@ class Limits(ShortRepr):
                 f"limits must be numbers or have shape ({inputs},), got {box.low.shape} and {box.high.shape}."
             )
         return cls(*(np.array(np.broadcast_to(bound, (inputs,))) for bound in (box.low, box.high)))
+
+    @classmethod
+    def _read(cls, limits: Any) -> Limits:
+        spellings = (
+            "write one number h for -h to h of every input, { low = 0.0, high = 8.0 } (in Python also Limits(low=0.0, "
+            "high=8.0)) with numbers or one for each input, or rows [[low, high], ...], one for each input"
+        )
+        if isinstance(limits, Mapping):
+            if set(limits) != {"low", "high"}:
+                given = ", ".join(map(str, limits)) or "neither"
+                raise InputError(
+                    f"limits must have low and high, of which one may be infinite, got {given}; {spellings}."
+                )
+            return cls(limits["low"], limits["high"])
+        try:
+            array = as_floats("limits", limits)
+        except InputError as error:
+            raise InputError(f"{str(error).removesuffix('.')}; {spellings}.") from error
+        if array.ndim == 0:
+            return cls(-array, array)
+        if array.ndim == 1 and array.size:
+            # It could be the lower and the upper limit, or the upper limits of several inputs.
+            raise InputError(f"limits must not be a flat list, got {array.tolist()}: {spellings}.")
+        if array.ndim != 2 or array.shape[1] != 2:
+            raise ShapeError(f"limits must not have shape {array.shape}; {spellings}.")
+        return cls(array[:, 0], array[:, 1])
 
     def describe(self) -> dict[str, Any]:
         """Return what identifies these limits in a store."""
@@ -115,40 +134,6 @@ class Limits(ShortRepr):
 
 LimitsLike = float | Limits | Mapping[str, ArrayLike] | ArrayLike
 """One number, ``Limits(low=, high=)``, a mapping of low and high, or rows ``(m, 2)``; see :meth:`Limits.of`."""
-
-
-def _read_limits(limits: Any) -> Limits:
-    if isinstance(limits, Mapping):
-        if set(limits) != {"low", "high"}:
-            raise InputError(
-                "limits must have low and high, of which one may be infinite, "
-                f"got {', '.join(map(str, limits)) or 'neither'}; {_SPELLINGS}."
-            )
-        return Limits(limits["low"], limits["high"])
-    try:
-        array = as_floats("limits", limits)
-    except InputError as error:
-        raise InputError(f"{str(error).removesuffix('.')}; {_SPELLINGS}.") from error
-    if array.ndim == 0:
-        return Limits(-array, array)
-    if array.ndim == 1 and array.size:
-        raise _flat(array.tolist())
-    if array.ndim != 2 or array.shape[1] != 2:
-        raise ShapeError(f"limits must not have shape {array.shape}; {_SPELLINGS}.")
-    return Limits(array[:, 0], array[:, 1])
-
-
-def _flat(listed: list[float]) -> InputError:
-    """Return the error that limits are a flat list, with the forms in which the user can write them instead."""
-    ways = []
-    if len(listed) == 2 and listed[0] < listed[1]:
-        low, high = listed
-        ways.append(f"{{ low = {low}, high = {high} }} for {low:g} to {high:g} of every input")
-    if all(high > 0 for high in listed):
-        ways.append(f"{[[-high, high] for high in listed]} for one row [low, high] for each input")
-    if len(ways) == 2:
-        return InputError(f"limits {listed} can be read in two ways: write {ways[0]}, or {ways[1]}.")
-    return InputError(f"limits must not be a flat list, got {listed}: {'write ' + ways[0] if ways else _SPELLINGS}.")
 
 
 def fed_back(K: Array, deviations: Array) -> Array:

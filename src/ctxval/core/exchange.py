@@ -34,11 +34,7 @@ Names = Mapping[str, str]
 
 @dataclass(frozen=True, eq=False)
 class ControllerFile(ShortRepr):
-    """A controller that was read from a file.
-
-    Attributes:
-        states, inputs: the names of the states and inputs with their units, in the order of the components.
-    """
+    """A controller that was read from a file, with the names of its states and inputs and their units, in order."""
 
     controller: AffineFeedback
     dt: float
@@ -49,36 +45,19 @@ class ControllerFile(ShortRepr):
 def write_controller(
     path: str | Path, controller: Any, *, dt: float, states: Names | None = None, inputs: Names | None = None
 ) -> None:
-    """Write the controller of one task as ``.json`` or ``.npz``.
+    """Write the controller of one task, affine feedback as LQR and iLQR design it, as ``.json`` or ``.npz``.
 
-    Args:
-        path: the file; its suffix, ``.json`` or ``.npz``, determines the format.
-        controller: affine feedback, as LQR and iLQR design it.
-        states, inputs: names and units of the components; ``x0, x1, ...`` and ``u0, u1, ...`` by default.
+    States and inputs are names and units of the components; ``x0, x1, ...`` and ``u0, u1, ...`` by default.
     """
     if not isinstance(controller, AffineFeedback):
-        raise InputError(
-            f"only affine feedback, such as that of LQR and iLQR, can be written to a file, got {controller!r}."
-        )
+        raise InputError(f"only affine feedback, as of LQR and iLQR, can be written to a file, got {controller!r}.")
     if controller.gains.ndim != 3 or controller.inputs.ndim != 2:
-        raise ShapeError(
-            f"the controller must be for one task, with gains of shape (H, m, n), got {controller.gains.shape}."
-        )
+        raise ShapeError(f"the controller must be for one task, with gains (H, m, n), got {controller.gains.shape}.")
     horizon, m, n = controller.gains.shape
-    about = {
-        "format": CONTROLLER_FORMAT,
-        "version": VERSION,
-        "law": LAW,
-        "dt": _seconds(dt),
-        "horizon": horizon,
-        **_named("state", states, n),
-        **_named("input", inputs, m),
-    }
-    arrays = {
-        "gains": as_finite("the controller's gains", controller.gains),
-        "inputs": as_finite("the controller's inputs", controller.inputs),
-        "states": as_finite("the controller's states", controller.states[:horizon]),
-    }
+    about = {"format": CONTROLLER_FORMAT, "version": VERSION, "law": LAW, "dt": _seconds(dt), "horizon": horizon}
+    about |= _named("state", states, n) | _named("input", inputs, m)
+    known = {"gains": controller.gains, "inputs": controller.inputs, "states": controller.states[:horizon]}
+    arrays = {name: as_finite(f"the controller's {name}", array) for name, array in known.items()}
     if controller.limits is not None:
         limits = Limits.of(controller.limits, m)
         arrays |= {"low": limits.low, "high": limits.high}
@@ -91,26 +70,22 @@ def read_controller(path: str | Path) -> ControllerFile:
 
 
 def write_task(path: str | Path, task: Task, *, states: Names | None = None) -> None:
-    """Write one task as JSON: its initial state, reference, horizon and time step.
-
-    Args:
-        states: names and units of the states; ``x0, x1, ...`` by default.
-    """
+    """Write one task as JSON; states are names and units of its states, ``x0, x1, ...`` by default."""
     if task.batch_shape:
         raise ShapeError(f"the file of a task must hold one task, got a batch of shape {task.batch_shape}.")
-    about = {
-        "format": TASK_FORMAT,
-        "version": VERSION,
-        "dt": task.dt,
-        "horizon": task.horizon,
-        **_named("state", states, task.initial_state.size),
-    }
+    about = {"format": TASK_FORMAT, "version": VERSION, "dt": task.dt, "horizon": task.horizon}
+    about |= _named("state", states, task.initial_state.size)
     _write(Path(path), about, {"initial_state": task.initial_state, "reference": task.reference})
 
 
 def read_task(path: str | Path) -> Task:
     """Read one task from a JSON file."""
-    return _read(Path(path), TASK_FORMAT, _task)
+
+    def build(content: Mapping[str, Any]) -> Task:
+        start = as_finite("initial_state", content["initial_state"])
+        return Task(start, horizon=content["horizon"], dt=content["dt"], reference=content["reference"])
+
+    return _read(Path(path), TASK_FORMAT, build)
 
 
 def _write(path: Path, about: dict[str, Any], arrays: Mapping[str, Array]) -> None:
@@ -159,26 +134,11 @@ def _controller(content: Mapping[str, Any]) -> ControllerFile:
         raise InputError(f"its horizon must be the number of its gains, {horizon}, got {str(content['horizon'])[:40]}.")
     limits = None
     if content.get("low") is not None or content.get("high") is not None:
-        limits = Limits.of(Limits(_bound(content["low"], -np.inf), _bound(content["high"], np.inf)), m)
-    return ControllerFile(
-        AffineFeedback(gains, inputs, states, limits),
-        _seconds(content["dt"]),
-        _names("state", content, n),
-        _names("input", content, m),
-    )
-
-
-def _task(content: Mapping[str, Any]) -> Task:
-    return Task(
-        as_finite("initial_state", content["initial_state"]),
-        horizon=content["horizon"],
-        dt=content["dt"],
-        reference=content["reference"],
-    )
-
-
-def _bound(values: Any, infinite: float) -> Array:
-    return as_floats("limits", [infinite if value is None else value for value in values])
+        low = [-np.inf if value is None else value for value in content["low"]]
+        high = [np.inf if value is None else value for value in content["high"]]
+        limits = Limits.of(Limits(as_floats("limits", low), as_floats("limits", high)), m)
+    feedback = AffineFeedback(gains, inputs, states, limits)
+    return ControllerFile(feedback, _seconds(content["dt"]), _names("state", content, n), _names("input", content, m))
 
 
 def _seconds(dt: Any) -> float:

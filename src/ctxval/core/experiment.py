@@ -31,10 +31,8 @@ class Experiment:
         units: the units of the distance.
         states, inputs: names of the states and inputs with their units, for files, pictures and reports.
 
-    The validation gets these names and units as its labels. What is not given here is taken from its labels.
-
-    Warns:
-        UnitsWarning: if the distance adds states of different units, and has neither weights nor scales.
+    The validation gets these names and units as its labels. What is not given here is taken from its labels. A
+    UnitsWarning says that the distance adds states of different units, and has neither weights nor scales.
     """
 
     name: str
@@ -67,10 +65,7 @@ class Experiment:
         return tuple(ask(units)) if callable(ask) and units else ()
 
     def names(self, states: int, inputs: int) -> tuple[dict[str, str], dict[str, str]]:
-        """Return the names of n states and m inputs with their units, for files.
-
-        They are the names of the experiment, else those of its system, else ``x0, x1, ...`` and ``u0, u1, ...``.
-        """
+        """Return the names of n states and m inputs with their units (:meth:`Labels.names`)."""
         return self.validation.names(states, inputs)
 
     def __repr__(self) -> str:

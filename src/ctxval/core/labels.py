@@ -31,7 +31,7 @@ class Labels(ShortRepr):
     def names(self, system: object, states: int, inputs: int) -> tuple[dict[str, str], dict[str, str]]:
         """Return the names of n states and m inputs with their units.
 
-        They are these labels, else the names that the system itself has, else ``x0, x1, ...`` and ``u0, u1, ...``.
+        They are these labels, else the names that the system has, else ``x0, x1, ...`` and ``u0, u1, ...``.
         """
         return (
             _named(self.states, names_of(system, "states"), "x", states),

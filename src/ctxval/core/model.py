@@ -14,8 +14,6 @@ from ctxval.errors import InputError, ModelError
 
 Step = Callable[[Array, Array], Array]
 
-_BLOCK = 4096  # points at which a model is evaluated in one call for differences, so that they fit into the cache
-
 
 @runtime_checkable
 class Model(Protocol):
@@ -31,11 +29,9 @@ class Model(Protocol):
 
 @part(functions={"step": "(x, u) -> x_next"})
 class Function(ShortRepr):
-    """A plain function ``(x, u) -> x_next`` as a model.
+    """A plain function ``(x, u) -> x_next`` of one state ``(n,)`` and one input ``(m,)`` as a model.
 
-    Args:
-        step: a function of one state ``(n,)`` and one input ``(m,)``.
-        vectorized: True if ``step`` takes whole batches ``(..., n)`` and ``(..., m)``.
+    A vectorized one takes whole batches ``(..., n)`` and ``(..., m)``.
     """
 
     def __init__(self, step: Step, *, vectorized: bool = False) -> None:
@@ -77,9 +73,6 @@ def linearize(model: Model, x: Array, u: Array) -> tuple[Array, Array]:
 
     They come from the model's own ``jacobian`` if it has one, and from central differences otherwise. Shapes
     ``(..., n), (..., m) -> (..., n, n), (..., n, m)``; a model whose Jacobian is constant may leave out the batch axes.
-
-    Raises:
-        ModelError: if the Jacobians are not finite.
     """
     jacobian = getattr(model, "jacobian", None)
     A, B = jacobian(x, u) if jacobian is not None else central_differences(model.step, x, u)
@@ -102,10 +95,19 @@ def central_differences(step: Step, x: Array, u: Array, precision: float | None 
     z = np.concatenate([x, u], axis=-1).reshape(-1, width)
     # The cube root of the precision balances truncation against rounding.
     h = np.cbrt(_precision(step, z, n) if precision is None else precision) * np.maximum(1.0, np.abs(z))
-    size = max(1, _BLOCK // (2 * width))
-    blocks = [slice(first, first + size) for first in range(0, max(1, len(z)), size)]
-    transposed = np.concatenate([_differences(step, z[rows], h[rows], n) for rows in blocks])
-    whole = np.swapaxes(transposed, -1, -2).reshape(*batch, n, width)
+    size = max(1, 4096 // (2 * width))
+    columns, derivatives = np.arange(width), []
+    for first in range(0, max(1, len(z)), size):
+        rows, steps = z[first : first + size], h[first : first + size].T
+        moved = np.empty((2, width, *rows.shape))
+        moved[:] = rows
+        moved[0, columns, :, columns] += steps
+        moved[1, columns, :, columns] -= steps
+        points = moved.reshape(-1, width)
+        states, inputs = np.ascontiguousarray(points[:, :n]), np.ascontiguousarray(points[:, n:])
+        up, down = np.asarray(step(states, inputs)).reshape(2, width, len(rows), n)
+        derivatives.append(np.swapaxes((up - down) / (2 * steps)[:, :, None], 0, 1))
+    whole = np.swapaxes(np.concatenate(derivatives), -1, -2).reshape(*batch, n, width)
     return whole[..., :n], whole[..., n:]
 
 
@@ -126,17 +128,3 @@ def _precision(step: Step, z: Array, n: int) -> float:
         lost = np.abs(fine - still - expected) > margin
     single = lost.any(axis=1).sum() > len(some) / 2
     return float(np.finfo(np.float32 if single else np.float64).eps)
-
-
-def _differences(step: Step, z: Array, h: Array, n: int) -> Array:
-    """Return the derivatives ``(N, n + m, n)`` of the next state by the pairs z, ``(N, n + m)``, with steps of h."""
-    count, width = z.shape
-    columns = np.arange(width)
-    moved = np.empty((2, width, count, width))
-    moved[:] = z
-    moved[0, columns, :, columns] += h.T
-    moved[1, columns, :, columns] -= h.T
-    points = moved.reshape(-1, width)
-    states, inputs = np.ascontiguousarray(points[:, :n]), np.ascontiguousarray(points[:, n:])
-    up, down = np.asarray(step(states, inputs)).reshape(2, width, count, n)
-    return np.swapaxes((up - down) / (2 * h.T)[:, :, None], 0, 1)

@@ -18,10 +18,7 @@ from ctxval.errors import InputError, ShapeError
 
 @dataclass(frozen=True, eq=False)
 class Plan(ShortRepr):
-    """What is known of a task g_p before S is executed: its controller pi(x; g_p, M) and the closed loop on M.
-
-    It may also be a batch of tasks.
-    """
+    """What is known of a task g_p, or a batch, before S is executed: its controller and the closed loop on M."""
 
     parameters: Parameters
     task: Task
@@ -45,12 +42,7 @@ class Outcome(ShortRepr):
 
 @dataclass(frozen=True)
 class Measurement:
-    """The distance of an execution, or the reason why there is none.
-
-    Attributes:
-        distance: d(p); None if the distance function gave no usable number.
-        unusable: the reason why it gave none; None if there is a distance.
-    """
+    """The distance of an execution, or the reason why there is none: the distance function gave no usable number."""
 
     distance: float | None
     unusable: str | None = None
@@ -68,9 +60,9 @@ def require_execution(plan: Plan, trajectory: Trajectory, start_tolerance: float
     start = plan.task.initial_state
     ranges = np.ptp(expected.states, axis=0)
     scale = np.maximum(np.maximum(ranges, np.abs(start)), max(0.05 * ranges.max(), 1e-6))
-    misses = np.abs(trajectory.states[0] - start)
-    if not (misses <= start_tolerance * scale).all():
-        i = int(np.argmax(~(misses <= start_tolerance * scale)))
+    near = np.abs(trajectory.states[0] - start) <= start_tolerance * scale
+    if not near.all():
+        i = int(np.argmin(near))
         raise InputError(
             f"the trajectory starts elsewhere: state {i} must start at {start[i]:g} within "
             f"{start_tolerance * scale[i]:.3g}, got {trajectory.states[0, i]:g}. "

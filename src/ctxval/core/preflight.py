@@ -35,10 +35,9 @@ class CostWarning(UserWarning):
 
 
 def try_distance(validation: Validation, plan: Plan) -> None:
-    """Measure the model's trajectory of a plan against itself.
+    """Measure the model's trajectory of a plan against itself; warn if the distance is not 0.
 
-    Warns:
-        DistanceWarning: if the distance is not 0. A distance to the task has the attribute ``to_task = True``.
+    A distance to the task has the attribute ``to_task = True``.
     """
     value = validation.measure(plan, plan.model_trajectory.copy())
     if value > 1e-9 and not (validation.is_on_model or getattr(validation.distance, "to_task", False)):
@@ -52,11 +51,7 @@ def try_distance(validation: Validation, plan: Plan) -> None:
 
 
 def require_affordable(validation: Validation, parameters: Parameters, task: Task) -> None:
-    """Refuse a horizon that is too long, and state the cost of a long one, estimated from the first steps of a plan.
-
-    Warns:
-        CostWarning: if the horizon is long, the first time.
-    """
+    """Refuse a horizon that is too long; state the cost of a long one once, from the first steps of a plan."""
     steps, permitted = task.horizon, task.horizon <= validation.longest
     if permitted and (steps <= _LONG or validation in _stated):
         return
@@ -82,9 +77,8 @@ def require_affordable(validation: Validation, parameters: Parameters, task: Tas
 class StartOffset:
     """How far an execution starts from the initial state of its task.
 
-    Attributes:
-        size: the offset as the distance measures differences of states; the largest of all states if that is unknown.
-        text: the offset of the state in which it is largest, with its unit and the name of the state.
+    The size is as the distance measures differences of states, or the largest of all states if that is unknown. The
+    text names the state whose offset is largest.
     """
 
     size: float

@@ -16,8 +16,6 @@ from ctxval.core.controller import Limits, Synthesizer
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.validation import Validation
 
-NEAR = 0.1  # two tasks are neighbours if they are nearer than this, in diagonals of the task space
-
 MISSED = 0.1  # M misses its goal if it ends farther away than this, as a share of the range of a state
 
 SATURATED = 0.01  # least share of steps at a limit that is worth a note
@@ -28,8 +26,7 @@ class Flips:
     """How much the controllers of neighbouring tasks differ.
 
     Attributes:
-        pairs: number of pairs of neighbouring tasks.
-        flipped: number of pairs whose controllers differ abruptly.
+        pairs, flipped: number of pairs of neighbouring tasks, and of those whose controllers differ abruptly.
         largest: the largest difference between their inputs on M, as a share of the range of the inputs.
         example: the tasks of the pair with the largest difference; of a flipped pair, if there is one.
     """
@@ -43,10 +40,11 @@ class Flips:
 def flips(points: Array, inputs: Sequence[Array]) -> Flips | None:
     """Return how much the inputs on M, ``(H, m)``, of neighbouring tasks ``(N, d)`` differ; None if there are none.
 
-    A pair flips if the inputs differ at some time by more than half of their range, and as signals by more than half of
-    the sum of their norms. Two controllers that only leave a limit at another time are alike.
+    Neighbours are nearer than a tenth of the diagonal of the task space. A pair flips if the inputs differ at some time
+    by more than half of their range, and as signals by more than half of the sum of their norms. Two controllers that
+    only leave a limit at another time are alike.
     """
-    near = scipy.spatial.KDTree(points / np.sqrt(points.shape[1])).query_pairs(NEAR)
+    near = scipy.spatial.KDTree(points / np.sqrt(points.shape[1])).query_pairs(0.1)
     pairs = [(i, j) for i, j in sorted(near) if inputs[i].shape == inputs[j].shape and inputs[i].size]
     if not pairs:
         return None
@@ -63,11 +61,9 @@ def flips(points: Array, inputs: Sequence[Array]) -> Flips | None:
 
 @dataclass(frozen=True, eq=False)
 class Saturation:
-    """How often inputs are at their limits.
+    """How often inputs are at their limits: the share of the steps for each input, shape ``(m,)``.
 
-    Attributes:
-        shares: the share of the steps in which each input is at a limit, shape ``(m,)``.
-        known: whether the synthesizer states the limits; otherwise they are taken from the inputs themselves.
+    The limits are ``known`` if the synthesizer states them; otherwise they are taken from the inputs themselves.
     """
 
     shares: Array
@@ -77,11 +73,8 @@ class Saturation:
 def saturation(inputs: Sequence[Array], synthesizer: Synthesizer | None) -> Saturation | None:
     """Return how often inputs are at their limits; None if there are no inputs.
 
-    If the synthesizer has no attribute ``limits``, or is not known, the extreme values of all tasks are taken to be
-    limits in those tasks that stay there for three steps.
-
-    Args:
-        inputs: the inputs of each task, shape ``(H, m)``.
+    The inputs of each task have shape ``(H, m)``. If the synthesizer has no attribute ``limits``, or is not known, the
+    extreme values of all tasks are taken to be limits in those tasks that stay there for three steps.
     """
     signals = [signal for signal in inputs if signal.size]
     if not signals:
@@ -102,12 +95,9 @@ def saturation(inputs: Sequence[Array], synthesizer: Synthesizer | None) -> Satu
 
 @dataclass(frozen=True, eq=False)
 class GoalMisses:
-    """How far M ends from the goals of tasks, in the states that its controllers bring to a goal and d compares.
+    """How far M ends from the goals of tasks, in the k states that its controllers bring to a goal and d compares.
 
-    Attributes:
-        states: the indices of these states, shape ``(k,)``.
-        misses: the errors of the final states, shape ``(N, k)``.
-        shares: the errors as shares of the range of each state over all tasks, shape ``(N, k)``.
+    The misses ``(N, k)`` are errors of final states; the shares are these over the range of each state in all tasks.
     """
 
     states: Rows

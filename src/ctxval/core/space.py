@@ -67,32 +67,27 @@ class TaskSpace:
             raise InputError("a task space needs at least one parameter, such as TaskSpace(goal=(-1, 1)).")
         self._columns: dict[str, int | slice] = {}
         self._units: dict[str, str] = {}
-        names: list[str] = []
-        lows: list[Array] = []
-        highs: list[Array] = []
+        names, lows, highs = list[str](), list[Array](), list[Array]()
         for name, bound in bounds.items():
             if name == "points" or name.startswith("_"):
                 raise InputError(
                     f"a task parameter must not be called 'points' or begin with an underscore, got {name!r}."
                 )
             low, high, self._units[name] = _bounds(name, bound)
-            start = len(names)
-            if low.ndim == 0:
-                self._columns[name] = start
-                names.append(name)
-            else:
-                self._columns[name] = slice(start, start + low.size)
-                names.extend(f"{name}[{i}]" for i in range(low.size))
+            scalar, start = low.ndim == 0, len(names)
+            self._columns[name] = start if scalar else slice(start, start + low.size)
+            names += [name] if scalar else [f"{name}[{i}]" for i in range(low.size)]
             lows.append(np.atleast_1d(low))
             highs.append(np.atleast_1d(high))
         self.names: tuple[str, ...] = tuple(names)
         self.low: Array = np.concatenate(lows)
         self.high: Array = np.concatenate(highs)
         # Digits after the point of tasks that are chosen, 1e-9 of the range, and of those that are recognised.
-        magnitude = _digits(np.maximum(np.abs(self.low), np.abs(self.high)))
-        chosen = np.minimum(9 - _digits(self.high - self.low), 15 - magnitude)
-        self._chosen = _power(chosen)
-        self._decimals = _power(np.maximum(chosen, 12 - magnitude))
+        largest = np.maximum(np.abs(self.low), np.abs(self.high))
+        magnitude, extent = np.ceil(np.log10(np.maximum([largest, self.high - self.low], 1e-300)))
+        chosen = np.minimum(9 - extent, 15 - magnitude)
+        # Powers of ten that are exact as floats.
+        self._chosen, self._decimals = 10.0 ** np.clip([chosen, np.maximum(chosen, 12 - magnitude)], 0, 22)
         self._distribution: TaskDistribution | None = None
 
     @property
@@ -120,10 +115,7 @@ class TaskSpace:
         return call(self, ends, distribution=self._distribution)
 
     def describe(self) -> dict[str, Any]:
-        """Return ``{scalar name: [low, high]}``, and the unit if it has one: what identifies this space in a store.
-
-        A distribution of tasks is part of it only if there is one.
-        """
+        """Return what identifies this space in a store, by scalar names, with a distribution if there is one."""
         distribution = {} if self._distribution is None else {DISTRIBUTION: self._distribution.describe()}
         return distribution | {
             name: [float(low), float(high), *([unit] if unit else [])]
@@ -193,10 +185,7 @@ class TaskSpace:
         return {name: point[columns].tolist() for name, columns in self._columns.items()}
 
     def unit_function(self, function: Callable[[Parameters], ArrayLike]) -> Callable[[Array], Array]:
-        """Return a function of named parameters as a function of unit-cube points ``(n, d)``.
-
-        Searches know only points of the unit cube; a known distance becomes the prior mean of a search in this way.
-        """
+        """Return a function of named parameters as one of unit-cube points ``(n, d)``, which searches know."""
 
         def of_points(unit: Array) -> Array:
             values = as_floats("prior mean", function(self.parameters(self.from_unit(unit))))
@@ -215,12 +204,10 @@ class TaskSpace:
         """Return this space with a distribution of tasks: independent parameters, all others uniform.
 
         Independent draws of tasks follow it, and a volume is then the probability under it. Searches are not affected.
+        Each parameter has a :class:`Normal` or a frozen continuous distribution of ``scipy.stats``, truncated to its
+        bounds; the components of a vector are independent.
 
         >>> space = TaskSpace(goal=(-1, 1), load=(0, 5)).distributed(goal=Normal(0.0, 0.3))
-
-        Args:
-            by_name: for each parameter, a :class:`Normal` or a frozen continuous distribution of ``scipy.stats``. It
-                is truncated to the parameter's bounds. The components of a vector are independent.
         """
         if not by_name:
             raise InputError("distributed needs the distribution of at least one parameter, such as goal=Normal(0, 1).")
@@ -231,8 +218,8 @@ class TaskSpace:
     def sampled(self, sampler: Sampler) -> TaskSpace:
         """Return this space with a distribution of tasks that a function draws from.
 
-        Args:
-            sampler: ``(rng, n)`` -> n independent tasks, rows ``(n, d)`` within the bounds, in the space's own units.
+        The sampler ``(rng, n)`` returns n independent tasks, rows ``(n, d)`` within the bounds, in the space's own
+        units.
         """
         if not callable(sampler):
             raise InputError(f"sampler must be a function (rng, n) -> rows (n, d), got {sampler!r}.")
@@ -269,16 +256,6 @@ class TaskSpace:
         """Return a full grid that includes both bounds of each axis, shape ``(per_axis ** d, d)``."""
         axes = [np.linspace(low, high, per_axis) for low, high in zip(self.low, self.high, strict=True)]
         return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, self.dimension)
-
-
-def _digits(size: Array) -> Array:
-    """Return the number of digits before the point, negative for zeros behind it."""
-    return np.asarray(np.ceil(np.log10(np.maximum(size, 1e-300))))
-
-
-def _power(decimals: Array) -> Array:
-    """Return powers of ten that are exact as floats."""
-    return np.asarray(10.0 ** np.clip(decimals, 0, 22))
 
 
 def _bounds(name: str, bound: Any) -> tuple[Array, Array, str]:

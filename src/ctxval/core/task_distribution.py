@@ -40,9 +40,8 @@ class Continuous(Protocol):
 class Normal(ShortRepr):
     """The normal distribution of a task parameter; a task space truncates it to the parameter's bounds.
 
-    Args:
-        mean: the mean, before the truncation, in the parameter's units; one number, or one for each component.
-        deviation: the standard deviation, before the truncation, in the same form.
+    Mean and standard deviation, before the truncation, are in the parameter's units: a number, or one for each
+    component.
     """
 
     mean: ArrayLike
@@ -63,43 +62,30 @@ class Normal(ShortRepr):
 
     def ppf(self, q: ArrayLike) -> Array:
         """Return the value that is exceeded with probability 1 - q."""
-        return np.asarray(self._floats[0] + self._floats[1] * scipy.special.ndtri(q))
+        return np.asarray(
+            as_floats("mean", self.mean) + as_floats("deviation", self.deviation) * scipy.special.ndtri(q)
+        )
 
     def isf(self, q: ArrayLike) -> Array:
         """Return the value that is exceeded with probability q."""
-        return np.asarray(self._floats[0] - self._floats[1] * scipy.special.ndtri(q))
+        return np.asarray(
+            as_floats("mean", self.mean) - as_floats("deviation", self.deviation) * scipy.special.ndtri(q)
+        )
 
-    @property
-    def _floats(self) -> tuple[Array, Array]:
-        return as_floats("mean", self.mean), as_floats("deviation", self.deviation)
+    def _of_standard(self, z: Array) -> Array:
+        return as_floats("mean", self.mean) + as_floats("deviation", self.deviation) * z
 
     def _standard(self, x: ArrayLike) -> Array:
-        mean, deviation = self._floats
-        return np.asarray((as_floats("x", x) - mean) / deviation)
+        return (as_floats("x", x) - as_floats("mean", self.mean)) / as_floats("deviation", self.deviation)
 
     def describe(self) -> dict[str, Any]:
         """Return what identifies the distribution in a store."""
-        mean, deviation = self._floats
-        return {"mean": mean.tolist(), "deviation": deviation.tolist()}
-
-
-class TaskDistribution(Protocol):
-    """A distribution of tasks over a box."""
-
-    def draw(self, n: int, rng: np.random.Generator) -> Array:
-        """Return n independent tasks, rows ``(n, d)`` in the units of the task space."""
-
-    def describe(self) -> dict[str, Any]:
-        """Return what identifies the distribution in a store, ready for JSON."""
+        return {name: as_floats(name, getattr(self, name)).tolist() for name in ("mean", "deviation")}
 
 
 @dataclass(frozen=True, eq=False)
 class ByParameter:
-    """Independent task parameters: some with a distribution that is truncated to its bounds, all others uniform.
-
-    Attributes:
-        columns: the columns of each parameter that has a distribution.
-    """
+    """Independent task parameters: of some columns, truncated to their bounds; all others are uniform."""
 
     low: Array
     high: Array
@@ -116,14 +102,12 @@ class ByParameter:
                 )
             low, high = self.low[self.columns[name]], self.high[self.columns[name]]
             try:
-                mass = np.maximum(
-                    marginal.cdf(high) - marginal.cdf(low), marginal.sf(low) - marginal.sf(high)
-                ) * np.ones(len(low))
-                fits = np.shape(mass) == np.shape(low)
+                mass = np.maximum(marginal.cdf(high) - marginal.cdf(low), marginal.sf(low) - marginal.sf(high))
+                mass = np.broadcast_to(mass, low.shape)
             except ValueError:
-                fits = False
-            if not fits:
-                raise InputError(f"the distribution of {name} must have one component or {len(low)}, got {marginal!r}.")
+                raise InputError(
+                    f"the distribution of {name} must have one component or {len(low)}, got {marginal!r}."
+                ) from None
             if not (mass > 1e-12).all():
                 raise InputError(f"the distribution of {name} has no probability within its bounds.")
 
@@ -143,7 +127,7 @@ class ByParameter:
         return points
 
     def describe(self) -> dict[str, Any]:
-        """Return the distribution of each parameter that has marginal, by name."""
+        """Return the distribution of each parameter that has one, by name: what identifies it in a store."""
         described = {}
         for name, marginal in self.distributions.items():
             if isinstance(marginal, Normal):
@@ -159,11 +143,7 @@ class ByParameter:
 
 @dataclass(frozen=True, eq=False)
 class BySampler:
-    """Tasks that a function draws.
-
-    Attributes:
-        sampler: ``(rng, n)`` -> n independent tasks, rows ``(n, d)`` in the units of the task space.
-    """
+    """Tasks that a function draws."""
 
     low: Array
     high: Array
@@ -179,8 +159,11 @@ class BySampler:
         return points
 
     def describe(self) -> dict[str, Any]:
-        """Return the description of the sampler's code."""
+        """Return the description of the code of the sampler."""
         return {"sampler": describe(self.sampler)}
+
+
+TaskDistribution = ByParameter | BySampler
 
 
 def distribution_text(described: object) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import io
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -10,11 +11,13 @@ from pathlib import Path
 import numpy as np
 
 from ctxval._util.arrays import Array, Mask, Rows, as_floats, held_means, rows_of
-from ctxval._util.columns import FAR, unit_advice
-from ctxval._util.files import MOST_BYTES, read_bytes
+from ctxval._util.columns import EPISODES, FAR, column_of, in_seconds, time_column, unit_advice
+from ctxval._util.csv_table import CsvTable
+from ctxval._util.files import MOST_BYTES, read_bytes, written_whole
 from ctxval._util.npz import Archive
 from ctxval._util.representation import ShortRepr, Shown, call, counted, number
-from ctxval.core.csv_columns import read_columns, write_columns
+from ctxval._util.texts import enumerated, guarded, parted, visible
+from ctxval._util.units import conversion, named_unit
 from ctxval.errors import InputError, ShapeError
 
 COMPLETE = "complete"
@@ -22,13 +25,9 @@ COMPLETE = "complete"
 
 @dataclass(frozen=True, eq=False)
 class Transitions(ShortRepr):
-    """Recorded steps of a system: in state x, the input u led to x_next.
+    """Recorded steps of a system: in state x ``(N, n)``, the input u ``(N, m)`` led to x_next ``(N, n)``.
 
-    Attributes:
-        x: the states, shape ``(N, n)``.
-        u: the inputs, shape ``(N, m)``.
-        x_next: the next states, shape ``(N, n)``.
-        dt: length of a step in seconds, if it is known.
+    The length of a step, dt in seconds, is None if it is not known.
     """
 
     x: Array
@@ -141,12 +140,8 @@ class Trajectory:
     ) -> Trajectory:
         """Read a trajectory from NPZ bytes or an NPZ file; no code in it is ever run.
 
-        The sizes are checked before any number is read.
-
-        Args:
-            source: the bytes, or the path of a regular file.
-            shape: shape ``(H + 1, n)`` that the states of a complete trajectory must have; None allows any shape.
-            most: largest size in bytes of the file, and of the numbers in it.
+        The states of a complete trajectory must have the shape ``(H + 1, n)``, if it is given. At most so many bytes
+        are read.
         """
         name = "these bytes" if isinstance(source, bytes) else str(source)
         try:
@@ -169,14 +164,25 @@ class Trajectory:
     def to_csv(
         self, path: str | Path, *, states: Sequence[str] | None = None, inputs: Sequence[str] | None = None
     ) -> None:
-        """Write one trajectory as CSV. The last row has no inputs.
+        """Write one trajectory as CSV; the last row has no inputs.
 
-        Args:
-            states, inputs: names of the columns; ``x0, x1, ...`` and ``u0, u1, ...`` by default. Times are ``t``.
+        The columns are ``t`` and the named states and inputs, ``x0, x1, ...`` and ``u0, u1, ...`` by default.
         """
         if self.batch_shape:
             raise ShapeError(f"a CSV file must hold one trajectory, got a batch of shape {self.batch_shape}.")
-        write_columns(path, self.times, self.states, self.inputs, states, inputs)
+        header = ["t"]
+        for letter, names, array in (("x", states, self.states), ("u", inputs, self.inputs)):
+            count = array.shape[-1]
+            columns = [f"{letter}{i}" for i in range(count)] if names is None else list(names)
+            if len(columns) != count:
+                raise ShapeError(f"there must be {count} names of columns, got {', '.join(columns) or 'none'}.")
+            header += columns
+        with written_whole(path, text=True) as file:
+            writer = csv.writer(file)
+            writer.writerow([guarded(visible(name)) for name in header])
+            rows = [*self.inputs.tolist(), [""] * self.inputs.shape[-1]]
+            for time, state, row in zip(self.times.tolist(), self.states.tolist(), rows, strict=True):
+                writer.writerow([time, *state, *row])
 
     @staticmethod
     def from_csv(
@@ -198,7 +204,24 @@ class Trajectory:
             most_rows: largest number of rows below the header; a file with more rows is refused. None allows any
                 number up to the largest size of a file.
         """
-        return Trajectory(*read_columns(path, states, inputs, most_rows))
+        table = CsvTable(path)
+        time = time_column(str(path), table.names)
+        x, u = _chosen(table, "x", states), _chosen(table, "u", inputs)
+        if any(table.names) and (time is None or not x):
+            raise InputError(
+                f"{path} must have the columns t, {', '.join(states or ('x0', '...'))}, "
+                f"{', '.join(inputs or ('u0', '...'))}; it has {_listed(table.names)}."
+            )
+        column, unit = time or ("", "s")
+        read = table.columns([column, *x, *u], last=list(u), most=most_rows)
+        if len(times := read[column]) < 2:
+            raise InputError(f"{path} must have a header and at least two rows.")
+        if any(len(set(table.texts(name))) > 1 for name in table.names if name in EPISODES and name not in read):
+            raise InputError(f"{path} has several recordings, which a column numbers; a file must hold one.")
+        seconds = in_seconds(str(path), times, unit or ("s" if column == "t" else ""))
+        chosen = (np.array([factor * read[name] for name, factor in part.items()]) for part in (x, u))
+        rows = [part.reshape(-1, len(times)).T for part in chosen]
+        return Trajectory(seconds, np.ascontiguousarray(rows[0]), np.ascontiguousarray(rows[1][:-1]))
 
     def resampled(self, times: Array) -> Trajectory:
         """Return one recorded trajectory at other times ``(H + 1,)``, in seconds after its first time, from 0.
@@ -266,3 +289,28 @@ def _require_fitting(times: tuple[int, ...], states: tuple[int, ...], inputs: tu
             "a trajectory needs times (H+1,), states (..., H+1, n) and inputs (..., H, m), "
             f"got {times}, {states} and {inputs}."
         )
+
+
+def _listed(names: Sequence[str]) -> str:
+    """Return names for a message; long names and long lists are cut."""
+    return enumerated((name[:60] for name in names), 20)
+
+
+def _chosen(table: CsvTable, letter: str, names: Sequence[str] | None) -> dict[str, float]:
+    """Return the columns of the states or inputs, each with the factor to its unit; numbered ones if none is named."""
+    path, wanted = str(table.path), dict(parted(name) for name in names or ())
+    columns = {name: column_of(path, table.names, name) for name in wanted}
+    if not any(columns.values()):
+        units = {plain: (name, unit) for name in table.names for plain, unit, _ in (named_unit(name),)}
+        count = sum(1 for plain in units if plain[:1] == letter and plain[1:].isdigit())
+        columns = {f"{letter}{i}": units.get(f"{letter}{i}") for i in range(count)}
+        wanted = dict(zip(columns, wanted.values(), strict=False)) if len(wanted) == count else {}
+    factors = dict[str, float]()
+    for name, column in columns.items():
+        if column is None:
+            raise InputError(f"{path} has no column {name}; there are {_listed(table.names)}.")
+        try:
+            factors[column[0]] = conversion(column[1], wanted.get(name) or column[1]) if column[1] else 1.0
+        except InputError:
+            raise InputError(f"{path} has {name} in {column[1]}, and {wanted[name]} is needed.") from None
+    return factors

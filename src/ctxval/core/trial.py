@@ -10,8 +10,8 @@ from ctxval._util.arrays import Array
 from ctxval._util.representation import ShortRepr, call, counted, line, lines, table
 from ctxval.core.space import Point
 
-Origin = Literal["iid", "initial", "acquisition", "covering", "manual"]
-"""The reason why a trial was chosen. Only iid trials enter a scenario bound."""
+Origin = Literal["iid", "spread", "initial", "acquisition", "covering", "manual"]
+"""The reason why a trial was chosen. Only iid trials, which are independent draws, enter a scenario bound."""
 
 State = Literal["open", "completed", "failed", "unmeasured"]
 """The state of a trial. Unmeasured: S was executed and its trajectory is stored, but d has no usable value."""
@@ -104,13 +104,9 @@ def designs_sentence(trials: Sequence[Trial]) -> str | None:
 
 @dataclass(frozen=True)
 class Change(ShortRepr):
-    """A later change of a store.
+    """A later change of a store: its kind, the reason that the user gave, and the previous values or the differences.
 
-    Attributes:
-        what: the kind of change.
-        why: the reason that the user gave.
-        content: the previous values, or the differences, as values for JSON.
-        at: the time of the change in UTC; empty until it is stored.
+    The time is in UTC; it is empty until the change is stored.
     """
 
     what: str

@@ -26,10 +26,6 @@ from ctxval.core.space import AxisPoints, Parameters
 from ctxval.core.validation import Validation
 from ctxval.errors import InputError
 
-_FINER = 9  # number of points on each axis of a refined grid around one point
-
-_PROBES = 16  # number of tasks whose distances show that a stored truth belongs to a system
-
 
 @dataclass(frozen=True, eq=False)
 class Truth(ShortRepr):
@@ -42,36 +38,25 @@ class Truth(ShortRepr):
 
 @checked
 def grid_truth(validation: Validation, per_axis: AxisPoints = 2001, refinements: NonNegativeInt = 6) -> Truth:
-    """Return the maximum on a dense grid, refined around its best points. S is executed for each grid point.
-
-    Args:
-        refinements: number of refinements, each with a finer grid around the best points.
-    """
-    count = per_axis**validation.space.dimension + 8 * refinements * _FINER**validation.space.dimension
-    with stage("searching the largest distance", count, "executions"):
-        return _grid_truth(validation, per_axis, refinements)
-
-
-def _grid_truth(validation: Validation, per_axis: int, refinements: int) -> Truth:
+    """Return the maximum on a dense grid, refined around its best points. S is executed for each grid point."""
     space = validation.space
-    points = space.grid(per_axis)
-    values = validation.distances(points)
-    if np.isnan(values).all():
-        raise InputError("the truth is unknown: every execution on the grid failed.")
     cell = (space.high - space.low) / (per_axis - 1)
-    best, best_value = points[np.nanargmax(values)], float(np.nanmax(values))
-    centres = points[np.argsort(-np.nan_to_num(values, nan=-np.inf))[:8]]
-    corners = np.meshgrid(*[np.linspace(-1, 1, _FINER)] * len(cell), indexing="ij")
+    corners = np.meshgrid(*[np.linspace(-1, 1, 9)] * len(cell), indexing="ij")
     offsets = np.stack(corners, axis=-1).reshape(-1, len(cell))
-    for _ in range(refinements):
-        points = (centres[:, None, :] + offsets * cell).reshape(-1, len(cell)).clip(space.low, space.high)
-        values = validation.distances(points)
-        cell = cell / 4
-        centres = points[np.argsort(-np.nan_to_num(values, nan=-np.inf))[:8]]
-        if np.nanmax(values) > best_value:
-            best, best_value = points[np.nanargmax(values)], float(np.nanmax(values))
-    count = f"{per_axis:,} points" + (" an axis" if space.dimension > 1 else "")
-    return Truth(best_value, space.parameters(best), f"dense grid of {count}, refined {refinements} times")
+    points, best, best_value = space.grid(per_axis), space.low, -np.inf
+    count = len(points) + 8 * refinements * len(offsets)
+    with stage("searching the largest distance", count, "executions"):
+        for refinement in range(refinements + 1):
+            values = np.nan_to_num(validation.distances(points), nan=-np.inf)
+            if values.max() > best_value:
+                best, best_value = points[values.argmax()], float(values.max())
+            if best_value == -np.inf:
+                raise InputError("the truth is unknown: every execution on the grid failed.")
+            centres = points[np.argsort(-values)[:8]]
+            points = (centres[:, None, :] + offsets * cell * 0.25**refinement).reshape(-1, len(cell))
+            points = points.clip(space.low, space.high)
+    grid = f"{per_axis:,} points" + (" an axis" if space.dimension > 1 else "")
+    return Truth(best_value, space.parameters(best), f"dense grid of {grid}, refined {refinements} times")
 
 
 @checked
@@ -130,22 +115,8 @@ class _TruthSearch:
 
     def repeat(self, rng: np.random.Generator) -> tuple[float, Array]:
         """Return the largest value of one search, and its point ``(d,)``."""
-        tops = [self._evolve(rng)]
-        for _ in range(self.climbs):
-            starts = rng.random((16, self.dimension))
-            values = self.values(starts)
-            tops.append((float(values.max()), starts[np.argmax(values)]))
-        points = np.array([self._climb(*top) for top in tops])
-        # A diverging loop amplifies the rounding of a batch, so the distance of the task executed alone counts.
-        alone = np.array([self.values(point[None])[0] for point in points])
-        return float(alone.max()), points[np.argmax(alone)]
-
-    def _evolve(self, rng: np.random.Generator) -> tuple[float, Array]:
-        def losses(columns: Array) -> Any:
-            return -self.values(columns.T)
-
         evolved = scipy.optimize.differential_evolution(
-            losses,
+            lambda columns: -self.values(columns.T),
             scipy.optimize.Bounds(np.zeros(self.dimension), np.ones(self.dimension)),
             popsize=self.population,
             maxiter=self.generations,
@@ -155,7 +126,15 @@ class _TruthSearch:
             vectorized=True,
             rng=rng,
         )
-        return -float(evolved.fun), np.asarray(evolved.x)
+        tops = [(-float(evolved.fun), np.asarray(evolved.x))]
+        for _ in range(self.climbs):
+            starts = rng.random((16, self.dimension))
+            values = self.values(starts)
+            tops.append((float(values.max()), starts[np.argmax(values)]))
+        points = np.array([self._climb(*top) for top in tops])
+        # A diverging loop amplifies the rounding of a batch, so the distance of the task executed alone counts.
+        alone = np.array([self.values(point[None])[0] for point in points])
+        return float(alone.max()), points[np.argmax(alone)]
 
     def _climb(self, value: float, point: Array) -> Array:
         scale = value if 0 < value < np.inf else 1.0  # L-BFGS-B's tolerances suit values about 1
@@ -181,22 +160,15 @@ def _gap(maxima: list[tuple[float, Array]]) -> float:
     return (values[0] - values[1]) / values[0] if values[0] > 0 else 0.0
 
 
-# Stored truths
-
-
 @checked
 def cached_truth(
     validation: Validation, compute: Callable[[Validation], Truth], folder: str | Path = "runs/truth"
 ) -> Truth:
     """Return a truth from its file in a folder, or find it and write that file.
 
-    The name of the file is a digest of sources and settings: those of the validation and of the method. The file keeps
-    the truths of systems that differ in numbers alone. A truth is used only if new executions of S on its task and on
-    some others give the stored distances again.
-
-    Args:
-        compute: a function that finds the truth; its settings, such as those of
-            ``functools.partial(search_truth, seed=1)``, are part of the hash.
+    The name of the file is a digest of sources and settings: those of the validation and of the method, for instance
+    ``functools.partial(search_truth, seed=1)``. The file keeps the truths of systems that differ in numbers alone. A
+    truth is used only if new executions of S on its task and on some others give the stored distances again.
     """
     # The signature adds the default values, which the description of a function leaves out.
     method = [describe(compute), str(inspect.signature(compute))]
@@ -204,20 +176,24 @@ def cached_truth(
         [validation.space.describe(), without_numbers(validation.describe()), *method], sort_keys=True
     )
     path = Path(folder) / f"{hashlib.sha256(identity.encode()).hexdigest()[:32]}.json"
+    probes = validation.space.iid(16, np.random.default_rng(0))  # their distances show that a truth is of this system
     stored = list[Any]()
     with suppress(OSError, ValueError):
         read = json.loads(path.read_text(encoding="utf-8"))
         stored = read if isinstance(read, list) else stored
-    for content in stored:
-        truth = _truth_of(content, validation)
-        if truth is not None:
-            return truth
+    for known in stored:
+        with suppress(ValueError, KeyError, TypeError):
+            point = validation.space.point(dict(known["parameters"]))
+            distances = np.array([known["distance"], *known["probes"]], dtype=np.float64)
+            present = validation.distances(np.vstack([point, probes]))
+            if np.allclose(present, distances, rtol=1e-6, atol=1e-12, equal_nan=True):
+                return Truth(float(known["distance"]), validation.space.parameters(point), str(known["method"]))
     truth = compute(validation)
     content = {
         "distance": truth.distance,
         "parameters": validation.space.describe_point(truth.parameters.points),
         "method": truth.method,
-        "probes": [str(value) for value in validation.distances(_probes(validation))],
+        "probes": [str(value) for value in validation.distances(probes)],
     }
     # If the folder cannot be written, this call still returns the truth; the next call must find it again.
     with suppress(OSError, InputError):
@@ -225,19 +201,3 @@ def cached_truth(
         with written_whole(path) as file:
             file.write(json.dumps([*stored, content], indent=1).encode())
     return truth
-
-
-def _truth_of(content: Any, validation: Validation) -> Truth | None:
-    try:
-        distance, method = float(content["distance"]), str(content["method"])
-        point = validation.space.point(dict(content["parameters"]))
-        known = np.array([distance, *map(float, content["probes"])])
-        present = validation.distances(np.vstack([point, _probes(validation)]))
-        same = np.allclose(present, known, rtol=1e-6, atol=1e-12, equal_nan=True)
-    except (ValueError, KeyError, TypeError):
-        return None
-    return Truth(distance, validation.space.parameters(point), method) if same else None
-
-
-def _probes(validation: Validation) -> Array:
-    return validation.space.iid(_PROBES, np.random.default_rng(0))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import Any, NoReturn
 
@@ -22,25 +22,13 @@ from ctxval.core.model import Model, Step, as_model, require_time_step
 from ctxval.core.plan import Measurement, Outcome, Plan, executed_in, require_execution
 from ctxval.core.preflight import LONGEST, require_affordable
 from ctxval.core.rollout import rollout
-from ctxval.core.simulated import Simulated
 from ctxval.core.space import Parameters, TaskSpace
-from ctxval.core.system import System
+from ctxval.core.system import Simulated, System
 from ctxval.core.task import Task
 from ctxval.core.trajectory import COMPLETE, Trajectory
-from ctxval.errors import (
-    CtxvalError,
-    DesignError,
-    DistanceError,
-    ExecutionError,
-    InputError,
-    ModelError,
-    ShapeError,
-)
+from ctxval.errors import CtxvalError, DesignError, DistanceError, ExecutionError, InputError, ModelError, ShapeError
 
 START = 0.05  # default start tolerance, as a fraction of the range of each state in the trajectory of the model
-
-_CHUNK = 4096  # tasks in one batched call: enough for speed, few enough for the memory
-_PLANNED = 256  # tasks that are planned in one call if S executes one at a time: more would hardly be faster
 
 
 @checked
@@ -60,6 +48,10 @@ class Validation:
         labels: the names and units of states, inputs and distance for files, pictures and reports; a distance may name
             states by them.
         longest: the largest horizon that is planned.
+
+    Its methods raise a DesignError if the synthesizer fails, a ModelError if the model fails or its closed loop is not
+    finite, an ExecutionError if the system fails or its result is not an execution of the task, and a DistanceError if
+    the distance fails or is not a finite number >= 0.
     """
 
     def __init__(
@@ -104,10 +96,8 @@ class Validation:
     def on_model(self, distance: Distance, *, units: str | None = None) -> Validation:
         """Return this validation with M itself in the place of S, which is never executed (the paper's Aspect 1).
 
-        Args:
-            distance: how far the trajectory of M is from completing its task, such as
-                :class:`ctxval.distances.GoalError`.
-            units: the units of this distance; None if they are those of the present distance.
+        The distance, with its units, is how far M is from completing its task, such as
+        :class:`ctxval.distances.GoalError`.
         """
         labels = self.labels if units is None else replace(self.labels, units=units)
         return self._with(system=Simulated(self.model), distance=distance, labels=labels, start_tolerance=START)
@@ -139,13 +129,9 @@ class Validation:
     # One task, step by step
 
     def plan(self, point: ArrayLike) -> Plan:
-        """Design the controller for the task at ``(d,)`` and run it on the model; S is not executed.
-
-        Raises:
-            DesignError: if the synthesizer failed.
-            ModelError: if the model failed, or its closed loop is not finite.
-        """
-        plan = self._plan(self.space.parameters(point))
+        """Design the controller for the task at ``(d,)`` and run it on the model; S is not executed."""
+        parameters = self.space.parameters(point)
+        plan = self.plan_of(parameters, self.task_at(parameters))
         if plan.task.batch_shape:
             raise ShapeError(f"the task function made a batch of shape {plan.task.batch_shape} of one point.")
         if not plan.model_trajectory.finite:
@@ -154,12 +140,7 @@ class Validation:
         return plan
 
     def execute(self, plan: Plan) -> Trajectory:
-        """Execute S once.
-
-        Raises:
-            ExecutionError: if the system raises an exception or tries to exit, or if its result is not an execution of
-                the plan; the message gives the reason.
-        """
+        """Execute S once."""
         try:
             trajectory = self.system.execute(plan.controller, plan.task)
         except BaseException as error:
@@ -174,12 +155,7 @@ class Validation:
     def require(self, plan: Plan, trajectory: object, start_tolerance: float | None = None) -> Trajectory:
         """Check that a trajectory is a complete and finite execution of a plan; return it.
 
-        Args:
-            start_tolerance: replaces the start tolerance of this validation.
-
-        Raises:
-            ExecutionError: if it is not a complete and finite execution.
-            InputError: if it belongs to another task.
+        An InputError says that it belongs to another task. A start tolerance replaces that of this validation.
         """
         if not isinstance(trajectory, Trajectory):
             raise ExecutionError(f"the system returned {type(trajectory).__name__} instead of a Trajectory")
@@ -193,10 +169,7 @@ class Validation:
     def accept(self, plan: Plan, trajectory: object, start_tolerance: float | None = None) -> Measurement:
         """Check that a trajectory is an execution of a plan, as :meth:`require` does, and measure its distance.
 
-        This is the single check for all executions: those of a system, those of workers, and recordings of users.
-
-        Raises:
-            ExecutionError: if it is not a complete and finite execution.
+        This is the single check for all executions: of a system, of workers, and recordings of users.
         """
         executed = self.require(plan, trajectory, start_tolerance)
         try:
@@ -205,11 +178,7 @@ class Validation:
             return Measurement(None, text_of(error))
 
     def measure(self, plan: Plan, trajectory: Trajectory) -> float:
-        """Return d(p).
-
-        Raises:
-            DistanceError: if the distance function raises an exception, or its value is not a finite number >= 0.
-        """
+        """Return d(p)."""
         return self._measured(plan.parameters, plan.task, plan.model_trajectory, trajectory)
 
     def remeasure(self, point: ArrayLike, model_trajectory: Trajectory, system_trajectory: Trajectory) -> float:
@@ -241,20 +210,22 @@ class Validation:
 
         If the synthesizer takes batches, the controllers of many tasks are designed in one call, and the results agree
         with those of single designs up to rounding.
-
-        Raises:
-            InputError, DesignError, ModelError: as in :meth:`plan`.
         """
-        rows = require_shape("points", as_floats("points", points), (self.space.dimension,))
-        chunks = [rows[i : i + _PLANNED] for i in range(0, len(rows), _PLANNED)]
-        return [plan for chunk in chunks for plan in self._planned_together(chunk) or map(self.plan, chunk)]
+        return list(self._planned(require_shape("points", as_floats("points", points), (self.space.dimension,))))
+
+    def _planned(self, points: Array) -> Iterator[Plan]:
+        # 256 tasks are planned in one call: more would hardly be faster.
+        for first in range(0, len(points), 256):
+            chunk = points[first : first + 256]
+            yield from self._planned_together(chunk) or map(self.plan, chunk)
 
     def _planned_together(self, points: Array) -> list[Plan] | None:
         """Return the plans of points ``(N, d)`` from one design; None if a part takes no batches, or a task fails."""
         if len(points) == 1 or not getattr(self.synthesizer, "batched", False):
             return None
         try:
-            whole = self._plan(self.space.parameters(points))
+            parameters = self.space.parameters(points)
+            whole = self.plan_of(parameters, self.task_at(parameters))
             if whole.task.batch_shape != (len(points),) or not whole.model_trajectory.finite.all():
                 return None
             plans = [whole.of(k, self.space.parameters(point)) for k, point in enumerate(points)]
@@ -266,21 +237,12 @@ class Validation:
         """Return d at points ``(N, d)``, shape ``(N,)``; NaN if the execution fails. Executes S N times.
 
         Tasks are planned together if the synthesizer takes batches, and executed together if S does, too.
-
-        Raises:
-            InputError, DesignError, ModelError: as in :meth:`plan`.
-            DistanceError: if the distance function raises an exception or returns the wrong shape.
         """
         rows = require_shape("points", as_floats("points", points), (self.space.dimension,))
         if self.batched and len(rows):
-            return np.concatenate([self._batch_distances(rows[i : i + _CHUNK]) for i in range(0, len(rows), _CHUNK)])
-        distances = []
-        for first in range(0, len(rows), _PLANNED):
-            chunk = rows[first : first + _PLANNED]
-            distances += [
-                self._distance_or_nan(plan) for plan in self._planned_together(chunk) or map(self.plan, chunk)
-            ]
-        return np.array(distances)
+            # 4096 tasks in one call: enough for speed, few enough for the memory.
+            return np.concatenate([self._batch_distances(rows[i : i + 4096]) for i in range(0, len(rows), 4096)])
+        return np.array([self._distance_or_nan(plan) for plan in self._planned(rows)])
 
     def _distance_or_nan(self, plan: Plan) -> float:
         try:
@@ -292,7 +254,8 @@ class Validation:
         return self.measure(plan, trajectory)
 
     def _batch_distances(self, points: Array) -> Array:
-        plan = self._plan(self.space.parameters(points))
+        parameters = self.space.parameters(points)
+        plan = self.plan_of(parameters, self.task_at(parameters))
         if plan.task.batch_shape != (len(points),):
             raise ShapeError(
                 f"the task function must make a batch of {len(points)} tasks of as many points, "
@@ -317,9 +280,6 @@ class Validation:
         return np.where(executed, values, np.nan)
 
     # Used for one task and for many
-
-    def _plan(self, parameters: Parameters) -> Plan:
-        return self.plan_of(parameters, self.task_at(parameters))
 
     def plan_of(self, parameters: Parameters, task: Task) -> Plan:
         """Return the plan of a task, or of a batch, that is made already; :meth:`plan` checks more."""

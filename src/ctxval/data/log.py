@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import re
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -16,13 +17,25 @@ import numpy as np
 from ctxval._util.arrays import Array
 from ctxval._util.columns import EPISODES, TIMES, column_of, in_seconds, require_distinct, time_column
 from ctxval._util.representation import ShortRepr
-from ctxval._util.texts import enumerated
+from ctxval._util.texts import enumerated, quoted, reason_of
 from ctxval.errors import InputError
 
 LISTED = 24
 """Largest number of fields that a message names."""
 
 _INDEX = re.compile(r"(.+?)\[(\d{1,6})\]")
+
+
+@contextmanager
+def reading(source: object, kind: str = "") -> Iterator[None]:
+    """Turn the many exceptions for damaged files into one sentence: that a source cannot be read as its kind."""
+    what = f"{source} cannot be read as {kind}" if kind else f"{source} cannot be read"
+    try:
+        yield
+    except InputError as error:
+        raise InputError(f"{what}: {error}.") from error
+    except Exception as error:
+        raise InputError(f"{what} ({quoted(reason_of(error))}).") from error
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,9 +100,6 @@ class Log(ShortRepr, ABC):
         Args:
             fields: names of fields; ``name[2]`` is one component of a vector.
             clock: where the times come from.
-
-        Raises:
-            InputError: if there is no such field, or it does not hold numbers; the message names file, field and row.
         """
 
     def episodes(self, used: Sequence[str]) -> list[Log]:
@@ -125,17 +135,19 @@ class Table(Log):
         require_distinct(self.source, names)
         split = {field: self._split(field, names) for field in fields}
         time, time_unit = self._time(clock, names)
-        wanted = dict.fromkeys([*(name for name, _, _ in split.values()), *([] if time is None else [time])])
-        arrays = self.columns(list(wanted))
+        arrays = self.columns(list(dict.fromkeys([*(name for name, _, _ in split.values()), *filter(None, [time])])))
         if time is None:
             rows = max(len(arrays[name]) for name, _, _ in split.values())
             times = np.asarray(np.arange(rows) * float(clock.period or 0), dtype=np.float64)
         else:
-            times = self._seconds(time, arrays[time], time_unit)
-        count = len(times)
+            times = self._oriented(time, arrays[time], arrays[time].size)[:, 0]
+            if not len(times) or not np.isfinite(times).all():
+                row = self.first + int(np.argmin(np.isfinite(times))) if len(times) else self.first
+                raise InputError(f"{self.source}, {self.word} {row}: the time {time} must be a number.")
+            times = in_seconds(self.source, times, time_unit)
         signals = {}
         for field, (name, unit, index) in split.items():
-            values = self._oriented(name, arrays[name], count)
+            values = self._oriented(name, arrays[name], len(times))
             if index is not None and index >= values.shape[1]:
                 raise InputError(f"{self.source}: {name} has {values.shape[1]} components, so there is no {field}.")
             chosen = values if index is None else values[:, [index]]
@@ -149,12 +161,12 @@ class Table(Log):
         if not marks or len({len(values) for values in marks}) > 1:
             return [self]
         changed = np.any([mark[1:] != mark[:-1] for mark in marks], axis=0)
-        ends = [*(np.flatnonzero(changed) + 1).tolist(), len(marks[0])]
-        kind = counters[0].partition("_")[0]
-        names = [f"{kind} {str(marks[0][start]).removesuffix('.0')}" for start in (0, *ends[:-1])]
-        read: dict[str, Array] = {}
-        pairs = zip(names, pairwise((0, *ends)), strict=True)
-        return [Rows(self, name, start, stop, ends[-1], read) for name, (start, stop) in pairs]
+        ends = [0, *(np.flatnonzero(changed) + 1).tolist(), len(marks[0])]
+        kind, read = counters[0].partition("_")[0], dict[str, Array]()
+        return [
+            Rows(self, f"{kind} {str(marks[0][start]).removesuffix('.0')}", slice(start, stop), ends[-1], read)
+            for start, stop in pairwise(ends)
+        ]
 
     def marks(self, name: str) -> Array:
         """Return a column whose values are only compared with each other."""
@@ -187,13 +199,6 @@ class Table(Log):
             raise InputError(f"{self.source} has its times in {unit}, and time_unit states {clock.unit}.")
         return column, unit or clock.unit
 
-    def _seconds(self, name: str, column: Array, unit: str) -> Array:
-        times = self._oriented(name, column, column.size)[:, 0]
-        if not len(times) or not np.isfinite(times).all():
-            row = self.first + int(np.argmin(np.isfinite(times))) if len(times) else self.first
-            raise InputError(f"{self.source}, {self.word} {row}: the time {name} must be a number.")
-        return in_seconds(self.source, times, unit)
-
     def _oriented(self, name: str, values: Array, count: int) -> Array:
         """Return an array as ``(N, k)``; MATLAB users also keep one time in each column."""
         array = values.reshape(1, -1).T if values.ndim <= 1 or 1 in values.shape else values
@@ -207,14 +212,7 @@ class Table(Log):
 
 
 class MemoryTable(Table):
-    """A table whose columns are in memory.
-
-    Args:
-        source: the file, for messages.
-        columns: the columns by name.
-        first: the number of the first row in messages.
-        period: seconds between two rows, if it is known.
-    """
+    """A table whose columns are in memory; ``first`` is the number of the first row in messages."""
 
     def __init__(self, source: str, columns: Mapping[str, Array], first: int = 0, period: float | None = None) -> None:
         self.source, self.first, self.period = source, first, period
@@ -232,10 +230,10 @@ class MemoryTable(Table):
 class Rows(Table):
     """Some rows of a table, such as one episode; ``read`` has the columns that other parts of the table have read."""
 
-    def __init__(self, table: Table, name: str, start: int, stop: int, count: int, read: dict[str, Array]) -> None:
-        self.source, self.word, self.first = f"{table.source}, {name}", table.word, table.first + start
-        self._table, self._rows, self._count, self._read = table, slice(start, stop), count, read
+    def __init__(self, table: Table, name: str, rows: slice, count: int, read: dict[str, Array]) -> None:
+        self.source, self.word, self.first = f"{table.source}, {name}", table.word, table.first + rows.start
         self.period = table.period
+        self._table, self._rows, self._count, self._read = table, rows, count, read
 
     def names(self) -> tuple[str, ...]:
         """Return the names of the columns."""

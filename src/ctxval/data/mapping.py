@@ -15,15 +15,12 @@ from ctxval._util.files import read_bytes
 from ctxval._util.representation import ShortRepr
 from ctxval._util.texts import enumerated
 from ctxval._util.units import conversion, named_unit
-from ctxval.data.log import LISTED, Clock, Log
+from ctxval.data.log import LISTED, Clock, Log, reading
 from ctxval.errors import InputError, UnknownNameError
 
 Stamp = Literal["auto", "log", "publish", "header"]
 
 _VALID = re.compile(r"\s*(\S.*?)\s*(==|!=)\s*([+-]?\d+(?:\.\d*)?)\s*")
-
-_STATES = ("states", "x", "observation.state")
-_INPUTS = ("inputs", "u", "action")  # names of whole vectors that are looked for if there is no mapping
 
 
 @checked
@@ -139,26 +136,34 @@ class LogMapping(ShortRepr):
         A field is a path, or a table with the attributes of :class:`Field`. ``states`` and ``inputs`` may also be lists
         of paths.
         """
-        known = [field.name for field in fields(LogMapping)]
+        names = [field.name for field in fields(LogMapping)]
         for key in table:
-            if key not in known:
-                raise UnknownNameError.among("entry of the mapping of recordings", key, known)
-        parts = {key: _named(key, table[key]) for key in ("states", "inputs") if key in table}
-        if "states" not in parts:
+            if key not in names:
+                raise UnknownNameError.among("entry of the mapping of recordings", key, names)
+        parts = dict[str, dict[str, Field]]()
+        for kind in ("states", "inputs"):
+            named = table.get(kind, {})
+            named = [named] if isinstance(named, str) else named
+            if isinstance(named, list):
+                named = {str(one.get("path") if isinstance(one, Mapping) else one): one for one in named}
+            if not isinstance(named, Mapping):
+                raise InputError(f"{kind} must be a table of fields or a list of paths, got {named!r}.")
+            parts[kind] = {name: _field(name, one) for name, one in named.items()}
+        if "states" not in table:
             raise InputError("the mapping of recordings needs states.")
         return LogMapping(**{**table, **parts})
 
     @staticmethod
     def from_toml(path: str | Path) -> LogMapping:
         """Return the mapping in a TOML file, or in the table ``[recordings]`` of an experiment file."""
+        with reading(path):
+            content = read_bytes(path)
         try:
-            content = tomllib.loads(read_bytes(path).decode("utf-8"))
-        except InputError as error:
-            raise InputError(f"{path} cannot be read: {error}.") from error
+            table = tomllib.loads(content.decode("utf-8"))
         except (ValueError, RecursionError) as error:
             raise InputError(f"{path} is not valid TOML: {error}.") from error
         try:
-            return LogMapping.from_table(content.get("recordings", content))
+            return LogMapping.from_table(table.get("recordings", table))
         except InputError as error:
             raise InputError(f"{path}: {error}") from error
 
@@ -173,17 +178,18 @@ class LogMapping(ShortRepr):
             log: the log.
             states, inputs: names with their units that are looked for before these.
         """
-        known = log.fields()
-        wanted = {**(states or {}), **(inputs or {})}
-        if wanted and all(column_of(log.source, known, name) for name in wanted):
+        columns, states, inputs = log.fields(), states or {}, inputs or {}
+        wanted = {**states, **inputs}
+        if wanted and all(column_of(log.source, columns, name) for name in wanted):
             named = {name: Field(name, unit) for name, unit in wanted.items()}
-            outputs = {name: one for name, one in named.items() if name not in (inputs or {})}
-            return LogMapping(outputs, {name: named[name] for name in inputs or {}}, dt=log.period)
-        usual = _usual(known, _STATES, "x"), _usual(known, _INPUTS, "u")
+            outputs = {name: one for name, one in named.items() if name not in inputs}
+            return LogMapping(outputs, {name: named[name] for name in inputs}, dt=log.period)
+        vectors = ("states", "x", "observation.state")
+        usual = _usual(columns, vectors, "x"), _usual(columns, ("inputs", "u", "action"), "u")
         if not usual[0]:
             raise InputError(
-                f"{log.source} has no states under a usual name ({', '.join(_STATES)}, x0): name the states and inputs "
-                f"with --state and --input or in a mapping; the fields are {enumerated(known, LISTED)}."
+                f"{log.source} has no states under a usual name ({', '.join(vectors)}, x0): name the states and inputs "
+                f"with --state and --input or in a mapping; the fields are {enumerated(columns, LISTED)}."
             )
         return LogMapping(*usual, dt=log.period)
 
@@ -207,29 +213,19 @@ def _usual(known: Sequence[str], vectors: Sequence[str], letter: str) -> dict[st
     return columns
 
 
-def _field(name: str, given: Any) -> Field:
-    if isinstance(given, Field):
-        return given
-    if isinstance(given, str):
-        return Field(given)
-    if isinstance(given, Mapping):
-        known = [field.name for field in fields(Field)]
-        table = {("path" if key == "field" else key): value for key, value in given.items()}
-        for key in table:
-            if key not in known:
-                raise UnknownNameError.among(f"entry of the field {name}", key, known)
-        try:
-            return Field(**{"path": name, **table})
-        except InputError as error:
-            raise InputError(f"the field {name}: {error}") from error
-    raise InputError(f"the field {name} must be a path or a table, got {given!r}.")
-
-
-def _named(kind: str, given: Any) -> dict[str, Any]:
-    if isinstance(given, str):
-        given = [given]
-    if isinstance(given, list):
-        given = {str(one.get("path") if isinstance(one, Mapping) else one): one for one in given}
-    if not isinstance(given, Mapping):
-        raise InputError(f"{kind} must be a table of fields or a list of paths, got {given!r}.")
-    return {name: replace(_field(name, one)) for name, one in given.items()}
+def _field(name: str, described: Any) -> Field:
+    if isinstance(described, Field):
+        return described
+    if isinstance(described, str):
+        return Field(described)
+    if not isinstance(described, Mapping):
+        raise InputError(f"the field {name} must be a path or a table, got {described!r}.")
+    names = [field.name for field in fields(Field)]
+    table = {("path" if key == "field" else key): value for key, value in described.items()}
+    for key in table:
+        if key not in names:
+            raise UnknownNameError.among(f"entry of the field {name}", key, names)
+    try:
+        return Field(**{"path": name, **table})
+    except InputError as error:
+        raise InputError(f"the field {name}: {error}") from error

@@ -13,17 +13,11 @@ import numpy as np
 from ctxval._util.arrays import Array
 from ctxval._util.extras import require_extra
 from ctxval._util.files import MOST_BYTES, open_regular
-from ctxval._util.texts import quoted, reason_of
-from ctxval.data.log import Log, MemoryTable
+from ctxval._util.texts import quoted
+from ctxval.data.log import Log, MemoryTable, reading
 from ctxval.errors import InputError
 
 _DEPTH = 6  # largest depth of structures in structures
-
-_MOST_OBJECTS = 10_000  # largest number of variables and fields in a file of version 7.3
-
-_SIGNATURE = b"\x89HDF\r\n\x1a\n"
-# The filters of HDF5 that MATLAB uses; others may be code in a library that a path in the environment names.
-_FILTERS = ("FILTER_DEFLATE", "FILTER_SHUFFLE", "FILTER_FLETCHER32")
 
 
 def read_mat(path: Path) -> list[Log]:
@@ -31,14 +25,10 @@ def read_mat(path: Path) -> list[Log]:
 
     References, which cells and arrays of structures consist of, are never followed.
     """
-    try:
+    with reading(path, "a MATLAB file"):
         with open_regular(path) as file:
-            is_hdf5 = any(file.seek(start) == start and file.read(8) == _SIGNATURE for start in (0, 512))
+            is_hdf5 = any(file.seek(start) == start and file.read(8) == b"\x89HDF\r\n\x1a\n" for start in (0, 512))
         columns = _version_7_3(path) if is_hdf5 else _version_5(path)
-    except InputError as error:
-        raise InputError(f"{path} cannot be read as a MATLAB file: {error}.") from error
-    except Exception as error:  # damaged files raise many kinds of exceptions
-        raise InputError(f"{path} cannot be read as a MATLAB file ({quoted(reason_of(error))}).") from error
     if not columns:
         raise InputError(f"{path} has no numeric array.")
     return [MemoryTable(str(path), columns)]
@@ -79,8 +69,8 @@ def _version_7_3(path: Path) -> dict[str, Array]:
         checked = _Checked(h5py)
         checked.group("", file.id, _DEPTH)
         arrays = {name: h5py.Dataset(identifier)[()] for name, identifier in checked.arrays.items()}
-        # MATLAB counts the first index fastest.
-        return {name: np.squeeze(np.asarray(values, dtype=np.float64)).T for name, values in arrays.items()}
+    # MATLAB counts the first index fastest.
+    return {name: np.squeeze(np.asarray(values, dtype=np.float64)).T for name, values in arrays.items()}
 
 
 class _Checked:
@@ -96,8 +86,8 @@ class _Checked:
     def group(self, before: str, group: Any, depth: int) -> None:
         for name in group:  # the names of the links, none of which is followed here
             self.objects += 1
-            if self.objects > _MOST_OBJECTS:
-                raise InputError(f"it has more than {_MOST_OBJECTS} variables and fields")
+            if self.objects > 10_000:
+                raise InputError("it has more than 10000 variables and fields")
             if group.links.get_info(name).type != self.h5py.h5l.TYPE_HARD:
                 raise InputError(f"{quoted(name.decode(errors='replace'))} is a link, which could lead to any file")
             path = f"{before}.{name.decode(errors='replace')}".removeprefix(".")
@@ -124,8 +114,9 @@ class _Checked:
         chunk = math.prod(plan.get_chunk()) if plan.get_layout() == h5d.CHUNKED else 0
         self.size += 8 * max(math.prod(shape), chunk)
         _require_size(self.size)
-        filters = {plan.get_filter(i)[0] for i in range(plan.get_nfilters())}
-        if not filters <= {getattr(h5z, name) for name in _FILTERS}:
+        # The filters that MATLAB uses; others may be code in a library that a path in the environment names.
+        usual = {h5z.FILTER_DEFLATE, h5z.FILTER_SHUFFLE, h5z.FILTER_FLETCHER32}
+        if not usual.issuperset(plan.get_filter(i)[0] for i in range(plan.get_nfilters())):
             raise InputError(f"{quoted(path)} is compressed in a way that MATLAB does not use")
         self.arrays[path] = identifier
 

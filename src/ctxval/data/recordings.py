@@ -17,12 +17,9 @@ from ctxval._util.units import conversion
 from ctxval.core.trajectory import Trajectory, Transitions
 from ctxval.data.log import Log, Table
 from ctxval.data.mapping import LogMapping
-from ctxval.data.parquet import lerobot_names
-from ctxval.data.readers import is_lerobot, read_logs
+from ctxval.data.readers import is_lerobot, lerobot_names, read_logs
 from ctxval.data.sampling import Break, Channel, sampled
 from ctxval.errors import InputError
-
-_LARGEST = 1e100  # largest size of a recorded value: squares of errors must be finite
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,9 +65,8 @@ class Recordings(ShortRepr):
         """Return the steps of some recordings as transitions, and the number of the recording of each."""
         numbers = list(range(len(self.runs)) if runs is None else runs)
         parts = [self.runs[number].trajectory.transitions() for number in numbers]
-        return replace(Transitions.joined(parts), dt=self.dt), np.repeat(
-            np.array(numbers, dtype=np.intp), [len(part) for part in parts]
-        )
+        of = np.repeat(np.array(numbers, dtype=np.intp), [len(part) for part in parts])
+        return replace(Transitions.joined(parts), dt=self.dt), of
 
 
 def read_recordings(
@@ -88,9 +84,6 @@ def read_recordings(
         mapping: which fields are states and inputs; by default, they are found by the names below, or by usual names.
         states, inputs: names and units of an experiment, to which values are converted.
         changes: other values of the mapping, such as ``dt`` and ``delay``.
-
-    Raises:
-        InputError: if a file cannot be read, or lacks a field; the message names file, field and row.
     """
     logs = read_logs(paths)
     chosen = LogMapping.usual(logs[0], states, inputs) if mapping is None else mapping
@@ -104,13 +97,7 @@ def read_recordings(
 def recordings_of(
     logs: Sequence[Log], mapping: LogMapping | None = None, names: dict[str, list[str]] | None = None
 ) -> Recordings:
-    """Return the recordings in logs.
-
-    Args:
-        logs: the logs.
-        mapping: which fields are states and inputs; by default, they are found by usual names.
-        names: names of the components of vector fields, if they are known.
-    """
+    """Return the recordings in logs; ``names`` are those of the components of vector fields, if they are known."""
     chosen = LogMapping.usual(logs[0]) if mapping is None else mapping
     runs: list[Recording] = []
     breaks: list[Break] = []
@@ -125,36 +112,34 @@ def recordings_of(
         first = first or channels
         channels = [_in_unit_of(log, *pair) for pair in zip(channels, first, strict=True)]
         dt = _period(log, channels[0]) if dt is None else dt
-        if chosen.longest_gap is None:
-            _require_period(log, channels, dt)
+        # States must not be recorded much less often than every step, or have times of another unit.
+        period = min((channel.period for channel in channels if not channel.of_input and channel.period), default=dt)
+        if chosen.longest_gap is None and (period > FAR * dt or unit_advice(period, dt)):
+            usual = f"give dt = {period:g}, or longest_gap if states are to be interpolated over so many steps"
+            raise InputError(
+                f"{log.source} has a sample of {channels[0].name} every {period:g} s, and a step takes {dt:g} s: "
+                f"{unit_advice(period, dt) or usual}."
+            )
         parts, gaps = sampled(log.source, channels, dt, chosen.delay, chosen.longest_gap)
         runs += [Recording(log.source, start, trajectory) for start, trajectory in parts]
         breaks += gaps
     if dt is None or not runs:
         why = "; ".join(str(one) for one in breaks[:3])
         raise InputError(f"no log has two samples of all states and inputs in a row: {why or 'they are empty'}.")
-    units = {channel.name: channel.unit for channel in first}
-    inputs = {channel.name for channel in first if channel.of_input}
-    return Recordings(
-        tuple(runs),
-        tuple(breaks),
-        dt,
-        {name: unit for name, unit in units.items() if name not in inputs},
-        {name: unit for name, unit in units.items() if name in inputs},
-        (*_notes(chosen, dt, first), *dict.fromkeys(notes)),
-    )
+    states, inputs = ({one.name: one.unit for one in first if one.of_input == of_input} for of_input in (False, True))
+    whole = (*_notes(chosen, dt, first), *dict.fromkeys(notes))
+    return Recordings(tuple(runs), tuple(breaks), dt, states, inputs, whole)
 
 
 def _channels(log: Log, mapping: LogMapping, names: dict[str, list[str]], notes: list[str]) -> list[Channel]:
     """Return the components of all states and inputs over time; sentences on how they were read are added to notes."""
-    clock = mapping.clock
+    clock, condition = mapping.clock, mapping.condition
     if clock.field is None and isinstance(log, Table) and time_column(log.source, log.names()) is None:
         clock = replace(clock, period=mapping.dt)
-    condition = mapping.condition
-    fields = mapping.fields
-    signals = log.signals([field.path for field in fields.values()] + ([condition[0]] if condition else []), clock)
+    paths = [field.path for field in mapping.fields.values()]
+    signals = log.signals([*paths, *([condition[0]] if condition else [])], clock)
     channels = []
-    for name, field in fields.items():
+    for name, field in mapping.fields.items():
         signal = signals[field.path]
         values = signal.values.copy()
         if condition is not None:
@@ -163,7 +148,8 @@ def _channels(log: Log, mapping: LogMapping, names: dict[str, list[str]], notes:
             rows = slice(None) if status.times is signal.times else np.maximum(at, 0)
             values[(status.values[rows, 0] == number) != equal] = np.nan
         if signal.clock:
-            notes.append(f"the times of messages are {_CLOCKS[signal.clock]}")
+            moment = {"log": "those at which they were logged", "publish": "those at which they were sent"}
+            notes.append(f"the times of messages are {moment.get(signal.clock, 'their header stamps')}")
         components = names.get(field.path, [])
         width, scale = values.shape[1], field.scale(signal.unit)
         for k in range(width):
@@ -176,9 +162,9 @@ def _channels(log: Log, mapping: LogMapping, names: dict[str, list[str]], notes:
                 )
                 values[rows_of_value, k] = np.nan
             known = np.abs(values[:, k][np.isfinite(values[:, k])])
-            if (largest := float(known.max(initial=0.0))) > _LARGEST:
+            if (largest := float(known.max(initial=0.0))) > 1e100:  # squares of errors must be finite
                 raise InputError(
-                    f"{log.source}: {label} must be at most {_LARGEST:g}, got {largest:g}; leave out missing values."
+                    f"{log.source}: {label} must be at most 1e+100, got {largest:g}; leave out missing values."
                 )
             channels.append(
                 Channel(
@@ -201,13 +187,6 @@ def _channels(log: Log, mapping: LogMapping, names: dict[str, list[str]], notes:
     ]
 
 
-_CLOCKS = {
-    "header": "their header stamps",
-    "log": "those at which they were logged",
-    "publish": "those at which they were sent",
-}
-
-
 def _in_unit_of(log: Log, channel: Channel, first: Channel) -> Channel:
     """Return a channel in the unit of the same channel in the first log."""
     if channel.unit == first.unit:
@@ -219,17 +198,6 @@ def _in_unit_of(log: Log, channel: Channel, first: Channel) -> Channel:
         )
     factor = conversion(channel.unit, first.unit)
     return replace(channel, unit=first.unit, values=factor * channel.values)
-
-
-def _require_period(log: Log, channels: Sequence[Channel], dt: float) -> None:
-    """Refuse states that are recorded much less often than every step, or whose times have another unit."""
-    period = min((channel.period for channel in channels if not channel.of_input and channel.period), default=dt)
-    advice = unit_advice(period, dt)
-    if period > FAR * dt or advice:
-        raise InputError(
-            f"{log.source} has a sample of {channels[0].name} every {period:g} s, and a step takes {dt:g} s: "
-            f"{advice or f'give dt = {period:g}, or longest_gap if states are to be interpolated over so many steps'}."
-        )
 
 
 def _period(log: Log, channel: Channel) -> float:

@@ -14,7 +14,6 @@ from ctxval.core.trajectory import Trajectory
 from ctxval.errors import InputError
 
 _SLACK = 1e-3  # a sample within this share of a period of a wanted time belongs to it, because times are rounded
-_MOST_STEPS = 20_000_000  # largest number of steps of one recording
 
 Interval = tuple[float, float]
 
@@ -119,18 +118,13 @@ def _forward_pieces(source: str, channels: Sequence[Channel], breaks: list[Break
     for end in ends:
         reason = f"go back from {first.times[end]:g} s to {first.times[end + 1]:g} s at {word} {line + end + 1}"
         breaks.append(Break(source, float(first.times[end]), 0.0, "times", reason))
-    return [
-        [
-            replace(
-                channel,
-                times=channel.times[start:stop],
-                values=channel.values[start:stop],
-                place=(channel.place[0], channel.place[1] + start),
-            )
-            for channel in channels
-        ]
-        for start, stop in pairwise([0, *(end + 1 for end in ends), len(first.times)])
-    ]
+
+    def piece(channel: Channel, start: int, stop: int) -> Channel:
+        place = channel.place[0], channel.place[1] + start
+        return replace(channel, times=channel.times[start:stop], values=channel.values[start:stop], place=place)
+
+    bounds = pairwise([0, *(end + 1 for end in ends), len(first.times)])
+    return [[piece(channel, *ends) for channel in channels] for ends in bounds]
 
 
 def _intervals(source: str, channel: Channel, longest_gap: float | None, breaks: list[Break]) -> list[Interval]:
@@ -185,16 +179,17 @@ def _part(source: str, channels: Sequence[Channel], interval: Interval, dt: floa
     steps = np.floor((end - start) / dt + 1e-3)
     if not 1 <= steps < np.inf:
         return None
-    if steps > _MOST_STEPS:
-        raise InputError(f"{source} has {steps:.3g} steps of {dt:g} s, more than {_MOST_STEPS}: give a larger dt.")
+    if steps > 20_000_000:
+        raise InputError(f"{source} has {steps:.3g} steps of {dt:g} s, more than 20000000: give a larger dt.")
     times: Array = np.asarray(dt * np.arange(int(steps) + 1), dtype=np.float64)
-    states = [_interpolated(channel, start + times) for channel in channels if not channel.of_input]
-    inputs = []
+    states, inputs = list[Array](), list[Array]()
     for channel in channels:
         if channel.of_input:  # it holds until the next sample, which may come within a step
             good = np.isfinite(channel.values)
             means = held_means(channel.times[good], channel.values[good, None], start + times, _SLACK * dt)
             inputs.append(means[:, 0])
+        else:
+            states.append(_interpolated(channel, start + times))
     columns = np.stack(inputs, axis=-1) if inputs else np.empty((int(steps), 0))
     return start, Trajectory(times, np.stack(states, axis=-1), columns)
 

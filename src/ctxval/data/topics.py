@@ -17,9 +17,7 @@ from ctxval._util.units import named_unit
 from ctxval.data.log import Clock, Log, Signal
 from ctxval.errors import InputError
 
-_MOST_MEMORY = 2**30  # largest size of the numbers of a log in bytes; each message needs :data:`_OBJECT` bytes more
-
-_OBJECT = 256
+_MOST_MEMORY = 2**30  # largest size of the numbers of a log in bytes; each message needs 256 bytes more
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,13 +64,12 @@ class TopicLog(Log):
         size = 0
         for message in self.messages(stamps):
             number = len(stamps[message.topic])
-            stamps[message.topic].append(
-                {"log": message.logged, "publish": message.published, "header": _header(message.content)}
-            )
+            stamp = {"log": message.logged, "publish": message.published, "header": _header(message.content)}
+            stamps[message.topic].append(stamp)
             for field, (topic, path) in split.items():
                 if topic == message.topic:
                     values[field].append(self._value(message, number, path))
-                    size += _OBJECT + values[field][-1].nbytes
+                    size += 256 + values[field][-1].nbytes
             if size > _MOST_MEMORY:
                 raise InputError(f"{self.source} has too many numbers: {_MOST_MEMORY} bytes of memory may be used.")
         for topic, unsorted in stamps.items():

@@ -22,11 +22,7 @@ class NamedStates(ShortRepr):
     """A dataclass whose options ``components``, ``angles`` and ``state`` may have names of states besides indices."""
 
     def with_states(self, names: Sequence[str]) -> Self:
-        """Return the same with the indices of states in place of their names.
-
-        Args:
-            names: the names of all states; if empty, nothing is replaced.
-        """
+        """Return the same with the indices of states in place of their names, if there are names."""
 
         def index(value: Any) -> Any:
             if isinstance(value, str) and value not in names:
@@ -80,11 +76,7 @@ class StateNorm(NamedStates):
         return None if (factors == 1).all() else factors
 
     def difference(self, states: Array, others: Array) -> Array:
-        """Return the weighted differences ``states - others`` of the compared states.
-
-        Args:
-            states, others: states, shape ``(..., n)``; each axis before the last must match or be 1.
-        """
+        """Return the weighted differences ``states - others`` of the compared states; the leading axes broadcast."""
         gap = selected(self.unwrapped(states - others), self.components)
         counts = [len(given) for given in (self.weights, self.scales) if given is not None]
         if set(counts) - {gap.shape[-1]}:
@@ -102,11 +94,7 @@ class StateNorm(NamedStates):
         return moved
 
     def mixed_units(self, units: Sequence[str]) -> tuple[str, ...]:
-        """Return the units that the norm adds although they differ; none if weights or scales are given.
-
-        Args:
-            units: the unit of each state; empty if it is unknown.
-        """
+        """Return the units of states that the norm adds although they differ; none if it has weights or scales."""
         if self.weights is not None or self.scales is not None:
             return ()
         compared = range(len(units)) if self.components is None else self.components
@@ -115,7 +103,6 @@ class StateNorm(NamedStates):
         return tuple(distinct) if len(distinct) > 1 else ()
 
     def describe(self) -> dict[str, Any]:
-        """Return what identifies the distance in a store. Weights and scales that change nothing are left out."""
         names = [field.name for field in dataclasses.fields(self)]
         described = {name: getattr(self, name) for name in names if name not in ("weights", "scales", "angles")}
         factors = self.factors
@@ -137,7 +124,6 @@ class ErrorNorm(StateNorm, ABC):
         return vector_norm(error, self.norm)
 
     def __call__(self, model_trajectory: Trajectory, system_trajectory: Trajectory, task: Task) -> Array:
-        """Return the distance, shape ``(...)``."""
         return self.compose(self.error(model_trajectory, system_trajectory, task))
 
 
@@ -164,10 +150,7 @@ def require_indices(name: str, indices: Sequence[int | str], count: int) -> list
 
 
 def require_numbers(name: str, given: ArrayLike | None, components: Sequence[int | str] | None, *, zero: bool) -> None:
-    """Check that an option is None or a list of positive numbers, one for each component if these are known.
-
-    With ``zero``, some of them may be 0.
-    """
+    """Check that an option is None, or a list of positive numbers (some 0 with ``zero``), one for each component."""
     if given is None:
         return
     array = as_finite(name, given)

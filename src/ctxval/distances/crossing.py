@@ -41,12 +41,10 @@ class AtCrossing(ErrorNorm):
     crossings: PositiveInt = 1
 
     def error(self, model_trajectory: Trajectory, system_trajectory: Trajectory, task: Task) -> Array:
-        """Return the weighted differences at the crossings, one after the other, shape ``(..., crossings k)``."""
         gap = self.difference(self._states(system_trajectory), self._states(model_trajectory))
         return np.asarray(gap.reshape(*gap.shape[:-2], -1))
 
     def compose(self, error: Array) -> Array:
-        """Return the largest norm over the crossings of error vectors ``(..., crossings k)``, shape ``(...)``."""
         gap = error.reshape(*error.shape[:-1], self.crossings, -1)
         return np.asarray(vector_norm(gap, self.norm).max(axis=-1))
 
@@ -71,8 +69,7 @@ class CrossingTime(NamedStates):
     A trajectory that does not cross the level counts as if it crossed it at its end.
 
     Attributes:
-        state: index or name of the state that crosses the level.
-        level: the level, in the unit of this state.
+        state: index or name of the state that crosses the level, which is in the unit of this state.
         direction: ``up``, ``down`` or ``either``: the direction in which the state crosses the level.
         angle: whether the state is an angle in radians, which crosses the level wherever it crosses it on the circle.
     """
@@ -83,13 +80,12 @@ class CrossingTime(NamedStates):
     angle: bool = False
 
     def __call__(self, model_trajectory: Trajectory, system_trajectory: Trajectory, task: Task) -> Array:
-        """Return the distance in seconds, shape ``(...)``."""
-        return np.asarray(np.abs(self._place(system_trajectory) - self._place(model_trajectory)) * task.dt)
-
-    def _place(self, trajectory: Trajectory) -> Array:
-        [state] = require_indices("state", [self.state], trajectory.states.shape[-1])
-        above = trajectory.states[..., state] - self.level
-        return _crossings(above, self.direction, 1, self.angle)[..., 0]
+        [state] = require_indices("state", [self.state], model_trajectory.states.shape[-1])
+        places = [
+            _crossings(trajectory.states[..., state] - self.level, self.direction, 1, self.angle)[..., 0]
+            for trajectory in (system_trajectory, model_trajectory)
+        ]
+        return np.asarray(np.abs(places[0] - places[1]) * task.dt)
 
 
 def _crossings(above: Array, direction: Direction, count: int, on_circle: bool) -> Array:

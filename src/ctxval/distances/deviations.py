@@ -26,7 +26,6 @@ class FinalState(ErrorNorm):
     """
 
     def error(self, model_trajectory: Trajectory, system_trajectory: Trajectory, task: Task) -> Array:
-        """Return the weighted difference between the final states, shape ``(..., k)``."""
         return self.difference(system_trajectory.final_state, model_trajectory.final_state)
 
 
@@ -48,7 +47,6 @@ class AtTimes(ErrorNorm):
         require_numbers("times", self.times, None, zero=True)
 
     def error(self, model_trajectory: Trajectory, system_trajectory: Trajectory, task: Task) -> Array:
-        """Return the weighted differences at the times, one after the other, shape ``(..., times k)``."""
         steps = np.round(np.asarray(self.times, dtype=np.float64) / task.dt).astype(np.intp)
         if (steps > task.horizon).any():
             end = task.horizon * task.dt
@@ -57,7 +55,6 @@ class AtTimes(ErrorNorm):
         return np.asarray(gap.reshape(*gap.shape[:-2], -1))
 
     def compose(self, error: Array) -> Array:
-        """Return the largest norm over the times of error vectors ``(..., times k)``, shape ``(...)``."""
         gap = error.reshape(*error.shape[:-1], len(self.times), -1)
         return np.asarray(vector_norm(gap, self.norm).max(axis=-1))
 
@@ -73,7 +70,6 @@ class MaximumDeviation(StateNorm):
     norm: Norm = 2
 
     def __call__(self, model_trajectory: Trajectory, system_trajectory: Trajectory, task: Task) -> Array:
-        """Return the distance, shape ``(...)``."""
         gap = self.difference(system_trajectory.states, model_trajectory.states)
         return np.asarray(vector_norm(gap, self.norm).max(axis=-1))
 
@@ -89,7 +85,6 @@ class MeanDeviation(StateNorm):
     norm: Norm = 2
 
     def __call__(self, model_trajectory: Trajectory, system_trajectory: Trajectory, task: Task) -> Array:
-        """Return the distance, shape ``(...)``."""
         gap = self.difference(system_trajectory.states, model_trajectory.states)
         return np.asarray(vector_norm(gap[..., 1:, :], self.norm).mean(axis=-1))
 
@@ -116,11 +111,9 @@ class RelativeDeviation(StateNorm):
         require_numbers("least", self.least, self.components, zero=False)
 
     def mixed_units(self, units: Sequence[str]) -> tuple[str, ...]:
-        """Return no units, because a relative error has none."""
         return ()
 
     def __call__(self, model_trajectory: Trajectory, system_trajectory: Trajectory, task: Task) -> Array:
-        """Return the distance, shape ``(...)``."""
         gap = self.difference(system_trajectory.states, model_trajectory.states)
         moved = selected(np.ptp(model_trajectory.states, axis=-2), self.components)
         ranges = np.maximum(moved, np.asarray(self.least, dtype=np.float64))
@@ -144,7 +137,6 @@ class WholeTrajectory(StateNorm):
     per_step: bool = False
 
     def __call__(self, model_trajectory: Trajectory, system_trajectory: Trajectory, task: Task) -> Array:
-        """Return the distance, shape ``(...)``."""
         gap = self.difference(system_trajectory.states, model_trajectory.states)
         whole = vector_norm(gap.reshape(*gap.shape[:-2], -1), self.norm)
         return whole / task.horizon if self.per_step else whole
@@ -163,7 +155,6 @@ class GoalError(ErrorNorm):
     """Whether it measures the system against the task, so that it need not be 0 if the system is like the model."""
 
     def error(self, model_trajectory: Trajectory, system_trajectory: Trajectory, task: Task) -> Array:
-        """Return the weighted difference between the final state of S and the goal, shape ``(..., k)``."""
         return self.difference(system_trajectory.final_state, task.goal)
 
 
@@ -185,7 +176,6 @@ class TrackingError(StateNorm):
     over: Literal["maximum", "mean"] = "maximum"
 
     def __call__(self, model_trajectory: Trajectory, system_trajectory: Trajectory, task: Task) -> Array:
-        """Return the distance, shape ``(...)``."""
         gap = self.difference(system_trajectory.states, task.reference)[..., 1:, :]
         norms = vector_norm(gap, self.norm)
         return np.asarray(norms.max(axis=-1) if self.over == "maximum" else norms.mean(axis=-1))

@@ -24,17 +24,6 @@ class Acquisition(Protocol):
         """Return the values ``(m,)`` and their gradients ``(m, d)``."""
 
 
-_DISTINCT = 1e-6
-"""Least distance of a proposal from every known point, in at least one coordinate."""
-_APART = 0.02
-"""Least distance of a proposal from the points in ``away``, as a share of the cube's diagonal."""
-_STARTS = 4
-"""Number of candidates from which the acquisition function is climbed."""
-_SEPARATION = 0.05
-"""Least distance between these candidates, as a share of the cube's diagonal."""
-_ITERATIONS = 20
-"""Largest number of iterations of one climb."""
-
 _FAR_BELOW = -1e3
 """Below this number of standard deviations, a series replaces differences of large logarithms."""
 _CERTAIN = 1e-9
@@ -47,7 +36,6 @@ class UpperConfidenceBound:
     """``alpha(p) = mu(p) + beta^(1/2) sigma(p)`` (the paper's eq. 10, GP-UCB).
 
     Attributes:
-        process: the surrogate.
         beta: the confidence parameter; the paper takes 2.
     """
 
@@ -73,7 +61,6 @@ class LogExpectedImprovement:
     """``log E max(f(p) - best, 0)``, also if the expectation underflows (Ament et al. 2023, eqs. 8 and 9).
 
     Attributes:
-        process: the surrogate.
         best: the value to improve on, in the process's units.
     """
 
@@ -92,7 +79,9 @@ class LogExpectedImprovement:
         sigma = np.maximum(np.sqrt(variance), _CERTAIN)
         d_sigma = np.where(np.sqrt(variance) > _CERTAIN, d_variance.T / (2 * sigma), 0.0).T
         z = (mean - self.best) / sigma
-        slope = _log_improvement_slope(z)
+        # The derivative of log_improvement, Phi(z) / (phi(z) + z Phi(z)).
+        near, far = np.maximum(z, _FAR_BELOW), np.minimum(z, _FAR_BELOW)
+        slope = np.where(z > _FAR_BELOW, np.exp(log_ndtr(near) - log_improvement(near)), -far - 2 / far)
         gradient = (slope * d_mean.T + (1 - z * slope) * d_sigma.T) / sigma
         return np.asarray(log_improvement(z) + np.log(sigma)), np.asarray(gradient.T)
 
@@ -110,19 +99,9 @@ def log_improvement(z: Array) -> Array:
     return np.asarray(np.where(z > -1, direct, np.where(z > _FAR_BELOW, scaled, series)))
 
 
-def _log_improvement_slope(z: Array) -> Array:
-    """Return the derivative ``Phi(z) / (phi(z) + z Phi(z))``."""
-    near, far = np.maximum(z, _FAR_BELOW), np.minimum(z, _FAR_BELOW)
-    return np.asarray(np.where(z > _FAR_BELOW, np.exp(log_ndtr(near) - log_improvement(near)), -far - 2 / far))
-
-
 @dataclass(frozen=True, eq=False)
 class Uncertainty:
-    """The posterior variance: pure exploration.
-
-    Attributes:
-        process: the surrogate.
-    """
+    """The posterior variance: pure exploration."""
 
     process: GaussianProcess
 
@@ -155,45 +134,42 @@ def maximise(
     Candidates are uniform, or small moves of the known points. The function is climbed from the best few of them.
 
     Args:
-        acquisition: the function to maximise.
-        dimension: the dimension d of the cube.
         known: points that must not be proposed again, shape ``(n, d)``, best first; the first few seed the local
             candidates.
-        rng: the source of the candidates.
         box: the part of the cube that is searched; all of it if None.
         corners: whether candidates include corners, and single coordinates are moved to bounds in the end while that
             increases the value.
         away: points ``(k, d)`` that are pending or have failed; the result keeps a distance from them.
     """
+    diagonal = float(np.sqrt(dimension))
+    others = np.empty((0, dimension)) if away is None else away
+
+    def is_apart(points: Array) -> Mask:
+        return np.asarray(cdist(points, others).min(axis=1, initial=np.inf) > 0.02 * diagonal)
+
     low, high = (np.zeros(dimension), np.ones(dimension)) if box is None else box
     candidates = low + rng.random((min(2000, 256 * dimension), dimension)) * (high - low)
     nearby = np.repeat(known[:8], 8, axis=0)
     nearby = np.clip(nearby + rng.normal(scale=0.02, size=nearby.shape), low, high)
     if corners:
-        _snap(candidates[::2], low, high, rng)
+        second = candidates[::2]
+        snapped = rng.random(second.shape) < rng.random((len(second), 1))  # the share is drawn for each point
+        second[snapped] = np.where(rng.random(second.shape) < 0.5, low, high)[snapped]
     candidates = np.concatenate([candidates, nearby])
-    if away is not None and (apart := _is_apart(candidates, away)).any():
+    if (apart := is_apart(candidates)).any():
         candidates = candidates[apart]
     order = np.argsort(-acquisition(candidates), kind="stable")
-    reach = _SEPARATION * float(np.sqrt(dimension))
     best = candidates[order[:200]]
-    starts = best[separated_rows(best, reach, _STARTS)]
-    climbed, _ = climb(acquisition.with_gradient, starts, low, high, iterations=_ITERATIONS)
+    starts = best[separated_rows(best, 0.05 * diagonal, 4)]
+    climbed, _ = climb(acquisition.with_gradient, starts, low, high, iterations=20)
     if corners:
         climbed = np.concatenate([climbed, _polish(acquisition, climbed, low, high)])
     finalists = np.concatenate([climbed, candidates[order[:16]]])
-    values = np.where(_is_distinct(finalists, known), acquisition(finalists), -np.inf)
-    if away is not None:
-        values[~_is_apart(finalists, away)] = -np.inf
+    is_new = cdist(finalists, known, "chebyshev").min(axis=1, initial=np.inf) > 1e-6
+    values = np.where(is_new & is_apart(finalists), acquisition(finalists), -np.inf)
     if not np.isfinite(values).any():
         return np.asarray(low + rng.random(dimension) * (high - low))
     return np.asarray(finalists[np.argmax(values)])
-
-
-def _snap(points: Array, low: Array, high: Array, rng: np.random.Generator) -> None:
-    """Move random coordinates to bounds, in place; the share of them is drawn for each point."""
-    snapped = rng.random(points.shape) < rng.random((len(points), 1))
-    points[snapped] = np.where(rng.random(points.shape) < 0.5, low, high)[snapped]
 
 
 def _polish(acquisition: Acquisition, points: Array, low: Array, high: Array) -> Array:
@@ -207,16 +183,3 @@ def _polish(acquisition: Acquisition, points: Array, low: Array, high: Array) ->
             break
         point, value = moved[np.argmax(values)], float(values.max())
     return np.asarray(point[None])
-
-
-def _is_apart(points: Array, away: Array) -> Mask:
-    if not len(away):
-        return np.ones(len(points), dtype=bool)
-    return np.asarray(cdist(points, away).min(axis=1) > _APART * np.sqrt(points.shape[1]))
-
-
-def _is_distinct(points: Array, known: Array) -> Mask:
-    if not len(known):
-        return np.ones(len(points), dtype=bool)
-    gaps = np.abs(points[:, None, :] - known[None, :, :]).max(axis=-1)
-    return np.asarray(gaps.min(axis=1) > _DISTINCT)

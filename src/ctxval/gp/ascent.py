@@ -20,30 +20,18 @@ _ROUNDS = 3
 """Number of line searches of each climb."""
 _FINALISTS = (3, 2)
 """Number of points from which the function itself is climbed after its approximation, and of line searches."""
-_SEPARATION = 0.1
-"""Least distance between the starts, as a share of the box's diagonal."""
 _FEW = 3
 """Largest dimension in which samples ever closer to the best points replace the climbs."""
 _POOL = 128
 """Number of points in few dimensions that are the same in each search, for each dimension."""
-_SCALES = (1.0, 0.3, 0.1)
-"""Standard deviations of these samples, in distances between the points of the pool; smaller in later rounds."""
-_WIDEST = 0.3
-"""Largest standard deviation, as a share of the box."""
 _ZOOMED = 6
 """Number of points that are sampled around."""
 _SAMPLES = 18
 """Number of samples in each round, for each dimension; there are 1, 3 and 5 rounds in 1, 2 and 3 dimensions."""
-_SHRINKS = 0.5
-"""Factor of the standard deviations from round to round."""
 _MOVED = 3
 """Number of best points of which single coordinates are moved to bounds in each round."""
 _REFINED = 16
 """Number of points at which the function itself is evaluated after its approximation."""
-_DISTINCT = 0.02
-"""Least distance between them, as a share of the box's diagonal."""
-_MOVES = 4
-"""Largest number of rounds in which coordinates are moved to bounds."""
 
 
 class Ascent:
@@ -57,7 +45,6 @@ class Ascent:
 
     Args:
         function: points ``(m, d)`` -> values ``(m,)``; values that are not finite are never a maximum.
-        low, high: the bounds of the box, shapes ``(d,)``.
         budget: number of points at which the function may be evaluated; the last climb may exceed it.
         rough: a cheap approximation of the function; the function itself if None.
     """
@@ -67,12 +54,7 @@ class Ascent:
         self._rough = self._exact if rough is None else Evaluations(rough, low, high, budget, strict=False)
 
     def run(self, starts: Array, rng: np.random.Generator) -> tuple[Array, Array]:
-        """Return points ``(m, d)`` and values ``(m,)`` that were evaluated, the largest first.
-
-        Args:
-            starts: points ``(s, d)`` to evaluate first.
-            rng: the source of the samples.
-        """
+        """Evaluate starts first, and return all points ``(m, d)`` and their values ``(m,)``, the largest first."""
         inside = np.clip(starts, self._exact.low, self._exact.high)
         if self._exact.dimension <= _FEW:
             self._search_few(inside, rng)
@@ -99,26 +81,25 @@ class Ascent:
             count = min(_SAMPLES * exact.dimension, self._left - len(best) - len(corners))
             if not len(best) or count < 1:
                 return
-            widths = np.minimum(gap, _WIDEST * (exact.high - exact.low))
-            steps = np.resize(_SCALES, count)[:, None] * widths
+            widths = np.minimum(gap, 0.3 * (exact.high - exact.low))
+            steps = np.resize((1.0, 0.3, 0.1), count)[:, None] * widths
             near = np.resize(best, (count, exact.dimension)) + steps * rng.normal(size=(count, exact.dimension))
             exact.evaluate(np.concatenate([best, np.clip(near, exact.low, exact.high), corners]))
             best = _best(exact, _ZOOMED)
-            gap *= _SHRINKS
+            gap *= 0.5
 
     def _search_many(self, starts: Array, rng: np.random.Generator) -> None:
         rough, exact = self._rough, self._exact
         rough.evaluate(np.concatenate([starts, rough.samples(max(8, rough.budget // 6), rng)]))
         self._climb(rough, _STARTS, _ROUNDS)
         if rough is not exact:
-            exact.evaluate(np.concatenate([starts, _best(rough, _REFINED, _DISTINCT)]))
+            exact.evaluate(np.concatenate([starts, _best(rough, _REFINED, 0.02)]))
         self._climb(exact, *_FINALISTS)
-        for _ in range(_MOVES):
+        for _ in range(4):
             if self._left < 1 or not exact.move_to_bounds(rng):
                 return
 
     def _climb(self, done: Evaluations, starts: int, rounds: int) -> None:
-        """Climb from the best points, from as many of them as the budget allows."""
         allowed = self._left // (rounds * line_search_cost(done.dimension))
         if allowed:
             done.search_lines(_best(done, min(starts, allowed)), rounds)
@@ -146,16 +127,10 @@ class Effort:
 
 def usual_effort(dimension: int, budget: int) -> Effort:
     """Return what a search with this budget usually evaluates, if the function has an approximation."""
-    return _effort_of_few(dimension, budget) if dimension <= _FEW else _effort_of_many(dimension, budget)
-
-
-def _effort_of_few(dimension: int, budget: int) -> Effort:
-    first, each = _STARTS + min(_POOL * dimension, budget // 3), _ZOOMED + (_SAMPLES + 2 * _MOVED) * dimension
-    exact = min(budget, first + (2 * dimension - 1) * each)
-    return Effort(exact, 0, 2 + -(-(exact - first) // each))
-
-
-def _effort_of_many(dimension: int, budget: int) -> Effort:
+    if dimension <= _FEW:
+        first, each = _STARTS + min(_POOL * dimension, budget // 3), _ZOOMED + (_SAMPLES + 2 * _MOVED) * dimension
+        exact = min(budget, first + (2 * dimension - 1) * each)
+        return Effort(exact, 0, 2 + -(-(exact - first) // each))
     line, rounds = line_search_cost(dimension), _ROUNDS - 1  # most climbs end before their last round
     rough = min(budget, _STARTS + max(8, budget // 6))
     climbs = min(_STARTS, (budget - rough) // (_ROUNDS * line))
@@ -167,7 +142,7 @@ def _effort_of_many(dimension: int, budget: int) -> Effort:
     return Effort(exact, rough, 3 + (2 * rounds if climbs else 0) + (3 if finals else 0))
 
 
-def _best(done: Evaluations, count: int, share: float = _SEPARATION) -> Array:
+def _best(done: Evaluations, count: int, share: float = 0.1) -> Array:
     """Return some of the best points, each at a distance from all better ones."""
     points, values = done.found()
     finite = points[np.isfinite(values)]

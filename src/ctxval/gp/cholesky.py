@@ -71,17 +71,6 @@ class CholeskyFactor:
         """Return ``log(det K) / 2``."""
         return float(np.log(np.diag(self.L)).sum())
 
-    def left_out_errors(self, weights: Array) -> Array:
-        """Return the difference between each observation and its prediction from all others.
-
-        Args:
-            weights: ``K^-1 y`` of observations y, shape ``(n,)`` or ``(n, k)``.
-
-        Source:
-            Rasmussen and Williams 2006, eq. 5.12.
-        """
-        return weights / (self.precisions if weights.ndim == 1 else self.precisions[:, None])
-
 
 def factorise(covariance: Array, noises: float | Iterable[float]) -> CholeskyFactor:
     """Return the Cholesky factor of ``covariance + noise I``.
@@ -89,9 +78,6 @@ def factorise(covariance: Array, noises: float | Iterable[float]) -> CholeskyFac
     Args:
         covariance: covariance of the noise-free observations, shape ``(n, n)``; it is not changed.
         noises: the noise variance, or several of them, which are tried one after the other.
-
-    Raises:
-        InputError: if the matrix is not positive definite for any of these noise variances.
     """
     tried = [noises] if isinstance(noises, float) else noises
     for noise in tried:

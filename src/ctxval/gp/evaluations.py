@@ -12,10 +12,6 @@ from ctxval._util.boxes import climb, moves_to_bounds
 Values = Callable[[Array], Array]
 """Points ``(m, d)`` -> values ``(m,)``."""
 
-_POLISHED = 3
-"""Number of best points whose coordinates are moved to bounds, several at a time."""
-_STEP = 1e-4
-"""Step of the one-sided differences."""
 _SHARES = np.array([0.03, 0.1, 0.3, 0.6, 1.0])
 """Steps of a line search, as shares of the way to a corner."""
 _LENGTHS = np.array([0.1, 0.4])
@@ -29,7 +25,6 @@ class Evaluations:
 
     Args:
         function: points ``(m, d)`` -> values ``(m,)``; values that are not finite are never a maximum.
-        low, high: the bounds of the box, shapes ``(d,)``.
         budget: number of points at which the function may be evaluated.
         strict: whether the budget is a hard limit; if not, a climb that has begun may exceed it.
     """
@@ -88,12 +83,7 @@ class Evaluations:
         return np.where(snapped, ends, points)
 
     def climb(self, starts: Array, budget: int) -> None:
-        """Climb from all starts at once along finite differences; the points reached are among those evaluated.
-
-        Args:
-            starts: points ``(s, d)``.
-            budget: number of evaluations, approximately.
-        """
+        """Climb from starts ``(s, d)`` along finite differences, with about so many evaluations."""
         if not len(starts):
             return
         scale = max(float(np.abs(self.found()[1][0])), 1e-300)
@@ -105,14 +95,10 @@ class Evaluations:
         climb(sloped, starts, self.low, self.high, scale=scale, iterations=calls, evaluations=calls)
 
     def search_lines(self, starts: Array, rounds: int) -> None:
-        """Search along lines from all starts at once, several times; the points reached are among those evaluated.
+        """Search along lines from all starts ``(s, d)`` at once, several times.
 
         Each line leads along the slopes, or to the corner to which they point (Frank and Wolfe 1956), where convex
         functions have their maxima. Some steps move only the coordinates that promise most.
-
-        Args:
-            starts: points ``(s, d)``.
-            rounds: number of line searches from each start.
         """
         points, row = starts, np.arange(len(starts))
         for _ in range(rounds):
@@ -137,9 +123,9 @@ class Evaluations:
         return np.asarray(np.clip(points[:, None] + np.concatenate(moves, axis=1), self.low, self.high))
 
     def _slopes(self, points: Array) -> tuple[Array, Array]:
-        """Return values and slopes by one-sided differences, which point inward if a bound is near."""
+
         n, d = points.shape
-        steps = np.where(points + _STEP <= self.high, _STEP, -_STEP)
+        steps = np.where(points + 1e-4 <= self.high, 1e-4, -1e-4)  # inward if a bound is near
         moved = points[:, None, :] + np.eye(d) * steps[:, None, :]
         values = self.evaluate(np.concatenate([points, moved.reshape(-1, d)]))
         here, there = values[:n], values[n:].reshape(n, d)
@@ -152,7 +138,7 @@ class Evaluations:
         """Move coordinates of the best points to bounds, singly and several at a time; return whether that helped."""
         points, values = self.found()
         d = self.dimension
-        best = points[:_POLISHED]
+        best = points[:3]
         ends = np.stack([self.low, self.high])
         single = moves_to_bounds(best[0], self.low, self.high)
         parents = best[rng.integers(len(best), size=2 * d)]

@@ -20,34 +20,10 @@ from ctxval.gp.evaluations import Evaluations, Values
 
 _SAMPLED, _EVOLVED, _CLIMBED = 0.35, 0.7, 0.88
 """Shares of the evaluations after which sampling, evolution and climbs end."""
-_STARTS = 12
-"""Largest number of points from which the function is climbed at once."""
-_SEPARATION = 0.2
-"""Least distance between these points, as a share of the cube's diagonal."""
-_CALLS = 8
-"""Number of slopes that a climb should have at least; if evaluations are few, there are fewer climbs."""
-_GENERATIONS = 40
-"""Largest number of generations of the evolution."""
-_REFINEMENTS = 12
-"""Largest number of batches of the refinement."""
-_ELITES = 30
-"""Number of parents of a generation, and of elites that are returned."""
-_DISTINCT = 0.02
-"""Least distance of prominent parents, as a share of the cube's diagonal."""
 _REACHES = (0.3, 0.1)
 """Least distance of good parents in the first and the last generation, and of elites, as a share of the diagonal."""
 _STEPS = (0.3, 0.005)
 """Largest standard deviation of a mutation in the first and in the last generation."""
-_SPREAD = 0.03
-"""Smallest standard deviation of a mutation, as a share of the largest one."""
-_PROMINENT = 200
-"""Number of prominent points that are remembered."""
-_POOL = 100
-"""Number of best points of whose differences moves are made."""
-_REFINED_POINTS = 4
-"""Number of best points that the refinement moves."""
-_REFINED = (0.02, 1e-5)
-"""Standard deviations of the moves in the first and in the last batch of the refinement."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,13 +35,16 @@ class GlobalMaximum:
         values: their values, shape ``(m,)``; minus infinity if the function was not finite there.
         elites: good points that are apart from each other, the best first, shape ``(e, d)``; none if no value is
             finite.
-        evaluations: number of points at which the function was evaluated.
     """
 
     points: Array
     values: Array
     elites: Array
-    evaluations: int
+
+    @property
+    def evaluations(self) -> int:
+        """The number of points at which the function was evaluated."""
+        return len(self.values)
 
 
 def search_globally(
@@ -75,9 +54,7 @@ def search_globally(
 
     Args:
         function: points ``(m, d)`` of the cube -> values ``(m,)``; values that are not finite are never a maximum.
-        dimension: the number d of coordinates.
         starts: points ``(s, d)`` to evaluate first; points outside of the cube are moved to its faces.
-        rng: the source of all random numbers.
         evaluations: number of points at which the function may be evaluated.
     """
     done = Evaluations(function, np.zeros(dimension), np.ones(dimension), evaluations)
@@ -85,10 +62,14 @@ def search_globally(
     for count in _batches(int(_SAMPLED * evaluations) - (evaluations - done.left), evaluations, 3):
         done.evaluate(done.samples(count, rng))
     _evolve(done, rng)
-    _climb(done, done.left - int((1 - _CLIMBED) * evaluations))
+    budget = done.left - int((1 - _CLIMBED) * evaluations)
+    climbs = min(12, budget // (8 * (dimension + 1)))  # each with 8 slopes at least
+    if climbs > 0:
+        points, values = done.found()
+        done.climb(_apart(points[np.isfinite(values)], 0.2)[:climbs], budget)
     _refine(done, rng)
     points, values = done.found()
-    return GlobalMaximum(points, values, _apart(points[np.isfinite(values)], _REACHES[-1]), len(values))
+    return GlobalMaximum(points, values, _apart(points[np.isfinite(values)], _REACHES[-1]))
 
 
 def _batches(count: int, evaluations: int, most: int) -> list[int]:
@@ -102,15 +83,7 @@ def _batches(count: int, evaluations: int, most: int) -> list[int]:
 
 def _apart(points: Array, reach: float) -> Array:
     """Return the first of the points ``(m, d)`` that are farther from each other than this share of the diagonal."""
-    return points[separated_rows(points, reach * float(np.sqrt(points.shape[1])), _ELITES)]
-
-
-def _climb(done: Evaluations, budget: int) -> None:
-    """Climb from the best points that are apart, with about so many evaluations; not at all if those are too few."""
-    points, values = done.found()
-    starts = min(_STARTS, budget // (_CALLS * (done.dimension + 1)))
-    if starts > 0:
-        done.climb(_apart(points[np.isfinite(values)], _SEPARATION)[:starts], budget)
+    return points[separated_rows(points, reach * float(np.sqrt(points.shape[1])), 30)]
 
 
 def _geometric(ends: tuple[float, float], share: float) -> float:
@@ -123,7 +96,7 @@ def _geometric(ends: tuple[float, float], share: float) -> float:
 def _evolve(done: Evaluations, rng: np.random.Generator) -> None:
     """Evaluate generations of offspring of good points and of prominent points, each set apart from each other."""
     count = done.left - int((1 - _EVOLVED) * done.budget)
-    sizes = _batches(count, done.budget, int(np.clip(np.sqrt(done.budget) / 4, 3, _GENERATIONS)))
+    sizes = _batches(count, done.budget, int(np.clip(np.sqrt(done.budget) / 4, 3, 40)))
     prominence = _Prominence()
     for generation, size in enumerate(sizes):
         share = generation / max(1, len(sizes) - 1)
@@ -134,8 +107,8 @@ def _evolve(done: Evaluations, rng: np.random.Generator) -> None:
             continue
         reach, step = _geometric(_REACHES, share), _geometric(_STEPS, share)
         prominent = prominence.update(*done.in_order())
-        first = _offspring(_apart(finite, reach), finite[:_POOL], step, size - size // 2, rng)
-        second = _offspring(_apart(prominent, _DISTINCT), finite[:_POOL], step, size // 2, rng)
+        first = _offspring(_apart(finite, reach), finite[:100], step, size - size // 2, rng)
+        second = _offspring(_apart(prominent, 0.02), finite[:100], step, size // 2, rng)
         done.evaluate(np.concatenate([first, second]))
 
 
@@ -154,7 +127,7 @@ class _Prominence:
         rows = np.concatenate([self._kept, np.arange(self._seen, len(points))])
         self._seen = len(points)
         found = _prominences(points, _compressed(values), rows)
-        order = np.argsort(-found, kind="stable")[:_PROMINENT]
+        order = np.argsort(-found, kind="stable")[:200]
         self._kept = rows[order]
         return points[self._kept]
 
@@ -188,8 +161,9 @@ def _offspring(parents: Array, pool: Array, step: float, count: int, rng: np.ran
         all_of + _normal(all_of.shape, step, rng),
         few_of + _normal(few_of.shape, max(step, _STEPS[0] / 3), rng) * _few(few_of.shape, rng),
         differential + _differences(pool, differential.shape, rng),
-        _to_bounds(bound + _normal(bound.shape, step, rng) * _few(bound.shape, rng), rng),
     ]
+    moved = bound + _normal(bound.shape, step, rng) * _few(bound.shape, rng)
+    children.append(np.where(_few(bound.shape, rng) > 0, rng.integers(2, size=bound.shape), moved))
     return np.clip(np.concatenate(children), 0, 1)
 
 
@@ -203,7 +177,7 @@ def _drawn(parents: int, count: int, rng: np.random.Generator) -> Rows:
 
 def _normal(shape: tuple[int, ...], step: float, rng: np.random.Generator) -> Array:
     """Return normal moves; the logarithm of each move's standard deviation is uniform up to that of the step."""
-    steps = step * _SPREAD ** rng.random((shape[0], 1))
+    steps = step * 0.03 ** rng.random((shape[0], 1))
     return np.asarray(steps * rng.normal(size=shape))
 
 
@@ -221,11 +195,6 @@ def _differences(pool: Array, shape: tuple[int, ...], rng: np.random.Generator) 
     return np.asarray(factor * (pool[first] - pool[second]) * (rng.random(shape) < 0.7))
 
 
-def _to_bounds(points: Array, rng: np.random.Generator) -> Array:
-    """Return the points with a coordinate or more moved to bounds."""
-    return np.where(_few(points.shape, rng) > 0, rng.integers(2, size=points.shape), points)
-
-
 # Refinement
 
 
@@ -236,10 +205,10 @@ def _refine(done: Evaluations, rng: np.random.Generator) -> None:
     if not len(finite):
         done.evaluate(done.samples(done.left, rng))
         return
-    sizes = _batches(done.left, done.budget, _REFINEMENTS)
+    sizes = _batches(done.left, done.budget, 12)
     for batch, size in enumerate(sizes):
         done.move_to_bounds(rng)
-        best = done.found()[0][:_POOL]
+        best = done.found()[0][:100]
         near = best[np.argsort(np.linalg.norm(best - best[0], axis=1), kind="stable")[: 2 * done.dimension + 2]]
-        step = _geometric(_REFINED, batch / max(1, len(sizes) - 1))
-        done.evaluate(_offspring(best[:_REFINED_POINTS], near, step, min(size, done.left), rng))
+        step = _geometric((0.02, 1e-5), batch / max(1, len(sizes) - 1))
+        done.evaluate(_offspring(best[:4], near, step, min(size, done.left), rng))

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ctxval._util.arrays import Array, ArrayLike, Rows
+from ctxval._util.arrays import Array, ArrayLike
 from ctxval._util.boxes import farthest_rows
 from ctxval._util.representation import ShortRepr
 from ctxval.errors import InputError
@@ -23,20 +23,6 @@ from ctxval.gp.kernels import Matern
 
 EXACT = 1e-10
 """Noise variance, relative to sigma^2, of values without noise: it keeps the Cholesky factor safe."""
-
-_FEWEST = 6
-"""Least number of well-spread data from which hyperparameters are drawn separately."""
-
-_STEP = 1.0
-"""Width of the slice sampler's first interval."""
-_MOST_STEPS = 8
-"""Largest width of the interval, in widths of the first one."""
-_MOST_SHRINKS = 60
-"""Largest number of proposals for which the interval shrinks; after that the state stays."""
-_BURN_IN = 20
-"""Number of sweeps of the chain before the first draw."""
-_FARTHEST = 12.0
-"""Largest magnitude of the logarithm of a length-scale."""
 
 
 @dataclass(frozen=True)
@@ -60,15 +46,11 @@ class Warp:
     def backward(self, z: ArrayLike) -> Array:
         """Return values on their own scale."""
         values = np.asarray(z, dtype=np.float64)
-        return values if np.isinf(self.offset) else np.exp(np.minimum(values, _LARGEST)) - self.offset
+        return values if np.isinf(self.offset) else np.exp(np.minimum(values, 700.0)) - self.offset  # 710 overflows
 
     def log_slope(self, y: Array) -> float:
         """Return the sum of the logarithms of the warp's slopes at values ``(n,)``, including the flat prior of mu."""
         return -float(np.log(self.unit)) if np.isinf(self.offset) else -float(np.log(y + self.offset).sum())
-
-
-_LARGEST = 700.0
-"""Largest exponent, so that ``exp`` does not overflow."""
 
 
 @dataclass(frozen=True)
@@ -104,18 +86,15 @@ class Prior:
         mean = float(y.mean())
         return (Warp(unit=mean), Warp(self.offset * mean))
 
-    def log_density(self, log_scales: Array) -> float:
-        """Return the log density of the length-scales' logarithms ``(d,)``, up to a constant."""
-        centre = np.log(self.length_scale) + 0.5 * np.log(len(log_scales))
-        return float(-0.5 * (((log_scales - centre) / self.deviation) ** 2).sum())
+    def centre(self, dimension: int) -> float:
+        """Return the mean of each length-scale's logarithm."""
+        return float(np.log(self.length_scale) + 0.5 * np.log(dimension))
 
     def draw(self, dimension: int, rng: np.random.Generator) -> Hyperparameters:
         """Return hyperparameters from the prior."""
-        centre = np.log(self.length_scale) + 0.5 * np.log(dimension)
         log_noise = rng.uniform(*np.log(self.noise))
-        return Hyperparameters(
-            float(rng.choice(self.smoothness)), rng.normal(centre, self.deviation, dimension), log_noise
-        )
+        nu = float(rng.choice(self.smoothness))
+        return Hyperparameters(nu, rng.normal(self.centre(dimension), self.deviation, dimension), log_noise)
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,6 +119,11 @@ class Hyperparameters(ShortRepr):
         """Return ``sum_j weights_ij dk(x_i, z_j)/dx_i``, shape ``(n, d)``."""
         return Matern(self.nu, ard=True).weighted_input_gradient(self._theta, X, Z, weights)
 
+    def as_rough_as(self, other: Hyperparameters) -> Hyperparameters:
+        """Return these hyperparameters with a smoothness and a mean length-scale that are at most those of another."""
+        shrink = min(0.0, float((other.log_scales - self.log_scales).mean()))
+        return Hyperparameters(min(self.nu, other.nu), self.log_scales + shrink, self.log_noise)
+
     @property
     def _theta(self) -> Array:
         return np.concatenate([[0.0], self.log_scales])
@@ -150,7 +134,6 @@ class Conditioned(ShortRepr):
     """A Gaussian process with one draw of hyperparameters, conditioned on data.
 
     Attributes:
-        hyperparameters: the draw of the hyperparameters.
         warp: the scale of the values.
         y: the values on that scale, shape ``(n,)``.
         factor: Cholesky factor of the observations' correlations.
@@ -171,15 +154,8 @@ class Conditioned(ShortRepr):
 
 
 def condition(hyperparameters: Hyperparameters, X: Array, values: Array, warp: Warp | None = None) -> Conditioned:
-    """Return the process with these hyperparameters, conditioned on values ``(n,)`` at points ``(n, d)``.
-
-    Args:
-        hyperparameters: smoothness, length-scales and noise.
-        X: points ``(n, d)``.
-        values: values ``(n,)``.
-        warp: the scale on which the values are a Gaussian process; their own scale if None.
-    """
-    scale = Warp() if warp is None else warp
+    """Return the process of values ``(n,)`` at points ``(n, d)``, on their own scale if there is no warp."""
+    scale = warp or Warp()
     n, y = len(values), scale.forward(values)
     factor = factorise(hyperparameters.kernel(X, X), float(np.exp(hyperparameters.log_noise)))
     pull = factor.solve(np.stack([np.ones(n), y], axis=1))
@@ -199,76 +175,55 @@ def condition(hyperparameters: Hyperparameters, X: Array, values: Array, warp: W
 def draw_hyperparameters(
     X: Array, y: Array, count: int, rng: np.random.Generator, prior: Prior | None = None
 ) -> list[Conditioned]:
-    """Return draws from the posterior of the hyperparameters, given values ``(n,)`` at unit-cube points ``(n, d)``.
-
-    Args:
-        X: points ``(n, d)``.
-        y: values ``(n,)``.
-        count: number of draws.
-        rng: the source of randomness.
-        prior: prior of the hyperparameters; the default :class:`Prior` if None.
-
-    Raises:
-        InputError: if there are fewer than three values, all of them are equal, or one is not finite.
-    """
+    """Return draws from the posterior of the hyperparameters, given values ``(n,)`` at unit-cube points ``(n, d)``."""
     if len(y) < 3 or not np.isfinite(y).all() or np.ptp(y) == 0:
         raise InputError(f"hyperparameters need at least three finite values that differ, got {y.tolist()}.")
-    believed = Prior() if prior is None else prior
-    drawn = _Sampler(X, y, believed, rng).draw(count)
-    apart = max(_FEWEST, int(np.ceil(believed.spread_share * len(y))))
+    prior = prior or Prior()
+    drawn = _Sampler(X, y, prior, rng).draw(count)
+    apart = max(6, int(np.ceil(prior.spread_share * len(y))))
     if apart < len(y):
-        rows = _well_spread(X, y, apart)
-        rougher = _Sampler(X[rows], y[rows], believed, rng).draw(count)
-        drawn = [(_as_rough_as(own, other), warp) for (own, warp), (other, _) in zip(drawn, rougher, strict=True)]
+        # The row of the largest value, and those of points chosen farthest-first from it, in the data's order.
+        first = int(y.argmax())
+        gaps = np.linalg.norm(X - X[first], axis=1)
+        gaps[first] = -np.inf
+        rows = np.sort([first, *farthest_rows(X, gaps, apart - 1)])
+        rougher = _Sampler(X[rows], y[rows], prior, rng).draw(count)
+        drawn = [(own.as_rough_as(other), warp) for (own, warp), (other, _) in zip(drawn, rougher, strict=True)]
     return [condition(own, X, y, warp) for own, warp in drawn]
-
-
-def _as_rough_as(own: Hyperparameters, other: Hyperparameters) -> Hyperparameters:
-    """Return hyperparameters that are made at least as rough as others.
-
-    The smaller smoothness of the two is taken. If the geometric mean of the length-scales is larger than that of the
-    others, they are shrunk to it by a common factor.
-    """
-    shrink = min(0.0, float((other.log_scales - own.log_scales).mean()))
-    return Hyperparameters(min(own.nu, other.nu), own.log_scales + shrink, own.log_noise)
 
 
 class _Sampler:
     """A Markov chain over (nu, log length-scales, log noise)."""
 
     def __init__(self, X: Array, y: Array, prior: Prior, rng: np.random.Generator) -> None:
-        self.X, self.y, self.prior, self.rng = X, y, prior, rng
-        self.d = X.shape[1]
+        self.X, self.y, self.prior, self.rng, self.d = X, y, prior, rng, X.shape[1]
         self.low, self.high = np.log(prior.noise)
         self.warps = prior.warps(y)
         self.choice = (prior.smoothness[0], self.warps[0])
-        centre = np.log(prior.length_scale) + 0.5 * np.log(self.d)
-        self.state = np.append(np.full(self.d, centre), 0.5 * (self.low + self.high))
+        self.state = np.append(np.full(self.d, prior.centre(self.d)), 0.5 * (self.low + self.high))
 
     def draw(self, count: int) -> list[tuple[Hyperparameters, Warp]]:
-        """Return draws two sweeps apart, after a burn-in."""
-        for _ in range(_BURN_IN):
+        """Return draws two sweeps apart."""
+        for _ in range(20):  # the burn-in
             self._sweep()
         draws = []
         for _ in range(count):
             self._sweep()
             self._sweep()
             nu, warp = self.choice
-            draws.append((self._hyperparameters(nu, self.state), warp))
+            draws.append((Hyperparameters(nu, self.state[:-1], float(self.state[-1])), warp))
         return draws
-
-    def _hyperparameters(self, nu: float, state: Array) -> Hyperparameters:
-        return Hyperparameters(nu, state[: self.d], float(state[self.d]))
 
     def _log_density(self, choice: tuple[float, Warp], state: Array) -> float:
         nu, warp = choice
-        if not self.low <= state[-1] <= self.high or np.abs(state[:-1]).max() > _FARTHEST:
+        if not self.low <= state[-1] <= self.high or np.abs(state[:-1]).max() > 12.0:
             return -np.inf
         try:
-            conditioned = condition(self._hyperparameters(nu, state), self.X, self.y, warp)
+            conditioned = condition(Hyperparameters(nu, state[:-1], float(state[-1])), self.X, self.y, warp)
         except InputError:
             return -np.inf
-        return conditioned.log_likelihood + self.prior.log_density(state[:-1])
+        away = (state[:-1] - self.prior.centre(self.d)) / self.prior.deviation
+        return conditioned.log_likelihood + float(-0.5 * (away**2).sum())
 
     def _sweep(self) -> None:
         """Move along all length-scales together, each length-scale and the noise; then draw smoothness and scale."""
@@ -279,40 +234,28 @@ class _Sampler:
             directions.append(np.eye(self.d + 1)[self.d])
         for direction in directions:
             self.state = _slice(lambda state: self._log_density(self.choice, state), self.state, direction, self.rng)
-        self._choose()
-
-    def _choose(self) -> None:
         choices = [(nu, warp) for nu in self.prior.smoothness for warp in self.warps]
-        if len(choices) == 1:
-            return
-        densities = np.array([self._log_density(choice, self.state) for choice in choices])
-        shares = np.exp(densities - densities.max())
-        self.choice = choices[int(self.rng.choice(len(choices), p=shares / shares.sum()))]
-
-
-def _well_spread(X: Array, y: Array, count: int) -> Rows:
-    """Return, in the data's order, the row of the largest value and those of points chosen farthest-first from it."""
-    first = int(y.argmax())
-    gaps = np.linalg.norm(X - X[first], axis=1)
-    gaps[first] = -np.inf
-    return np.sort([first, *farthest_rows(X, gaps, count - 1)])
+        if len(choices) > 1:
+            densities = np.array([self._log_density(choice, self.state) for choice in choices])
+            shares = np.exp(densities - densities.max())
+            self.choice = choices[int(self.rng.choice(len(choices), p=shares / shares.sum()))]
 
 
 def _slice(log_density: Callable[[Array], float], state: Array, direction: Array, rng: np.random.Generator) -> Array:
     """Return the next state of a slice sampler along a line, stepping out and shrinking (Neal 2003, Figs. 3 and 5)."""
     level = log_density(state) + np.log(rng.random())
-    left = -_STEP * rng.random()
-    right = left + _STEP
-    steps_left = int(rng.integers(_MOST_STEPS))
+    left = -rng.random()  # the first interval has width 1, and the interval grows to at most 8
+    right = left + 1.0
+    steps_left = int(rng.integers(8))
     for _ in range(steps_left):
         if log_density(state + left * direction) <= level:
             break
-        left -= _STEP
-    for _ in range(_MOST_STEPS - 1 - steps_left):
+        left -= 1.0
+    for _ in range(7 - steps_left):
         if log_density(state + right * direction) <= level:
             break
-        right += _STEP
-    for _ in range(_MOST_SHRINKS):
+        right += 1.0
+    for _ in range(60):
         move = rng.uniform(left, right)
         proposal = state + move * direction
         if log_density(proposal) > level:

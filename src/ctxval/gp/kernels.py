@@ -25,14 +25,15 @@ Towards = Callable[[Array], Array]
 class Covariance(Protocol):
     """A covariance function k(x, z; theta)."""
 
-    def __call__(self, theta: Array, X: Array, Z: Array) -> Array:
-        """Return the covariances ``(n, m)``."""
-
     def towards(self, theta: Array, Z: Array) -> Towards:
         """Return the covariances with points ``(m, d)`` as a function, which prepares these points only once."""
 
     def diagonal(self, theta: Array, X: Array) -> Array:
         """Return the variances k(x, x), shape ``(n,)``."""
+
+    def __call__(self, theta: Array, X: Array, Z: Array) -> Array:
+        """Return the covariances ``(n, m)``."""
+        return self.towards(theta, Z)(X)
 
 
 class Kernel(Covariance, Protocol):
@@ -52,7 +53,7 @@ class Kernel(Covariance, Protocol):
 
 
 @dataclass(frozen=True)
-class Matern:
+class Matern(Kernel):
     """Matern kernel of smoothness 3/2, 5/2 or 9/2; theta = log of (variance, length-scales).
 
     Attributes:
@@ -60,9 +61,6 @@ class Matern:
         ard: whether each dimension has its own length-scale; if not, all share one.
         length_scale: bounds of the length-scales in the unit cube.
         variance: bounds of the variance, for values of unit variance.
-
-    Raises:
-        InputError: if nu is another number.
     """
 
     nu: float = 1.5
@@ -75,33 +73,28 @@ class Matern:
             raise InputError(f"the smoothness nu of a Matern kernel must be 1.5, 2.5 or 4.5, got {self.nu!r}.")
 
     def bounds(self, dimension: int) -> Bounds:
-        """Return the box of theta."""
         low, high = np.log(self.length_scale).tolist()
         scales = [(low, high)] * (dimension if self.ard else 1)
         return [(float(np.log(self.variance[0])), float(np.log(self.variance[1]))), *scales]
 
-    def __call__(self, theta: Array, X: Array, Z: Array) -> Array:
-        """Return the covariances ``(n, m)``."""
-        return self.towards(theta, Z)(X)
-
     def towards(self, theta: Array, Z: Array) -> Towards:
-        """Return the covariances with points ``(m, d)`` as a function of other points."""
         variance, scales = np.exp(theta[0]), np.exp(theta[1:])
         own = Z / scales
 
         def covariances(X: Array) -> Array:
-            found = self._profile(cdist(X / scales, own))
+            s = cdist(X / scales, own)
+            s *= np.sqrt(2 * self.nu)
+            found: Array = np.exp(-s)
+            found *= self._polynomial(s)
             found *= variance
             return found
 
         return covariances
 
     def diagonal(self, theta: Array, X: Array) -> Array:
-        """Return the variance at each point, shape ``(n,)``."""
         return np.full(len(X), np.exp(theta[0]))
 
     def weighted_gradient(self, theta: Array, X: Array, W: Array) -> Array:
-        """Return ``sum_ij W_ij dK_ij/dtheta``."""
         scales = np.exp(theta[1:])
         Y = X / scales
         r = cdist(Y, Y)
@@ -118,47 +111,32 @@ class Matern:
         return np.concatenate([[by_variance], by_scales])
 
     def input_gradient(self, theta: Array, X: Array, Z: Array) -> Array:
-        """Return ``dk(x_i, z_j)/dx_i``, shape ``(n, m, d)``."""
         scales = np.exp(theta[1:])
         Y, V = X / scales, Z / scales
-        slope = np.exp(theta[0]) * self._slope(cdist(Y, V))
+        slope = np.exp(theta[0]) * self._profile_and_slope(cdist(Y, V))[1]
         return np.asarray(-slope[:, :, None] * (Y[:, None, :] - V[None, :, :]) / scales)
 
     def weighted_input_gradient(self, theta: Array, X: Array, Z: Array, weights: Array) -> Array:
         """Return ``sum_j weights_ij dk(x_i, z_j)/dx_i``, shape ``(n, d)``, without the ``(n, m, d)`` of its terms."""
         scales = np.exp(theta[1:])
-        pulls = np.exp(theta[0]) * weights * self._slope(cdist(X / scales, Z / scales))
+        pulls = np.exp(theta[0]) * weights * self._profile_and_slope(cdist(X / scales, Z / scales))[1]
         return np.asarray((pulls @ Z - pulls.sum(axis=1)[:, None] * X) / scales**2)
 
     def diagonal_input_gradient(self, theta: Array, X: Array) -> Array:
-        """Return zero: the kernel is stationary."""
         return np.zeros_like(X)
 
-    def _profile(self, r: Array) -> Array:
-        """Return k(r) for unit variance and length-scale; r is overwritten."""
-        r *= np.sqrt(2 * self.nu)
-        found = np.exp(-r)
-        found *= self._polynomial(r)
-        return found
-
-    def _slope(self, r: Array) -> Array:
-        """Return ``-k'(r) / r``, which is finite at r = 0."""
-        return self._profile_and_slope(r)[1]
-
     def _profile_and_slope(self, r: Array) -> tuple[Array, Array]:
+        """Return k(r) and ``-k'(r) / r``, which is finite at r = 0, for unit variance and length-scale."""
         s = np.sqrt(2 * self.nu) * r
         decay = np.exp(-s)
-        slope = self._slope_polynomial(s) * decay
+        if self.nu == 1.5:
+            slope = 3.0 * decay
+        elif self.nu == 2.5:
+            slope = 5 / 3 * (1 + s) * decay
+        else:
+            slope = 9 / 7 * (1 + s * (1 + s * (2 / 5 + s / 15))) * decay
         decay *= self._polynomial(s)
         return decay, slope
-
-    def _slope_polynomial(self, s: Array) -> Array | float:
-        """Return the polynomial that multiplies ``exp(-s)`` in the slope."""
-        if self.nu == 1.5:
-            return 3.0
-        if self.nu == 2.5:
-            return 5 / 3 * (1 + s)
-        return 9 / 7 * (1 + s * (1 + s * (2 / 5 + s / 15)))
 
     def _polynomial(self, s: Array) -> Array:
         """Return the polynomial that multiplies ``exp(-s)``; s is overwritten."""
@@ -175,7 +153,7 @@ class Matern:
 
 
 @dataclass(frozen=True)
-class Linear:
+class Linear(Kernel):
     """Linear kernel ``v_0 + v_1 (x - c)'(z - c)``; theta = log of (v_0, v_1).
 
     Attributes:
@@ -187,16 +165,10 @@ class Linear:
     variance: tuple[float, float] = (1e-4, 50.0)
 
     def bounds(self, dimension: int) -> Bounds:
-        """Return the box of theta."""
         low, high = np.log(self.variance).tolist()
         return [(low, high), (low, high)]
 
-    def __call__(self, theta: Array, X: Array, Z: Array) -> Array:
-        """Return the covariances ``(n, m)``."""
-        return self.towards(theta, Z)(X)
-
     def towards(self, theta: Array, Z: Array) -> Towards:
-        """Return the covariances with points ``(m, d)`` as a function of other points."""
         constant, slope = np.exp(theta)
         own = (Z - self.centre).T
 
@@ -208,26 +180,22 @@ class Linear:
         return covariances
 
     def diagonal(self, theta: Array, X: Array) -> Array:
-        """Return the variances, shape ``(n,)``."""
         return np.asarray(np.exp(theta[0]) + np.exp(theta[1]) * ((X - self.centre) ** 2).sum(axis=1))
 
     def weighted_gradient(self, theta: Array, X: Array, W: Array) -> Array:
-        """Return ``sum_ij W_ij dK_ij/dtheta``."""
         Y = X - self.centre
         return np.array([np.exp(theta[0]) * W.sum(), np.exp(theta[1]) * (Y * (W @ Y)).sum()])
 
     def input_gradient(self, theta: Array, X: Array, Z: Array) -> Array:
-        """Return ``dk(x_i, z_j)/dx_i``, shape ``(n, m, d)``."""
         gradient = np.exp(theta[1]) * (Z - self.centre)
         return np.broadcast_to(gradient, (len(X), *Z.shape))
 
     def diagonal_input_gradient(self, theta: Array, X: Array) -> Array:
-        """Return ``dk(x, x)/dx``, shape ``(n, d)``."""
         return np.asarray(2 * np.exp(theta[1]) * (X - self.centre))
 
 
 @dataclass(frozen=True)
-class Sum:
+class Sum(Kernel):
     """The sum of two kernels; theta is that of the first, then that of the second."""
 
     first: Kernel
@@ -238,15 +206,9 @@ class Sum:
         return theta[:size], theta[size:]
 
     def bounds(self, dimension: int) -> Bounds:
-        """Return the box of theta."""
         return [*self.first.bounds(dimension), *self.second.bounds(dimension)]
 
-    def __call__(self, theta: Array, X: Array, Z: Array) -> Array:
-        """Return the covariances ``(n, m)``."""
-        return self.towards(theta, Z)(X)
-
     def towards(self, theta: Array, Z: Array) -> Towards:
-        """Return the covariances with points ``(m, d)`` as a function of other points."""
         a, b = self._split(theta, Z.shape[1])
         first, second = self.first.towards(a, Z), self.second.towards(b, Z)
 
@@ -258,21 +220,17 @@ class Sum:
         return covariances
 
     def diagonal(self, theta: Array, X: Array) -> Array:
-        """Return the variances, shape ``(n,)``."""
         a, b = self._split(theta, X.shape[1])
         return self.first.diagonal(a, X) + self.second.diagonal(b, X)
 
     def weighted_gradient(self, theta: Array, X: Array, W: Array) -> Array:
-        """Return ``sum_ij W_ij dK_ij/dtheta``."""
         a, b = self._split(theta, X.shape[1])
         return np.concatenate([self.first.weighted_gradient(a, X, W), self.second.weighted_gradient(b, X, W)])
 
     def input_gradient(self, theta: Array, X: Array, Z: Array) -> Array:
-        """Return ``dk(x_i, z_j)/dx_i``, shape ``(n, m, d)``."""
         a, b = self._split(theta, X.shape[1])
         return self.first.input_gradient(a, X, Z) + self.second.input_gradient(b, X, Z)
 
     def diagonal_input_gradient(self, theta: Array, X: Array) -> Array:
-        """Return ``dk(x, x)/dx``, shape ``(n, d)``."""
         a, b = self._split(theta, X.shape[1])
         return self.first.diagonal_input_gradient(a, X) + self.second.diagonal_input_gradient(b, X)

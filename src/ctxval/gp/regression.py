@@ -24,17 +24,6 @@ LogDensity = Callable[[Array], tuple[float, Array]]
 NOISE = 1e-6
 """The least noise variance, for values of unit variance: it keeps the covariance matrix positive definite."""
 
-_IMPOSSIBLE = 1e25
-"""Negative log density that is assigned to hyperparameters if their covariance matrix is not positive definite."""
-_MANY = 30
-"""Beyond this number of observations the likelihood has one clear mode, and one climb finds it."""
-_ITERATIONS = 50
-"""Largest number of iterations of each climb of :func:`fit`."""
-_TOLERANCE = 1e-7
-"""Relative change of the log density at which a climb of :func:`fit` ends."""
-_SMOOTHNESS = np.array([0.25, 0.5, 0.75])
-"""Initial length-scales, as positions between the logarithms of their bounds (0: lower, 1: upper)."""
-
 
 def zero_mean(X: Array) -> Array:
     """Return the paper's prior mean, zero everywhere."""
@@ -46,9 +35,6 @@ class GaussianProcess:
     """A Gaussian process conditioned on observations; make one with :func:`condition` or :func:`fit`.
 
     Attributes:
-        kernel, theta: the covariance and the logarithms of its hyperparameters.
-        noise: variance of the observations' noise.
-        mean: prior mean function.
         X, y: observations, shapes ``(n, d)`` and ``(n,)``.
         factor: Cholesky factor of ``K + noise I``.
         alpha: ``(K + noise I)^-1 (y - mean(X))``.
@@ -65,10 +51,8 @@ class GaussianProcess:
 
     def predict(self, X: Array) -> tuple[Array, Array]:
         """Return the posterior mean and variance of the noise-free function at ``(m, d)``, shapes ``(m,)``."""
-        k = self.kernel(self.theta, X, self.X)
-        half = self.factor.whiten(k.T)
-        variance = self.kernel.diagonal(self.theta, X) - (half**2).sum(axis=0)
-        return self.mean(X) + k @ self.alpha, np.maximum(variance, 0.0)
+        k, variance = _covariances_and_variance(self, X)
+        return self.mean(X) + k @ self.alpha, variance
 
     def predict_with_gradient(self, X: Array) -> tuple[Array, Array, Array, Array]:
         """Return mean and variance ``(m,)`` and their gradients ``(m, d)``; cheaper than two separate calls."""
@@ -82,12 +66,8 @@ class GaussianProcess:
         return self.mean(X) + k @ self.alpha, variance, d_mean, d_variance
 
     def left_out(self) -> tuple[Array, Array]:
-        """Return mean and variance ``(n,)`` of each observation given all others.
-
-        Source:
-            Rasmussen and Williams 2006, eq. 5.12.
-        """
-        return self.y - self.factor.left_out_errors(self.alpha), 1 / self.factor.precisions
+        """Return mean and variance ``(n,)`` of each observation given all others (Rasmussen and Williams, eq. 5.12)."""
+        return self.y - self.alpha / self.factor.precisions, 1 / self.factor.precisions
 
     def log_marginal_likelihood(self) -> float:
         """Return log p(y | X, theta)."""
@@ -99,13 +79,9 @@ class MultiOutputProcess:
     """Gaussian processes of zero mean for several outputs that share a covariance, conditioned on observations.
 
     Attributes:
-        kernel, theta: the covariance and the logarithms of its hyperparameters.
         X, Y: observations, shapes ``(n, d)`` and ``(n, k)``.
         noises: variances of the observations' noise, which are tried in this order until the covariance matrix is
             positive definite.
-
-    Raises:
-        InputError: on first use, if the covariance matrix is positive definite for none of them.
     """
 
     kernel: Kernel
@@ -126,18 +102,19 @@ class MultiOutputProcess:
 
     def predict(self, X: Array) -> tuple[Array, Array]:
         """Return the posterior means ``(m, k)`` at ``(m, d)``, and the variance ``(m,)``, which all outputs share."""
-        k = self.kernel(self.theta, X, self.X)
-        half = self.factor.whiten(k.T)
-        variance = self.kernel.diagonal(self.theta, X) - (half**2).sum(axis=0)
-        return k @ self.weights, np.maximum(variance, 0.0)
+        k, variance = _covariances_and_variance(self, X)
+        return k @ self.weights, variance
 
     def left_out(self, rows: Rows) -> Array:
-        """Return the means ``(m, k)`` of some observations, each given all others.
-
-        Source:
-            Rasmussen and Williams 2006, eq. 5.12.
-        """
+        """Return the means ``(m, k)`` of some observations, each given all others (Rasmussen and Williams, 5.12)."""
         return np.asarray(self.Y[rows] - self.weights[rows] / self.factor.precisions_of(rows)[:, None])
+
+
+def _covariances_and_variance(process: GaussianProcess | MultiOutputProcess, X: Array) -> tuple[Array, Array]:
+    """Return the covariances ``(m, n)`` of points ``(m, d)`` with the observations, and the posterior variance."""
+    k = process.kernel(process.theta, X, process.X)
+    half = process.factor.whiten(k.T)
+    return k, np.maximum(process.kernel.diagonal(process.theta, X) - (half**2).sum(axis=0), 0.0)
 
 
 def _mean_gradient(mean: Mean, X: Array) -> Array:
@@ -153,12 +130,7 @@ def _mean_gradient(mean: Mean, X: Array) -> Array:
 def condition(
     kernel: Kernel, theta: Array, X: Array, y: Array, *, noise: float = NOISE, mean: Mean = zero_mean
 ) -> GaussianProcess:
-    """Return the process with these hyperparameters, conditioned on observations ``(n, d)``, ``(n,)``.
-
-    Raises:
-        ShapeError: if the shapes of X and y do not fit together.
-        InputError: if the covariance matrix is not positive definite.
-    """
+    """Return the process with these hyperparameters, conditioned on observations ``(n, d)``, ``(n,)``."""
     if X.ndim != 2 or y.shape != (len(X),):
         raise ShapeError(f"observations need X (n, d) and y (n,), got {X.shape} and {y.shape}.")
     factor = factorise(kernel(theta, X, X), noise)
@@ -174,15 +146,8 @@ def _log_likelihood(factor: CholeskyFactor, alpha: Array, residual: Array) -> fl
 def log_likelihood_of_outputs(K: Array, noise: float, Y: Array) -> tuple[float, Array]:
     """Return ``sum_o log p(Y[:, o])`` up to a constant, and its derivative W with respect to K.
 
-    If the covariance changes by a small dK, the value changes by ``sum(W * dK)``.
-
-    Args:
-        K: covariance of the noise-free outputs, ``(n, n)``.
-        noise: variance of their noise.
-        Y: outputs that share the covariance, ``(n, k)``.
-
-    Source:
-        Rasmussen and Williams 2006, eqs. 5.8 and 5.9.
+    The outputs ``(n, k)`` share the covariance K ``(n, n)``. If K changes by a small dK, the value changes by
+    ``sum(W * dK)`` (Rasmussen and Williams 2006, eqs. 5.8 and 5.9).
     """
     factor = factorise(K, noise)
     alpha = factor.solve(Y)
@@ -196,10 +161,6 @@ def log_marginal_likelihood(
     """Return log p(residual | X, theta, noise) and its gradient with respect to (theta, log noise).
 
     Args:
-        kernel: the covariance.
-        theta: logarithms of its hyperparameters.
-        noise: variance of the observations' noise.
-        X: observed points ``(n, d)``.
         residual: the observations minus the prior mean, ``(n,)``.
 
     Source:
@@ -230,16 +191,10 @@ def fit(
     If ``log_prior`` is given, the result is the mode of the posterior.
 
     Args:
-        kernel: the covariance.
-        X: observed points ``(n, d)``.
-        y: observed values ``(n,)``, about unit variance.
+        X, y: observed points ``(n, d)`` and values ``(n,)``, about unit variance.
         noise: bounds of the noise variance; equal bounds fix it.
-        mean: prior mean function.
         log_prior: logarithm of the prior density of (theta, log noise), with its gradient.
-        starts: starts of the climbs, shape ``(s, len(theta) + 1)``; several length-scales by default.
-
-    Raises:
-        InputError: if the covariance matrix is not positive definite for the hyperparameters found.
+        starts: starts of the climbs, shape ``(s, len(theta) + 1)``; rough, middling and smooth functions by default.
     """
     bounds = [*kernel.bounds(X.shape[1]), (float(np.log(noise[0])), float(np.log(noise[1])))]
     residual = y - mean(X)
@@ -252,9 +207,12 @@ def fit(
         prior, prior_gradient = log_prior(parameters)
         return value + prior, gradient + prior_gradient
 
-    starts = _default_starts(bounds) if starts is None else starts
-    many = len(X) > _MANY
-    best = most_likely(log_density, starts, bounds, best_start=many, iterations=_ITERATIONS, tolerance=_TOLERANCE)
+    if starts is None:
+        low, high = np.array(bounds).T
+        starts = np.tile(0.5 * (low + high), (3, 1))
+        starts[:, 1:-1] = low[1:-1] + np.array([[0.25], [0.5], [0.75]]) * (high - low)[1:-1]
+    many = len(X) > 30  # then the likelihood has one clear mode, and one climb finds it
+    best = most_likely(log_density, starts, bounds, best_start=many, iterations=50, tolerance=1e-7)
     return condition(kernel, best[:-1], X, y, noise=float(np.exp(best[-1])), mean=mean)
 
 
@@ -270,10 +228,9 @@ def most_likely(
     """Return the hyperparameters of largest density within bounds, by climbs with L-BFGS-B from several starts.
 
     Args:
-        log_density: the function to maximise. It may raise an InputError if the covariance matrix is not positive
-            definite; these hyperparameters count as impossible.
+        log_density: the function to maximise; hyperparameters for which it raises an InputError, because the
+            covariance matrix is not positive definite, are impossible.
         starts: starts of the climbs, shape ``(s, k)``.
-        bounds: bounds of each of the k hyperparameters.
         best_start: whether to climb from the most likely start only, instead of from all.
         iterations: largest number of iterations of one climb.
         tolerance: relative change of the log density at which a climb ends; the default of L-BFGS-B if None.
@@ -283,19 +240,11 @@ def most_likely(
         try:
             value, gradient = log_density(parameters)
         except InputError:
-            return _IMPOSSIBLE, np.zeros_like(parameters)
+            return 1e25, np.zeros_like(parameters)
         return -value, -gradient
 
     if best_start:
         starts = starts[[np.argmin([negative(start)[0] for start in starts])]]
     options: Any = {"maxiter": iterations, **({} if tolerance is None else {"ftol": tolerance})}
     found = [minimize(negative, start, jac=True, method="L-BFGS-B", bounds=bounds, options=options) for start in starts]
-    return np.asarray(min(found, key=lambda one: float(one.fun)).x)
-
-
-def _default_starts(bounds: Bounds) -> Array:
-    """Return starts for rough, middling and smooth functions of middling variance."""
-    low, high = np.array(bounds).T
-    starts = np.tile(0.5 * (low + high), (len(_SMOOTHNESS), 1))
-    starts[:, 1:-1] = low[1:-1] + _SMOOTHNESS[:, None] * (high - low)[1:-1]
-    return starts
+    return np.asarray(min(found, key=lambda climb: float(climb.fun)).x)

@@ -19,16 +19,12 @@ WAVES = 512
 """Number of frequencies of a prior path. The error of its covariance is about ``1 / sqrt(2 WAVES)``, and that of a
 path's maximum much smaller."""
 
-_STARTS = 4
-"""Number of points from which each path is climbed."""
-
 
 @dataclass(frozen=True, eq=False)
 class Paths:
     """Paths under one draw of hyperparameters, as functions on the unit cube.
 
     Attributes:
-        conditioned: the hyperparameters, conditioned on the data.
         X: the data's points ``(n, d)``.
         frequencies: frequencies of the waves, shape ``(F, d)``.
         amplitudes: amplitudes of cosines and sines, shape ``(2 F, s)``.
@@ -95,14 +91,7 @@ def _waves(Z: Array, frequencies: Array) -> Array:
 
 
 def draw_paths(conditioned: Conditioned, X: Array, count: int, rng: np.random.Generator) -> Paths:
-    """Return paths on the process's scale given points ``(n, d)``, with mu and sigma drawn from their posterior.
-
-    Args:
-        conditioned: the process under one draw of hyperparameters, conditioned on the data.
-        X: the data's points ``(n, d)``.
-        count: number of paths.
-        rng: the source of all random numbers.
-    """
+    """Return paths on the process's scale given points ``(n, d)``, with mu and sigma drawn from their posterior."""
     hyperparameters, (n, d) = conditioned.hyperparameters, X.shape
     # The spectrum of a Matern kernel is a multivariate t with 2 nu degrees of freedom.
     tails = np.sqrt(2 * hyperparameters.nu / rng.chisquare(2 * hyperparameters.nu, (WAVES, 1)))
@@ -123,41 +112,24 @@ def maxima(paths: Paths, known: Array, rng: np.random.Generator) -> tuple[Array,
     Candidates are uniform, near ``known`` points (best first) and at corners. They are divided into several groups, and
     each path is climbed from the best of each group. Beyond two dimensions there are more groups, only the highest
     climbs are completed, and in the end single coordinates are moved to their bounds while that increases the value.
-
-    Args:
-        paths: the paths.
-        known: points ``(n, d)``, best first.
-        rng: the source of the candidates.
     """
     d = paths.X.shape[1]
-    candidates = _candidates(known, d, rng)
-    many = _STARTS if d <= 2 else _STARTS * (1 + d)
-    starts = _starts(candidates, paths.roughly(candidates), many)
+    near = np.repeat(known[:8], 16, axis=0)
+    near = np.clip(near + rng.normal(size=near.shape) * rng.choice([0.003, 0.03], (len(near), 1)), 0.0, 1.0)
+    corners = rng.integers(0, 2, (min(2**d, 256), d)).astype(np.float64)
+    candidates = np.concatenate([known, near, corners, rng.random((min(2048, 512 * d), d))])
+    values, groups = paths.roughly(candidates), 4 if d <= 2 else 4 * (1 + d)
+    best_of = [candidates[group::groups][values[group::groups].argmax(axis=0)] for group in range(groups)]
+    starts = np.stack(best_of, axis=1)  # (s, groups, d)
     if d > 2:
-        starts = _highest(paths, _climb(paths, starts, 20))
+        climbed = _climb(paths, starts, 20)
+        highest = np.argsort(-paths.own(climbed), axis=1)[:, :4]
+        starts = np.take_along_axis(climbed, highest[..., None], axis=1)
     points = np.concatenate([starts, _climb(paths, starts, 30 if d <= 2 else 80)], axis=1)
     heights = paths.own(points)
     best, rows = np.argmax(heights, axis=1), np.arange(len(paths))
     tops, where = heights[rows, best], points[rows, best]
     return _polish(paths, tops, where) if d > 2 else (tops, where)
-
-
-def _candidates(known: Array, d: int, rng: np.random.Generator) -> Array:
-    near = np.repeat(known[:8], 16, axis=0)
-    near = np.clip(near + rng.normal(size=near.shape) * rng.choice([0.003, 0.03], (len(near), 1)), 0.0, 1.0)
-    corners = rng.integers(0, 2, (min(2**d, 256), d)).astype(np.float64)
-    return np.concatenate([known, near, corners, rng.random((min(2048, 512 * d), d))])
-
-
-def _starts(candidates: Array, values: Array, many: int) -> Array:
-    """Return the best candidate of each of many groups for each path, shape ``(s, many, d)``: they are spread out."""
-    return np.stack([candidates[group::many][values[group::many].argmax(axis=0)] for group in range(many)], axis=1)
-
-
-def _highest(paths: Paths, points: Array) -> Array:
-    """Return each path's few points of largest value, of ``(s, q, d)``."""
-    order = np.argsort(-paths.own(points), axis=1)[:, :_STARTS]
-    return np.take_along_axis(points, order[..., None], axis=1)
 
 
 def _climb(paths: Paths, starts: Array, steps: int) -> Array:

@@ -35,13 +35,9 @@ def kept_rows(points: Array, values: Array, count: int, long: int = LONG) -> Row
 
 
 def pivoted_rows(kernel: Covariance, theta: Array, X: Array, count: int, least: float) -> Rows:
-    """Return rows by pivoted Cholesky: each has the largest variance given the rows before it.
+    """Return at most ``count`` rows by pivoted Cholesky: each has the largest variance given the rows before it.
 
-    Args:
-        kernel, theta: the covariance and the logarithms of its hyperparameters.
-        X: points ``(n, d)``.
-        count: largest number of rows.
-        least: the choice ends if no remaining variance is larger than this.
+    The choice ends if no remaining variance is larger than ``least``.
     """
     towards = kernel.towards(theta, X)
     return pivoted_cholesky(kernel.diagonal(theta, X), lambda row: towards(X[row : row + 1])[0], count, least).rows
@@ -70,8 +66,7 @@ def pivoted_cholesky(
     Args:
         variances: the diagonal of the matrix, shape ``(n,)``.
         covariances: a row of the matrix -> its n entries, in an array that may be overwritten.
-        count: largest number of rows.
-        least: the choice ends if no remaining variance is larger than this.
+        count, least: as in :func:`pivoted_rows`.
     """
     left = np.array(variances)
     columns = np.empty((min(count, len(left)), len(left)))

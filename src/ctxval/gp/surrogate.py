@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 
 import numpy as np
 
-from ctxval._util.arrays import Array, Rows
+from ctxval._util.arrays import Array
 from ctxval._util.representation import ShortRepr
 from ctxval.errors import InputError
 from ctxval.gp.hyperposterior import Warp
@@ -15,24 +16,6 @@ from ctxval.gp.regression import NOISE, GaussianProcess, Mean, condition, fit, z
 
 _KERNEL = Sum(Matern(1.5, ard=True, length_scale=(0.02, 100.0)), Linear())
 """The kernel of :class:`Learned`."""
-_LENGTH_SCALE = 0.4
-"""Prior median of the length-scales, divided by the square root of the dimension."""
-_COMMON_DEVIATION = 0.5
-"""Prior standard deviation of the mean of the length-scales' logarithms; few values suffice to learn this mean."""
-_ARD_DEVIATION = 0.3
-"""Prior standard deviation of each logarithm around that mean; it is small, as many values are needed to learn them."""
-_VARIANCE = 1.0
-"""Prior median of the variance of the Matern kernel."""
-_LINEAR = 0.3
-"""Prior median of each variance of the linear kernel, averaged over the cube."""
-_VARIANCE_DEVIATION = 1.5
-"""Prior standard deviation of the logarithms of these variances."""
-_OFFSET = 0.1
-"""The c of ``log(d + c)``, in means of the values, as in the prior of the certificates."""
-_CLEARLY = 0.25
-"""Least advantage in log density, per value, for which the logarithms of the values are preferred."""
-_LEARNED_FROM = 300
-"""Largest number of values from which the hyperparameters are learned."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,14 +51,10 @@ def fit_surrogate(
     uncertainty around them and leaves the mean unchanged.
 
     Args:
-        points: points of the unit cube ``(n, d)``.
-        values: values ``(n,)``; NaN if pending or failed.
+        points, values: the history; values are NaN if pending or failed.
         kernel: the covariance; Matern 3/2 with one length-scale if None.
         noise: bounds of the noise variance relative to that of the values; equal bounds fix it.
         prior_mean: prior mean of the values as a function of points; their average if None.
-
-    Raises:
-        InputError: if fewer than two values are known, or the prior mean is not finite at a known point.
     """
     known = np.isfinite(values)
     if known.sum() < 2:
@@ -86,26 +65,19 @@ def fit_surrogate(
         raise InputError("the prior mean must return one finite value for each point.")
     shift = float(y.mean()) if prior_mean is None else 0.0
     scale = _scale(y - shift - prior)
-    mean = zero_mean if prior_mean is None else _Scaled(prior_mean, scale)
+    mean = zero_mean if prior_mean is None else functools.partial(_scaled, prior_mean, scale)
     process = fit(Matern(1.5) if kernel is None else kernel, X, (y - shift) / scale, noise=noise, mean=mean)
     return Surrogate(_with_imputed(process, points[~known]), shift, scale)
+
+
+def _scaled(mean: Mean, scale: float, X: Array) -> Array:
+    return np.asarray(mean(X), dtype=np.float64) / scale
 
 
 def _scale(residual: Array) -> float:
     """Return the residual's root mean square, or 1 if it vanishes."""
     size = float(np.sqrt((residual**2).mean()))
     return size if size > 1e-12 else 1.0
-
-
-@dataclass(frozen=True)
-class _Scaled:
-    """A prior mean in units of the standardised values."""
-
-    mean: Mean
-    scale: float
-
-    def __call__(self, X: Array) -> Array:
-        return np.asarray(self.mean(X), dtype=np.float64) / self.scale
 
 
 def _with_imputed(process: GaussianProcess, points: Array) -> GaussianProcess:
@@ -156,23 +128,19 @@ def learn(points: Array, values: Array) -> Learned:
     Nardi 2024). The process models the logarithms of the values if no value is negative and if that predicts each
     value clearly better from all others; else it models the values.
     """
-    if len(values) > _LEARNED_FROM:
-        rows = _informative_rows(values)
+    if len(values) > 300:
+        # The largest values, and others evenly spread over the history.
+        order = np.argsort(-values, kind="stable")
+        largest, others = order[:150], np.sort(order[150:])
+        evenly = others[np.linspace(0, len(others) - 1, 150).astype(int)]
+        rows = np.sort(np.concatenate([largest, evenly]))
         points, values = points[rows], values[rows]
     score, learned = _learn_on(points, values, Warp())
     if values.min() >= 0 and values.max() > 0:
-        log_score, of_logarithm = _learn_on(points, values, Warp(_OFFSET * float(values.mean())))
-        if log_score > score + _CLEARLY * len(values):
+        log_score, of_logarithm = _learn_on(points, values, Warp(0.1 * float(values.mean())))
+        if log_score > score + 0.25 * len(values):
             return of_logarithm
     return learned
-
-
-def _informative_rows(values: Array) -> Rows:
-    """Return the rows of the largest values and of others evenly spread over the history."""
-    order = np.argsort(-values, kind="stable")
-    largest, others = order[: _LEARNED_FROM // 2], np.sort(order[_LEARNED_FROM // 2 :])
-    evenly = others[np.linspace(0, len(others) - 1, _LEARNED_FROM - len(largest)).astype(int)]
-    return np.sort(np.concatenate([largest, evenly]))
 
 
 def _learn_on(points: Array, values: Array, warp: Warp) -> tuple[float, Learned]:
@@ -181,42 +149,35 @@ def _learn_on(points: Array, values: Array, warp: Warp) -> tuple[float, Learned]
     shift = float(warped.mean())
     scale = _scale(warped - shift)
     y = (warped - shift) / scale
-    process = fit(_KERNEL, points, y, log_prior=_LogPrior(points.shape[1]), starts=_starts(points.shape[1]))
+    prior = _LogPrior(points.shape[1])
+    rougher = np.zeros_like(prior.centre)
+    rougher[1 : points.shape[1] + 1] = -1.0
+    starts = np.stack([prior.centre, prior.centre + rougher])
+    process = fit(_KERNEL, points, y, log_prior=prior, starts=starts)
     mean, variance = process.left_out()
     score = -0.5 * (np.log(variance) + (y - mean) ** 2 / variance).sum() - len(y) * np.log(scale)
     return float(score) + warp.log_slope(values), Learned(process.theta, warp, shift, scale)
 
 
-def _centre(dimension: int) -> Array:
-    """Return the logarithms of the prior medians of theta, and of the noise, which is fixed."""
-    scales = [_LENGTH_SCALE * np.sqrt(dimension)] * dimension
-    return np.asarray(np.log([_VARIANCE, *scales, _LINEAR, 12 * _LINEAR / dimension, NOISE]))
-
-
-def _starts(dimension: int) -> Array:
-    """Return two starts of the climbs: the prior's mode, and one with shorter length-scales."""
-    rougher = np.zeros(dimension + 4)
-    rougher[1 : dimension + 1] = -1.0
-    return np.asarray(_centre(dimension) + np.array([np.zeros(dimension + 4), rougher]))
-
-
 @dataclass(frozen=True)
 class _LogPrior:
-    """Independent normal densities of the hyperparameters' logarithms; length-scales share an uncertain mean.
-
-    Attributes:
-        dimension: the dimension of the points.
-    """
+    """Independent normal densities of the hyperparameters' logarithms; length-scales share an uncertain mean."""
 
     dimension: int
+
+    @property
+    def centre(self) -> Array:
+        """The logarithms of the prior medians of theta, and of the noise, which is fixed."""
+        scales = [0.4 * np.sqrt(self.dimension)] * self.dimension
+        # The linear kernel's variances are 0.3, averaged over the cube.
+        return np.asarray(np.log([1.0, *scales, 0.3, 12 * 0.3 / self.dimension, NOISE]))
 
     def __call__(self, parameters: Array) -> tuple[float, Array]:
         """Return the log density at (theta, log noise), up to a constant, and its gradient."""
         scales = slice(1, self.dimension + 1)
-        away = parameters - _centre(self.dimension)
-        gradient = -away / _VARIANCE_DEVIATION**2
+        away = parameters - self.centre
+        gradient = -away / 1.5**2
+        # Few values suffice to learn the mean of the length-scales' logarithms, many are needed to learn each of them.
         common = away[scales].mean()
-        gradient[scales] = (
-            -common / (self.dimension * _COMMON_DEVIATION**2) - (away[scales] - common) / _ARD_DEVIATION**2
-        )
+        gradient[scales] = -common / (self.dimension * 0.5**2) - (away[scales] - common) / 0.3**2
         return 0.5 * float(away @ gradient), gradient  # the density is quadratic

@@ -21,10 +21,6 @@ from ctxval.core.validation import Validation
 from ctxval.learning.draws import DynamicsDraws
 from ctxval.learning.dynamics_posterior import DynamicsPosterior
 
-_TASKS = 512
-"""Largest number of tasks whose controllers are designed in one call."""
-_FARTHEST = 1e3
-"""Standardised pairs beyond this magnitude belong to loops that diverge, which would otherwise take all pivots."""
 _REMEMBERED = 64_000_000
 """Largest size of the plans that are kept, in bytes, approximately."""
 
@@ -35,9 +31,6 @@ class PlannedTasks:
 
     Attributes:
         rows: the rows of these tasks among all points that were planned, shape ``(q,)``.
-        task: the task, or a batch of q tasks.
-        controller: its controller.
-        promised: the trajectory of M.
     """
 
     rows: Rows
@@ -66,9 +59,6 @@ class LoopPlanner:
 
     The latest plans are kept. Tasks that are planned together are kept together, because a controller of a batch need
     not have parts; they are found again if the same points are asked for in the same order.
-
-    Args:
-        validation: the map p -> d(p); S is never executed.
     """
 
     def __init__(self, validation: Validation) -> None:
@@ -90,12 +80,10 @@ class LoopPlanner:
                 return True
         return False
 
-    def plan(self, points: Array, together: int = _TASKS) -> list[PlannedTasks]:
+    def plan(self, points: Array, together: int = 512) -> list[PlannedTasks]:
         """Return the plans of points ``(q, d)``; tasks for which no controller can be designed are left out.
 
-        Args:
-            points: points of the unit cube.
-            together: largest number of tasks that are planned in one call, if the synthesizer takes batches.
+        If the synthesizer takes batches, at most ``together`` tasks are planned in one call.
         """
         size = together if self.batched else 1
         return [
@@ -117,7 +105,9 @@ class LoopPlanner:
             return self._kept[key][0]
         planned = list(self._planned(points, np.arange(len(points))))
         advance(len(points))
-        size = sum(map(_size, planned)) + len(key)
+        # Trajectories, and gains as large as those of a linear feedback.
+        arrays = [(one.promised.states, one.promised.inputs) for one in planned]
+        size = sum(2 * (x.nbytes + u.nbytes) + int(x.shape[-1]) * u.nbytes for x, u in arrays) + len(key)
         self._kept[key] = planned, size
         self._size += size
         while self._size > _REMEMBERED:
@@ -134,12 +124,8 @@ class LoopPlanner:
                 yield from self._planned(points, rows[:half])
                 yield from self._planned(points, rows[half:])
             elif self.batched:
-                yield from self._alone(points[rows[0]], rows)
-
-    def _alone(self, point: Array, rows: Rows) -> Iterator[PlannedTasks]:
-        """Yield the plan of one task without batch axis, if it can be planned."""
-        with contextlib.suppress(Exception):  # the user's own parts
-            yield self._plan(point, rows)
+                with contextlib.suppress(Exception):  # the same
+                    yield self._plan(points[rows[0]], rows)
 
     def _plan(self, chosen: Array, rows: Rows) -> PlannedTasks:
         parts = self.validation
@@ -165,8 +151,8 @@ class LoopPlanner:
         S, q, d = points.shape
         found = np.full(S * q, np.nan)
         for one in self.plan(points.reshape(S * q, d), together=S * q):
-            own = int(one.rows[0]) // q
-            step: Step = _OwnStep(draws, q, one.rows) if one.task.batch_shape else draws.model_of(own).step
+            alone = draws.model_of(int(one.rows[0]) // q).step
+            step: Step = _own_step(draws, q, one.rows) if one.task.batch_shape else alone
             found[one.rows] = self.compared(one, rollout(step, one.controller, one.task))
             advance(len(one.rows))
         return found.reshape(S, q)
@@ -175,7 +161,11 @@ class LoopPlanner:
         task, S = planned.task, len(draws)
         if self._takes_draws_together(planned, S):
             start = np.repeat(task.initial_state[None], S, axis=0)
-            step: Step = draws.step if task.batch_shape else _Single(draws)
+
+            def of_one_task(x: Array, u: Array) -> Array:
+                return np.asarray(draws.step(x[:, None], u[:, None])[:, 0])
+
+            step: Step = draws.step if task.batch_shape else of_one_task
             together = rollout(step, planned.controller, Task(start, horizon=task.horizon, dt=task.dt))
             loops = [Trajectory(together.times, together.states[s], together.inputs[s]) for s in range(S)]
         else:
@@ -190,13 +180,17 @@ class LoopPlanner:
 
     def _takes_draws_together(self, planned: PlannedTasks, draws: int) -> bool:
         """Return whether controllers take draws as another first axis; if not, one loop is run after the other."""
-        if draws == 1:
-            return False
-        if self._together is None:
-            start = planned.task.initial_state
-            steps = 1e-3 * np.arange(draws).reshape(-1, *[1] * start.ndim)
-            self._together = _same(planned.controller, start + steps)
-        return self._together
+        if draws > 1 and self._together is None:
+            start, controller = planned.task.initial_state, planned.controller
+            probe = start + 1e-3 * np.arange(draws).reshape(-1, *[1] * start.ndim)
+            self._together = False
+            with contextlib.suppress(Exception), np.errstate(all="ignore"):  # the user's controller
+                together = np.asarray(controller(0, probe))
+                one_by_one = np.stack([np.asarray(controller(0, row), dtype=np.float64) for row in probe])
+                self._together = together.shape == one_by_one.shape and np.allclose(
+                    together, one_by_one, equal_nan=True
+                )
+        return draws > 1 and bool(self._together)
 
     def compared(self, planned: PlannedTasks, loops: Trajectory) -> Array:
         """Return the distances ``(q,)`` of loops; infinity if a loop diverges, NaN if that of M does."""
@@ -240,56 +234,23 @@ def loop_pairs(planner: LoopPlanner, posterior: DynamicsPosterior, tasks: Array)
         visited = posterior.data.standardised(loops.states[..., :-1, :], loops.inputs)
         parts.append(visited.reshape(-1, visited.shape[-1]))
     pairs = np.concatenate(parts)
-    return np.asarray(pairs[(np.abs(pairs) < _FARTHEST).all(axis=1)])
+    return np.asarray(pairs[(np.abs(pairs) < 1e3).all(axis=1)])
 
 
-@dataclass(frozen=True, eq=False)
-class _Single:
-    """The step of draws on one task: shapes ``(S, n), (S, m) -> (S, n)``."""
+def _own_step(draws: DynamicsDraws, tasks: int, rows: Rows) -> Step:
+    """Return the step of draws on tasks of their own: a flat batch has some rows of all their ``S q`` tasks."""
+    first, last = int(rows[0]) // tasks, int(rows[-1]) // tasks + 1
+    needed, own = draws.between(first, last), rows - first * tasks
 
-    draws: DynamicsDraws
+    def of_all_tasks(part: Array) -> Array:
+        whole = np.zeros(((last - first) * tasks, part.shape[-1]))
+        whole[own] = part
+        return whole.reshape(last - first, tasks, part.shape[-1])
 
-    def __call__(self, x: Array, u: Array) -> Array:
-        return np.asarray(self.draws.step(x[:, None], u[:, None])[:, 0])
+    def step(x: Array, u: Array) -> Array:
+        return np.asarray(needed.step(of_all_tasks(x), of_all_tasks(u)).reshape(-1, x.shape[-1])[own])
 
-
-@dataclass(frozen=True, eq=False)
-class _OwnStep:
-    """The step of draws on tasks of their own, in one flat batch.
-
-    Attributes:
-        draws: S draws of the dynamics.
-        tasks: the number q of tasks of each draw.
-        rows: the rows of this batch among all ``S q`` tasks.
-    """
-
-    draws: DynamicsDraws
-    tasks: int
-    rows: Rows
-
-    def __call__(self, x: Array, u: Array) -> Array:
-        first = self._first * self.tasks
-        whole = [np.zeros((len(self._needed) * self.tasks, part.shape[-1])) for part in (x, u)]
-        for all_rows, part in zip(whole, (x, u), strict=True):
-            all_rows[self.rows - first] = part
-        states, inputs = (part.reshape(len(self._needed), self.tasks, part.shape[-1]) for part in whole)
-        return np.asarray(self._needed.step(states, inputs).reshape(-1, x.shape[-1])[self.rows - first])
-
-    @property
-    def _first(self) -> int:
-        """The first draw with a task in this batch."""
-        return int(self.rows[0]) // self.tasks
-
-    @functools.cached_property
-    def _needed(self) -> DynamicsDraws:
-        """The draws with tasks in this batch."""
-        return self.draws.between(self._first, int(self.rows[-1]) // self.tasks + 1)
-
-
-def _size(planned: PlannedTasks) -> int:
-    """Return the approximate size of a plan in bytes, with gains as large as those of a linear feedback."""
-    states, inputs = planned.promised.states, planned.promised.inputs
-    return 2 * (states.nbytes + inputs.nbytes) + int(states.shape[-1]) * inputs.nbytes
+    return step
 
 
 def _without_divergence(loops: Trajectory, finite: Mask) -> Trajectory:
@@ -298,14 +259,3 @@ def _without_divergence(loops: Trajectory, finite: Mask) -> Trajectory:
         return loops
     kept = finite[..., None, None]
     return Trajectory(loops.times, np.where(kept, loops.states, 0.0), np.where(kept, loops.inputs, 0.0))
-
-
-def _same(controller: Controller, probe: Array) -> bool:
-    """Return whether a controller takes another first axis, with the same result as one call after the other."""
-    try:
-        with np.errstate(all="ignore"):
-            together = np.asarray(controller(0, probe))
-            one_by_one = np.stack([np.asarray(controller(0, row), dtype=np.float64) for row in probe])
-    except Exception:  # the user's controller, which need not take another axis
-        return False
-    return together.shape == one_by_one.shape and np.allclose(together, one_by_one, equal_nan=True)

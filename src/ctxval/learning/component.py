@@ -13,18 +13,12 @@ from ctxval.gp.subset import pivoted_cholesky
 from ctxval.learning.hyperparameters import Hyperparameters
 from ctxval.learning.kernel_expansion import KernelExpansion
 
-_NEGLIGIBLE = 1e-6
-"""Share of the largest posterior variance below which a pivot adds nothing to those chosen before it."""
-_ROUNDING = 1e-13
-"""Posterior variances below this share of the prior variance are rounding errors."""
-
 
 @dataclass(frozen=True, eq=False)
 class Component:
     """The posterior of r for one draw of the hyperparameters.
 
     Attributes:
-        hyperparameters: the covariance and its hyperparameters.
         centres: standardised pairs that it is conditioned on, shape ``(M, k)``.
         factor: Cholesky factor of their covariance with noise.
         weights: weights of the mean, shape ``(M, n)``.
@@ -78,15 +72,15 @@ class Component:
         half, left = self._halved(relevant)
         first = left.max(initial=0.0)
         # Variances below the noise are drawn too: many noisy transitions determine a function better than one does.
-        rounding = _ROUNDING * kernel.diagonal(theta, relevant).max(initial=0.0)
+        rounding = 1e-13 * kernel.diagonal(theta, relevant).max(initial=0.0)
         towards = kernel.towards(theta, relevant)
 
         def covariances(row: int) -> Array:
             return np.asarray(towards(relevant[row : row + 1])[0] - half[:, row] @ half)
 
-        found = pivoted_cholesky(left, covariances, count, least=max(_NEGLIGIBLE * first, rounding))
-        left_out = found.left.max() / first if first > rounding else 0.0
-        return found.rows, found.L, float(left_out)
+        chosen = pivoted_cholesky(left, covariances, count, least=max(1e-6 * first, rounding))
+        left_out = chosen.left.max() / first if first > rounding else 0.0
+        return chosen.rows, chosen.L, float(left_out)
 
 
 def _amplitudes(squares: Array, count: int, rng: np.random.Generator) -> Array:
@@ -102,9 +96,7 @@ def draw_functions(
     Args:
         alike: components that differ in their amplitudes only.
         relevant: pairs ``(R, k)`` that closed loops visit; the pivots, at which draws are exact, are chosen from them.
-        count: number of draws.
         pivots: largest number of pivots.
-        rng: the source of the draws.
     """
     own = alike[0]
     chosen, L, left_out = own.pivots(relevant, pivots)

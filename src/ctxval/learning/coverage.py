@@ -16,14 +16,8 @@ from ctxval.learning.dynamics_posterior import DynamicsPosterior
 
 MOST_COORDINATES = 6
 """Largest number of state-input coordinates for which pairs of coordinates are compared."""
-_TASKS, _STEPS = 256, 40
-"""Largest numbers of tasks, and of steps of each closed loop, in which gaps between the records are looked for."""
-_BEYOND, _PAIR = 10.0, 0.3
-"""Weights of a state or input beyond all records, and of a gap in two coordinates, against a gap in one of them."""
 _FARTHEST = 1e3
 """Standardised coordinates are limited to this magnitude."""
-_TAIL = 1e-3
-"""Share of the visited coordinates on each side that does not count in their range."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,25 +60,20 @@ class Coverage(ShortRepr):
 def coverage(
     posterior: DynamicsPosterior, tasks: Array, planned: Sequence[PlannedTasks], loops: Sequence[Loops]
 ) -> Coverage:
-    """Return how well the records cover the closed loops of tasks on the posterior mean.
-
-    Args:
-        posterior: the posterior of the dynamics, with its data.
-        tasks: points of the unit cube ``(q, d)``.
-        planned: their plans.
-        loops: their closed loops on the posterior mean.
-    """
-    visited, rows = _visited(posterior, loops), np.concatenate([one.rows for one in planned])
-    low, high = np.quantile(visited, [_TAIL, 1 - _TAIL], axis=(0, 1))
+    """Return how well the records cover the closed loops of tasks ``(q, d)`` on the posterior mean."""
+    visited, rows = _visited(posterior, loops), np.concatenate([tasks.rows for tasks in planned])
+    low, high = np.quantile(visited, [1e-3, 1 - 1e-3], axis=(0, 1))
     width = np.maximum(high - low, 1e-9)
     recorded, scaled = posterior.data.pairs / width, visited / width
     beyond = np.maximum(np.maximum(scaled - recorded.max(axis=0), recorded.min(axis=0) - scaled), 0.0)
-    compared = _some(len(scaled), _TASKS)
-    some = scaled[compared][:, _some(scaled.shape[1], _STEPS)]
+    # Gaps between the records are looked for in a part of the tasks and of the steps.
+    compared = _some(len(scaled), 256)
+    some = scaled[compared][:, _some(scaled.shape[1], 40)]
     gaps = np.stack([_nearest(recorded[:, i], some[..., i]) for i in range(len(width))], axis=-1)
     pairs = _pair_gaps(recorded, some)
-    far = _BEYOND * beyond.max(axis=(1, 2))
-    far[compared] += (gaps.max(axis=-1) + (0.0 if pairs is None else _PAIR * pairs.max(axis=-1))).max(axis=1)
+    # What is beyond all records weighs ten times as much as a gap in one coordinate, and a gap in two of them less.
+    far = 10.0 * beyond.max(axis=(1, 2))
+    far[compared] += (gaps.max(axis=-1) + (0.0 if pairs is None else 0.3 * pairs.max(axis=-1))).max(axis=1)
 
     def largest(of: Array, coordinates: list[tuple[int, ...]], where: Array) -> Gap:
         at = np.unravel_index(int(of.argmax()), of.shape)
@@ -103,10 +92,7 @@ def coverage(
 
 
 def _visited(posterior: DynamicsPosterior, loops: Sequence[Loops]) -> Array:
-    """Return the standardised pairs ``(q, H, k)`` on loops of the mean.
-
-    The last pair of a task with a shorter horizon is repeated.
-    """
+    """Return the standardised pairs ``(q, H, k)`` on loops; the last pair of a task with a shorter horizon repeats."""
     parts = [posterior.data.standardised(one.states[0][:, :-1], one.inputs[0]) for one in loops]
     horizon = max(part.shape[1] for part in parts)
     longest = [np.pad(part, ((0, 0), (0, horizon - part.shape[1]), (0, 0)), mode="edge") for part in parts]

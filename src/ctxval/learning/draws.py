@@ -12,17 +12,12 @@ from ctxval.core.model import Model
 from ctxval.learning.kernel_expansion import KernelExpansion
 from ctxval.learning.residual_data import ResidualData
 
-_LARGEST = 1e6
-"""Standardised pairs are limited to this magnitude, so that a loop that diverges stays finite in its residual."""
-
 
 @dataclass(frozen=True, eq=False)
 class DynamicsDraws(ShortRepr):
     """S models ``M + r_s``, run together: a draw is the first axis of states and inputs.
 
     Attributes:
-        model: the model M.
-        data: constants that standardise pairs and residuals.
         expansions: functions r_s, in groups that share their centres.
         left_out: share of the posterior variance that the draws of each group leave out between pivots.
         limit: the largest standardised residual of each learned state, in magnitude; None if there is no limit.
@@ -74,19 +69,15 @@ class DynamicsDraws(ShortRepr):
 
 
 def bounded(z: Array) -> Array:
-    """Return standardised pairs within limits, in the same array; NaN becomes 0."""
-    np.maximum(z, -_LARGEST, out=z)
-    np.minimum(z, _LARGEST, out=z)
+    """Return standardised pairs within limits, in the same array: a loop that diverges stays finite; NaN becomes 0."""
+    np.maximum(z, -1e6, out=z)
+    np.minimum(z, 1e6, out=z)
     z[np.isnan(z)] = 0.0
     return z
 
 
 class DrawnModel:
-    """The model ``M + r_s`` of one draw.
-
-    Args:
-        draws: draws of the dynamics with one member.
-    """
+    """The model ``M + r_s`` of the only one of some draws."""
 
     def __init__(self, draws: DynamicsDraws) -> None:
         self._draws = draws

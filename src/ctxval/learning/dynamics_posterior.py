@@ -32,22 +32,11 @@ from ctxval.learning.hyperparameters import (
     learning_rows,
 )
 from ctxval.learning.kernel_expansion import KernelExpansion, weights_without
-from ctxval.learning.recorded import affordable_centres
 from ctxval.learning.residual_data import ResidualData, residual_data
 from ctxval.learning.without_model import smoother_than
 
 _PIVOT = 0.1
 """Variance, as a share of the noise, below which a transition adds nothing to those chosen before it."""
-_CENTRES = (150, 400)
-"""Least and largest number of centres."""
-_REACH = 5.0
-"""Residuals of the mean are limited to this many times the largest one recorded."""
-_STEPS_SAMPLED = 12
-"""Number of steps of a predicted trajectory from which its unfamiliarity is computed."""
-_REPLACING = (600, 100)
-"""Number of other transitions from which replacements of those that are left out are chosen, and of replacements."""
-_ROUGH_CENTRES, _ROUGHLY = 64, 0.03
-"""Least number of centres of a rough mean, and its largest error as a share of the residuals that it predicts."""
 
 
 @dataclass(frozen=True)
@@ -75,7 +64,7 @@ class PosteriorSettings:
     @classmethod
     def for_horizon(cls, horizon: int) -> PosteriorSettings:
         """Return settings in which a closed loop of many steps has fewer centres, so that it does not take longer."""
-        return cls(centres=affordable_centres(horizon, *_CENTRES))
+        return cls(centres=int(np.clip(30_000 // horizon, 150, 400)))
 
     def without_model(self) -> PosteriorSettings:
         """Return settings for learning S itself, which is smoother than the error of M and takes more transitions."""
@@ -90,9 +79,6 @@ class LearnedCovariances(ShortRepr):
         model: the model to which residuals are added: M, or a linear one.
         without_model: whether it is a linear one, because M is rougher than the system.
         scale: the units of the standardised pairs to which the hyperparameters belong, shape ``(n + m,)``.
-        posterior: the posterior of the hyperparameters.
-        settings: numbers on which accuracy and cost depend.
-        seed: seed of the draws.
     """
 
     model: Model
@@ -112,12 +98,7 @@ class LearnedCovariances(ShortRepr):
 
 @dataclass(frozen=True, eq=False)
 class DynamicsPosterior(ShortRepr):
-    """The posterior of the dynamics of S, given recorded transitions.
-
-    Attributes:
-        covariances: the model to which residuals are added, and the posterior of the hyperparameters.
-        data: the standardised residuals.
-    """
+    """The posterior of the dynamics of S, given recorded transitions."""
 
     covariances: LearnedCovariances
     data: ResidualData
@@ -194,15 +175,13 @@ class DynamicsPosterior(ShortRepr):
     @functools.cached_property
     def rough_mean(self) -> DynamicsDraws:
         """The same with fewer centres if those predict the others well; it is cheaper to evaluate."""
-        rough = self.with_few_centres(_ROUGH_CENTRES, _ROUGHLY)
+        rough = self.with_few_centres(64, 0.03)
         return self.mean if len(rough.centres) == len(self.rows) else self._limited(rough)
 
     def with_few_centres(self, least: int, error: float) -> KernelExpansion:
         """Return the mean of r conditioned on as few of the transitions as predict the others well.
 
-        Args:
-            least: number of transitions that are tried first; then twice as many are, and so on.
-            error: largest error, as a share of the residuals at the others.
+        It tries ``least`` of them first, then twice as many. ``error`` is a share of the residuals at the others.
         """
         most, (Z, Y) = self.most_probable, self._known(self.rows)
         while least < len(Z):
@@ -215,16 +194,13 @@ class DynamicsPosterior(ShortRepr):
         return most.mean
 
     def means_without(self, left_out: Sequence[Collection[int]]) -> DynamicsDraws:
-        """Return means without some executions, as one draw for each; the hyperparameters do not change.
-
-        Args:
-            left_out: for each of the means, the executions that it does not know.
-        """
+        """Return one mean for each set of executions that are left out, as draws; the hyperparameters do not change."""
         most, unused = self.most_probable.hyperparameters, np.setdiff1d(np.arange(len(self.data.pairs)), self.rows)
-        some = unused[np.linspace(0, max(0, len(unused) - 1), min(_REPLACING[0], len(unused))).astype(int)]
+        some = unused[np.linspace(0, max(0, len(unused) - 1), min(600, len(unused))).astype(int)]
         with single_threaded():
+            # Up to 100 other transitions replace those that are left out.
             least = _PIVOT * most.noise
-            spare = pivoted_rows(most.kernel, most.theta, self.data.pairs[some], _REPLACING[1], least=least)
+            spare = pivoted_rows(most.kernel, most.theta, self.data.pairs[some], 100, least=least)
             rows = np.concatenate([self.rows, some[spare]])
             Z, Y = self._known(rows)
             gone = np.array([np.isin(self.data.sources[rows], list(without)) for without in left_out])
@@ -234,7 +210,7 @@ class DynamicsPosterior(ShortRepr):
     @property
     def limit(self) -> Array:
         """The largest standardised residual that the mean returns, in magnitude, shape ``(n,)``."""
-        return np.asarray(_REACH * np.abs(self.data.outputs).max(axis=0))
+        return np.asarray(5.0 * np.abs(self.data.outputs).max(axis=0))
 
     def _limited(self, mean: KernelExpansion) -> DynamicsDraws:
         return DynamicsDraws(self.model, self.data, (mean,), (0.0,), self.limit[self.data.learned])
@@ -246,7 +222,7 @@ class DynamicsPosterior(ShortRepr):
             states, inputs: shapes ``(q, H + 1, n)`` and ``(q, H, m)``.
         """
         horizon, data, most = inputs.shape[1], self.data, self.most_probable
-        at = np.linspace(0, horizon - 1, min(_STEPS_SAMPLED, horizon)).astype(int)
+        at = np.linspace(0, horizon - 1, min(12, horizon)).astype(int)
         Z = bounded(data.standardised(states[:, at], inputs[:, at]))
         variance = most.variance(Z.reshape(-1, Z.shape[-1])).reshape(Z.shape[:2]).mean(axis=1)
         sizes = (data.sizes / data.steps)[data.learned] ** 2 * most.squares / len(most.centres)
@@ -265,23 +241,20 @@ class DynamicsPosterior(ShortRepr):
 
         Args:
             relevant: standardised pairs ``(R, k)`` that closed loops visit.
-            rng: the source of the draws.
             functions: number of functions for each draw of the hyperparameters; that of the settings if None.
             hyperparameters: number of draws of the hyperparameters that are used; all if None.
         """
         count = self.settings.functions if functions is None else functions
         with single_threaded():
+            components = self.components if hyperparameters is None else self._some_components(hyperparameters)
             # Adjacent components of the same hyperparameters share their pivots and are evaluated together.
-            components = self._some_components(hyperparameters)
             groups = [list(group) for _, group in groupby(components, lambda one: id(one.factor))]
             drawn = [draw_functions(group, relevant, count, self.settings.pivots, rng) for group in groups]
         expansions, left_out = zip(*drawn, strict=True)
         return DynamicsDraws(self.model, self.data, expansions, left_out)
 
-    def _some_components(self, count: int | None) -> Sequence[Component]:
-        """Return the components of about so many draws of the hyperparameters, evenly spread; all if None."""
-        if count is None:
-            return self.components
+    def _some_components(self, count: int) -> Sequence[Component]:
+        """Return the components of about so many draws of the hyperparameters, evenly spread."""
         rows = np.unique(np.linspace(1, len(self.covariances.drawn) - 1, count - 1).astype(int)).tolist()
         found = [self.most_probable]
         for row in rows:
@@ -311,13 +284,9 @@ def learn_covariances(
     residuals are those of a linear model (:mod:`ctxval.learning.without_model`).
 
     Args:
-        model: the model M.
-        transitions: N transitions of the system.
         sources: the execution of each transition; -1 for data that the model was made from, shape ``(N,)``.
-        seed: seed of the draws.
-        settings: numbers on which accuracy and cost depend; the defaults if None.
     """
-    chosen = PosteriorSettings() if settings is None else settings
+    chosen = settings or PosteriorSettings()
     data = residual_data(model, transitions, sources)
     if data is None:
         return None
@@ -338,10 +307,6 @@ def condition(covariances: LearnedCovariances, transitions: Transitions, sources
     """Return the posterior of the dynamics given recorded transitions, and hyperparameters learned from some of them.
 
     Returns None if fewer than two transitions are usable, or if the model explains all of them.
-
-    Args:
-        covariances: the posterior of the hyperparameters.
-        transitions, sources: as in :func:`learn_covariances`.
     """
     data = residual_data(covariances.model, transitions, sources)
     return None if data is None else DynamicsPosterior(covariances, data)
@@ -354,10 +319,6 @@ def learn_posterior(
     seed: tuple[int, ...] = (0,),
     settings: PosteriorSettings | None = None,
 ) -> DynamicsPosterior | None:
-    """Return the posterior of the dynamics, with hyperparameters that are learned from the same transitions.
-
-    Args:
-        model, transitions, sources, seed, settings: as in :func:`learn_covariances`.
-    """
+    """Return the posterior of the dynamics, with hyperparameters that are learned from the same transitions."""
     found = learn_covariances(model, transitions, sources, seed, settings)
     return None if found is None else condition(found, transitions, sources)

@@ -26,35 +26,22 @@ from ctxval.learning.dynamics_posterior import (
     condition,
     learn_covariances,
 )
-from ctxval.learning.error_vectors import ErrorVectors, Executed
 from ctxval.learning.execution_prediction import ExecutionPrediction, predict_execution
 from ctxval.learning.prediction import predict_distance
 from ctxval.learning.recorded import closed_loops_on_model, recorded_transitions
-from ctxval.learning.vector import predict_composed
-from ctxval.learning.worst_case import WorstCase, WorstCaseSearch, WorstCaseSettings, WorstOfMean
+from ctxval.learning.vector import ErrorVectors, Executed, predict_composed
+from ctxval.learning.worst_case import WorstCase, WorstCaseSearch, WorstCaseSettings
 from ctxval.models.corrected import before_refinement
 from ctxval.searches import Prediction
 
-_PROBED = 8
-"""Number of tasks at which each task parameter is moved, to see whether it changes the closed loops of M."""
-_WEAK = 0.02
-"""A change of the loops by less than this many standard deviations of states and inputs is no change."""
 _SLOW = 0.02
 """Seconds: if a single closed loop on M takes longer, closed loops are distributed over the cores."""
-_REMEMBERED = 8
-"""Number of sets of executions whose covariances are kept."""
-_PAIRS = 300
-"""Largest number of pairs from which the pivots of a single task are chosen."""
 
 
 class DynamicsStudy(ShortRepr):
     """Learns the dynamics of one experiment from growing sets of executions.
 
     Everything is a function of the executions and the seed. Controllers that are designed are kept.
-
-    Args:
-        validation: the map p -> d(p); S is never executed.
-        seed: seed of all random numbers.
     """
 
     def __init__(self, validation: Validation, seed: int = 0) -> None:
@@ -97,12 +84,12 @@ class DynamicsStudy(ShortRepr):
 
     @functools.cached_property
     def unseen_parameters(self) -> tuple[int, ...]:
-        """The indices of the task parameters that hardly change the closed loops of M.
+        """The indices of the task parameters that change the closed loops of M by less than 2 % of their deviation.
 
         What they change in the system, such as a payload, is no function of state and input.
         """
         d = self.validation.space.dimension
-        some = self.search.pool[:_PROBED]
+        some = self.search.pool[:8]
         ends = moves_to_bounds(some, np.zeros(d), np.ones(d)).reshape(-1, d)
         loops: dict[int, Array] = {}
         for one in self.planner.plan(ends):
@@ -117,16 +104,12 @@ class DynamicsStudy(ShortRepr):
                 low, high = loops.get(first + j), loops.get(first + d + j)
                 if low is not None and high is not None and low.shape == high.shape:
                     effects[j] = max(effects[j], float(np.nanmax(np.abs(high - low) / size)))
-        return tuple(np.flatnonzero(effects < _WEAK).tolist())
+        return tuple(np.flatnonzero(effects < 0.02).tolist())
 
     def learn(self, executed: Executed, logged: Sequence[Trajectory] = ()) -> LearnedDynamics | None:
-        """Return what executions teach, and other recordings of the system.
+        """Return what executions teach, and recordings with the same time step that belong to no task.
 
         Returns None if there are no recorded transitions, if M explains them, or if no task can be planned.
-
-        Args:
-            executed: points of the unit cube ``(d,)`` with the system's trajectories there.
-            logged: recordings with the same time step that belong to no task.
         """
         if self._parts is None:
             self._parts = self._state_of_parts()
@@ -138,29 +121,29 @@ class DynamicsStudy(ShortRepr):
         if covariances is None and some < len(executed):
             # If nothing could be learned when it was scheduled, it is learned now.
             covariances = self._learned_covariances(executed, logged, recorded)
-        posterior = None if covariances is None else condition(covariances, *recorded)
-        if posterior is None or not np.isfinite(posterior.most_probable.weights).all():
-            return None
-        points = np.array([point for point, _ in executed]).reshape(-1, self.validation.space.dimension)
-        return LearnedDynamics(self, posterior, points)
+        return self._conditioned(covariances, recorded, executed)
 
     def as_if_executed(
         self, learned: LearnedDynamics, executed: Executed, pending: Executed, logged: Sequence[Trajectory] = ()
     ) -> LearnedDynamics | None:
         """Return what executions teach with those that are pending, as if these had gone as predicted.
 
-        The hyperparameters and the predicted distances stay, and the doubt is less near the pending executions.
-
-        Args:
-            learned: what the executions teach.
-            executed, logged: as in :meth:`learn`.
-            pending: :meth:`LearnedDynamics.trajectories` of the tasks that are being executed.
+        The hyperparameters and the predicted distances stay, and the doubt is less near the pending executions, which
+        are :meth:`LearnedDynamics.trajectories` of the tasks that are being executed.
         """
-        recorded = self._recorded([*executed, *pending], logged)
-        posterior = None if recorded is None else condition(learned.posterior.covariances, *recorded)
+        together = [*executed, *pending]
+        return self._conditioned(learned.posterior.covariances, self._recorded(together, logged), together)
+
+    def _conditioned(
+        self, covariances: LearnedCovariances | None, recorded: tuple[Transitions, Rows] | None, executed: Executed
+    ) -> LearnedDynamics | None:
+        if covariances is None or recorded is None:
+            return None
+        posterior = condition(covariances, *recorded)
         if posterior is None or not np.isfinite(posterior.most_probable.weights).all():
             return None
-        return LearnedDynamics(self, posterior, np.array([point for point, _ in (*executed, *pending)]))
+        points = np.array([point for point, _ in executed]).reshape(-1, self.validation.space.dimension)
+        return LearnedDynamics(self, posterior, points)
 
     def _learned_covariances(
         self, executed: Executed, logged: Sequence[Trajectory], recorded: tuple[Transitions, Rows] | None
@@ -175,7 +158,7 @@ class DynamicsStudy(ShortRepr):
             model, seed = before_refinement(self.validation.model), (self.seed, len(executed), 0)
             settings = PosteriorSettings.for_horizon(self._loops.horizon)
             self._covariances[key] = learn_covariances(model, *recorded, seed, settings)
-            while len(self._covariances) > _REMEMBERED:
+            while len(self._covariances) > 8:
                 self._covariances.popitem(last=False)
         return self._covariances[key]
 
@@ -185,17 +168,12 @@ class DynamicsStudy(ShortRepr):
         return recorded_transitions(self.validation.model, [one for _, one in executed], self._loops, logged)
 
     def predict(self, executed: Executed) -> Prediction | None:
-        """Return the distances that executions predict, for a search; S is never executed.
-
-        Returns None if nothing can be learned.
+        """Return the distances that executions predict, for a search; None if nothing can be learned.
 
         If the distance is composed of a short vector, such as the error of the final state, a second prediction models
         the vector as a function of p, because an error that is no function of state and input may still be a function
         of p. The first prediction offers the second one as ``otherwise``. If there is no first prediction, the second
         one is returned instead.
-
-        Args:
-            executed: points of the unit cube ``(d,)`` with the system's trajectories there.
         """
         return self.prediction_of(self.learn(executed), executed)
 
@@ -222,8 +200,6 @@ class LearnedDynamics(ShortRepr):
     """The dynamics learned from the executions so far; everything that follows is computed once, if it is needed.
 
     Attributes:
-        study: the experiment.
-        posterior: the posterior of the dynamics.
         executed: the executed tasks, points of the unit cube ``(n, d)``.
     """
 
@@ -259,24 +235,11 @@ class LearnedDynamics(ShortRepr):
     @functools.cached_property
     def screened(self) -> WorstCase:
         """The largest distance over some tasks, for each of a few draws of the dynamics: a quick lower bound."""
-        return self.study.search.screened(self.posterior, self._screened_mean, self.executed, self._rng(5))
-
-    @property
-    def worst_of_mean(self) -> WorstCase:
-        """The largest distance over some tasks on the posterior mean alone, as if it were the only draw."""
-        found = self._screened_mean
-        return WorstCase(
-            np.array([found.highest]),
-            found.elites[:1],
-            found.highest,
-            found.elites,
-            found.evaluations,
-            0.0,
-            self.study.search.unplanned,
-        )
+        return self.study.search.screened(self.posterior, self.worst_of_mean, self.executed, self._rng(5))
 
     @functools.cached_property
-    def _screened_mean(self) -> WorstOfMean:
+    def worst_of_mean(self) -> WorstCase:
+        """The largest distance over some tasks on the posterior mean alone, as if it were the only draw."""
         return self.study.search.on_mean(self.posterior, self._on_pool[0], self.executed, self._rng(4), globally=False)
 
     def worst_case_of(self, draws: int) -> WorstCase:
@@ -333,7 +296,7 @@ class LearnedDynamics(ShortRepr):
             pairs = loop_pairs(self.study.planner, self.posterior, point[None])
             if not len(pairs):
                 return None
-            draws = self.posterior.draw(pairs[rng.permutation(len(pairs))[:_PAIRS]], rng)
+            draws = self.posterior.draw(pairs[rng.permutation(len(pairs))[:300]], rng)
             return predict_execution(self.study.planner, draws, point, len(self.executed))
 
     def _rng(self, purpose: int) -> np.random.Generator:

@@ -15,18 +15,8 @@ from ctxval.core.trajectory import Trajectory
 from ctxval.learning.closed_loops import LoopPlanner
 from ctxval.learning.draws import DynamicsDraws
 
-_STEPS = 16
-"""Largest number of steps of a trajectory that are predicted."""
 _QUANTILES = np.linspace(0.0, 1.0, 21)
 """Levels of the stored quantiles of the distance."""
-_DIGITS = 8
-"""Significant digits of the stored numbers."""
-_NEGLIGIBLE_STATE = 1e-4
-"""A deviation of a state below this share of its range does not count as an error."""
-_NEGLIGIBLE_DISTANCE = 2e-3
-"""A deviation of the distance below this share of it does not count as an error."""
-_DIVERGED = 1e6
-"""A draw has diverged if a state exceeds this magnitude, in ranges of the states of all other draws."""
 
 
 @dataclass(frozen=True)
@@ -34,7 +24,6 @@ class ExecutionPrediction(ShortRepr):
     """Draws of the trajectory and of the distance of one task, summarised in plain numbers for JSON.
 
     Attributes:
-        learned_from: number of executions from which the dynamics were learned.
         quantiles: quantiles of the distance at 0, 0.05, ..., 1; infinity if a draw diverges.
         deviation: standard deviation of the distance over the draws that do not diverge.
         steps: indices of the predicted states, from 1 to the horizon.
@@ -86,22 +75,14 @@ class ExecutionPrediction(ShortRepr):
             )
         except (KeyError, TypeError, ValueError, OverflowError):
             return None
-        return found if found._is_consistent else None
-
-    @property
-    def _is_consistent(self) -> bool:
-        widths = {len(row) for row in (*self.states, *self.deviations)}
-        lengths = {len(self.steps), len(self.states), len(self.deviations)}
-        ordered = all(one <= other for one, other in pairwise(self.quantiles))
-        return len(self.quantiles) == len(_QUANTILES) and ordered and len(lengths) == len(widths) == 1
+        widths = {len(row) for row in (*found.states, *found.deviations)}
+        lengths = {len(found.steps), len(found.states), len(found.deviations)}
+        ordered = all(one <= other for one, other in pairwise(found.quantiles))
+        consistent = len(found.quantiles) == len(_QUANTILES) and ordered and len(lengths) == len(widths) == 1
+        return found if consistent else None
 
     def score(self, executed: Trajectory, distance: float) -> PredictionScore | None:
-        """Return how an execution agrees with the prediction; None if they do not fit together.
-
-        Args:
-            executed: the trajectory of the system.
-            distance: the executed distance.
-        """
+        """Return how an execution agrees with the prediction; None if they do not fit together."""
         states = np.array(self.states)
         if max(self.steps) > executed.horizon or states.shape[1:] != executed.states.shape[1:]:
             return None
@@ -111,9 +92,10 @@ class ExecutionPrediction(ShortRepr):
             return PredictionScore(np.inf, rank, 0.0)
         ranges = np.maximum(np.ptp(executed.states, axis=0), 1e-9)
         errors = (executed.states[list(self.steps)] - states) / ranges
-        variances = (np.array(self.deviations) / ranges) ** 2 + _NEGLIGIBLE_STATE**2
+        # Deviations of a state below 1e-4 of its range and of the distance below 0.2 % of it are no errors.
+        variances = (np.array(self.deviations) / ranges) ** 2 + 1e-4**2
         of_states = float((errors**2).sum() / variances.sum())
-        scale2 = self.deviation**2 + (_NEGLIGIBLE_DISTANCE * max(distance, self.median)) ** 2
+        scale2 = self.deviation**2 + (2e-3 * max(distance, self.median)) ** 2
         of_distance = (distance - self.median) ** 2 / max(scale2, 1e-300)
         return PredictionScore(max(of_states, of_distance), rank, distance / max(self.median, 1e-300))
 
@@ -137,23 +119,16 @@ class PredictionScore:
 def predict_execution(
     planner: LoopPlanner, draws: DynamicsDraws, point: Array, learned_from: int
 ) -> ExecutionPrediction | None:
-    """Return the prediction of the execution of a task; None if it cannot be planned.
-
-    Args:
-        planner: designs controllers and runs closed loops.
-        draws: draws of the dynamics.
-        point: the task, a point of the unit cube ``(d,)``.
-        learned_from: number of executions from which the dynamics were learned.
-    """
+    """Return the prediction of the execution of a task ``(d,)``; None if it cannot be planned."""
     found = planner.run(draws, planner.plan(point[None]))
     if not found:
         return None
     horizon = found[0].inputs.shape[2]
-    steps = np.unique(np.linspace(1, horizon, min(horizon, _STEPS)).astype(int))
+    steps = np.unique(np.linspace(1, horizon, min(horizon, 16)).astype(int))
     states, distances = found[0].states[:, 0][:, steps], found[0].distances[:, 0]
     size = max(float(np.nanmedian(np.abs(states))), 1e-9)
-    with np.errstate(all="ignore"):
-        kept = np.isfinite(distances) & (np.abs(states) < _DIVERGED * size).all(axis=(1, 2))
+    with np.errstate(all="ignore"):  # what is far beyond the states of all other draws has diverged
+        kept = np.isfinite(distances) & (np.abs(states) < 1e6 * size).all(axis=(1, 2))
     good, values = (states[kept], distances[kept]) if kept.any() else (np.zeros_like(states), np.zeros(len(states)))
     return ExecutionPrediction(
         learned_from,
@@ -171,4 +146,4 @@ def _rows(listed: Iterable[Iterable[Any]]) -> tuple[tuple[float, ...], ...]:
 
 
 def _rounded(values: ArrayLike) -> list[float]:
-    return [float(f"{value:.{_DIGITS}g}") for value in np.ravel(values)]
+    return [float(f"{value:.8g}") for value in np.ravel(values)]

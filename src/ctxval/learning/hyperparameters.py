@@ -18,9 +18,9 @@ from scipy.special import gammaln, logsumexp
 from ctxval._util.arrays import Array, Rows
 from ctxval.errors import InputError
 from ctxval.gp.cholesky import CholeskyFactor, factorise
+from ctxval.gp.kernels import Bounds, Covariance, Linear, Matern, Towards
 from ctxval.gp.regression import most_likely
 from ctxval.gp.subset import pivoted_rows
-from ctxval.learning.residual_kernel import ResidualKernel
 
 FAMILIES = ((2.5, 0.0), (2.5, 1.0), (1.5, 0.0))
 """Smoothness and growth of the covariances, equally likely a priori."""
@@ -35,22 +35,74 @@ _LENGTH = (3.0, 1.0)
 """Median of the length-scales in standard deviations of the data, and the deviation of their logarithms."""
 _LINEAR_PART = (1.0, 5.0)
 """The same for the variances of the constant and of the linear part, relative to that of the Matern part."""
-_NOISE_PRIOR = (1e-6, 4.0)
-"""The same for the noise variance."""
 _FREEDOM = 6.0
 """Degrees of freedom of the t distribution of the proposals."""
-_PROPOSALS = 48
-"""Number of proposals for each family."""
-_STARTS = (1e-5, 0.1)
-"""Noise variances from which climbs start: the data can look like a rough function, or like a smooth one with noise."""
-_LOWEST = 12.0
-"""A mode whose log posterior is lower than the highest one by more than this does not count."""
-_SAME = 0.5
-"""Two climbs whose logarithms differ by less than this have reached the same mode."""
-_LEAST_CURVATURE = 0.25
-"""No direction is less certain than a standard deviation of 2 in the logarithm."""
-_STEP = 0.05
-"""Step of the differences of gradients that give the curvature."""
+
+_LINEAR_KERNEL = Linear(centre=0.0, variance=(1e-4, 1e6))
+
+
+@dataclass(frozen=True)
+class ResidualKernel(Covariance):
+    """``k(z, w) = matern(z, w) (1 + growth u.u') + constant + slope z.w`` for standardised pairs z = (x, u).
+
+    theta = log of (length-scales, one for each column; constant; slope). The Matern part has unit variance. If M has
+    the wrong gain from the input to the states, then the residual grows with the input; a stationary covariance would
+    return to its mean outside the data.
+
+    Attributes:
+        nu: smoothness of the Matern part, 1.5, 2.5 or 4.5.
+        growth: factor of the product of the inputs; 0 for a stationary Matern part.
+        inputs: the number m of inputs of the system, which are the last columns.
+    """
+
+    nu: float
+    growth: float
+    inputs: int
+
+    def bounds(self, dimension: int) -> Bounds:
+        """Return the bounds of theta; no column is irrelevant beyond 100 standard deviations of the data."""
+        scales = (float(np.log(0.05)), float(np.log(100.0)))
+        return [*[scales] * dimension, *_LINEAR_KERNEL.bounds(dimension)]
+
+    def towards(self, theta: Array, Z: Array) -> Towards:
+        """Return the covariances with points ``(m, k)`` as a function of other points."""
+        matern = Matern(self.nu, ard=True).towards(self._unit(theta), Z)
+        linear = _LINEAR_KERNEL.towards(theta[-2:], Z)
+
+        def covariances(X: Array) -> Array:
+            found = self._grow(matern(X), X, Z)
+            found += linear(X)
+            return found
+
+        return covariances
+
+    def diagonal(self, theta: Array, X: Array) -> Array:
+        """Return the variances k(z, z), shape ``(n,)``."""
+        grown = 1 + self.growth * (self._inputs(X) ** 2).sum(axis=1)
+        return np.asarray(grown + _LINEAR_KERNEL.diagonal(theta[-2:], X))
+
+    def weighted_gradient(self, theta: Array, X: Array, W: Array) -> Array:
+        """Return ``sum_ij W_ij dK_ij/dtheta`` for K = k(X, X) and a symmetric W, in the shape of theta."""
+        grown = self._grow(W.copy(), X, X)
+        of_scales = Matern(self.nu, ard=True).weighted_gradient(self._unit(theta), X, grown)[1:]
+        return np.concatenate([of_scales, _LINEAR_KERNEL.weighted_gradient(theta[-2:], X, W)])
+
+    def _grow(self, covariances: Array, X: Array, Z: Array) -> Array:
+        """Multiply covariances ``(n, m)`` by the growth with the inputs, and return them."""
+        if self.growth:
+            factors = self._inputs(X) @ self._inputs(Z).T
+            factors *= self.growth
+            factors += 1
+            covariances *= factors
+        return covariances
+
+    def _inputs(self, Z: Array) -> Array:
+        """Return the columns of the inputs; a system may have none."""
+        return Z[:, Z.shape[1] - self.inputs :]
+
+    @staticmethod
+    def _unit(theta: Array) -> Array:
+        return np.concatenate([[0.0], theta[:-2]])
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +110,6 @@ class Hyperparameters:
     """One draw of the hyperparameters.
 
     Attributes:
-        kernel: the family of covariances.
         theta: logarithms of the kernel's hyperparameters.
         noise: noise variance, relative to that of the Matern part.
     """
@@ -70,13 +121,11 @@ class Hyperparameters:
 
 @dataclass(frozen=True, eq=False)
 class _Mode:
-    """The posterior of one family around one of its modes.
+    """The posterior of one family, given pairs and residuals, around one of its modes.
 
     Attributes:
-        kernel: the family.
-        height: the log posterior there.
+        height: the log posterior at the mode.
         place: the (theta, log noise) of the mode.
-        Z, Y: standardised pairs and residuals.
     """
 
     kernel: ResidualKernel
@@ -90,13 +139,14 @@ class _Mode:
         """A root ``(D, D)`` of the inverse of the curvature of the log posterior, by differences of its gradient."""
         low, high = _box(self.kernel, self.Z.shape[1])
         curvature = np.empty((len(self.place), len(self.place)))
-        for i, step in enumerate(np.eye(len(self.place)) * _STEP):
+        for i, step in enumerate(np.eye(len(self.place)) * 0.05):
             up, down = np.minimum(self.place + step, high), np.maximum(self.place - step, low)
             slopes = _gradient_or_zero(self.kernel, up, self.Z, self.Y)
             slopes -= _gradient_or_zero(self.kernel, down, self.Z, self.Y)
             curvature[i] = -slopes / (up - down)[i]
         values, vectors = np.linalg.eigh(0.5 * (curvature + curvature.T))
-        return np.asarray(vectors / np.sqrt(np.maximum(values, _LEAST_CURVATURE)))
+        # No direction is less certain than a standard deviation of 2 in the logarithm.
+        return np.asarray(vectors / np.sqrt(np.maximum(values, 0.25)))
 
     def proposals(self, count: int, rng: np.random.Generator) -> Array:
         """Return draws ``(count, D)`` of a t distribution around the mode."""
@@ -124,14 +174,7 @@ class HyperparameterPosterior:
 
     @classmethod
     def given(cls, Z: Array, Y: Array, inputs: int, families: Sequence[tuple[float, float]]) -> HyperparameterPosterior:
-        """Return the posterior.
-
-        Args:
-            Z: standardised pairs ``(N, k)``.
-            Y: standardised residuals ``(N, n)``.
-            inputs: the number of inputs of the system.
-            families: smoothness and growth of each covariance.
-        """
+        """Return the posterior given standardised pairs ``(N, k)`` and residuals ``(N, n)``."""
         return cls(tuple(_modes_of(ResidualKernel(nu, growth, inputs), Z, Y) for nu, growth in families))
 
     @functools.cached_property
@@ -144,7 +187,7 @@ class HyperparameterPosterior:
         """Return ``count`` draws; hyperparameters that are drawn again are the same object, and follow each other."""
         found, weights = [], []
         for family in self.families:
-            drawn = np.concatenate([mode.proposals(_PROPOSALS // len(family), rng) for mode in family])
+            drawn = np.concatenate([mode.proposals(48 // len(family), rng) for mode in family])
             # All modes of a family make one proposal distribution: the mixture of theirs in equal parts.
             density = logsumexp([mode.log_density(drawn) for mode in family], axis=0) - np.log(len(family))
             first = family[0]
@@ -158,26 +201,14 @@ class HyperparameterPosterior:
 
 
 def draw_prior(dimension: int, inputs: int, rng: np.random.Generator) -> Hyperparameters:
-    """Return hyperparameters from the prior, such as those of a system on which a posterior is tested.
-
-    Args:
-        dimension: the number k of coordinates of a state-input pair.
-        inputs: the number of inputs of the system.
-        rng: the source of the draw.
-    """
+    """Return hyperparameters from the prior, such as those of a system on which a posterior is tested."""
     nu, growth = FAMILIES[rng.integers(len(FAMILIES))]
     centres, deviations = _prior(dimension + 3)
     return _of(ResidualKernel(nu, growth, inputs), centres + deviations * rng.standard_normal(dimension + 3))
 
 
 def highest_log_posterior(Z: Array, Y: Array, inputs: int) -> float:
-    """Return the largest log density of the hyperparameters of the most usual family, up to a constant.
-
-    Args:
-        Z: standardised pairs ``(N, k)``.
-        Y: standardised residuals ``(N, n)``.
-        inputs: the number of inputs of the system.
-    """
+    """Return the largest log density of the hyperparameters of the most usual family, up to a constant."""
     return _climbed(ResidualKernel(*FAMILIES[0], inputs), Z, Y)[0][0]
 
 
@@ -224,7 +255,7 @@ def _log_prior(parameters: Array) -> tuple[float, Array]:
 
 def _prior(count: int) -> tuple[Array, Array]:
     """Return means and standard deviations of the ``count`` parameters (theta, log noise)."""
-    medians, deviations = np.transpose([*[_LENGTH] * (count - 3), _LINEAR_PART, _LINEAR_PART, _NOISE_PRIOR])
+    medians, deviations = np.transpose([*[_LENGTH] * (count - 3), _LINEAR_PART, _LINEAR_PART, (1e-6, 4.0)])
     return np.log(medians), deviations
 
 
@@ -237,21 +268,18 @@ def _box(kernel: ResidualKernel, dimension: int) -> tuple[Array, Array]:
 def _modes_of(kernel: ResidualKernel, Z: Array, Y: Array) -> tuple[_Mode, ...]:
     """Return the modes of a family, the highest first: one with little noise, one with much, or one that is both."""
     (height, place), (lower, other) = found = _climbed(kernel, Z, Y)
-    relevant = height - lower < _LOWEST and np.abs(place - other).max() > _SAME
+    relevant = height - lower < 12.0 and np.abs(place - other).max() > 0.5  # else negligible, or the same mode
     return tuple(_Mode(kernel, *one, Z, Y) for one in (found if relevant else found[:1]))
 
 
 def _climbed(kernel: ResidualKernel, Z: Array, Y: Array) -> list[tuple[float, Array]]:
     """Return the log posterior and its place where climbs from little and from much noise end, the highest first."""
-    low, high = _box(kernel, Z.shape[1])
-    found: list[tuple[float, Array]] = []
-    for noise in _STARTS:
-        start = np.log([*[_LENGTH[0]] * Z.shape[1], 1.0, 1.0, noise])
-        mode = most_likely(
-            lambda parameters: log_posterior(kernel, parameters, Z, Y), start[None], list(zip(low, high, strict=True))
-        )
-        found.append((log_posterior(kernel, mode, Z, Y)[0], mode))
-    return sorted(found, key=lambda one: -one[0])
+    density = functools.partial(log_posterior, kernel, Z=Z, Y=Y)
+    bounds = list(zip(*_box(kernel, Z.shape[1]), strict=True))
+    # The data can look like a rough function, or like a smooth one with noise.
+    starts = [np.log([*[_LENGTH[0]] * Z.shape[1], 1.0, 1.0, noise]) for noise in (1e-5, 0.1)]
+    modes = [most_likely(density, start[None], bounds) for start in starts]
+    return sorted(((density(mode)[0], mode) for mode in modes), key=lambda mode: -mode[0])
 
 
 def _gradient_or_zero(kernel: ResidualKernel, parameters: Array, Z: Array, Y: Array) -> Array:

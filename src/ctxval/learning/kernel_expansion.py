@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 
@@ -12,18 +12,12 @@ from ctxval._util.arrays import Array, Mask
 from ctxval.gp.cholesky import factorise, tenfold
 from ctxval.learning.hyperparameters import Hyperparameters
 
-_CACHED = 20_000
-"""Number of covariances that are computed together, so that intermediate results stay in the processor's cache."""
-_MISFIT = 1e-6
-"""Largest error of standardised residuals at centres that rounding may cause."""
-
 
 @dataclass(frozen=True, eq=False)
 class KernelExpansion:
     """S functions ``f_s(z) = sum_j weights_sj k(z, centre_j)`` with n values each.
 
     Attributes:
-        hyperparameters: the covariance k and its hyperparameters.
         centres: standardised pairs, shape ``(M, k)``.
         weights: shape ``(S, M, n)``.
     """
@@ -41,7 +35,11 @@ class KernelExpansion:
         np.multiply(z, z, out=extended[..., k:-1])
         extended[..., -1] = 1.0
         values = np.matmul(extended, self._linear)
-        for block in _blocks(S, q, max(1, _CACHED // len(self.centres))):
+        # As many covariances as stay in the processor's cache are computed together.
+        largest = max(1, 20_000 // len(self.centres))
+        together = max(1, largest // max(1, q))
+        for s, j in product(range(0, S, together), range(0, q, largest)):
+            block = slice(s, s + together), slice(j, j + largest)
             some = extended[block]
             covariances = self._matern(some.reshape(-1, 2 * k + 1)).reshape(*some.shape[:2], -1)
             values[block] += np.matmul(covariances, self.weights[block[0]])
@@ -86,7 +84,6 @@ class KernelExpansion:
         r2 = extended @ self._squared
         np.abs(r2, out=r2)  # rounding errors around zero
         r = np.sqrt(r2)
-        # The same array holds the squares, and then the polynomial.
         polynomial = _polynomial(kernel.nu, r, r2)
         np.negative(r, out=r)
         decay = np.exp(r, out=r)
@@ -115,14 +112,6 @@ def _polynomial(nu: float, r: Array, r2: Array) -> Array:
     return r2
 
 
-def _blocks(functions: int, arguments: int, largest: int) -> Iterator[tuple[slice, slice]]:
-    """Yield blocks of functions and arguments that are evaluated together, about ``largest`` arguments in all."""
-    together = max(1, largest // max(1, arguments))
-    for function in range(0, functions, together):
-        for argument in range(0, arguments, largest):
-            yield slice(function, function + together), slice(argument, argument + largest)
-
-
 def weights_without(covariance: Array, noise: float, outputs: Array, gone: Mask) -> Array:
     """Return the weights ``(k, M, n)`` of k processes, each without the data that are gone for it, ``(k, M)``.
 
@@ -138,6 +127,6 @@ def weights_without(covariance: Array, noise: float, outputs: Array, gone: Mask)
         own -= inverse[:, rows] @ np.linalg.solve(inverse[np.ix_(rows, rows)], known[rows])
         own[rows] = 0.0
         misfit = covariance[kept] @ own + added * own[kept] - outputs[kept]
-        if not np.abs(misfit).max(initial=0.0) < _MISFIT:
+        if not np.abs(misfit).max(initial=0.0) < 1e-6:
             own[kept] = factorise(covariance[np.ix_(kept, kept)], tenfold(noise)).solve(outputs[kept])
     return found

@@ -17,11 +17,8 @@ from ctxval._util.cores import on_all_cores
 from ctxval.learning.closed_loops import LoopPlanner
 from ctxval.learning.draws import DynamicsDraws
 from ctxval.learning.dynamics_posterior import DynamicsPosterior
-from ctxval.learning.error_vectors import executions_of
+from ctxval.learning.vector import executions_of
 from ctxval.searches import Prediction
-
-_DESIGNS, _SLOW_DESIGNS = 2000, 150
-"""Numbers of designs for one suggestion, if the synthesizer takes batches, and if it takes one task at a time."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,11 +26,8 @@ class PredictedDistance:
     """The validation of M against M_hat, as a function of points of the unit cube.
 
     Attributes:
-        planner: designs controllers and runs closed loops.
-        posterior: the posterior of the dynamics.
         executed: executed points ``(n, d)``, in the order of the executions that the posterior knows.
         in_parallel: whether closed loops are distributed over the cores; their results are the same.
-        mean: the mean of the posterior that is used, M_hat.
     """
 
     planner: LoopPlanner
@@ -51,9 +45,7 @@ class PredictedDistance:
         if new:
             with single_threaded():
                 found = self._predicted(points[new])
-            self._known.update(
-                zip((keys[row] for row in new), zip(*map(np.ndarray.tolist, found), strict=True), strict=True)
-            )
+            self._known.update(zip((keys[row] for row in new), map(tuple, found.T.tolist()), strict=True))
         distance, doubt = np.array([self._known[key] for key in keys]).reshape(-1, 2).T
         return distance, doubt
 
@@ -69,13 +61,13 @@ class PredictedDistance:
             found = _halved(own, 0, len(rows), 1)[0]
         return np.where(np.isfinite(found), found, np.nan)
 
-    def _predicted(self, points: Array) -> tuple[Array, Array]:
+    def _predicted(self, points: Array) -> Array:
+        """Return distances and doubts ``(2, m)``; both are NaN if one is not finite."""
         if not self.in_parallel or all(map(self.planner.has, points)):
-            distance, doubt = self._guarded(points)
+            found = self._guarded(points)
         else:
-            distance, doubt = np.concatenate(on_all_cores(self._guarded, list(points[:, None])), axis=1)
-        finite = np.isfinite(distance) & np.isfinite(doubt)
-        return np.where(finite, distance, np.nan), np.where(finite, doubt, np.nan)
+            found = np.concatenate(on_all_cores(self._guarded, list(points[:, None])), axis=1)
+        return np.where(np.isfinite(found).all(axis=0), found, np.nan)
 
     def _guarded(self, points: Array) -> Array:
         return _halved(lambda first, last: self._closed_loops(points[first:last]), 0, len(points), 2)
@@ -111,13 +103,9 @@ def _halved(function: Callable[[int, int], Array], first: int, last: int, values
 def predict_distance(
     planner: LoopPlanner, posterior: DynamicsPosterior, executed: Array, in_parallel: bool = False
 ) -> Prediction:
-    """Return the prediction of d for a search.
-
-    Args:
-        planner, posterior, executed, in_parallel: as in :class:`PredictedDistance`.
-    """
+    """Return the prediction of d for a search; the arguments are those of :class:`PredictedDistance`."""
     exact = PredictedDistance(planner, posterior, executed, in_parallel, posterior.mean)
     # If few centres do not suffice, both predictions are one, so that no task is predicted twice.
     rough_mean = posterior.rough_mean
     rough = exact if rough_mean is posterior.mean else replace(exact, mean=rough_mean)
-    return Prediction(exact, exact.left_out, _DESIGNS if planner.batched else _SLOW_DESIGNS, rough=rough)
+    return Prediction(exact, exact.left_out, 2000 if planner.batched else 150, rough=rough)

@@ -1,12 +1,12 @@
 """Executed tasks on the corrected model: what the executions of the other tasks predict for each of them.
 
-Each task is replayed on the corrected model ``M_hat = M + r``, where r is learned without the executions of that task.
-The controller is the one that is designed on M, so the replay answers whether the recorded dynamics explain what the
+The controller is the one that is designed on M, so a replay answers whether the recorded dynamics explain what the
 system did. The system is never executed.
 """
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -19,9 +19,9 @@ from ctxval.core.rollout import rollout
 from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.validation import Validation
-from ctxval.learning.draws import DrawnModel, DynamicsDraws
+from ctxval.learning.draws import DrawnModel
 from ctxval.learning.dynamics_study import DynamicsStudy
-from ctxval.learning.error_vectors import Executed, executions_of
+from ctxval.learning.vector import Executed, executions_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,7 +29,6 @@ class Replay(ShortRepr):
     """One executed task on M, and on the corrected model that is learned from all other tasks.
 
     Attributes:
-        task: the task.
         corrected: the closed loop on the corrected model; None if nothing can be learned, or if it diverges.
         distance: the distance between the closed loops on M and on the corrected model; NaN if there is none.
     """
@@ -43,26 +42,18 @@ def replay_executed(validation: Validation, executed: Executed, wanted: Sequence
     """Return the replays of tasks; None for a task that cannot be planned.
 
     Args:
-        validation: the map p -> d(p); S is never executed.
         executed: points of the unit cube ``(d,)`` with the system's trajectories there; the dynamics are learned from
             all of them, except those at the task that is replayed.
         wanted: points of the unit cube ``(d,)`` of the tasks.
     """
+    models: list[DrawnModel | None] = [None] * len(wanted)
     with single_threaded():
-        without = _means_without(validation, executed, wanted)
-        models = (None if without is None else without.model_of(k) for k in range(len(wanted)))
+        with contextlib.suppress(Exception):  # the user's own parts, at states that no execution has reached
+            learned = DynamicsStudy(validation).learn(executed)
+            if learned is not None:
+                without = learned.posterior.means_without(executions_of(learned.executed, wanted))
+                models = [without.model_of(k) for k in range(len(wanted))]
         return [_replayed(validation, model, point) for model, point in zip(models, wanted, strict=True)]
-
-
-def _means_without(validation: Validation, executed: Executed, wanted: Sequence[Array]) -> DynamicsDraws | None:
-    """Return the corrected model for each task, as one draw; None if nothing can be learned."""
-    try:
-        learned = DynamicsStudy(validation).learn(executed)
-        if learned is None:
-            return None
-        return learned.posterior.means_without(executions_of(learned.executed, wanted))
-    except Exception:  # the user's own parts, at states that no execution has reached
-        return None
 
 
 def _replayed(validation: Validation, model: DrawnModel | None, point: Array) -> Replay | None:

@@ -13,8 +13,6 @@ from ctxval.models.scaling import standard_deviations, standardised_pairs
 
 NEGLIGIBLE = 1e-7
 """A residual below this share of the state's typical change is rounding."""
-_ABSURD = 1e100
-"""Transitions with larger numbers have diverged and are left out; the squares of such numbers would not be finite."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,7 +26,6 @@ class ResidualData:
         shift, scale: constants that standardise a state-input pair, shapes ``(n + m,)``.
         sizes: root mean square of the residual of each state, shape ``(n,)``.
         steps: standard deviation of the change of each state in one step, shape ``(n,)``.
-        transitions: the N transitions.
     """
 
     pairs: Array
@@ -61,24 +58,16 @@ class ResidualData:
 
 
 def residual_data(model: Model, transitions: Transitions, sources: Rows) -> ResidualData | None:
-    """Return the residuals of a model on recorded transitions.
-
-    Returns None if fewer than two transitions are usable, or if M explains all of them.
-
-    Args:
-        model: the model M.
-        transitions: N transitions of the system.
-        sources: the execution of each transition; -1 for data that the model was made from, shape ``(N,)``.
-    """
+    """Return the residuals of a model; None if fewer than two transitions are usable, or if M explains all of them."""
     with np.errstate(all="ignore"):
         residuals = transitions.x_next - model.step(transitions.x, transitions.u)
         steps = transitions.x_next - transitions.x
     pairs = np.concatenate([transitions.x, transitions.u], axis=1)
-    usable = (np.abs(np.concatenate([pairs, residuals, steps], axis=1)) < _ABSURD).all(axis=1)
+    # Larger numbers have diverged, and their squares would not be finite.
+    usable = (np.abs(np.concatenate([pairs, residuals, steps], axis=1)) < 1e100).all(axis=1)
     if usable.sum() < 2:
         return None
     pairs, residuals = pairs[usable], residuals[usable]
-    kept = Transitions(transitions.x[usable], transitions.u[usable], transitions.x_next[usable])
     typical = standard_deviations(steps[usable])
     sizes = np.sqrt((residuals**2).mean(axis=0))
     learned = sizes > NEGLIGIBLE * typical
@@ -86,4 +75,6 @@ def residual_data(model: Model, transitions: Transitions, sources: Rows) -> Resi
         return None
     shift, scale = pairs.mean(axis=0), standard_deviations(pairs)
     outputs = residuals / np.where(learned, sizes, np.inf)
-    return ResidualData((pairs - shift) / scale, outputs, sources[usable], shift, scale, sizes, typical, kept)
+    return ResidualData(
+        (pairs - shift) / scale, outputs, sources[usable], shift, scale, sizes, typical, transitions[usable]
+    )

@@ -6,17 +6,25 @@ Gaussian processes that share a covariance, one for each entry, and values are c
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
 from ctxval._util.arrays import Array, Rows, single_threaded
+from ctxval._util.progress import advance
+from ctxval.core.distance import ComposedDistance
+from ctxval.core.trajectory import Trajectory
 from ctxval.errors import ShapeError
 from ctxval.gp.cholesky import tenfold
 from ctxval.gp.kernels import Linear, Matern, Sum
 from ctxval.gp.regression import MultiOutputProcess, log_likelihood_of_outputs, most_likely
+from ctxval.learning.closed_loops import LoopPlanner
 from ctxval.searches.base import Prediction
+
+Executed = Sequence[tuple[Array, Trajectory]]
+"""Points of the unit cube ``(d,)`` with the system's trajectories there."""
 
 Compose = Callable[[Array], Array]
 """Vectors ``(..., k)`` -> values ``(...)``."""
@@ -24,30 +32,52 @@ Compose = Callable[[Array], Array]
 _KERNEL = Sum(Matern(2.5, ard=True, length_scale=(0.05, 100.0), variance=(1e-6, 1e3)), Linear(variance=(1e-6, 1e3)))
 _NOISE = 1e-8
 """Noise variance relative to the vectors' mean square: it keeps the covariance matrix positive definite."""
-_START = (0.1, 0.5, 0.1, 1.0)
-"""Prior medians of the Matern variance, of the length-scale over the root of the dimension, and of the constant and the
-slope variance of the linear kernel; the search for the most likely hyperparameters starts there."""
-_LENGTH_SCALE_DEVIATION = 1.0
-"""Prior standard deviation of a length-scale's logarithm."""
-_VARIANCE_DEVIATION = 3.0
-"""Prior standard deviation of a variance's logarithm."""
 _LEARNED_FROM = 200
 """Largest number of vectors, the latest ones, from which the hyperparameters are learned."""
-_BUDGET = 6000
-"""Number of points that may be predicted for one suggestion; it is large because no controller is designed for them."""
-_DRAWS = 32
-"""Number of draws of the vector from which the doubt is computed."""
+
+
+def executions_of(executed: Array, points: Iterable[Array]) -> list[list[int]]:
+    """Return the rows of executed points ``(n, d)`` at each of some points ``(d,)``."""
+    return [np.flatnonzero((executed.reshape(-1, len(point)) == point).all(axis=1)).tolist() for point in points]
+
+
+class ErrorVectors:
+    """Computes the vectors of executions; each needs the design of a controller, so it is kept like its trajectory."""
+
+    def __init__(self, planner: LoopPlanner) -> None:
+        self.validation = planner.validation
+        self._planner = planner
+        self._known: WeakKeyDictionary[Trajectory, Array] = WeakKeyDictionary()
+
+    def of(self, executed: Executed) -> Array | None:
+        """Return the vectors ``(n, k)`` of two executions or more; None if a vector cannot be computed."""
+        distance = self.validation.distance
+        if not isinstance(distance, ComposedDistance) or len(executed) < 2:
+            return None
+        try:
+            errors = np.array([self._of(distance, *pair) for pair in executed])
+        except Exception:  # the user's own parts: a distance may reject even tasks that were executed
+            return None
+        return errors if errors.ndim == 2 and np.isfinite(errors).all() else None
+
+    def _of(self, distance: ComposedDistance, point: Array, trajectory: Trajectory) -> Array:
+        known = self._known.get(trajectory)
+        if known is None:
+            if self._planner.batched:
+                plan = self.validation.plan(self.validation.space.from_unit(point))
+                advance()
+                task, promised = plan.task, plan.model_trajectory
+            else:
+                (planned,) = self._planner.plan(point[None])
+                task, promised = planned.task, planned.promised
+            # Some distances change the arrays that they are given.
+            known = self._known[trajectory] = distance.error(promised.copy(), trajectory.copy(), task)
+        return known
 
 
 @dataclass(frozen=True, eq=False)
 class _ComposedPosterior:
-    """The posterior of the vectors, and the values composed of it.
-
-    Attributes:
-        vectors: the posterior of the vectors, divided by ``scale``.
-        scale: root mean square of the vectors.
-        compose: the function from vectors to values.
-    """
+    """The posterior of the vectors, which are divided by their root mean square, and the values composed of it."""
 
     vectors: MultiOutputProcess
     scale: float
@@ -59,7 +89,7 @@ class _ComposedPosterior:
             mean, variance = self.vectors.predict(points)
         expected = np.asarray(self.compose(self.scale * mean))
         # The draws are the same at all points and in all calls, so that the result is a function of the point.
-        draws = np.random.default_rng(0).normal(size=(_DRAWS, 1, mean.shape[1]))
+        draws = np.random.default_rng(0).normal(size=(32, 1, mean.shape[1]))
         drawn = self.compose(self.scale * (mean + np.sqrt(variance)[:, None] * draws))
         deviation = np.sqrt(((drawn - expected) ** 2).mean(axis=0))
         return expected, deviation / np.maximum(np.abs(expected), 1e-12 * self.scale)
@@ -70,17 +100,9 @@ class _ComposedPosterior:
 
 
 def predict_composed(points: Array, vectors: Array, compose: Compose) -> Prediction | None:
-    """Return a prediction of values from the vectors of which they are composed at known points.
+    """Return a prediction of values from the vectors ``(n, k)`` of which they are composed at points ``(n, d)``.
 
     Returns None if fewer than two vectors are known, or if all of them are zero.
-
-    Args:
-        points: known points of the unit cube, ``(n, d)``.
-        vectors: the vectors at these points, ``(n, k)``.
-        compose: vectors ``(..., k)`` -> values ``(...)``.
-
-    Raises:
-        ShapeError: if the shapes of points and vectors do not fit together.
     """
     if points.ndim != 2 or vectors.ndim != 2 or len(points) != len(vectors):
         raise ShapeError(f"points must be (n, d) and vectors (n, k), got {points.shape}, {vectors.shape}.")
@@ -89,21 +111,18 @@ def predict_composed(points: Array, vectors: Array, compose: Compose) -> Predict
         return None
     with single_threaded():
         theta = _most_likely(points[-_LEARNED_FROM:], vectors[-_LEARNED_FROM:] / scale)
-    known = _ComposedPosterior(MultiOutputProcess(_KERNEL, theta, points, vectors / scale, _noises()), scale, compose)
-    return Prediction(known.expected, known.left_out, _BUDGET)
-
-
-def _noises() -> tuple[float, ...]:
-    """Return noise variances in the order in which they are tried: points may be too similar for the first."""
-    return (_NOISE, *(_NOISE + more for more in tenfold(_NOISE)))
+    noises = (_NOISE, *(_NOISE + more for more in tenfold(_NOISE)))  # points may be too similar for the first
+    known = _ComposedPosterior(MultiOutputProcess(_KERNEL, theta, points, vectors / scale, noises), scale, compose)
+    # Many points may be predicted, because no controller is designed for them.
+    return Prediction(known.expected, known.left_out, 6000)
 
 
 def _most_likely(X: Array, Y: Array) -> Array:
     """Return the hyperparameters that make vectors ``(n, k)``, their entries independent, most likely a posteriori."""
     d = X.shape[1]
-    variance, length, constant, slope = np.log(_START)
+    variance, length, constant, slope = np.log((0.1, 0.5, 0.1, 1.0))  # prior medians, where the climb starts
     medians = np.array([variance, *[length + 0.5 * np.log(d)] * d, constant, slope])
-    deviations = np.array([_VARIANCE_DEVIATION, *[_LENGTH_SCALE_DEVIATION] * d, *[_VARIANCE_DEVIATION] * 2])
+    deviations = np.array([3.0, *[1.0] * d, *[3.0] * 2])
 
     def log_density(theta: Array) -> tuple[float, Array]:
         away = (theta - medians) / deviations

@@ -17,27 +17,17 @@ from ctxval.learning.residual_data import NEGLIGIBLE, ResidualData, residual_dat
 from ctxval.models.linear import Linear
 from ctxval.models.scaling import standard_deviations
 
-PREFERRED = 1.0
-"""Least gain in the log density of each recorded number by which the linear model is preferred to M."""
-
-_FEWEST = 10
-"""Least number of transitions for each coefficient of the linear model, so that the fit itself explains little."""
-
-_LINEAR = 1e-3
-"""M is linear if it differs from a linear model by less than this share of its residual in every state."""
-
 
 def smoother_than(data: ResidualData, count: int) -> tuple[Model, ResidualData] | None:
     """Return a linear model and its residuals if with them the transitions are far more probable than with M's.
 
-    Args:
-        data: the residuals of M.
-        count: number of transitions from which hyperparameters are learned.
+    The hyperparameters are learned from ``count`` transitions.
     """
-    if len(data.pairs) < _FEWEST * (data.pairs.shape[1] + 1) or _is_linear(data):
+    # With at least 10 transitions for each coefficient, the fit itself explains little.
+    if len(data.pairs) < 10 * (data.pairs.shape[1] + 1) or _is_linear(data):
         return None
     rows = learning_rows(data.pairs, data.inputs, count)
-    needed = _log_density(data, rows) + PREFERRED * len(rows) * len(data.sizes)
+    needed = _log_density(data, rows) + len(rows) * len(data.sizes)  # a gain of 1 for each recorded number
     known = data.transitions
     # If S itself is linear, its linear model leaves no residual. The change of its state has the same prior.
     for linear in (_fitted(known, known.x_next), Identity()):
@@ -67,7 +57,7 @@ def _is_linear(data: ResidualData) -> bool:
     known = data.transitions
     predicted = known.x_next - data.outputs * data.units
     deviations = predicted - _fitted(known, predicted).step(known.x, known.u)
-    return bool((np.sqrt((deviations**2).mean(axis=0)) <= _LINEAR * data.sizes).all())
+    return bool((np.sqrt((deviations**2).mean(axis=0)) <= 1e-3 * data.sizes).all())
 
 
 def _fitted(known: Transitions, following: Array) -> Linear:

@@ -10,7 +10,7 @@ rounds each draw tries the best tasks of the others.
 from __future__ import annotations
 
 import functools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -26,20 +26,12 @@ _DIVERGED = 1e30
 """The distance of a loop that diverges, in searches: larger than all others, and finite."""
 _EVALUATIONS = (512, 2048, 4096, 6000, 6000, 6000, 12000)
 """Number of tasks in the global search for 1, 2, ... task parameters; the last one holds for all higher numbers."""
-_SHARES = (0.1, 0.05, 0.02, 0.007)
-"""Standard deviations of the random moves in successive rounds of the search on each draw."""
-_EXCHANGED = 2
-"""Round before which each draw tries the best tasks of the other draws."""
 _SHOWN = 16
 """Largest number of these tasks."""
-_SAME = 0.02
-"""Least distance of two of them, as a share of the cube's diagonal."""
 _NEARBY = 1e-3
 """Largest change of each coordinate to a task that is nearly the same."""
 _SCREENED = (8, 1500)
 """Number of draws of the hyperparameters in a screening, and of tasks in its search on the mean."""
-_DEEPER = 4
-"""Factor of the number of tasks in a deeper search."""
 _APART = 0.15
 """Least distance of two tasks that are not next to each other, as a share of the cube's diagonal."""
 
@@ -72,31 +64,11 @@ class WorstCaseSettings:
 
     @classmethod
     def for_dimension(cls, dimension: int, batched: bool = True) -> WorstCaseSettings:
-        """Return settings with as many tasks as a search of so many task parameters needs.
-
-        Args:
-            dimension: the number of task parameters.
-            batched: whether controllers are designed in batches; if not, there are far fewer tasks.
-        """
+        """Return settings for so many task parameters; there are far fewer tasks if they are designed one by one."""
         if not batched:
             return cls(pool=64, evaluations=256, elites=6, shared=12, moves=2, rounds=0, peaks=1, nearby=8)
         evaluations = _EVALUATIONS[min(dimension, len(_EVALUATIONS)) - 1]
         return cls(pool=min(1024, evaluations // 4), evaluations=evaluations)
-
-
-@dataclass(frozen=True, eq=False)
-class WorstOfMean:
-    """The largest distance on the posterior mean.
-
-    Attributes:
-        highest: the largest distance.
-        elites: tasks with large distances, points ``(e, d)``, the largest first.
-        evaluations: number of closed loops that were compared.
-    """
-
-    highest: float
-    elites: Array
-    evaluations: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,7 +78,6 @@ class WorstCase:
     Attributes:
         maxima: the largest distance of each draw, shape ``(S,)``; infinity if its closed loop diverges.
         points: where it lies, points of the unit cube ``(S, d)``.
-        of_mean: the largest distance on the posterior mean.
         elites: tasks with large distances on the posterior mean, points ``(e, d)``, the largest first.
         evaluations: number of closed loops that were compared; a few of them may be the same.
         left_out: largest share of the posterior variance that a draw leaves out between its pivots.
@@ -125,13 +96,7 @@ class WorstCase:
 
 
 class WorstCaseSearch:
-    """Searches the tasks for the largest distance, for each draw of the dynamics.
-
-    Args:
-        planner: designs controllers and runs closed loops.
-        seed: seed of the tasks of the pool.
-        settings: numbers of closed loops; the defaults if None.
-    """
+    """Searches the tasks for the largest distance, for each draw of the dynamics."""
 
     def __init__(self, planner: LoopPlanner, seed: int, settings: WorstCaseSettings | None = None) -> None:
         self.planner = planner
@@ -198,13 +163,9 @@ class WorstCaseSearch:
         """Return the largest distances on the mean ``(2,)`` in two separate searches, and their points ``(2, d)``.
 
         Each of them has four times as many tasks as the usual one, and none of its tasks.
-
-        Args:
-            posterior: the posterior of the dynamics.
-            rng: the source of all random numbers.
         """
         distance, none = functools.partial(self._distances, posterior.mean), np.empty((0, self.dimension))
-        evaluations = _DEEPER * self.settings.evaluations
+        evaluations = 4 * self.settings.evaluations
         with single_threaded():
             found = [search_globally(distance, self.dimension, none, rng, evaluations=evaluations) for _ in range(2)]
         return np.array([one.values[0] for one in found]), np.array([one.points[0] for one in found])
@@ -223,14 +184,12 @@ class WorstCaseSearch:
         rng: np.random.Generator,
         *,
         globally: bool = True,
-    ) -> WorstOfMean:
-        """Return the largest distance on the posterior mean.
+    ) -> WorstCase:
+        """Return the largest distance on the posterior mean, as if it were the only draw.
 
         Args:
-            posterior: the posterior of the dynamics.
             of_pool: the distances of the pool's tasks on the posterior mean, shape ``(N,)``.
             known: tasks to look at in any case, such as those of earlier maxima, points ``(k, d)``.
-            rng: the source of the tasks that are tried.
             globally: whether large distances on a small share of the tasks are looked for.
         """
         settings, distance = self.settings, functools.partial(self._distances, posterior.mean)
@@ -242,22 +201,20 @@ class WorstCaseSearch:
                 ascent = Ascent(distance, np.zeros(self.dimension), np.ones(self.dimension), budget)
                 points, values = ascent.run(starts[: len(known) + _SHOWN], rng)
                 apart = separated_rows(points, _APART * np.sqrt(self.dimension), settings.elites)
-                return WorstOfMean(float(values[0]), points[apart], len(self.pool) + len(points))
+                return self._of_mean(float(values[0]), points[apart], len(points))
             evaluations = max(len(starts) + 50, settings.evaluations - len(self.pool))
             found = search_globally(distance, self.dimension, starts, rng, evaluations=evaluations)
         elites = np.concatenate([found.points[:1], found.elites[: settings.elites]])
-        return WorstOfMean(float(found.values[0]), elites, len(self.pool) + found.evaluations)
+        return self._of_mean(float(found.values[0]), elites, found.evaluations)
+
+    def _of_mean(self, highest: float, elites: Array, evaluations: int) -> WorstCase:
+        maxima, loops = np.array([highest]), len(self.pool) + evaluations
+        return WorstCase(maxima, elites[:1], highest, elites, loops, 0.0, self.unplanned)
 
     def screened(
-        self, posterior: DynamicsPosterior, of_mean: WorstOfMean, known: Array, rng: np.random.Generator
+        self, posterior: DynamicsPosterior, of_mean: WorstCase, known: Array, rng: np.random.Generator
     ) -> WorstCase:
-        """Return the largest distances of a few draws over the elites, known tasks and random ones: a lower bound.
-
-        Args:
-            posterior, known: as in :meth:`on_mean`.
-            of_mean: the largest distance on the posterior mean.
-            rng: the source of the draws.
-        """
+        """Return the largest distances of a few draws over the elites, known tasks and random ones: a lower bound."""
         with single_threaded():
             tasks = self._shared_tasks(of_mean, known, rng)
             draws = posterior.draw(self._relevant(posterior, tasks, rng), rng, 1, _SCREENED[0])
@@ -268,19 +225,12 @@ class WorstCaseSearch:
     def maxima(
         self,
         posterior: DynamicsPosterior,
-        of_mean: WorstOfMean,
+        of_mean: WorstCase,
         known: Array,
         rng: np.random.Generator,
         functions: int | None = None,
     ) -> WorstCase:
-        """Return the largest distances of draws from a posterior.
-
-        Args:
-            posterior, known: as in :meth:`on_mean`.
-            of_mean: the largest distance on the posterior mean, searched globally.
-            rng: the source of the draws and of the moves.
-            functions: number of functions for each draw of the hyperparameters; that of the settings if None.
-        """
+        """Return the largest distances of so many functions for each draw of the posterior's hyperparameters."""
         with single_threaded():
             tasks = self._shared_tasks(of_mean, known, rng)
             draws = posterior.draw(self._relevant(posterior, tasks, rng), rng, functions)
@@ -288,23 +238,21 @@ class WorstCaseSearch:
             sharpness = self._sharpness(posterior.mean, of_mean.elites, rng)
         return self._worst_case(of_mean, draws, maxima, points, loops, sharpness)
 
-    def _shared_tasks(self, of_mean: WorstOfMean, known: Array, rng: np.random.Generator) -> Array:
+    def _shared_tasks(self, of_mean: WorstCase, known: Array, rng: np.random.Generator) -> Array:
         """Return the tasks that all draws are run on: elites, known tasks and random ones."""
         random = self.pool[rng.permutation(len(self.pool))[: self.settings.shared]]
         return np.concatenate([of_mean.elites, known, random])
 
     def _worst_case(
-        self, of_mean: WorstOfMean, draws: DynamicsDraws, maxima: Array, points: Array, loops: int, sharpness: float
+        self, of_mean: WorstCase, draws: DynamicsDraws, maxima: Array, points: Array, loops: int, sharpness: float
     ) -> WorstCase:
-        return WorstCase(
-            np.where(maxima >= _DIVERGED, np.inf, maxima),
-            points,
-            of_mean.highest,
-            of_mean.elites,
-            of_mean.evaluations + len(draws) * loops,
-            max(draws.left_out),
-            self.unplanned,
-            sharpness,
+        return replace(
+            of_mean,
+            maxima=np.where(maxima >= _DIVERGED, np.inf, maxima),
+            points=points,
+            evaluations=of_mean.evaluations + len(draws) * loops,
+            left_out=max(draws.left_out),
+            sharpness=sharpness,
         )
 
     def _distances(self, mean: DynamicsDraws, points: Array) -> Array:
@@ -337,31 +285,26 @@ class WorstCaseSearch:
         order = np.argsort(-values, axis=1, kind="stable")
         best, points = np.take_along_axis(values, order[:, :1], 1)[:, 0], tasks[order[:, 0]]
         second, loops = _others(tasks, order), len(tasks)
-        for round_, share in enumerate(_SHARES[: self.settings.rounds]):
-            if round_ == _EXCHANGED:
-                points, best, more = self._exchanged(draws, points, best)
-                loops += more
+        for round_, share in enumerate((0.1, 0.05, 0.02, 0.007)[: self.settings.rounds]):
+            if round_ == 2:
+                # Each draw tries the best tasks of all others.
+                ordered = points[np.argsort(-best, kind="stable")]
+                shown = ordered[separated_rows(ordered, 0.02 * np.sqrt(self.dimension), _SHOWN)]
+                found = _finite(self.planner.distances(draws, self.planner.plan(shown), len(shown)))
+                points, best = _better(points, best, np.broadcast_to(shown, (len(best), *shown.shape)), found)
+                loops += len(shown)
             moved = self._moves(points, second, share, rng)
             found = _finite(self.planner.own_distances(draws, moved))
             together = _together(points, best, moved, found)[:, None]
-            last = self._new_distances(draws, together, np.concatenate([points[:, None], moved], axis=1))
+            known = np.concatenate([points[:, None], moved], axis=1)
+            if (together == known).all(axis=2).any(axis=1).all():
+                last = np.full((len(points), 1), -np.inf)  # none of them is a new task
+            else:
+                last = _finite(self.planner.own_distances(draws, together))
             tried, found = np.concatenate([moved, together], axis=1), np.concatenate([found, last], axis=1)
             points, best = _better(points, best, tried, found)
             loops += tried.shape[1]
         return points, best, loops
-
-    def _new_distances(self, draws: DynamicsDraws, tasks: Array, known: Array) -> Array:
-        """Return the distances ``(S, 1)`` of each draw on its task; minus infinity if none of them is a new one."""
-        if (tasks == known).all(axis=2).any(axis=1).all():
-            return np.full(tasks.shape[:2], -np.inf)
-        return _finite(self.planner.own_distances(draws, tasks))
-
-    def _exchanged(self, draws: DynamicsDraws, points: Array, best: Array) -> tuple[Array, Array, int]:
-        """Return the better of each draw's best point and the best points of all others, and the number of loops."""
-        order = np.argsort(-best, kind="stable")
-        tasks = points[order][separated_rows(points[order], _SAME * np.sqrt(self.dimension), _SHOWN)]
-        found = _finite(self.planner.distances(draws, self.planner.plan(tasks), len(tasks)))
-        return *_better(points, best, np.broadcast_to(tasks, (len(best), *tasks.shape)), found), len(tasks)
 
     def _moves(self, points: Array, others: Array, share: float, rng: np.random.Generator) -> Array:
         """Return the moves of each point: to bounds, 2 d of them, and at random around it and around another one."""

@@ -31,7 +31,6 @@ class SquaredExponential(ShortRepr):
     length_scales: Array
 
     def __call__(self, z: Array, centres: Array) -> Array:
-        """Return the covariances ``(N, M)`` of points ``(N, k)`` and ``(M, k)``."""
         a, b = z / self.length_scales, centres / self.length_scales
         exponent = a @ b.T
         exponent -= 0.5 * (a**2).sum(axis=1)[:, None]
@@ -84,9 +83,7 @@ class GaussianProcessModel(ShortRepr):
     ) -> GaussianProcessModel:
         """Condition on recorded transitions, with the most likely hyperparameters (eq. 5.8, summed over the states).
 
-        Args:
-            points: how many of them, drawn at random, it is conditioned on; the effort grows with their cube.
-            iterations: of the search for the hyperparameters, at most.
+        It is conditioned on so many points, drawn at random; the effort grows with their cube.
         """
         scaling = IncrementScaling.of(data)
         rows = np.random.default_rng(seed).permutation(len(data))[:points]
@@ -115,13 +112,11 @@ class GaussianProcessModel(ShortRepr):
         return cls(covariance, Z, factorise(covariance(Z, Z), noise).solve(Y), scaling, data)
 
     def step(self, x: Array, u: Array) -> Array:
-        """Return the next state; shapes ``(..., n), (..., m) -> (..., n)``."""
         z = self.scaling.inputs(x, u)
         output = self._contracted(z.reshape(-1, z.shape[-1]), self.weights)
         return self.scaling.step(x, output.reshape(*z.shape[:-1], self.weights.shape[1]))
 
     def jacobian(self, x: Array, u: Array) -> tuple[Array, Array]:
-        """Return A ``(..., n, n)`` and B ``(..., n, m)``."""
         z = self.scaling.inputs(x, u)
         rows = z.reshape(-1, z.shape[-1])
         n, k = self.weights.shape[1], rows.shape[1]

@@ -1,16 +1,17 @@
-"""A linear model learned from data."""
+"""Linear models: learned from data, or state-space models of python-control and of scipy."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import numpy as np
 
 from ctxval._util.arrays import Array, ArrayLike, as_finite, single_threaded
+from ctxval._util.checked import Seconds
 from ctxval._util.registry import part
 from ctxval._util.representation import ShortRepr
 from ctxval.core.trajectory import Transitions
 from ctxval.errors import InputError, ShapeError
-
-_LARGEST_CONDITION = 1e8  # half of the digits of a double; beyond it rounding and noise determine the weights
 
 
 @part()
@@ -56,11 +57,20 @@ class Linear(ShortRepr):
                 f"the data do not determine a linear model: {len(data)} transitions of {n} states and {m} inputs "
                 f"have rank {rank}, and {regressors.shape[1]} is needed; excite every state and input."
             )
-        _require_identifiable(regressors, n, m)
+        # No regressor may nearly be a linear combination of the others, independently of units.
+        with single_threaded():
+            _, sizes, directions = np.linalg.svd(regressors / np.linalg.norm(regressors, axis=0), full_matrices=False)
+        if sizes[0] > 1e8 * sizes[-1]:  # half of the digits; beyond it rounding and noise determine the weights
+            names = [*(f"x{i}" for i in range(n)), *(f"u{i}" for i in range(m)), "the constant"]
+            together = [names[i] for i in np.flatnonzero(np.abs(directions[-1]) > 0.1)]
+            raise InputError(
+                f"the data hardly determine a linear model: {' and '.join(together)} depend on each other in all "
+                f"transitions (condition {sizes[0] / sizes[-1]:.1e}, at most 1e+08); excite them independently, for "
+                "example without feedback."
+            )
         return cls(weights[:n].T, weights[n : n + m].T, weights[n + m] if intercept else None, data)
 
     def step(self, x: Array, u: Array) -> Array:
-        """Return the next state; shapes ``(..., n), (..., m) -> (..., n)``."""
         try:
             return np.asarray(x @ self.A.T + u @ self.B.T + self.c)
         except ValueError as error:
@@ -74,17 +84,26 @@ class Linear(ShortRepr):
         return self.A, self.B
 
 
-def _require_identifiable(regressors: Array, n: int, m: int) -> None:
-    """Check that no regressor is nearly a linear combination of the others, independently of units."""
-    scaled = regressors / np.linalg.norm(regressors, axis=0)
-    with single_threaded():
-        _, sizes, directions = np.linalg.svd(scaled, full_matrices=False)
-    if sizes[0] <= _LARGEST_CONDITION * sizes[-1]:
-        return
-    names = [*(f"x{i}" for i in range(n)), *(f"u{i}" for i in range(m)), "the constant"]
-    together = [names[i] for i in np.flatnonzero(np.abs(directions[-1]) > 0.1)]
-    raise InputError(
-        f"the data hardly determine a linear model: {' and '.join(together)} depend on each other in all transitions "
-        f"(condition {sizes[0] / sizes[-1]:.1e}, at most {_LARGEST_CONDITION:.0e}); excite them independently, "
-        "for example without feedback."
-    )
+@part()
+def state_space(system: Any, dt: Seconds) -> Linear:
+    """Return a ``StateSpace`` of python-control or of scipy as a linear model with its Jacobian.
+
+    The model has the state of the system; C and D are not used. A continuous system, whose own dt is 0 or None, is
+    discretised exactly for inputs that are held over a step. A discrete system whose dt is True has any time step.
+    """
+    if not all(hasattr(system, name) for name in ("A", "B")):
+        raise InputError(f"a state-space model must have A and B, got {system!r}.")
+    A, B = as_finite("A", system.A), as_finite("B", system.B)
+    if A.ndim != 2 or A.shape[0] != A.shape[1] or B.ndim != 2 or len(B) != len(A):
+        raise ShapeError(f"a state-space model needs A (n, n) and B (n, m), got {A.shape} and {B.shape}.")
+    own = getattr(system, "dt", None)
+    if not own:
+        from scipy.linalg import expm
+
+        # For an input that is held over dt: the exponential of [[A, B], [0, 0]] dt.
+        n, m = B.shape
+        whole = expm(np.block([[A, B], [np.zeros((m, n + m))]]) * dt)
+        return Linear(whole[:n, :n], whole[:n, n:])
+    if own is not True and not np.isclose(own, dt, rtol=1e-9, atol=0):
+        raise InputError(f"dt must be that of the discrete system, {own:g} s, got {dt:g} s.")
+    return Linear(A, B)

@@ -38,7 +38,11 @@ class MuJoCo(ShortRepr):
     def __init__(self, mjcf: str | Path, *, dt: Seconds | None = None, data: Transitions | None = None) -> None:
         self._mujoco = require_extra("mujoco", "mujoco", "models of MuJoCo")
         _, self._model = compile_mjcf(mjcf if is_mjcf_text(mjcf) else identified_in(Path(mjcf)))
-        self.substeps = _substeps(float(self._model.opt.timestep), dt)
+        timestep = float(self._model.opt.timestep)
+        ratio = 1.0 if dt is None else dt / timestep
+        self.substeps = round(ratio)
+        if self.substeps < 1 or abs(ratio - self.substeps) > 1e-6 * max(1.0, ratio):
+            raise InputError(f"dt must be a multiple of the model's timestep, {timestep:g} s, got {dt:g} s.")
         self.data = data
         if self._model.na:
             raise InputError(
@@ -51,7 +55,6 @@ class MuJoCo(ShortRepr):
         return float(self._model.opt.timestep) * self.substeps
 
     def step(self, x: Array, u: Array) -> Array:
-        """Return the next state; shapes ``(..., n), (..., m) -> (..., n)``."""
         model, nq = self._model, self._model.nq
         if (x.shape[-1], u.shape[-1]) != (nq + model.nv, model.nu):
             raise ShapeError(
@@ -94,12 +97,3 @@ def identified_in(path: Path) -> Path:
 def is_sysid_result(path: Path) -> bool:
     """Return whether a path is a folder that ``mujoco.sysid.save_results`` wrote."""
     return path.is_dir() and (path / _SYSID).is_file()
-
-
-def _substeps(timestep: float, dt: float | None) -> int:
-    if dt is None:
-        return 1
-    ratio = dt / timestep
-    if round(ratio) < 1 or abs(ratio - round(ratio)) > 1e-6 * max(1.0, ratio):
-        raise InputError(f"dt must be a multiple of the model's timestep, {timestep:g} s, got {dt:g} s.")
-    return round(ratio)

@@ -70,19 +70,30 @@ class FeedforwardReLU(ShortRepr):
         restarts: PositiveInt = 4,
         iterations: PositiveInt = 1000,
     ) -> FeedforwardReLU:
-        """Train networks on recorded transitions with scikit-learn's MLPRegressor and L-BFGS; return the best one.
+        """Train networks on recorded transitions with scikit-learn's MLPRegressor and L-BFGS.
 
-        Args:
-            hidden: number of units in each hidden layer.
-            restarts: number of networks to train; the one with the smallest loss on the data is returned.
+        So many networks with these hidden layers are trained; the one with the smallest loss on the data is returned.
         """
         scaling = IncrementScaling.of(data)
         seeds = np.random.SeedSequence(seed).generate_state(restarts)
-        trained = [_trained(data, scaling, tuple(hidden), int(start), iterations) for start in seeds]
+        network = require_extra("sklearn.neural_network", "cases", "learned networks").MLPRegressor
+        ignored = require_extra("sklearn.exceptions", "cases", "learned networks").ConvergenceWarning
+        trained = []
+        with single_threaded(), warnings.catch_warnings():
+            warnings.simplefilter("ignore", ignored)  # stopping at the limit of iterations is intended
+            for start in seeds:
+                regressor = network(
+                    hidden_layer_sizes=tuple(hidden),
+                    solver="lbfgs",
+                    alpha=1e-6,  # almost no penalty, because so few weights do not overfit thousands of transitions
+                    max_iter=iterations,
+                    max_fun=2 * iterations,
+                    random_state=int(start),
+                )
+                trained.append(regressor.fit(scaling.inputs(data.x, data.u), scaling.targets(data)))
         return cls.from_sklearn(min(trained, key=lambda regressor: regressor.loss_), scaling, data)
 
     def step(self, x: Array, u: Array) -> Array:
-        """Return the next state; shapes ``(..., n), (..., m) -> (..., n)``."""
         z = self.scaling.inputs(x, u)
         for weight, bias in zip(self.weights[:-1], self.biases[:-1], strict=True):
             z = np.maximum(z @ weight + bias, 0.0)
@@ -97,19 +108,3 @@ class FeedforwardReLU(ShortRepr):
             gradient = (gradient @ weight) * (before > 0)[..., None, :]
             z = np.maximum(before, 0.0)
         return self.scaling.jacobian(np.swapaxes(gradient @ self.weights[-1], -1, -2))
-
-
-def _trained(data: Transitions, scaling: IncrementScaling, hidden: tuple[int, ...], seed: int, iterations: int) -> Any:
-    """Return a fitted MLPRegressor."""
-    regressor = require_extra("sklearn.neural_network", "cases", "learned networks").MLPRegressor(
-        hidden_layer_sizes=hidden,
-        solver="lbfgs",
-        alpha=1e-6,  # almost no penalty, because so few weights do not overfit thousands of transitions
-        max_iter=iterations,
-        max_fun=2 * iterations,
-        random_state=seed,
-    )
-    with single_threaded(), warnings.catch_warnings():
-        ignored = require_extra("sklearn.exceptions", "cases", "learned networks").ConvergenceWarning
-        warnings.simplefilter("ignore", ignored)  # stopping at the limit of iterations is intended
-        return regressor.fit(scaling.inputs(data.x, data.u), scaling.targets(data))

@@ -44,7 +44,6 @@ class Onnx(ShortRepr):
             )
 
     def step(self, x: Array, u: Array) -> Array:
-        """Return the next state; shapes ``(..., n), (..., m) -> (..., n)``."""
         pair = (x, u) if len(self.network.widths) == 2 else (np.concatenate(paired(x, u), axis=-1),)
         output = self.network(*pair)
         if output.shape[-1] != x.shape[-1]:
@@ -58,5 +57,4 @@ class Onnx(ShortRepr):
         return central_differences(self.step, *paired(x, u), self.network.precision)
 
     def describe(self) -> dict[str, Any]:
-        """Return what identifies this model in a store."""
         return {**self.network.describe(), "increments": self.increments}

@@ -48,5 +48,4 @@ class Parametric(ShortRepr):
         self._step = Function(lambda x, u: step(x, u, values), vectorized=vectorized)
 
     def step(self, x: Array, u: Array) -> Array:
-        """Return the next state; shapes ``(..., n), (..., m) -> (..., n)``."""
         return self._step.step(x, u)

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
+from scipy.spatial.distance import cdist
 
 from ctxval._util.arrays import Array
-from ctxval.models import kernel_maps as kernels
-from ctxval.models.kernel_maps import Kernel, KernelSum
-from ctxval.models.smooth_maps import ACTIVATIONS, Affine, Chain, Monomials, Network, Scaled, SideBySide, SmoothMap
+from ctxval.models import smooth_maps as maps
+from ctxval.models.smooth_maps import Kernel, Slope, Slopes, SmoothMap
 
 _LINEAR = {
     *("ARDRegression", "BayesianRidge", "ElasticNet", "ElasticNetCV", "HuberRegressor", "Lars", "LarsCV", "Lasso"),
@@ -27,9 +27,36 @@ def smooth_map(regressor: Any) -> SmoothMap | None:
     The formula refers to the numbers of the regressor and does not copy them. Classes that users derive from those of
     scikit-learn may predict otherwise, so only the classes themselves are known.
     """
-    name = _name(regressor)
-    read = _regressor_linear if name in _LINEAR else _REGRESSORS.get(name)
-    return None if read is None else read(regressor)
+    match _name(regressor):
+        case name if name in _LINEAR:
+            coefficients = np.asarray(regressor.coef_, dtype=np.float64)
+            constants = np.atleast_1d(np.asarray(regressor.intercept_, dtype=np.float64))
+            return maps.affine(np.atleast_2d(coefficients).T, constants)
+        case "MLPRegressor":
+            if regressor.activation not in maps.ACTIVATIONS or regressor.out_activation_ != "identity":
+                return None
+            return maps.network(regressor.coefs_, regressor.intercepts_, regressor.activation)
+        case "GaussianProcessRegressor":
+            centres = getattr(regressor, "X_train_", None)
+            kernel = None if centres is None else _covariance(regressor.kernel_)
+            if kernel is None or not isinstance(centres, np.ndarray) or centres.ndim != 2:
+                return None
+            process = maps.kernel_sum(kernel, centres, _columns(regressor.alpha_))
+            return maps.chain([process, maps.scaled(regressor._y_train_std, regressor._y_train_mean)])
+        case "KernelRidge" if isinstance(regressor.X_fit_, np.ndarray):
+            kernel = _ridge_kernel(regressor, regressor.X_fit_.shape[1])
+            return kernel and maps.kernel_sum(kernel, regressor.X_fit_, _columns(regressor.dual_coef_))
+        case "MultiOutputRegressor":
+            return _composed(maps.side_by_side, [smooth_map(estimator) for estimator in regressor.estimators_])
+        case "Pipeline":
+            *before, (_, last) = regressor.steps
+            used = [part for _, part in before if part is not None and part != "passthrough"]
+            return _composed(maps.chain, [*map(_transformer, used), smooth_map(last)])
+        case "TransformedTargetRegressor":
+            forward = _scaler(regressor.transformer_)
+            inverse = None if forward is None else maps.scaled(1.0 / forward[0], -forward[1] / forward[0])
+            return _composed(maps.chain, [smooth_map(regressor.regressor_), inverse])
+    return None
 
 
 def _name(part: Any) -> str:
@@ -38,38 +65,52 @@ def _name(part: Any) -> str:
     return kind.__name__ if kind.__module__.startswith("sklearn.") else ""
 
 
-def _composed(kind: type[Chain | SideBySide], *parts: SmoothMap | None) -> SmoothMap | None:
+def _composed(
+    compose: Callable[[Sequence[SmoothMap]], SmoothMap], parts: Sequence[SmoothMap | None]
+) -> SmoothMap | None:
     known = [part for part in parts if part is not None]
-    return kind(known) if len(known) == len(parts) else None
+    return compose(known) if len(known) == len(parts) else None
 
 
-# Regressors
+def _columns(weights: Array) -> Array:
+    return weights[:, None] if weights.ndim == 1 else weights
 
 
-def _regressor_linear(regressor: Any) -> SmoothMap:
-    coefficients = np.asarray(regressor.coef_, dtype=np.float64)
-    return Affine(np.atleast_2d(coefficients).T, np.atleast_1d(np.asarray(regressor.intercept_, dtype=np.float64)))
+# Transformers of features and targets
 
 
-def _network(regressor: Any) -> SmoothMap | None:
-    if regressor.activation not in ACTIVATIONS or regressor.out_activation_ != "identity":
-        return None
-    return Network(regressor.coefs_, regressor.intercepts_, regressor.activation)
+def _transformer(part: Any) -> SmoothMap | None:
+    if _name(part) == "PolynomialFeatures":
+        return maps.monomials(part.powers_)
+    if _name(part) == "PCA" and not part.whiten:
+        return maps.affine(part.components_.T, -part.mean_ @ part.components_.T)
+    scaler = _scaler(part)
+    return None if scaler is None else maps.scaled(*scaler)
 
 
-def _gaussian_process(regressor: Any) -> SmoothMap | None:
-    centres = getattr(regressor, "X_train_", None)
-    kernel = None if centres is None else _covariance(regressor.kernel_)
-    if kernel is None or not isinstance(centres, np.ndarray) or centres.ndim != 2:
-        return None
-    output = Scaled(regressor._y_train_std, regressor._y_train_mean)
-    return Chain([KernelSum(kernel, centres, _columns(regressor.alpha_)), output])
+def _scaler(part: Any) -> tuple[Array | float, Array | float] | None:
+    """Return the scale and the shift by which a scaler transforms columns; None if it is not known."""
+
+    def centred(centre: Array | None, scale: Array | None) -> tuple[Array | float, Array | float]:
+        factor = 1.0 if scale is None else 1.0 / scale
+        return factor, 0.0 if centre is None else -centre * factor
+
+    match _name(part):
+        case "MinMaxScaler" if not part.clip:
+            return part.scale_, part.min_
+        case "StandardScaler":
+            return centred(part.mean_ if part.with_mean else None, part.scale_)
+        case "RobustScaler":
+            centre, scale = part.with_centering, part.with_scaling
+            return centred(part.center_ if centre else None, part.scale_ if scale else None)
+        case "MaxAbsScaler" if not getattr(part, "clip", False):
+            return centred(None, part.scale_)
+        case "FunctionTransformer" if part.func is None and part.inverse_func is None:
+            return 1.0, 0.0
+    return None
 
 
-def _kernel_ridge(regressor: Any) -> SmoothMap | None:
-    centres = regressor.X_fit_
-    kernel = _ridge_kernel(regressor, centres.shape[1]) if isinstance(centres, np.ndarray) else None
-    return None if kernel is None else KernelSum(kernel, centres, _columns(regressor.dual_coef_))
+# Kernels between new points and known ones
 
 
 def _ridge_kernel(regressor: Any, features: int) -> Kernel | None:
@@ -77,109 +118,79 @@ def _ridge_kernel(regressor: Any, features: int) -> Kernel | None:
     shift, degree = regressor.coef0, regressor.degree
     match regressor.kernel:
         case "rbf":
-            return kernels.squared_exponential(float((2 * gamma) ** -0.5))
+            return maps.matern(float((2 * gamma) ** -0.5), np.inf)
         case "linear":
-            return kernels.of_products(lambda p: p, lambda p: 1.0)
+            return _of_products(lambda p: p, lambda p: 1.0)
         case "poly" | "polynomial":
-            return kernels.of_products(
+            return _of_products(
                 lambda p: (gamma * p + shift) ** degree, lambda p: gamma * degree * (gamma * p + shift) ** (degree - 1)
             )
         case "sigmoid":
-            return kernels.of_products(
-                lambda p: np.tanh(gamma * p + shift), lambda p: gamma / np.cosh(gamma * p + shift) ** 2
-            )
+            return _of_products(lambda p: np.tanh(gamma * p + shift), lambda p: gamma / np.cosh(gamma * p + shift) ** 2)
     return None
-
-
-def _several_outputs(regressor: Any) -> SmoothMap | None:
-    return _composed(SideBySide, *map(smooth_map, regressor.estimators_))
-
-
-def _pipeline(regressor: Any) -> SmoothMap | None:
-    *before, (_, last) = regressor.steps
-    used = [part for _, part in before if part is not None and part != "passthrough"]
-    return _composed(Chain, *map(_transformer, used), smooth_map(last))
-
-
-def _transformed_target(regressor: Any) -> SmoothMap | None:
-    forward = _scaler(regressor.transformer_)
-    inverse = None if forward is None else Scaled(1.0 / forward.scale, -forward.shift / forward.scale)
-    return _composed(Chain, smooth_map(regressor.regressor_), inverse)
-
-
-def _columns(weights: Array) -> Array:
-    return weights[:, None] if weights.ndim == 1 else weights
-
-
-_REGRESSORS: dict[str, Callable[[Any], SmoothMap | None]] = {
-    "MLPRegressor": _network,
-    "GaussianProcessRegressor": _gaussian_process,
-    "KernelRidge": _kernel_ridge,
-    "MultiOutputRegressor": _several_outputs,
-    "Pipeline": _pipeline,
-    "TransformedTargetRegressor": _transformed_target,
-}
-
-
-# Transformers of features and targets
-
-
-def _transformer(part: Any) -> SmoothMap | None:
-    """Return a transformer of features as a map; None if it is not known."""
-    if _name(part) == "PolynomialFeatures":
-        return Monomials(part.powers_)
-    if _name(part) == "PCA" and not part.whiten:
-        return Affine(part.components_.T, -part.mean_ @ part.components_.T)
-    return _scaler(part)
-
-
-def _scaler(part: Any) -> Scaled | None:
-    """Return a scaler of columns as a map; None if it is not known."""
-    match _name(part):
-        case "MinMaxScaler" if not part.clip:
-            return Scaled(part.scale_, part.min_)
-        case "StandardScaler":
-            return _centred(part.mean_ if part.with_mean else None, part.scale_)
-        case "RobustScaler":
-            centre, scale = part.with_centering, part.with_scaling
-            return _centred(part.center_ if centre else None, part.scale_ if scale else None)
-        case "MaxAbsScaler" if not getattr(part, "clip", False):
-            return _centred(None, part.scale_)
-        case "FunctionTransformer" if part.func is None and part.inverse_func is None:
-            return Scaled(1.0, 0.0)
-    return None
-
-
-def _centred(centre: Array | None, scale: Array | None) -> Scaled:
-    factor = 1.0 if scale is None else 1.0 / scale
-    return Scaled(factor, 0.0 if centre is None else -centre * factor)
-
-
-# Kernels of Gaussian processes
 
 
 def _covariance(kernel: Any) -> Kernel | None:
-    """Return a kernel of ``sklearn.gaussian_process`` between new points and known ones; None if it is not known."""
+    """Return a kernel of ``sklearn.gaussian_process``; None if it is not known."""
     match _name(kernel):
         case "ConstantKernel":
-            return kernels.constant(float(kernel.constant_value))
+            value = float(kernel.constant_value)
+            return lambda Z, X: (value, list)
         case "WhiteKernel":
-            return kernels.constant(0.0)  # its noise is not shared with a new point
+            return lambda Z, X: (0.0, list)  # its noise is not shared with a new point
         case "RBF":
-            return kernels.squared_exponential(kernel.length_scale)
-        case "Matern":
-            return kernels.matern(kernel.length_scale, kernel.nu)
+            return maps.matern(kernel.length_scale, np.inf)
+        case "Matern" if kernel.nu in (0.5, 1.5, 2.5, np.inf):
+            return maps.matern(kernel.length_scale, kernel.nu)
         case "RationalQuadratic":
-            return kernels.rational_quadratic(kernel.length_scale, kernel.alpha)
+            return _rational_quadratic(kernel.length_scale, kernel.alpha)
         case "DotProduct":
             offset = float(kernel.sigma_0) ** 2
-            return kernels.of_products(lambda p: p + offset, lambda p: 1.0)
+            return _of_products(lambda p: p + offset, lambda p: 1.0)
         case "Sum" | "Product" as name:
             first, second = _covariance(kernel.k1), _covariance(kernel.k2)
-            if first is None or second is None:
-                return None
-            return (kernels.total if name == "Sum" else kernels.product)(first, second)
+            return first and second and _joined(first, second, is_sum=name == "Sum")
         case "Exponentiation":
             base = _covariance(kernel.kernel)
-            return None if base is None else kernels.power(base, kernel.exponent)
+            return base and _power(base, kernel.exponent)
     return None
+
+
+def _rational_quadratic(length_scale: float, alpha: float) -> Kernel:
+    def kernel(Z: Array, X: Array) -> tuple[Array, Slopes]:
+        base = 1 + cdist(Z / length_scale, X / length_scale, "sqeuclidean") / (2 * alpha)
+        return base**-alpha, lambda: [(base ** (-alpha - 1), 1.0, length_scale**-2.0)]
+
+    return kernel
+
+
+def _of_products(function: Callable[[Array], Array], slope: Callable[[Array], Any]) -> Kernel:
+    """Return a function of the inner product x'z as a kernel, from the function and its derivative."""
+
+    def kernel(Z: Array, X: Array) -> tuple[Array, Slopes]:
+        products = Z @ X.T
+        return function(products), lambda: [(slope(products), 0.0, 1.0)]
+
+    return kernel
+
+
+def _times(slopes: list[Slope], other: Array | float) -> list[Slope]:
+    return [(factor * other, pull, weight) for factor, pull, weight in slopes]
+
+
+def _joined(first: Kernel, second: Kernel, *, is_sum: bool) -> Kernel:
+    def kernel(Z: Array, X: Array) -> tuple[Array | float, Slopes]:
+        (one, one_slopes), (two, two_slopes) = first(Z, X), second(Z, X)
+        if is_sum:
+            return one + two, lambda: [*one_slopes(), *two_slopes()]
+        return one * two, lambda: [*_times(one_slopes(), two), *_times(two_slopes(), one)]
+
+    return kernel
+
+
+def _power(base: Kernel, exponent: float) -> Kernel:
+    def kernel(Z: Array, X: Array) -> tuple[Array | float, Slopes]:
+        K, slopes = base(Z, X)
+        return K**exponent, lambda: _times(slopes(), exponent * K ** (exponent - 1))
+
+    return kernel

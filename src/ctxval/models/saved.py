@@ -17,8 +17,7 @@ from ctxval._util.registry import part
 from ctxval.core.model import Model
 from ctxval.core.trajectory import Transitions
 from ctxval.errors import InputError
-from ctxval.models.corrected import Corrected, Refined
-from ctxval.models.correction import Correction
+from ctxval.models.corrected import Corrected, Correction, Refined
 from ctxval.models.gaussian_process import GaussianProcessModel, SquaredExponential
 from ctxval.models.linear import Linear
 from ctxval.models.neural_network import FeedforwardReLU
@@ -29,6 +28,7 @@ _SCALING = ("shift_in", "scale_in", "shift_out", "scale_out")
 _DATA = ("x", "u", "x_next")
 _CORRECTED = "corrected_"  # before the names of the arrays of the model that a correction belongs to
 
+_PLAIN = (Linear, FeedforwardReLU, GaussianProcessModel)
 SavedModel = Linear | FeedforwardReLU | GaussianProcessModel | Corrected
 """The models that can be written to a file."""
 
@@ -36,15 +36,19 @@ SavedModel = Linear | FeedforwardReLU | GaussianProcessModel | Corrected
 def write_model(path: str | Path, model: Model, note: dict[str, Any] | None = None) -> None:
     """Write a model and the transitions that it was learned from as an NPZ file.
 
-    Of a correction of any other model, the file has the correction alone, which :func:`read_refined` adds to the model
-    that it is given.
-
-    Args:
-        model: a ``Linear``, ``FeedforwardReLU``, ``GaussianProcessModel`` or ``Corrected``, perhaps ``Refined``.
-        note: plain values that are kept in the file, for :func:`read_note`.
+    The model is a ``Linear``, ``FeedforwardReLU``, ``GaussianProcessModel`` or ``Corrected``, perhaps ``Refined``. Of a
+    correction of any other model, the file has the correction alone, which :func:`read_refined` adds to the model that
+    it is given. The note has plain values, for :func:`read_note`.
     """
-    inner = model.model if isinstance(model, Refined) else model
-    about, arrays = _contents(inner)
+    inner: Any = model.model if isinstance(model, Refined) else model
+    about: dict[str, Any] = {"kind": type(inner).__name__}
+    if isinstance(inner, Corrected):
+        about["linearised"], arrays = inner.linearised, dict[str, Any](inner.correction.arrays())
+        if isinstance(inner.model, _PLAIN):
+            about["corrects"] = type(inner.model).__name__
+            arrays |= {_CORRECTED + name: array for name, array in _arrays(inner.model).items()}
+    else:
+        arrays = _arrays(inner)
     data = getattr(model, "data", None)
     if data is not None:
         arrays |= _data_arrays(data)
@@ -105,14 +109,19 @@ def read_model(source: str | Path) -> SavedModel:
 
 
 def read_refined(source: str | Path, before: Model | None) -> SavedModel:
-    """Return a model from a file, as :func:`read_model` does; a correction alone is added to the model before.
-
-    Args:
-        before: the model that was refined; None if it is not known.
-    """
+    """Return a model from a file, as :func:`read_model` does; a correction alone is added to the model before."""
     try:
         arrays = Archive(read_bytes(source))
-        about = _about(arrays)
+        about: Any = {"format": _FORMAT, "version": 1, "kind": "Linear"}
+        if "about" in arrays:
+            about = json.loads(arrays.text("about"))
+        plain = tuple(kind.__name__ for kind in _PLAIN)
+        if not isinstance(about, dict) or about.get("format") != _FORMAT or about.get("version") != 1:
+            raise InputError(f"its format must be {_FORMAT!r} of version 1")
+        for key, kinds in (("kind", (*plain, "Corrected")), ("corrects", (*plain, None))):
+            if about.get(key) not in kinds:
+                known = ", ".join(filter(None, kinds))
+                raise InputError(f"its {key} must be one of {known}, got {str(about.get(key))[:40]!r}")
         data = stored_transitions(arrays)
         if about["kind"] != "Corrected":
             return _plain_model(arrays, about["kind"], data)
@@ -132,9 +141,6 @@ def read_refined(source: str | Path, before: Model | None) -> SavedModel:
         ) from error
 
 
-_PLAIN = (Linear, FeedforwardReLU, GaussianProcessModel)
-
-
 def _plain_model(arrays: Archive, kind: str, data: Transitions | None, prefix: str = "") -> SavedModel:
     """Return a model whose arrays have a prefix before their names."""
 
@@ -150,33 +156,6 @@ def _plain_model(arrays: Archive, kind: str, data: Transitions | None, prefix: s
         return FeedforwardReLU(weights, biases, scaling, data)
     covariance = SquaredExponential(float(numbers("variance")), numbers("length_scales"))
     return GaussianProcessModel(covariance, numbers("centres"), numbers("weights"), scaling, data)
-
-
-def _about(arrays: Archive) -> dict[str, Any]:
-    if "about" not in arrays:
-        return {"kind": "Linear"}
-    about: Any = json.loads(arrays.text("about"))
-    plain = tuple(kind.__name__ for kind in _PLAIN)
-    if not isinstance(about, dict) or about.get("format") != _FORMAT or about.get("version") != 1:
-        raise InputError(f"its format must be {_FORMAT!r} of version 1")
-    for key, kinds in (("kind", (*plain, "Corrected")), ("corrects", plain)):
-        given = about.get(key)
-        if given not in kinds and not (key == "corrects" and given is None):
-            raise InputError(f"its {key} must be one of {', '.join(kinds)}, got {str(given)[:40]!r}")
-    return about
-
-
-def _contents(model: Model) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return what a file states about a model, and its arrays."""
-    about: dict[str, Any] = {"kind": type(model).__name__}
-    if not isinstance(model, Corrected):
-        return about, _arrays(model)
-    about["linearised"] = model.linearised
-    arrays: dict[str, Any] = dict(model.correction.arrays())
-    if isinstance(model.model, _PLAIN):
-        about["corrects"] = type(model.model).__name__
-        arrays |= {_CORRECTED + name: array for name, array in _arrays(model.model).items()}
-    return about, arrays
 
 
 def _arrays(model: Model) -> dict[str, Any]:

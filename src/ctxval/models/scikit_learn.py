@@ -16,8 +16,6 @@ from ctxval.errors import InputError, ShapeError
 from ctxval.models.regressors import smooth_map
 from ctxval.models.smooth_maps import SmoothMap
 
-_BLOCK = 1024  # rows in one call of a formula: enough to be fast, few enough for the cache
-
 
 @part()
 class ScikitLearn(ShortRepr):
@@ -57,23 +55,29 @@ class ScikitLearn(ShortRepr):
         return cls(regressor, increments=increments, data=data)
 
     def step(self, x: Array, u: Array) -> Array:
-        """Return the next state; shapes ``(..., n), (..., m) -> (..., n)``."""
-        self._require_features(x, u)
-        n = x.shape[-1]
-        batch = np.broadcast_shapes(x.shape[:-1], u.shape[:-1])
-        output = self._predicted(_pairs(x, u))
-        _require_states(output, n)
-        output = output.reshape(*batch, n)
-        return x + output if self.increments else output
+        """Return the next state; shapes ``(..., n), (..., m) -> (..., n)``.
+
+        The formula gives what ``predict`` gives, without its checks, which take longer than the formula on few rows.
+        A pair that is not finite leads to NaN.
+        """
+        rows, batch = self._rows(x, u)
+        finite: Mask = np.asarray(np.isfinite(rows).all(axis=-1, keepdims=True))
+        complete = rows if finite.all() else np.where(finite, rows, 0.0)
+        formula = self._formula()
+        if formula is None:
+            outputs = _as_columns(self.regressor.predict(complete))
+        else:
+            outputs = np.concatenate([formula.value(block) for block in _blocks(complete)])
+        _require_states(outputs, x.shape[-1])
+        outputs = (outputs if finite.all() else np.where(finite, outputs, np.nan)).reshape(*batch, -1)
+        return x + outputs if self.increments else outputs
 
     def jacobian(self, x: Array, u: Array) -> tuple[Array, Array]:
         """Return A ``(..., n, n)`` and B ``(..., n, m)``, without batch axes if the model is linear."""
-        self._require_features(x, u)
-        formula = self._formula()
+        rows, batch = self._rows(x, u)
+        formula, n = self._formula(), x.shape[-1]
         if formula is None:
             return central_differences(self.step, x, u)
-        n, batch = x.shape[-1], np.broadcast_shapes(x.shape[:-1], u.shape[:-1])
-        rows = _pairs(x, u)
         if formula.constant:
             rows, batch = np.zeros((1, self.features)), ()
         whole = np.concatenate([formula.jacobian(block) for block in _blocks(rows)])
@@ -82,24 +86,13 @@ class ScikitLearn(ShortRepr):
         A, B = whole[..., :n], whole[..., n:]
         return (A + np.eye(n) if self.increments else A), B
 
-    def _require_features(self, x: Array, u: Array) -> None:
+    def _rows(self, x: Array, u: Array) -> tuple[Array, tuple[int, ...]]:
+        """Return states and inputs side by side, shape ``(N, n + m)``, and the shape of their batch."""
         n, m = x.shape[-1], u.shape[-1]
         if n + m != self.features:
             raise ShapeError(f"the regressor was fitted on {self.features} features, got {n} states and {m} inputs.")
-
-    def _predicted(self, rows: Array) -> Array:
-        """Return the outputs ``(N, n)`` for rows ``(N, n + m)``; NaN for rows that are not finite.
-
-        The formula gives what ``predict`` gives, without its checks, which take longer than the formula on few rows.
-        """
-        finite: Mask = np.asarray(np.isfinite(rows).all(axis=-1, keepdims=True))
-        complete = rows if finite.all() else np.where(finite, rows, 0.0)
-        formula = self._formula()
-        if formula is None:
-            outputs = _as_columns(self.regressor.predict(complete))
-        else:
-            outputs = np.concatenate([formula.value(block) for block in _blocks(complete)])
-        return outputs if finite.all() else np.where(finite, outputs, np.nan)
+        pairs = np.concatenate(paired(x, u), axis=-1)
+        return rows_of(pairs), pairs.shape[:-1]
 
     def _formula(self) -> SmoothMap | None:
         # It is read again each time, because a regressor may be fitted again.
@@ -111,13 +104,9 @@ def _require_states(outputs: Array, n: int) -> None:
         raise ShapeError(f"the regressor must predict as many states as it takes, {n}, got shape {outputs.shape}.")
 
 
-def _pairs(x: Array, u: Array) -> Array:
-    """Return states and inputs side by side, shape ``(N, n + m)``."""
-    return rows_of(np.concatenate(paired(x, u), axis=-1))
-
-
 def _blocks(rows: Array) -> list[Array]:
-    return [rows[first : first + _BLOCK] for first in range(0, max(1, len(rows)), _BLOCK)]
+    """Return blocks of 1024 rows: enough to be fast, few enough for the cache."""
+    return [rows[first : first + 1024] for first in range(0, max(1, len(rows)), 1024)]
 
 
 def _as_columns(output: Any) -> Array:

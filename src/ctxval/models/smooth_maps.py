@@ -5,11 +5,11 @@ Derivatives are pulled back from the outputs to the inputs (reverse mode): a mod
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.distance import cdist
 from scipy.special import expit
 
 from ctxval._util.arrays import Array
@@ -18,17 +18,17 @@ PullBack = Callable[[Array], Array]
 """Maps derivatives by the values of a map, ``(N, p, o)``, to derivatives by its rows, ``(N, p, k)``."""
 
 
-class SmoothMap(ABC):
-    """A function from rows ``(N, k)`` to values ``(N, o)``; its derivative is the same everywhere if it is constant."""
+@dataclass(frozen=True, eq=False)
+class SmoothMap:
+    """A function from rows ``(N, k)`` to values ``(N, o)``.
 
-    @property
-    def constant(self) -> bool:
-        """Whether the derivative is the same everywhere."""
-        return False
+    Attributes:
+        linearised: returns the values at rows, and what pulls derivatives back to the rows.
+        constant: whether the derivative is the same everywhere.
+    """
 
-    @abstractmethod
-    def linearised(self, Z: Array) -> tuple[Array, PullBack]:
-        """Return the values ``(N, o)`` at rows ``(N, k)``, and what pulls derivatives back to the rows."""
+    linearised: Callable[[Array], tuple[Array, PullBack]]
+    constant: bool = False
 
     def value(self, Z: Array) -> Array:
         """Return the values ``(N, o)`` at rows ``(N, k)``."""
@@ -41,144 +41,87 @@ class SmoothMap(ABC):
         return pull_back(np.broadcast_to(np.eye(outputs), (count, outputs, outputs)))
 
 
-@dataclass(frozen=True, eq=False)
-class Affine(SmoothMap):
-    """The map ``z W + b``, with W of shape ``(k, o)`` and b of shape ``(o,)``."""
-
-    W: Array
-    b: Array
-
-    constant = True
-
-    def linearised(self, Z: Array) -> tuple[Array, PullBack]:
-        """Return the values, and G W'."""
-        return np.asarray(Z @ self.W + self.b), lambda G: np.asarray(G @ self.W.T)
+def affine(W: Array, b: Array) -> SmoothMap:
+    """Return the map ``z W + b``, with W of shape ``(k, o)`` and b of shape ``(o,)``."""
+    return SmoothMap(lambda Z: (np.asarray(Z @ W + b), lambda G: np.asarray(G @ W.T)), constant=True)
 
 
-@dataclass(frozen=True, eq=False)
-class Scaled(SmoothMap):
-    """The map ``scale * z + shift`` of each column; both are numbers, or have shape ``(k,)``."""
-
-    scale: Array | float
-    shift: Array | float
-
-    constant = True
-
-    def linearised(self, Z: Array) -> tuple[Array, PullBack]:
-        """Return the values, and G times the scale."""
-        return np.asarray(self.scale * Z + self.shift), lambda G: np.asarray(G * self.scale)
+def scaled(scale: Array | float, shift: Array | float) -> SmoothMap:
+    """Return the map ``scale * z + shift`` of each column; both are numbers, or have shape ``(k,)``."""
+    return SmoothMap(lambda Z: (np.asarray(scale * Z + shift), lambda G: np.asarray(G * scale)), constant=True)
 
 
-@dataclass(frozen=True, eq=False)
-class Monomials(SmoothMap):
-    """The products of powers of the columns, such as those of polynomial features.
+def monomials(powers: Array) -> SmoothMap:
+    """Return the products of powers of the columns; the powers in each product are integers of shape ``(o, k)``."""
 
-    Attributes:
-        powers: the power of each column in each product, integers of shape ``(o, k)``.
-    """
+    def products(table: Array, exponents: Array) -> Array:
+        values = np.ones((table.shape[1], len(exponents)), dtype=table.dtype)
+        for j in np.flatnonzero(exponents.any(axis=0)):
+            values *= table[exponents[:, j], :, j].T
+        return values
 
-    powers: Array
-
-    @property
-    def constant(self) -> bool:
-        """Whether the derivative is the same everywhere."""
-        return bool((self.powers.sum(axis=1) <= 1).all())
-
-    def linearised(self, Z: Array) -> tuple[Array, PullBack]:
-        """Return the values, and what pulls derivatives back to the rows."""
-        table = self._table(Z)
+    def linearised(Z: Array) -> tuple[Array, PullBack]:
+        # The powers of the columns from 0 to the largest, shape (largest + 1, N, k).
+        table = np.ones((int(powers.max(initial=0)) + 1, *Z.shape), dtype=Z.dtype)
+        for power in range(1, len(table)):
+            table[power] = table[power - 1] * Z
 
         def pull_back(G: Array) -> Array:
             columns = []
             for j in range(Z.shape[1]):
-                with_j = np.flatnonzero(self.powers[:, j])
-                lower = self.powers[with_j].copy()
+                with_j = np.flatnonzero(powers[:, j])
+                lower = powers[with_j].copy()
                 lower[:, j] -= 1
-                slopes = self.powers[with_j, j] * self._products(table, lower)
+                slopes = powers[with_j, j] * products(table, lower)
                 columns.append((G[:, :, with_j] @ slopes[:, :, None])[..., 0])
             return np.stack(columns, axis=-1)
 
-        return self._products(table, self.powers), pull_back
+        return products(table, powers), pull_back
 
-    def _table(self, Z: Array) -> Array:
-        """Return the powers of the columns from 0 to the largest, shape ``(largest + 1, N, k)``."""
-        table = np.ones((int(self.powers.max(initial=0)) + 1, *Z.shape), dtype=Z.dtype)
-        for power in range(1, len(table)):
-            table[power] = table[power - 1] * Z
-        return table
-
-    def _products(self, table: Array, powers: Array) -> Array:
-        products = np.ones((table.shape[1], len(powers)), dtype=table.dtype)
-        for j in np.flatnonzero(powers.any(axis=0)):
-            products *= table[powers[:, j], :, j].T
-        return products
+    return SmoothMap(linearised, constant=bool((powers.sum(axis=1) <= 1).all()))
 
 
-Activation = tuple[Callable[[Array], Array], Callable[[Array], Array]]
-"""A function of the units, and its derivative as a function of its own value."""
-
-ACTIVATIONS: dict[str, Activation] = {
+ACTIVATIONS: dict[str, tuple[Callable[[Array], Array], Callable[[Array], Array]]] = {
     "identity": (lambda z: z, np.ones_like),
     "logistic": (expit, lambda a: a * (1 - a)),
     "tanh": (np.tanh, lambda a: 1 - a * a),
     "relu": (lambda z: np.maximum(z, 0), lambda a: (a > 0).astype(np.float64)),
 }
-"""The functions of units of networks by scikit-learn's names. At its kink, a ReLU counts as inactive."""
+"""The functions of units by scikit-learn's names, and their derivatives as functions of their own values.
+
+At its kink, a ReLU counts as inactive.
+"""
 
 
-@dataclass(frozen=True, eq=False)
-class Network(SmoothMap):
-    """A feedforward network with a linear last layer.
+def network(weights: Sequence[Array], biases: Sequence[Array], activation: str) -> SmoothMap:
+    """Return a feedforward network with a linear last layer; its weights have shapes ``(k, h), (h, h'), ...``."""
+    function, slope = ACTIVATIONS[activation]
 
-    Attributes:
-        weights: one matrix for each layer, shapes ``(k, h), (h, h'), ...``.
-        biases: one vector for each layer.
-        activation: the function of the hidden units, a name of ``ACTIVATIONS``.
-    """
-
-    weights: Sequence[Array]
-    biases: Sequence[Array]
-    activation: str
-
-    @property
-    def constant(self) -> bool:
-        """Whether the derivative is the same everywhere."""
-        return self.activation == "identity" or len(self.weights) == 1
-
-    def linearised(self, Z: Array) -> tuple[Array, PullBack]:
-        """Return the values, and what pulls derivatives back to the rows."""
-        function, slope = ACTIVATIONS[self.activation]
+    def linearised(Z: Array) -> tuple[Array, PullBack]:
         hidden: list[Array] = []
-        for weight, bias in zip(self.weights[:-1], self.biases[:-1], strict=True):
+        for weight, bias in zip(weights[:-1], biases[:-1], strict=True):
             Z = function(Z @ weight + bias)
             hidden.append(Z)
 
         def pull_back(G: Array) -> Array:
-            G = G @ self.weights[-1].T
-            for units, weight in zip(reversed(hidden), reversed(self.weights[:-1]), strict=True):
+            G = G @ weights[-1].T
+            for units, weight in zip(reversed(hidden), reversed(weights[:-1]), strict=True):
                 G = G * slope(units)[:, None, :]
                 # One product of two matrices is far faster than one for each row.
                 G = (G.reshape(-1, G.shape[-1]) @ weight.T).reshape(*G.shape[:2], -1)
             return G
 
-        return Z @ self.weights[-1] + self.biases[-1], pull_back
+        return Z @ weights[-1] + biases[-1], pull_back
+
+    return SmoothMap(linearised, constant=activation == "identity" or len(weights) == 1)
 
 
-@dataclass(frozen=True, eq=False)
-class Chain(SmoothMap):
-    """Several maps, one after the other."""
+def chain(parts: Sequence[SmoothMap]) -> SmoothMap:
+    """Return several maps, one after the other."""
 
-    parts: Sequence[SmoothMap]
-
-    @property
-    def constant(self) -> bool:
-        """Whether the derivative is the same everywhere."""
-        return all(part.constant for part in self.parts)
-
-    def linearised(self, Z: Array) -> tuple[Array, PullBack]:
-        """Return the values, and what pulls derivatives back to the rows."""
+    def linearised(Z: Array) -> tuple[Array, PullBack]:
         pulls: list[PullBack] = []
-        for part in self.parts:
+        for part in parts:
             Z, pull = part.linearised(Z)
             pulls.append(pull)
 
@@ -189,21 +132,14 @@ class Chain(SmoothMap):
 
         return Z, pull_back
 
+    return SmoothMap(linearised, constant=all(part.constant for part in parts))
 
-@dataclass(frozen=True, eq=False)
-class SideBySide(SmoothMap):
-    """Several maps of the same rows, whose values are joined."""
 
-    parts: Sequence[SmoothMap]
+def side_by_side(parts: Sequence[SmoothMap]) -> SmoothMap:
+    """Return several maps of the same rows, whose values are joined."""
 
-    @property
-    def constant(self) -> bool:
-        """Whether the derivative is the same everywhere."""
-        return all(part.constant for part in self.parts)
-
-    def linearised(self, Z: Array) -> tuple[Array, PullBack]:
-        """Return the values, and what pulls derivatives back to the rows."""
-        values, pulls = zip(*(part.linearised(Z) for part in self.parts), strict=True)
+    def linearised(Z: Array) -> tuple[Array, PullBack]:
+        values, pulls = zip(*(part.linearised(Z) for part in parts), strict=True)
         ends = np.cumsum([part.shape[1] for part in values])
 
         def pull_back(G: Array) -> Array:
@@ -211,3 +147,64 @@ class SideBySide(SmoothMap):
             return np.asarray(np.sum([pull(piece) for pull, piece in zip(pulls, pieces, strict=True)], axis=0))
 
         return np.concatenate(values, axis=1), pull_back
+
+    return SmoothMap(linearised, constant=all(part.constant for part in parts))
+
+
+# Sums of kernels around centres (Rasmussen and Williams 2006, chapter 4)
+
+Slope = tuple[Array | float, float, Array | float]
+"""Terms ``factor (x_j - pull z_j) weight_j`` of the derivative of k(z, x) by z_j: factor, pull and weight.
+
+The factor is a number or has shape ``(N, M)``, and the weight is a number or has shape ``(k,)``. The pull is 1 if the
+kernel depends on x - z, and 0 if it depends on x'z.
+"""
+Slopes = Callable[[], list[Slope]]
+Kernel = Callable[[Array, Array], tuple[Array | float, Slopes]]
+"""Maps points ``(N, k)`` and centres ``(M, k)`` to ``k(z, x)``, ``(N, M)`` or a number, and the terms of its slope."""
+
+
+def kernel_sum(kernel: Kernel, centres: Array, weights: Array) -> SmoothMap:
+    """Return the map ``sum_i k(z, x_i) w_i`` of centres x_i ``(M, k)`` and weights w_i ``(M, o)``."""
+
+    def linearised(Z: Array) -> tuple[Array, PullBack]:
+        covariances, slopes = kernel(Z, centres)
+        (count, k), outputs, shape = Z.shape, weights.shape[1], (len(Z), len(centres))
+
+        def pull_back(G: Array) -> Array:
+            # Sums over the centres of factor w and of factor w x.
+            moments = (weights[:, :, None] * centres[:, None, :]).reshape(len(centres), -1)
+            columns = np.concatenate([weights, moments], axis=1)
+            derivatives = np.zeros((count, outputs, k))
+            for factor, pull, weight in slopes():
+                sums = np.broadcast_to(factor, shape) @ columns
+                drawn = sums[:, outputs:].reshape(count, outputs, k)
+                derivatives += (drawn - pull * sums[:, :outputs, None] * Z[:, None, :]) * weight
+            return np.asarray(G @ derivatives)
+
+        return np.broadcast_to(covariances, shape) @ weights, pull_back
+
+    return SmoothMap(linearised)
+
+
+def matern(length_scale: Array | float, nu: float) -> Kernel:
+    """Return the Matern kernel of smoothness 1/2, 3/2, 5/2, or infinity: ``exp(-d^2 / 2)``, d in length-scales."""
+
+    def squared_exponential(Z: Array, X: Array) -> tuple[Array, Slopes]:
+        K = np.exp(-0.5 * cdist(Z / length_scale, X / length_scale, "sqeuclidean"))
+        return K, lambda: [(K, 1.0, np.asarray(length_scale) ** -2.0)]
+
+    def kernel(Z: Array, X: Array) -> tuple[Array, Slopes]:
+        r = np.sqrt(2 * nu) * cdist(Z / length_scale, X / length_scale)
+        decay = np.exp(-r)
+        polynomial = {0.5: 1.0, 1.5: 1 + r, 2.5: 1 + r + r**2 / 3}[nu]
+
+        def slopes() -> list[Slope]:
+            # At a centre, the kernel of smoothness 1/2 has a kink and no derivative.
+            pole = np.divide(decay, r, out=np.zeros_like(r), where=r > 0) if nu == 0.5 else 0.0
+            factor = {0.5: pole, 1.5: 3 * decay, 2.5: 5 / 3 * (1 + r) * decay}[nu]
+            return [(factor, 1.0, np.asarray(length_scale) ** -2.0)]
+
+        return polynomial * decay, slopes
+
+    return squared_exponential if nu == np.inf else kernel

@@ -15,7 +15,7 @@ from ctxval.campaign.campaign import Campaign
 from ctxval.certificates import CertificateOptions, Verdict
 from ctxval.report.charts import Axis, Chart
 from ctxval.report.context import ReportContext, context_of_campaign, context_of_store
-from ctxval.report.findings import Finding
+from ctxval.report.diagnostics import Finding
 from ctxval.report.markup import bullets, element, heading, joined, paragraph, table
 from ctxval.report.page import page, write_page
 from ctxval.report.sections import SECTIONS, Section
@@ -54,18 +54,15 @@ def write(
     certificate: CertificateOptions | None = None,
     sections: Sequence[Section] = (),
 ) -> Path:
-    """Write the report of a campaign as one HTML file, and return its path.
+    """Write the report of a campaign as one HTML file, and return its path. Its system is not executed.
 
     Args:
-        campaign: the campaign. Its system is not executed.
+        campaign: the campaign.
         path: the file to write.
         threshold: tau, for the verdict; without it and without ``verdict`` there is no verdict.
         verdict: the verdict, if it was computed before.
         certificate: the kind and the options of the certificate, as in :meth:`ctxval.Campaign.verdict`.
         sections: sections of your own, which follow the others.
-
-    Raises:
-        InputError: if the file cannot be written, or a section has no title or no method ``render``.
     """
     context = context_of_campaign(campaign, verdict, threshold=threshold, certificate=certificate)
     return write_page(context, path, sections)

@@ -20,9 +20,6 @@ from ctxval._util.representation import ShortRepr
 from ctxval.certificates.bounds import at_most
 from ctxval.report.markup import element, number
 
-WIDTH, HEIGHT = 480, 280
-"""Size of a chart in its own units; on the page it is as wide as its column."""
-
 SMALL = {"width": 340, "height": 220}
 """Size of a chart of which several stand side by side."""
 
@@ -63,13 +60,9 @@ class Axis(ShortRepr):
 
     @classmethod
     def over(cls, label: str, *values: ArrayLike, zero: bool = False, room: float = 0.06) -> Axis:
-        """Return an axis that holds all finite values, with some room around them.
+        """Return an axis that holds all finite values, with some room around them: a share of the range at each end.
 
-        Args:
-            label: its name with the unit.
-            values: arrays or numbers that must be visible.
-            zero: whether it starts at 0; values are then expected to be at least 0.
-            room: share of the range that is left free at each end.
+        With ``zero`` it starts at 0; values are then expected to be at least 0.
         """
         flat = np.concatenate([np.ravel(np.asarray(array, dtype=np.float64)) for array in values] or [np.zeros(1)])
         finite = flat[np.isfinite(flat) & (np.abs(flat) < 1e300)]
@@ -114,12 +107,10 @@ class Chart:
     title: str
     x: Axis
     y: Axis
-    width: int = WIDTH
-    height: int = HEIGHT
+    width: int = 480
+    height: int = 280
     _parts: list[Markup] = field(default_factory=list, init=False)
     _legend: dict[str, tuple[str, str]] = field(default_factory=dict, init=False)
-
-    # Positions
 
     def across(self, values: ArrayLike) -> Array:
         """Return the horizontal positions of values of x; NaN stays NaN."""
@@ -128,8 +119,6 @@ class Chart:
     def up(self, values: ArrayLike) -> Array:
         """Return the vertical positions of values of y; NaN stays NaN."""
         return np.asarray(self.height - _BOTTOM - self.y.shares(values) * (self.height - _TOP - _BOTTOM))
-
-    # What is drawn
 
     def line(self, x: ArrayLike, y: ArrayLike, kind: Kind, label: str = "") -> Chart:
         """Add a line; it is interrupted at values that are not finite."""
@@ -156,21 +145,20 @@ class Chart:
         """Add marks; their names appear if the pointer rests on them."""
         xs, ys = np.ravel(self.across(x)), np.ravel(self.up(y))
         self._named(kind, label, "mark")
-        places = [(k, xs[k], ys[k]) for k in np.flatnonzero(np.isfinite(xs + ys)).tolist()]
+        drawn = np.flatnonzero(np.isfinite(xs + ys)).tolist()
         if len(xs) > 600:  # dots have no names, and are smaller in the file
-            dots = "".join(f"M{left:.0f},{top:.0f}h0" for _, left, top in places)
+            dots = "".join(f"M{xs[k]:.0f},{ys[k]:.0f}h0" for k in drawn)
             self._parts.append(element("path", d=dots, class_=f"dots {kind}"))
             return self
-        for k, left, top in places:
+        for k in drawn:
             name = None if names is None else element("title", names[k])
-            where = f"translate({left:.1f} {top:.1f})"
+            where = f"translate({xs[k]:.1f} {ys[k]:.1f})"
             self._parts.append(element("path", name, d=_MARKS[kind], transform=where, class_=f"mark {kind}"))
         return self
 
     def whiskers(self, x: ArrayLike, low: ArrayLike, high: ArrayLike, kind: Kind) -> Chart:
         """Add vertical intervals."""
-        across = np.ravel(self.across(x))
-        ends = np.stack([[across, np.ravel(self.up(end))] for end in (low, high)])
+        ends = np.stack([[np.ravel(self.across(x)), np.ravel(self.up(end))] for end in (low, high)])
         for interval in np.moveaxis(ends, -1, 0):
             if np.isfinite(interval).all():
                 self._parts.append(_path(interval, f"whisker {kind}"))
@@ -208,46 +196,36 @@ class Chart:
         if label:
             self._legend[label] = (kind, form)
 
-    # The chart
-
     def __html__(self) -> str:
         """Return the chart with its legend, as templates and elements insert it."""
         return str(self.render())
 
     def render(self, *below: Markup, with_legend: bool = True) -> Markup:
         """Return the chart as a figure with a legend and its title; elements ``below`` follow the legend."""
-        drawing = element(
-            "svg",
-            element("title", self.title),
-            self._frame(),
-            element("g", *self._parts),
-            viewBox=f"0 0 {self.width} {self.height}",
-            role="img",
-            class_="chart",
-            width=self.width,
-        )
+        inside = element("title", self.title), self._frame(), element("g", *self._parts)
+        shape = {"viewBox": f"0 0 {self.width} {self.height}", "role": "img", "class_": "chart", "width": self.width}
         names = legend(self._legend) if with_legend else None
-        return element("figure", drawing, names, *below, element("figcaption", self.title))
+        return element("figure", element("svg", *inside, **shape), names, *below, element("figcaption", self.title))
 
     def _frame(self) -> Markup:
-        left, right = _LEFT, self.width - _RIGHT
-        top, bottom = _TOP, self.height - _BOTTOM
-        box = element("path", d=f"M{left},{top}V{bottom}H{right}", class_="axis")
-        middle = 0.5 * (top + bottom)
-        names = (
-            element("text", self.x.label, x=0.5 * (left + right), y=self.height - 8, class_="axis-label"),
-            element("text", self.y.label, transform=f"translate(13 {middle}) rotate(-90)", class_="axis-label"),
-        )
-        ticks = []
+        left, right, top, bottom = _LEFT, self.width - _RIGHT, _TOP, self.height - _BOTTOM
+        parts = []
         for value in self.x.ticks():
             at = round(float(self.across(value)), 1)
-            ticks.append(element("path", d=f"M{at},{bottom}v4", class_="axis"))
-            ticks.append(element("text", number(value), x=at, y=bottom + 18, class_="tick across"))
+            parts.append(element("path", d=f"M{at},{bottom}v4", class_="axis"))
+            parts.append(element("text", number(value), x=at, y=bottom + 18, class_="tick across"))
         for value in self.y.ticks():
             at = round(float(self.up(value)), 1)
-            ticks.append(element("path", d=f"M{left},{at}H{right}", class_="grid"))
-            ticks.append(element("text", number(value), x=left - 6, y=at + 4, class_="tick up"))
-        return element("g", *ticks, box, *names)
+            parts.append(element("path", d=f"M{left},{at}H{right}", class_="grid"))
+            parts.append(element("text", number(value), x=left - 6, y=at + 4, class_="tick up"))
+        upright = f"translate(13 {0.5 * (top + bottom)}) rotate(-90)"
+        return element(
+            "g",
+            *parts,
+            element("path", d=f"M{left},{top}V{bottom}H{right}", class_="axis"),
+            element("text", self.x.label, x=0.5 * (left + right), y=self.height - 8, class_="axis-label"),
+            element("text", self.y.label, transform=upright, class_="axis-label"),
+        )
 
     def __repr__(self) -> str:
         return f"Chart({self.title!r}, {self.x!r}, {self.y!r})"

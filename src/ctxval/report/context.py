@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,6 +14,7 @@ from ctxval._util.progress import stage
 from ctxval._util.representation import ShortRepr
 from ctxval.campaign.campaign import Campaign
 from ctxval.campaign.dynamics import NEAR
+from ctxval.campaign.storage.store import Store
 from ctxval.certificates import Certificate, CertificateOptions, Provenance, Verdict, judge
 from ctxval.core.labels import Labels, labels_of
 from ctxval.core.space import TaskSpace
@@ -23,14 +24,19 @@ from ctxval.core.validation import Validation
 from ctxval.errors import InputError
 from ctxval.learning.replays import Replay, replay_executed
 from ctxval.report.distance_model import DistanceModel
-from ctxval.storage.store import Store
 
 
 class TrajectoryPair(NamedTuple):
-    """The trajectories of one trial: the closed loop on M, and the execution of S."""
+    """A completed trial with its closed loop on M, and the execution of S."""
 
+    trial: Trial
     model: Trajectory
     system: Trajectory
+
+    @property
+    def distance(self) -> float:
+        """The distance of the trial."""
+        return distance_of(self.trial)
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,8 +149,7 @@ class ReportContext(ShortRepr):
     @functools.cached_property
     def recordings(self) -> dict[int, TrajectoryPair]:
         """The trajectories of the worst trials that have both, by number; those of another size are left out."""
-        pairs: dict[int, TrajectoryPair] = {}
-        widths: tuple[int, int] | None = None
+        pairs, widths = dict[int, TrajectoryPair](), None
         for trial in self.worst_first[:400]:
             model, system = (self.store.trajectory(trial.number, side) for side in ("model", "system"))
             if model is None or system is None or model.batch_shape or system.batch_shape:
@@ -155,7 +160,7 @@ class ReportContext(ShortRepr):
             width = system.states.shape[-1], system.inputs.shape[-1]
             widths = widths or width
             if width == widths:
-                pairs[trial.number] = TrajectoryPair(model, system)
+                pairs[trial.number] = TrajectoryPair(trial, model, system)
         return pairs
 
     @functools.cached_property
@@ -165,9 +170,8 @@ class ReportContext(ShortRepr):
             return (), ()
         first = next(iter(self.recordings.values())).system
         system = None if self.validation is None else self.validation.system
-        named = self.labels.names(system, first.states.shape[-1], first.inputs.shape[-1])
-        of_states, of_inputs = map(labels_of, named)
-        return of_states, of_inputs
+        states, inputs = self.labels.names(system, first.states.shape[-1], first.inputs.shape[-1])
+        return labels_of(states), labels_of(inputs)
 
     @property
     def distance_label(self) -> str:
@@ -195,8 +199,7 @@ class ReportContext(ShortRepr):
         learned, model = self.provenance.learned, self.distance_model
         if learned is None:
             return None
-        executed = {trial.number: distance_of(trial) for trial in self.completed}
-        errors = np.array([replay.distance - executed[number] for number, replay in self.replays.items()])
+        errors = np.array([replay.distance - self.recordings[k].distance for k, replay in self.replays.items()])
         if model is not None and not (errors**2).mean() <= ((model.left_out.median - model.values) ** 2).mean():
             return None
         try:
@@ -211,13 +214,12 @@ class ReportContext(ShortRepr):
         """The replays of the trials with recordings on the corrected model, by number; empty without the experiment."""
         if self.validation is None or not self.recordings:
             return {}
-        points = {trial.number: trial.unit_point for trial in self.completed}
+        executed = [(pair.trial.unit_point, pair.system) for pair in self.recordings.values()]
         # Designs that cannot be made in a batch take long.
-        numbers = list(self.recordings)[: 120 if self.batched else 40]
-        executed = [(points[number], pair.system) for number, pair in self.recordings.items()]
-        with stage("replaying executed tasks", len(numbers), "tasks"):
-            replays = replay_executed(self.validation, executed, [points[number] for number in numbers])
-        return {number: replay for number, replay in zip(numbers, replays, strict=True) if replay is not None}
+        points = [point for point, _ in executed[: 120 if self.batched else 40]]
+        with stage("replaying executed tasks", len(points), "tasks"):
+            replays = replay_executed(self.validation, executed, points)
+        return {k: replay for k, replay in zip(self.recordings, replays, strict=False) if replay is not None}
 
 
 def distance_of(trial: Trial) -> float:
@@ -236,12 +238,7 @@ def context_of_campaign(
 ) -> ReportContext:
     """Return what a report of a campaign is made from.
 
-    Args:
-        campaign: the campaign.
-        verdict: its verdict, if it was computed before.
-        threshold: tau, for a verdict that is computed now; None to use ``verdict``.
-        certificate: the kind and the options of the certificate of that verdict.
-        budget: the budget of the campaign.
+    Its verdict is ``verdict``, if that was computed before, or else that against ``threshold`` by ``certificate``.
     """
     if verdict is None and threshold is not None:
         verdict = campaign.verdict(threshold, certificate=certificate)
@@ -271,12 +268,7 @@ def context_of_store(
 ) -> ReportContext:
     """Return what a report of a store is made from, if its experiment is not loaded. No code is imported or run.
 
-    Args:
-        store: the store.
-        threshold: tau; without it there is no verdict.
-        certificate: the kind and the options of the certificate.
-        missing: why the experiment is not loaded, as a sentence.
-        labels: names and units.
+    Without ``threshold`` there is no verdict; ``missing`` says why the experiment is not loaded, as a sentence.
     """
     with store.snapshot():
         description, changes, trials = store.description(), store.history(), store.trials()
@@ -285,11 +277,12 @@ def context_of_store(
     if space is None or any(len(trial.unit_point) != space.dimension for trial in trials):
         raise InputError(f"{store.name} has no readable task space, so there is nothing to report.")
     name = description.get("name")
-    context = ReportContext(
+    return ReportContext(
         name if isinstance(name, str) else "",
         space,
         tuple(trials),
         store,
+        None if threshold is None else judge(trials, threshold, certificate, provenance),
         missing=missing or "the experiment is not loaded",
         labels=labels or Labels(),
         settings=store.settings(),
@@ -297,6 +290,3 @@ def context_of_store(
         changes=tuple(changes),
         provenance=provenance,
     )
-    if threshold is None:
-        return context
-    return replace(context, verdict=judge(trials, threshold, certificate, provenance))

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
+
 import numpy as np
 from scipy.spatial import KDTree
 
 from ctxval._util.arrays import Array
-from ctxval._util.representation import counted
+from ctxval._util.representation import ShortRepr, counted
+from ctxval._util.texts import reason_of
 from ctxval.campaign.dynamics import PREDICTION
 from ctxval.certificates import RESOLUTION
 from ctxval.certificates.bounds import at_most, of_tasks
@@ -15,15 +20,60 @@ from ctxval.certificates.dynamics_diagnostics import ACCURATE, agrees
 from ctxval.core.trial import Trial
 from ctxval.learning import ExecutionPrediction
 from ctxval.report.context import ReportContext, distance_of
-from ctxval.report.findings import Finding, Light, Question, findings_of
 from ctxval.report.markup import number, percent, quantity
 
-_IMPROVED = 0.01  # least increase of the largest distance that counts as an improvement, as a share of it
+Light = Literal["good", "note", "attention", "bad", "unknown"]
+"""A traffic light: nothing speaks against M or the verdict; neither good nor bad; read it; it speaks against it; it is
+not known."""
 
-_LISTED = 10  # largest number of failed trials that are listed one by one
+# The word of each light stands beside its colour.
+WORDS: dict[Light, str] = {
+    **{"good": "good", "note": "note", "attention": "attention"},
+    **{"bad": "problem", "unknown": "not known"},
+}
 
-# Range of the root mean square of standardised errors that is as expected, and the value above which it is not.
-_CALIBRATED, _ROUGH = (0.5, 1.5), 2.5
+
+@dataclass(frozen=True)
+class Finding(ShortRepr):
+    """One thing that the trials show.
+
+    Attributes:
+        name: what it is about, in a few words.
+        light: how it is to be taken.
+        text: one or more sentences with the numbers.
+        numbers: the same numbers for JSON, by name.
+    """
+
+    name: str
+    light: Light
+    text: str
+    numbers: dict[str, Any] = field(default_factory=dict)
+
+    def unless(self, doubt: str | None) -> Finding:
+        """Return this finding, which is not good if there is a doubt about what it concludes."""
+        if self.light != "good" or doubt is None:
+            return self
+        text = f"{self.text} But {doubt}: tasks between the executed ones may be unlike them."
+        return replace(self, light="attention", text=text)
+
+    def to_json(self) -> dict[str, Any]:
+        """Return all attributes, ready for JSON."""
+        return vars(self)
+
+
+Question = Callable[[ReportContext], Finding | None]
+"""A function that looks for one thing; it returns None if there is nothing to say."""
+
+
+def findings_of(questions: Iterable[tuple[str, Question]], context: ReportContext) -> list[Finding]:
+    """Return what questions find; a question that fails is a finding that is not known."""
+    findings: list[Finding | None] = []
+    for name, question in questions:
+        try:
+            findings.append(question(context))
+        except Exception as error:  # one question about odd data must not hide the answers to the others
+            findings.append(Finding(name, "unknown", f"This could not be computed: {reason_of(error)}."))
+    return [finding for finding in findings if finding is not None]
 
 
 def diagnostics(context: ReportContext) -> list[Finding]:
@@ -42,9 +92,7 @@ def _executions(context: ReportContext) -> Finding | None:
     if listed["open"]:
         waiting = ", ".join(map(str, listed["open"]))
         return Finding("Executions", "attention", f"Trials are open and wait for their results: {waiting}.", numbers)
-    if not context.executions:
-        return Finding("Executions", "unknown", "Nothing was executed.", numbers)
-    return None
+    return None if context.executions else Finding("Executions", "unknown", "Nothing was executed.", numbers)
 
 
 def _certificate(context: ReportContext) -> Finding | None:
@@ -63,13 +111,9 @@ def _certificate(context: ReportContext) -> Finding | None:
 def _rests_on_distances(context: ReportContext) -> bool:
     """Return whether the answer depends on where the tasks lie: not a counterexample, not a bound from dynamics."""
     verdict, certificate = context.verdict, context.certificate
-    if verdict is None:
-        return True
-    return (
-        verdict.answer != "falsified"
-        and certificate is not None
-        and (certificate.kind != "dynamics" or certificate.doubt is not None)
-    )
+    if verdict is None or verdict.answer == "falsified" or certificate is None:
+        return verdict is None
+    return certificate.kind != "dynamics" or certificate.doubt is not None
 
 
 def _covering(context: ReportContext) -> Finding | None:
@@ -99,12 +143,12 @@ def _converged(context: ReportContext) -> Finding | None:
     if len(distances) < 2 or not _rests_on_distances(context):
         return None
     so_far = np.maximum.accumulate(distances)
-    last = int(np.argmax(so_far >= (1 - _IMPROVED) * so_far[-1]))
+    last = int(np.argmax(so_far >= 0.99 * so_far[-1]))
     quiet = len(distances) - 1 - last
     good = quiet >= max(3.0, len(distances) / 3)
     text = (
-        f"The largest distance was within {percent(_IMPROVED)} of its final value after {last + 1} of "
-        f"{len(distances)} measured executions; {quiet} followed without an improvement."
+        f"The largest distance was within 1 % of its final value after {last + 1} of {len(distances)} measured "
+        f"executions; {quiet} followed without an improvement."
     )
     return Finding("Search converged", "good" if good else "attention", text, {"last": last + 1, "after": quiet})
 
@@ -114,20 +158,21 @@ def _smooth(context: ReportContext) -> Finding | None:
     if model is None or not _rests_on_distances(context):
         return None
     size = model.calibration
-    light: Light = "good" if _CALIBRATED[0] <= size <= _CALIBRATED[1] else "attention" if size <= _ROUGH else "bad"
+    light: Light = "good" if 0.5 <= size <= 1.5 else "attention" if size <= 2.5 else "bad"
     text = (
         "A Gaussian process of the distance predicts each trial from the others with errors of "
         f"{number(size, 2)} of its own standard deviations (root mean square; about 1 is expected)."
     )
-    finding = Finding("Distance is smooth over the tasks", light, text, {"standardised_error": size})
-    return finding.unless(context.designs)
+    return Finding("Distance is smooth over the tasks", light, text, {"standardised_error": size}).unless(
+        context.designs
+    )
 
 
 def stored_predictions(context: ReportContext) -> list[tuple[Trial, ExecutionPrediction]]:
     """Return the trials whose execution was predicted beforehand, with the predictions."""
-    noted = [(trial, (trial.note or {}).get(PREDICTION)) for trial in context.completed]
-    read = [(trial, ExecutionPrediction.from_json(note)) for trial, note in noted if isinstance(note, dict)]
-    return [(trial, one) for trial, one in read if one is not None]
+    notes = [(trial, (trial.note or {}).get(PREDICTION)) for trial in context.completed]
+    read = [(trial, ExecutionPrediction.from_json(note)) for trial, note in notes if isinstance(note, dict)]
+    return [(trial, prediction) for trial, prediction in read if prediction is not None]
 
 
 def _predictions(context: ReportContext) -> Finding | None:
@@ -187,14 +232,13 @@ def not_tested(context: ReportContext) -> list[str]:
         where = "ends of the range" if d == 1 else "corners of the task space"
         if bare:
             sentences.append(f"{bare} of the {2**d} {where} have no trial next to them.")
-    for trial in context.failed[:_LISTED]:
+    for trial in context.failed[:10]:
         values = zip(context.space.labels, context.coordinates([trial])[0], strict=True)
         where = ", ".join(f"{label} = {number(value)}" for label, value in values)
         ended = "failed" if trial.state == "failed" else "could not be measured"
         sentences.append(f"The distance at the task of trial {trial.number} ({where}), because it {ended}.")
-    if len(context.failed) > _LISTED:
-        more = len(context.failed) - _LISTED
-        sentences.append(f"The distances of {more} more trials that failed or were not measured.")
+    if len(context.failed) > 10:
+        sentences.append(f"The distances of {len(context.failed) - 10} more trials that failed or were not measured.")
     sentences.append(
         "Tasks outside the task space, other controllers, and conditions that the recorded state does not hold, such "
         "as wear, temperature or payload."

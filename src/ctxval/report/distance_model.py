@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -14,14 +15,8 @@ from ctxval.gp.regression import GaussianProcess
 from ctxval.gp.surrogate import Learned, learn
 
 
-@dataclass(frozen=True, eq=False)
-class Band:
-    """Predicted distances of several tasks.
-
-    Attributes:
-        median: the medians ``(m,)``.
-        low, high: the ends of their bands of 95 %, ``(m,)``; none is below 0.
-    """
+class Band(NamedTuple):
+    """The medians of predicted distances ``(m,)``, and the ends of their bands of 95 %; none is below 0."""
 
     median: Array
     low: Array

@@ -8,8 +8,8 @@ from ctxval._util.arrays import Array
 from ctxval._util.representation import counted
 from ctxval.core import soundness
 from ctxval.core.distance import ComposedDistance
-from ctxval.report.context import ReportContext, TrajectoryPair, distance_of
-from ctxval.report.findings import Finding, Question, findings_of
+from ctxval.report.context import ReportContext, TrajectoryPair
+from ctxval.report.diagnostics import Finding, Question, findings_of
 from ctxval.report.markup import number, percent, quantity
 
 _WORST = 5  # number of trials with the largest distances that the insights on closed loops look at
@@ -20,23 +20,19 @@ def insights(context: ReportContext) -> list[Finding]:
     return findings_of(_QUESTIONS, context)
 
 
-# The distance over the tasks
-
-
 def weak_region(context: ReportContext) -> Finding | None:
     """Where the distance exceeds the threshold, executed and predicted."""
     tau, units = context.threshold, context.labels.units
     if tau is None or not len(context.distances):
         return None
     above = context.distances > tau
-    largest = quantity(float(context.distances.max()), units)
-    model = context.distance_model
+    largest, model = quantity(float(context.distances.max()), units), context.distance_model
     share = 0.0 if model is None else float((model.over_tasks.median > tau).mean())
     numbers = {"executed_above": int(above.sum()), "executed": len(above), "predicted_share_above": share}
     if not above.any():
         text = f"No executed task exceeds {quantity(tau, units)}, but the trials predict that {percent(share)} do."
         return Finding("Where M is weak", "attention", text, numbers) if share else None
-    # Below this share, too few of the random tasks are weak.
+    # Below a share of 0.002, too few of the random tasks are weak.
     weak = context.points[above] if model is None or share < 0.002 else model.tasks[model.over_tasks.median > tau]
     text = (
         f"{int(above.sum())} of {len(above)} executed tasks exceed {quantity(tau, units)}, the largest with {largest}: "
@@ -49,24 +45,19 @@ def region_text(context: ReportContext, points: Array) -> str:
     """Return where points of the unit cube ``(m, d)`` lie, by the parameters in which they differ from all tasks."""
     low, high = np.quantile(points, [0.05, 0.95], axis=0)
     width = high - low
-    narrow = [int(j) for j in np.argsort(width) if width[j] < 0.7][:3]  # narrower than this share of the range
-    if not narrow:
-        return "they are spread over the task space"
     ends = context.space.from_unit(np.stack([low, high]))
     parts = []
-    for j in narrow:
-        first, last = number(ends[0, j], 3), number(ends[1, j], 3)
-        label = context.space.labels[j]
+    for j in [int(j) for j in np.argsort(width) if width[j] < 0.7][:3]:  # narrower than this share of the range
+        first, last, label = number(ends[0, j], 3), number(ends[1, j], 3), context.space.labels[j]
         parts.append(f"{label} at {first}" if first == last else f"{label} from {first} to {last}")
-    return f"most of them have {' and '.join(parts)}"
+    return f"most of them have {' and '.join(parts)}" if parts else "they are spread over the task space"
 
 
 def weak_states(context: ReportContext) -> Finding | None:
     """Which states and inputs the system visits where M is weak, and not elsewhere."""
     if len(context.recordings) < 4:
         return None
-    by_number = {trial.number: distance_of(trial) for trial in context.completed}
-    above = np.array([by_number[number] for number in context.recordings]) > (context.threshold or np.inf)
+    above = np.array([run.distance for run in context.recordings.values()]) > (context.threshold or np.inf)
     weak, which = above, "above the threshold"
     if above.all() or not above.any():
         weak, which = np.arange(len(above)) < max(1, len(above) // 4), "with the largest distances"
@@ -119,8 +110,8 @@ def explained(context: ReportContext) -> Finding | None:
     """Whether the corrected model, learned from the other trials, predicts the distance."""
     if context.validation is None:
         return Finding("Corrected model", "unknown", "Not known: it needs the experiment, which is not loaded.")
-    by_number = {trial.number: distance_of(trial) for trial in context.completed}
-    pairs = [(by_number[k], replay.distance) for k, replay in context.replays.items() if np.isfinite(replay.distance)]
+    replays = {k: replay.distance for k, replay in context.replays.items() if np.isfinite(replay.distance)}
+    pairs = [(context.recordings[k].distance, distance) for k, distance in replays.items()]
     if len(pairs) < 2:
         return Finding("Corrected model", "unknown", "Not known: the trials do not teach a correction of M.")
     executed, predicted = np.array(pairs).T
@@ -133,28 +124,22 @@ def explained(context: ReportContext) -> Finding | None:
         f"an error of {quantity(error, context.labels.units)} (root mean square), "
         f"{percent(error / max(size, 1e-300))} of the distances."
     )
-    if share >= 0.8:
-        text += (
-            " It explains the distance: the difference is a function of the recorded state and input, and a model "
-            "that is fitted to these data can remove it."
-        )
-        return Finding("Corrected model", "good", text, numbers)
     text += (
-        " It does not explain the distance: a state that is not recorded, a contact, dry friction or noise is the "
+        " It explains the distance: the difference is a function of the recorded state and input, and a model that is "
+        "fitted to these data can remove it."
+        if share >= 0.8
+        else " It does not explain the distance: a state that is not recorded, a contact, dry friction or noise is the "
         "likely cause, or too few trials."
     )
-    return Finding("Corrected model", "attention", text, numbers)
-
-
-# The closed loops
+    return Finding("Corrected model", "good" if share >= 0.8 else "attention", text, numbers)
 
 
 def components(context: ReportContext) -> Finding | None:
     """Which states err in the worst trials, and when their errors peak."""
     if not context.recordings:
         return None
-    worst = list(context.recordings.values())[:_WORST]
-    spans = soundness.ranges([run.system.states for run in context.recordings.values()])
+    runs = list(context.recordings.values())
+    worst, spans = runs[:_WORST], soundness.ranges([run.system.states for run in runs])
     errors = [np.abs(run.system.states - run.model.states) / spans for run in worst]
     peaks = np.mean([error.max(axis=0) for error in errors], axis=0)
     j = int(peaks.argmax())
@@ -176,13 +161,10 @@ def components(context: ReportContext) -> Finding | None:
 
 def _shares(context: ReportContext, worst: list[TrajectoryPair]) -> dict[str, float]:
     """Return the shares of the states in the error that the distance is composed of; empty if they are not known."""
-    validation = context.validation
-    distance = None if validation is None else validation.distance
-    if validation is None or not isinstance(distance, ComposedDistance) or not hasattr(distance, "components"):
+    distance, labels = getattr(context.validation, "distance", None), context.signals[0]
+    if not isinstance(distance, ComposedDistance) or not hasattr(distance, "components"):
         return {}
-    compared = distance.components
-    labels = context.signals[0]
-    names = labels if compared is None else [labels[i] for i in compared]
+    names = labels if distance.components is None else [labels[i] for i in distance.components]
     tasks = [context.replays[k].task for k in list(context.recordings)[:_WORST] if k in context.replays]
     errors = np.array([distance.error(one.model, one.system, task) for one, task in zip(worst, tasks, strict=False)])
     if errors.ndim != 2 or errors.shape[1] != len(names) or not np.abs(errors).sum() > 0:
@@ -195,10 +177,9 @@ def flips(context: ReportContext) -> Finding | None:
     """Whether the controllers of neighbouring tasks differ abruptly."""
     if len(context.recordings) < 2:
         return None
-    by_number = {trial.number: trial for trial in context.completed}
-    numbers = list(context.recordings)
-    points = np.array([by_number[k].unit_point for k in numbers])
-    pairs = soundness.flips(points, [run.model.inputs for run in context.recordings.values()])
+    numbers, runs = list(context.recordings), list(context.recordings.values())
+    points = np.array([run.trial.unit_point for run in runs])
+    pairs = soundness.flips(points, [run.model.inputs for run in runs])
     if pairs is None or not pairs.flipped:
         return None
     i, j = pairs.example
@@ -215,9 +196,8 @@ def unusual_motion(context: ReportContext) -> Finding | None:
     """Whether M itself makes an unusual motion in the worst trials, such as turning over."""
     if len(context.recordings) < 4:
         return None
-    sizes = np.array(
-        [np.abs(run.model.states - run.model.states[0]).max(axis=0) for run in context.recordings.values()]
-    )
+    runs = [run.model.states for run in context.recordings.values()]
+    sizes = np.array([np.abs(states - states[0]).max(axis=0) for states in runs])
     usual = np.maximum(np.median(sizes, axis=0), 1e-3 * sizes.max(axis=0) + 1e-300)
     ratios = sizes[:_WORST] / usual
     row, j = (int(k) for k in np.unravel_index(int(ratios.argmax()), ratios.shape))

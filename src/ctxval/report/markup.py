@@ -14,8 +14,7 @@ from markupsafe import Markup, escape
 from ctxval._util.representation import shown
 from ctxval._util.texts import plain, shortened, visible
 
-UNCUT = 100_000
-"""Characters of one text that must never be shortened, such as an assumption."""
+UNCUT = 100_000  # characters of one text that must never be shortened, such as an assumption
 
 
 def text(value: object, longest: int = 2_000) -> Markup:
@@ -67,29 +66,19 @@ def bullets(items: Iterable[object], class_: str | None = None) -> Markup:
 
 
 def table(caption: str, headers: Sequence[str], rows: Iterable[Sequence[object]], class_: str | None = None) -> Markup:
-    """Return a table with a caption; the first cell of each row is its header. Numbers have four digits.
-
-    Args:
-        caption: what the table shows.
-        headers: the names of the columns.
-        rows: one sequence of cells for each row; each cell is a number, a text or an element.
-        class_: further classes of the element.
-    """
+    """Return a table with a caption; the first cell of each row is its header. Numbers have four digits."""
     head = element("tr", *(element("th", header, scope="col") for header in headers))
     body = [
         element("tr", element("th", cell(first), scope="row"), *(element("td", cell(value)) for value in others))
         for first, *others in rows
     ]
     inside = element("caption", caption), element("thead", head), element("tbody", *body)
-    # A wide table scrolls by itself, so it can be reached by the keyboard.
-    return element(
-        "div",
-        element("table", *inside, class_=class_),
-        class_="scroll",
-        tabindex="0",
-        role="region",
-        aria_label=shortened(visible(caption), 120),
-    )
+    return scrolling(element("table", *inside, class_=class_), shortened(visible(caption), 120))
+
+
+def scrolling(content: object, label: str, class_: str = "scroll") -> Markup:
+    """Return a wide element that scrolls by itself, so that it can be reached by the keyboard."""
+    return element("div", content, class_=class_, tabindex="0", role="region", aria_label=label)
 
 
 def cell(value: object) -> Markup:

@@ -16,10 +16,10 @@ from markupsafe import Markup
 
 from ctxval._util.files import write_text
 from ctxval._util.texts import reason_of, visible
+from ctxval._util.version import VERSION
 from ctxval.report.context import ReportContext
 from ctxval.report.markup import paragraph, text
 from ctxval.report.sections import Section, all_sections
-from ctxval.version import VERSION
 
 if TYPE_CHECKING:
     import jinja2
@@ -33,16 +33,10 @@ class Rendered(NamedTuple):
 
 
 def page(context: ReportContext, sections: Sequence[Section] = ()) -> str:
-    """Return a report as one HTML page.
-
-    Args:
-        context: what the report is made from.
-        sections: further sections, which follow those that every report has.
-    """
+    """Return a report as one HTML page; ``sections`` follow those that every report has."""
     with np.errstate(all="ignore"):  # a store may have any numbers
-        parts = [
-            rendered(section.title, functools.partial(section.render, context)) for section in all_sections(sections)
-        ]
+        whole = all_sections(sections)
+        parts = [rendered(section.title, functools.partial(section.render, context)) for section in whole]
     name = visible(context.name) or "campaign"
     return framed(f"Validation of {name}", f"Store {context.store.name}; report made {now()}.", parts, folded=True)
 

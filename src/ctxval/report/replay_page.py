@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -12,10 +11,10 @@ from markupsafe import Markup
 from ctxval._util.files import write_text
 from ctxval._util.representation import counted
 from ctxval._util.texts import visible
-from ctxval.replay import PredictedTask, PredictedTasks, ReplayReport, StepError
 from ctxval.report.charts import SMALL, Axis, Chart, small_charts
 from ctxval.report.markup import bar, bullets, details, joined, number, paragraph, percent, quantity, table
 from ctxval.report.page import framed, now, rendered
+from ctxval.studies.replay import PredictedTask, PredictedTasks, ReplayReport, StepError
 
 __all__ = ["replay_page", "write_replay_page"]
 
@@ -25,17 +24,17 @@ _CHARTED = 12  # largest number of states and inputs with charts of their own
 
 def replay_page(report: ReplayReport, *, name: str = "", units: str = "") -> str:
     """Return what recordings show of a model as one HTML page, which opens no connection."""
-    sections: dict[str, Callable[[ReplayReport], Markup]] = {
-        "What follows": _insights,
-        "Error of the prediction": _errors,
-        "Where the error is large": _regions,
-        "What a better model could explain": _residuals,
+    tasks = report.tasks
+    sections: dict[str, Callable[[], Markup]] = {
+        "What follows": lambda: _insights(report),
+        "Error of the prediction": lambda: _errors(report),
+        "Where the error is large": lambda: _regions(report),
+        "What a better model could explain": lambda: _residuals(report),
+        **({} if tasks is None else {"Tasks": lambda: _tasks(tasks, units)}),
+        "Recordings": lambda: _recordings(report),
     }
     with np.errstate(all="ignore"):  # recordings may have any numbers
-        parts = [rendered(title, partial(render, report)) for title, render in sections.items()]
-        if report.tasks is not None:
-            parts.append(rendered("Tasks", partial(_tasks, report.tasks, units)))
-        parts.append(rendered("Recordings", partial(_recordings, report)))
+        parts = [rendered(title, render) for title, render in sections.items()]
     count = counted(report.data.recordings, "recording")
     title = f"Recordings replayed on {visible(name) or 'a model'}"
     return framed(title, f"{count} compared with the model; nothing was executed; report made {now()}.", parts)
@@ -53,27 +52,16 @@ def _insights(report: ReplayReport) -> Markup:
 
 
 def _errors(report: ReplayReport) -> Markup:
-    """Return a chart of the error over the number of steps for each state, and the table of errors."""
     if not report.errors:
         return paragraph("No recording has a single step.")
     by_state = {state: [error for error in report.errors if error.state == state] for state in report.data.states}
-    rows = [
-        (
-            error.state,
-            error.steps,
-            quantity(error.rms, error.unit),
-            f"{number(error.lowest, 3)} to {number(error.highest, 3)}",
-            number(error.upper, 3),
-            percent(error.relative, 3) if np.isfinite(error.relative) else "more than any change",
-            percent(error.diverged),
-        )
-        for errors in by_state.values()
-        for error in errors
-    ]
-    headers = (
-        *("State", "Steps", "RMS error", "Over the recordings", "95 % below"),
-        *("Share of the change", "Diverged"),
-    )
+    rows = []
+    for error in (error for errors in by_state.values() for error in errors):
+        spread = f"{number(error.lowest, 3)} to {number(error.highest, 3)}"
+        share = percent(error.relative, 3) if np.isfinite(error.relative) else "more than any change"
+        sizes = (quantity(error.rms, error.unit), spread, number(error.upper, 3), share)
+        rows.append((error.state, error.steps, *sizes, percent(error.diverged)))
+    headers = ("State", "Steps", "RMS error", "Over the recordings", "95 % below", "Share of the change", "Diverged")
     meaning = (
         "A share of 100 % of the change is the error of a model that predicts no change. The errors are those of "
         "recordings that the model has not seen, unless it has seen all of them."
@@ -84,7 +72,6 @@ def _errors(report: ReplayReport) -> Markup:
 
 
 def _regions(report: ReplayReport) -> Markup:
-    """Return a chart of the one-step error for each state and input, and the table behind them."""
     if not report.regions:
         return paragraph("There are too few recorded steps to divide them into regions.")
     names = list(dict.fromkeys(region.variable for region in report.regions))
@@ -104,24 +91,18 @@ def _regions(report: ReplayReport) -> Markup:
 
 
 def _residuals(report: ReplayReport) -> Markup:
-    """Return how much of the error a better model could explain."""
     if not report.residuals:
         return paragraph("There are too few recorded steps to tell.")
 
     def share(value: float) -> Markup:
         return joined([percent(value, 3), bar(min(max(value, 0.0), 1.0))])
 
-    headers = (
-        *("State", "RMS residual", "Explained by state and input", "By an affine function"),
-        *("RMS of the rest", "Rest explained by the step before"),
-    )
-    rows = [
-        (
-            *(state.state, quantity(state.rms, state.unit), share(state.explained), share(state.linear)),
-            *(quantity(state.rest, state.unit), share(state.history)),
-        )
-        for state in report.residuals
-    ]
+    explained = ("Explained by state and input", "By an affine function")
+    headers = ("State", "RMS residual", *explained, "RMS of the rest", "Rest explained by the step before")
+    rows = []
+    for state in report.residuals:
+        rms, rest = quantity(state.rms, state.unit), quantity(state.rest, state.unit)
+        rows.append((state.state, rms, share(state.explained), share(state.linear), rest, share(state.history)))
     meaning = (
         "All shares are of the mean square of the one-step residual, measured on held-out recordings. A large share of "
         "the step before shows a state that is not recorded, a delay, or filtered measurements."
@@ -130,7 +111,6 @@ def _residuals(report: ReplayReport) -> Markup:
 
 
 def _tasks(tasks: PredictedTasks, units: str) -> Markup:
-    """Return the worst tasks and the executions that would tell most; no execution has tested them."""
     bound = (
         f"The largest distance over all tasks is {quantity(tasks.median, units)} in the median of {tasks.draws} "
         f"posterior samples of the dynamics, and at most {quantity(tasks.upper, units)} in 95 % of them. No execution "
@@ -168,7 +148,6 @@ def _task_table(caption: str, tasks: Sequence[PredictedTask], units: str) -> Mar
 
 
 def _recordings(report: ReplayReport) -> Markup:
-    """Return the sizes of the recordings, how they were read, the sources and the splits."""
     data = report.data
     rows: list[tuple[str, object]] = [
         ("Recordings", data.recordings),

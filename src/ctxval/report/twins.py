@@ -13,14 +13,11 @@ from ctxval._util.describe import describe
 from ctxval._util.files import MADE_BY
 from ctxval._util.texts import markdown_text, shortened, visible
 from ctxval.report.context import ReportContext, distance_of
-from ctxval.report.diagnostics import diagnostics, not_tested
-from ctxval.report.findings import WORDS, Finding
+from ctxval.report.diagnostics import WORDS, Finding, diagnostics, not_tested
 from ctxval.report.insights import insights
 from ctxval.report.markup import UNCUT, number, quantity
 from ctxval.report.sections.appendix import appendix
 from ctxval.report.sections.repeat import command_snippet, identity, python_snippet, repeating_command
-
-_WORST = 5
 
 
 def to_json(context: ReportContext) -> dict[str, Any]:
@@ -46,7 +43,7 @@ def to_json(context: ReportContext) -> dict[str, Any]:
                     "python": python_snippet(context, trial),
                     "command": command_snippet(context, trial),
                 }
-                for trial in context.worst_tasks(_WORST)
+                for trial in context.worst_tasks()
             ],
             "command": repeating_command(context) or None,
             "identity": identity(context),
@@ -77,11 +74,10 @@ def junit(context: ReportContext) -> str:
     add("ctxval", "verdict", answer, "" if answer == "validated" else reason)
     for finding in diagnostics(context):
         add("ctxval.diagnostics", finding.name, finding.light, finding.text)
-    suite.set("tests", str(len(suite)))
-    suite.set("failures", str(len(suite.findall("testcase/failure"))))
-    suite.set("skipped", str(len(suite.findall("testcase/skipped"))))
-    suite.set("errors", "0")
-    suite.set("time", f"{sum(trial.seconds or 0.0 for trial in context.trials):.3f}")
+    failures, skipped = (len(suite.findall(f"testcase/{tag}")) for tag in ("failure", "skipped"))
+    seconds = f"{sum(trial.seconds or 0.0 for trial in context.trials):.3f}"
+    counts = {"tests": len(suite), "failures": failures, "skipped": skipped, "errors": 0, "time": seconds}
+    suite.attrib |= {name: str(value) for name, value in counts.items()}
     ElementTree.indent(suite)
     content = ElementTree.tostring(suite, encoding="unicode")
     return f'<?xml version="1.0" encoding="utf-8"?>\n<!-- {MADE_BY} -->\n{content}\n'
@@ -96,52 +92,36 @@ def markdown(context: ReportContext) -> str:
     """Return the report without its charts as Markdown; texts of the store cannot become markup."""
     units, verdict = context.labels.units, context.verdict
     answer = "No verdict: no threshold was given." if verdict is None else f"{verdict}"
-    trials = context.worst_tasks(_WORST)
-    lines = [
+    trials = context.worst_tasks()
+    rows = [
+        f"| {trial.number} | {markdown_text(quantity(distance_of(trial), units))} | {' | '.join(map(number, point))} |"
+        for trial, point in zip(trials, context.coordinates(trials).tolist(), strict=True)
+    ]
+    entries = [
+        f"- **{markdown_text(entry.term)}** ({entry.standard}): {markdown_text(entry.content, UNCUT)}"
+        for entry in appendix(context)
+    ]
+
+    def items(findings: list[Finding]) -> list[str]:
+        listed = [
+            f"- {WORDS[finding.light]}: **{markdown_text(finding.name)}.** {markdown_text(finding.text)}"
+            for finding in findings
+        ]
+        return listed or ["Nothing is unusual."]
+
+    head = f"| trial | distance | {' | '.join(map(markdown_text, context.space.labels))} |"
+    parts = {
+        "Diagnostics": items(diagnostics(context)),
+        "Insights": items(insights(context)),
+        "What was not tested": [f"- {markdown_text(sentence)}" for sentence in not_tested(context)],
+        "Worst tasks": [head, f"|{'---|' * (2 + context.space.dimension)}", *rows],
+        "For the file": entries,
+    }
+    blocks = [
         f"# Validation of {markdown_text(context.name) or 'campaign'}",
-        "",
         f"**{markdown_text(answer)}**",
-        "",
         f"{context.executions} executions, {len(context.failed)} without a distance.",
-        "",
-        "## Diagnostics",
-        "",
-        *_items(diagnostics(context)),
-        "",
-        "## Insights",
-        "",
-        *_items(insights(context)),
-        "",
-        "## What was not tested",
-        "",
-        *(f"- {markdown_text(sentence)}" for sentence in not_tested(context)),
-        "",
-        "## Worst tasks",
-        "",
-        f"| trial | distance | {' | '.join(map(markdown_text, context.space.labels))} |",
-        f"|{'---|' * (2 + context.space.dimension)}",
-        *(
-            f"| {trial.number} | {markdown_text(quantity(distance_of(trial), units))} | "
-            f"{' | '.join(map(number, point))} |"
-            for trial, point in zip(trials, context.coordinates(trials).tolist(), strict=True)
-        ),
-        "",
-        "## For the file",
-        "",
-        *(
-            f"- **{markdown_text(entry.term)}** ({entry.standard}): {markdown_text(entry.content, UNCUT)}"
-            for entry in appendix(context)
-        ),
-        "",
+        *(block for title, lines in parts.items() for block in (f"## {title}", "\n".join(lines))),
         f"<!-- {MADE_BY} -->",
-        "",
     ]
-    return "\n".join(lines)
-
-
-def _items(findings: list[Finding]) -> list[str]:
-    items = [
-        f"- {WORDS[finding.light]}: **{markdown_text(finding.name)}.** {markdown_text(finding.text)}"
-        for finding in findings
-    ]
-    return items or ["Nothing is unusual."]
+    return "\n\n".join(blocks) + "\n"

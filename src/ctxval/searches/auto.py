@@ -21,10 +21,6 @@ FAST = 0.15
 """Share of the largest number of points that fast thinking predicts."""
 _SHARES = (1.0, 0.4, FAST)
 """Shares of the largest number of points that are predicted for one choice, from thorough to fast."""
-_SHORT = 1.0
-"""Seconds for which a search may think in any case."""
-_SUPPOSED = 10.0
-"""Seconds of an execution that are supposed before one was timed."""
 
 DESIGNS = "designs"
 """Key in a note: the number of points that are predicted for each choice of the campaign."""
@@ -52,7 +48,6 @@ class Auto(TrustRegion):
         self._fixed_now: int | None = None
 
     def use_prediction(self, prediction: Prediction | None) -> None:
-        """Take the prediction for the point that is asked for next; None if there is none."""
         self._fixed_now = None
         if prediction is not None:
             prediction = replace(prediction, budget=self.designs(prediction))
@@ -70,19 +65,17 @@ class Auto(TrustRegion):
         """Return the number of points that are predicted for the next choice."""
         most = min(prediction.budget, self._settings.points * self.dimension)
         match self.thinking:
-            case "balanced":
-                return min(most, self._noted_designs() or self._measured_designs(prediction, most))
             case "thorough":
                 return most
             case "fast":
-                return _designs(FAST, most)
-            case number:
+                return max(1, round(FAST * most))
+            case number if number != "balanced":
                 return min(int(number), most)
-
-    def _measured_designs(self, prediction: Prediction, most: int) -> int:
-        """Return the number of designs for the measured costs; it is fixed once an execution was timed."""
-        if prediction.costs is None:
-            return most
+        # The number is fixed once an execution was timed; the note of that choice has it.
+        noted = (note.get(DESIGNS) for note in self.notes if note is not None)
+        fixed = next((number for number in noted if isinstance(number, int) and number >= 1), None)
+        if fixed is not None or prediction.costs is None:
+            return min(most, fixed or most)
         costs = prediction.costs()
         designs = self._balanced(costs, most)
         self._fixed_now = None if costs.evaluation is None else designs
@@ -94,15 +87,7 @@ class Auto(TrustRegion):
 
     def _balanced(self, costs: Costs, most: int) -> int:
         """Return the largest number of designs that takes no longer than one evaluation, or than is always short."""
-        seconds = max(_SHORT, _SUPPOSED if costs.evaluation is None else costs.evaluation)
-        numbers = [_designs(share, most) for share in _SHARES]
+        # An execution that was not timed is supposed to take 10 s, and one second is short in any case.
+        seconds = max(1.0, 10.0 if costs.evaluation is None else costs.evaluation)
+        numbers = [max(1, round(share * most)) for share in _SHARES]
         return next((number for number in numbers if self.thinking_seconds(costs, number) <= seconds), numbers[-1])
-
-    def _noted_designs(self) -> int | None:
-        """Return the number of designs that was fixed at an earlier choice; None if there was none."""
-        noted = (note.get(DESIGNS) for note in self.notes if note is not None)
-        return next((number for number in noted if isinstance(number, int) and number >= 1), None)
-
-
-def _designs(share: float, most: int) -> int:
-    return max(1, round(share * most))

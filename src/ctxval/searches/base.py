@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import warnings
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Protocol, runtime_checkable
@@ -48,7 +47,6 @@ class Pending(ShortRepr):
     """Points that are being evaluated.
 
     Attributes:
-        points: points of the unit cube ``(k, d)``.
         prediction: returns the prediction as if they had the expected values: the doubt near them is less.
     """
 
@@ -86,11 +84,7 @@ class Prediction(ShortRepr):
     pending: Pending | None = None
 
     def with_rows(self, left_out_of: Callable[[Prediction], Callable[[Rows], Array]]) -> Prediction:
-        """Return the prediction with other rows, also in those that it may turn to.
-
-        Args:
-            left_out_of: a prediction with these rows -> its ``left_out`` for the other rows.
-        """
+        """Return the prediction, and those that it may turn to, with a function of other rows for each ``left_out``."""
 
         def otherwise() -> Prediction | None:
             other = None if self.otherwise is None else self.otherwise()
@@ -114,17 +108,20 @@ class Search(Protocol):
     names.
     """
 
+    @abstractmethod
     def reset(self, dimension: int, seed: int) -> None:
         """Forget everything and start on the unit cube of this dimension."""
 
+    @abstractmethod
     def ask(self, n: int = 1) -> Array:
         """Return the next points, shape ``(n, d)``; they are pending until told."""
 
+    @abstractmethod
     def tell(self, points: ArrayLike, values: ArrayLike) -> None:
         """Learn the values ``(n,)`` at points ``(n, d)``; NaN for an evaluation that is pending or has failed."""
 
 
-class BaseSearch(ABC):
+class BaseSearch(Search):
     """Base class of searches with more than the three methods of :class:`Search`; all ready-made ones inherit it.
 
     A subclass implements these three methods. All others have a default, which does nothing.
@@ -140,31 +137,13 @@ class BaseSearch(ABC):
     initial: int = 0
     discard: int = 0
 
+    def __init__(self) -> None:
+        """Take no options; a protocol without a constructor would take any."""
+
     @staticmethod
     def of(search: Search) -> BaseSearch:
         """Return the search itself if it is of this class; else wrap it with the defaults of this class."""
-        if isinstance(search, BaseSearch):
-            return search
-        if getattr(search, "iid", False) is True:
-            # Before version 0.2 this attribute was enough, and such a search would lose its scenario bound in silence.
-            warnings.warn(
-                f"{type(search).__name__} has iid = True, which counts only if the class inherits "
-                "ctxval.searches.BaseSearch; its points are not taken to be independent draws.",
-                stacklevel=2,
-            )
-        return _WithDefaults(search)
-
-    @abstractmethod
-    def reset(self, dimension: int, seed: int) -> None:
-        """Forget everything and start on the unit cube of this dimension."""
-
-    @abstractmethod
-    def ask(self, n: int = 1) -> Array:
-        """Return the next points, shape ``(n, d)``; they are pending until told."""
-
-    @abstractmethod
-    def tell(self, points: ArrayLike, values: ArrayLike) -> None:
-        """Learn the values ``(n,)`` at points ``(n, d)``; NaN for an evaluation that is pending or has failed."""
+        return search if isinstance(search, BaseSearch) else _WithDefaults(search)
 
     @property
     def uses_prediction(self) -> bool:
@@ -174,34 +153,26 @@ class BaseSearch(ABC):
         """
         return type(self).use_prediction is not BaseSearch.use_prediction
 
-    def use_prediction(self, prediction: Prediction | None) -> None:  # noqa: B027
+    def use_prediction(self, prediction: Prediction | None) -> None:
         """Take the prediction for the points that are asked for next; None if there is none."""
 
     def note(self) -> Note | None:
         """Return the note on the point that was asked for last, in types that JSON has; None if there is none."""
         return None
 
-    def remember(self, notes: Sequence[Note | None]) -> None:  # noqa: B027
+    def remember(self, notes: Sequence[Note | None]) -> None:
         """Take the notes on a history that was told: one for each point, in the order of the points."""
 
     def estimate(self, points: Array, values: Array) -> float | None:
         """Return the estimate of the maximum: the largest known value after the ``discard`` largest are left out.
 
         Returns None if there are too few values.
-
-        Args:
-            points: points of the unit cube, shape ``(n, d)``.
-            values: their values, shape ``(n,)``, finite.
         """
         ordered = np.sort(values)[::-1]
         return float(ordered[self.discard]) if len(ordered) > self.discard else None
 
     def surrogate(self) -> Surrogate | None:
-        """Return the Gaussian process of the values that the search uses; None if it uses none.
-
-        Raises:
-            InputError: if too few values are known.
-        """
+        """Return the Gaussian process of the values that the search uses; None if it uses none."""
         return None
 
 
@@ -226,7 +197,6 @@ class SequentialSearch(BaseSearch):
 
     @checked
     def reset(self, dimension: PositiveInt, seed: NonNegativeInt) -> None:
-        """Forget everything and start on the unit cube of this dimension."""
         self._dimension, self._seed = dimension, seed
         self._points: list[Array] = []
         self._values: list[float] = []
@@ -236,7 +206,6 @@ class SequentialSearch(BaseSearch):
 
     @checked
     def ask(self, n: PositiveInt = 1) -> Array:
-        """Return the next points, shape ``(n, d)``; they are pending until told."""
         self._require_reset()
         proposals = []
         for _ in range(n):
@@ -247,12 +216,6 @@ class SequentialSearch(BaseSearch):
         return np.array(proposals)
 
     def tell(self, points: ArrayLike, values: ArrayLike) -> None:
-        """Learn the values ``(n,)`` at points ``(n, d)``; NaN for an evaluation that is pending or has failed.
-
-        Raises:
-            ShapeError: if points and values do not fit together, or do not have the dimension of the cube.
-            InputError: if a point is outside the unit cube, or the search was never reset.
-        """
         self._require_reset()
         rows, scalars = as_floats("points", points), as_floats("values", values)
         if rows.ndim != 2 or rows.shape[1] != self._dimension or scalars.shape != (len(rows),):
@@ -262,7 +225,8 @@ class SequentialSearch(BaseSearch):
         if not ((rows >= 0) & (rows <= 1)).all():
             raise InputError(f"points must be in the unit cube, got {rows.tolist()}.")
         for point, value in zip(rows, scalars.tolist(), strict=True):
-            slot = self._waiting_slot(point)
+            waiting = (slot for slot in self._slots.get(_key(point), []) if np.isnan(self._values[slot]))
+            slot = next(waiting, None)
             if slot is None:
                 self._append(point, value, None)
             else:
@@ -279,16 +243,10 @@ class SequentialSearch(BaseSearch):
         self._points[last] = point
 
     def note(self) -> Note | None:
-        """Return the note on the point that was asked for last; None if there is none."""
         self._require_reset()
         return self._last_note
 
     def remember(self, notes: Sequence[Note | None]) -> None:
-        """Take the notes on the points told so far: one for each point, in the order of the points.
-
-        Raises:
-            ShapeError: if the number of notes differs from the number of points.
-        """
         self._require_reset()
         if len(notes) != len(self._points):
             raise ShapeError(f"there must be one note for each of {len(self._points)} points, got {len(notes)}.")
@@ -303,9 +261,6 @@ class SequentialSearch(BaseSearch):
     def _require_reset(self) -> None:
         if not hasattr(self, "_points"):
             raise InputError("reset(dimension, seed) must come before ask and tell.")
-
-    def _waiting_slot(self, point: Array) -> int | None:
-        return next((slot for slot in self._slots.get(_key(point), []) if np.isnan(self._values[slot])), None)
 
     @abstractmethod
     def propose(self, rng: np.random.Generator) -> Array:

@@ -12,7 +12,7 @@ all, because the path away from a wide maximum leads through lower values.
 from __future__ import annotations
 
 from bisect import insort
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -27,25 +27,10 @@ from ctxval.searches.base import Note, SequentialSearch, best_first
 
 _WORTH = 0.005
 """Least improvement worth an execution, as a share of the difference between the best value and the median."""
-_MISSES = 8
-"""Number of executions without improvement after which the search branches."""
-_BRANCH_MISSES = 6
-"""Number of executions without improvement after which the search leaves a branch for another one."""
 _EVERYWHERE = 4
 """Period of executions that are chosen from the whole cube, also in a branch; in few dimensions they fill the space."""
 _BOUND = 3
 """Period of executions that maximise the upper confidence bound."""
-_BOLD = 100.0
-"""Confidence parameter of the bound at the start of a branch."""
-_FEW = 2
-"""Largest dimension in which some of the executions fill the space."""
-_FILLERS = 512
-"""Number of candidates for an execution that fills the space."""
-_EACH = 20
-"""Hyperparameters are learned at each new value below twice this number of values, at every second value below four
-times this number, and so on."""
-_KEPT = 1000
-"""Largest number of points that the surrogate is conditioned on."""
 _ENGINE = "scalar"
 """The name of this search in notes. Existing stores contain it, so it differs from the name of the class."""
 
@@ -65,10 +50,6 @@ class _Branch:
     upper: bool
     best: float = -np.inf
     misses: int = 0
-
-    def has(self, point: Array) -> bool:
-        """Return whether a point ``(d,)`` is in this half."""
-        return bool(point[self.coordinate] >= 0.5) is self.upper
 
     def box(self, dimension: int) -> Box:
         """Return the bounds of this half."""
@@ -94,23 +75,16 @@ class BayesianOptimisation(SequentialSearch):
         self.beta = beta
 
     def reset(self, dimension: int, seed: int) -> None:
-        """Forget everything and start on the unit cube of this dimension."""
         super().reset(dimension, seed)
         self._memo: tuple[bytes, Learned] | None = None
 
     def propose(self, rng: np.random.Generator) -> Array:
-        """Return the next point ``(d,)``."""
         point, self._last_note = self.choose(self.points, self.values, rng)
         return point
 
     def choose(self, points: Array, values: Array, rng: np.random.Generator) -> tuple[Array, Note]:
-        """Return the next point ``(d,)`` after a history, which any search may have made, and a note on the choice.
-
-        Args:
-            points, values: the history, ``(n, d)`` and ``(n,)``; values are NaN if pending or failed.
-            rng: the source of the candidates.
-        """
-        few = self.dimension <= _FEW
+        """Return the next point ``(d,)`` after a history, which any search may have made, and a note on the choice."""
+        few = self.dimension <= 2
         if len(values) < self.initial or np.isfinite(values).sum() < 2:
             point = _filling(points, rng) if few and len(points) else rng.random(self.dimension)
             return point, {"engine": _ENGINE, "how": "initial"}
@@ -122,7 +96,7 @@ class BayesianOptimisation(SequentialSearch):
     def _most_worth(self, points: Array, values: Array, rng: np.random.Generator) -> tuple[Array, Note]:
         known = np.isfinite(values)
         learned = self._learned(points[known], values[known])
-        rows = kept_rows(points, values, _KEPT)
+        rows = kept_rows(points, values, 1000)
         process = learned.condition(points[rows], values[rows])
         branch = None if len(values) % _EVERYWHERE == 0 else _branch(points[known], values[known])
         believed = process.y[int(known[rows].sum()) :].max(initial=-np.inf)
@@ -141,8 +115,8 @@ class BayesianOptimisation(SequentialSearch):
         self, learned: Learned, process: GaussianProcess, values: Array, branch: _Branch | None, believed: float
     ) -> Acquisition:
         if branch is not None and not np.isfinite(branch.best):
-            # Start far from the maximum that was left: near it, the branch would only lead back to it.
-            return UpperConfidenceBound(process, _BOLD)
+            # Be bold, far from the maximum that was left: near it, the branch would only lead back to it.
+            return UpperConfidenceBound(process, 100.0)
         if len(values) % _BOUND == _BOUND - 1:
             return UpperConfidenceBound(process, self.beta)
         if branch is not None:
@@ -152,20 +126,18 @@ class BayesianOptimisation(SequentialSearch):
         return LogExpectedImprovement(process, max(best, believed))
 
     def _learned(self, points: Array, values: Array) -> Learned:
-        """Return hyperparameters learned from the first values; a fixed schedule says how many of them are used."""
-        count = _scheduled(len(values))
+        """Return hyperparameters learned from the first values; a fixed schedule says how many of them are used.
+
+        They are learned at each new value up to 40, at every second value up to 80, and so on.
+        """
+        step = 1
+        while len(values) >= 40 * step:
+            step *= 2
+        count = len(values) - len(values) % step
         key = points[:count].tobytes() + values[:count].tobytes()
         if self._memo is None or self._memo[0] != key:
             self._memo = (key, learn(points[:count], values[:count]))
         return self._memo[1]
-
-
-def _scheduled(count: int) -> int:
-    """Return the largest number up to ``count`` at which hyperparameters are learned."""
-    step = 1
-    while count >= 2 * _EACH * step:
-        step *= 2
-    return count - count % step
 
 
 def _worthwhile(learned: Learned, values: Array, best: float) -> float:
@@ -176,7 +148,7 @@ def _worthwhile(learned: Learned, values: Array, best: float) -> float:
 
 def _filling(points: Array, rng: np.random.Generator) -> Array:
     """Return the candidate ``(d,)`` that is farthest from all points."""
-    candidates = rng.random((_FILLERS, points.shape[1]))
+    candidates = rng.random((512, points.shape[1]))
     gaps = np.linalg.norm(candidates[:, None, :] - points[None, :, :], axis=2).min(axis=1)
     return np.asarray(candidates[np.argmax(gaps)])
 
@@ -196,23 +168,12 @@ def _branch(points: Array, values: Array) -> _Branch | None:
             branch, misses = None, 0
         elif branch is None:
             misses += 1
-        elif branch.has(point):
-            branch = _after(branch, value, margin)
-        exhausted = misses >= _MISSES if branch is None else branch.misses >= _BRANCH_MISSES
-        if exhausted:
-            branch, misses = _across(place, points[:count]), 0
+        elif bool(point[branch.coordinate] >= 0.5) is branch.upper:
+            fruitless = 0 if value > branch.best + margin else branch.misses + 1
+            branch = replace(branch, best=max(branch.best, value), misses=fruitless)
+        if (misses >= 8) if branch is None else (branch.misses >= 6):
+            # The next branch is the half with the fewest points, of those halves that do not contain the best point.
+            upper = place < 0.5
+            coordinate = int(((points[:count] >= 0.5) == upper).sum(axis=0).argmin())
+            branch, misses = _Branch(coordinate, bool(upper[coordinate])), 0
     return branch
-
-
-def _after(branch: _Branch, value: float, margin: float) -> _Branch:
-    """Return a branch after one more value in it."""
-    misses = 0 if value > branch.best + margin else branch.misses + 1
-    return _Branch(branch.coordinate, branch.upper, max(branch.best, value), misses)
-
-
-def _across(place: Array, points: Array) -> _Branch:
-    """Return the half of the cube with the fewest points, of those halves that do not contain a place ``(d,)``."""
-    upper = place < 0.5
-    visited = ((points >= 0.5) == upper).sum(axis=0)
-    coordinate = int(visited.argmin())
-    return _Branch(coordinate, bool(upper[coordinate]))

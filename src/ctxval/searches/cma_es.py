@@ -15,11 +15,6 @@ from ctxval.searches.base import SequentialSearch
 if TYPE_CHECKING:
     from cmaes import CMA
 
-_SMALLEST_POPULATION = 4
-"""The fewest points in a generation."""
-_POINT = 1e-4
-"""Width of a generation, as a share of the cube on every axis, below which a run has converged."""
-
 
 @part("cma-es")
 class CMAES(SequentialSearch):
@@ -33,19 +28,16 @@ class CMAES(SequentialSearch):
         sigma: standard deviation of the first generation on each axis, in widths of the cube.
         population: number of points in a generation; ``4 + floor(3 ln d)`` by default.
 
-    Raises:
-        InputError: if the population is below 4, or ``cmaes`` is not installed.
     """
 
     def __init__(self, sigma: PositiveFloat = 0.3, population: PositiveInt | None = None) -> None:
-        if population is not None and population < _SMALLEST_POPULATION:
-            raise InputError(f"CMA-ES needs a population of at least {_SMALLEST_POPULATION}, got {population!r}.")
+        if population is not None and population < 4:
+            raise InputError(f"CMA-ES needs a population of at least 4, got {population!r}.")
         _cma_class()
         self.sigma = sigma
         self.population = population
 
     def reset(self, dimension: int, seed: int) -> None:
-        """Forget everything and start on the unit cube of this dimension."""
         super().reset(dimension, seed)
         self._begin()
 
@@ -65,18 +57,16 @@ class CMAES(SequentialSearch):
             self._begin()  # a late value belongs to a generation that was learned without it
         while (last := (first := len(self._learned)) + self._distribution.population_size) <= len(points):
             _learn(self._distribution, points[first:last], values[first:last])
-            if self._distribution.should_stop() or (np.ptp(points[first:last], axis=0) < _POINT).all():
-                self._distribution = self._restarted(2 * self._distribution.population_size, last)
+            if self._distribution.should_stop() or (np.ptp(points[first:last], axis=0) < 1e-4).all():
+                # Trial k draws from [seed, k]; the third number of the seed separates the restart from it.
+                rng = np.random.default_rng(np.random.SeedSequence([self._seed, last, 1]))
+                population = 2 * self._distribution.population_size
+                self._distribution = self._started(rng.random(self.dimension), population)
             self._learned = values[:last]
 
     def _started(self, mean: Array, population: int | None) -> CMA:
         bounds = np.tile([0.0, 1.0], (self.dimension, 1))
         return _cma_class()(mean=mean, sigma=self.sigma, bounds=bounds, population_size=population)
-
-    def _restarted(self, population: int, number: int) -> CMA:
-        # Trial k draws from [seed, k]; the third number of the seed separates the restart from it.
-        rng = np.random.default_rng(np.random.SeedSequence([self._seed, number, 1]))
-        return self._started(rng.random(self.dimension), population)
 
 
 def _learn(distribution: CMA, points: Array, values: Array) -> None:

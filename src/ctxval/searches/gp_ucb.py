@@ -14,11 +14,6 @@ from ctxval.gp.subset import kept_rows
 from ctxval.gp.surrogate import Surrogate, fit_surrogate
 from ctxval.searches.base import SequentialSearch, best_first
 
-_NEGLIGIBLE = 1e-3
-"""Least predicted improvement worth an execution, in standard deviations of the values."""
-_KEPT = 500
-"""Largest number of points that the surrogate is fitted to; its hyperparameters are learned again each time."""
-
 
 @part("gp-ucb")
 class GPUCB(SequentialSearch):
@@ -61,13 +56,13 @@ class GPUCB(SequentialSearch):
             known = best_first(self.points, values)
             bound = UpperConfidenceBound(process, self.beta)
             point = maximise(bound, self.dimension, known, rng)
-            if bound(point[None])[0] - process.y.max() <= _NEGLIGIBLE:
-                # The search has converged: the bound predicts no improvement, so the rest of the budget explores.
+            if bound(point[None])[0] - process.y.max() <= 1e-3:
+                # The bound predicts no improvement worth an execution, so the rest of the budget explores.
                 point = maximise(Uncertainty(process), self.dimension, known, rng)
             return point
 
     def surrogate(self) -> Surrogate:
         """Return the GP conditioned on the history."""
         points, values = self.points, self.values
-        rows = kept_rows(points, values, _KEPT)
+        rows = kept_rows(points, values, 500)
         return fit_surrogate(points[rows], values[rows], self.kernel, noise=self.noise, prior_mean=self.prior_mean)

@@ -17,7 +17,6 @@ class Random(SequentialSearch):
     iid = True
 
     def propose(self, rng: np.random.Generator) -> Array:
-        """Return a uniform draw."""
         return rng.random(self.dimension)
 
 

@@ -26,18 +26,11 @@ from ctxval._util.checked import NonNegativeFloat, PositiveInt
 from ctxval._util.registry import part
 from ctxval.gp.acquisition import Box
 from ctxval.gp.ascent import Ascent
+from ctxval.gp.subset import kept_rows
+from ctxval.gp.surrogate import fit_surrogate
 from ctxval.searches.base import Note, Prediction, SequentialSearch, best_first
 from ctxval.searches.bayesian_optimisation import BayesianOptimisation
-from ctxval.searches.optimistic_value import (
-    Candidate,
-    OptimisticValue,
-    left_out_by_surrogate,
-    log_error,
-    represented,
-)
 
-_STARTS = 8
-"""Number of best points at which a maximisation starts."""
 _ENGINE = "climb"
 """The name of this search in notes. Existing stores contain it, so it differs from the name of the class."""
 
@@ -86,6 +79,43 @@ class TrustRegionSettings:
 
 
 @dataclass(frozen=True, eq=False)
+class _Candidate:
+    """A point ``(d,)`` of the unit cube, the value that is predicted there, and its doubt."""
+
+    point: Array
+    expected: float
+    doubt: float
+
+    def optimistic(self, optimism: float) -> float:
+        """Return the optimistic value with this kappa."""
+        return self.expected * (1 + optimism * self.doubt)
+
+
+@dataclass(frozen=True, eq=False)
+class _OptimisticValue:
+    """The optimistic value of points: the prediction d_hat, raised by kappa (``optimism``) times its doubt w."""
+
+    prediction: Prediction
+    optimism: float
+
+    @property
+    def rough(self) -> _OptimisticValue | None:
+        """The same with the rough prediction; None if there is none."""
+        rough = self.prediction.rough
+        return None if rough is None else replace(self, prediction=replace(self.prediction, expected=rough))
+
+    def __call__(self, points: Array) -> Array:
+        """Return the optimistic values ``(m,)`` of points ``(m, d)``."""
+        expected, doubt = self.prediction.expected(points)
+        return np.asarray(expected * (1 + self.optimism * doubt))
+
+    def at(self, point: Array) -> _Candidate:
+        """Return a point ``(d,)`` with what is predicted there."""
+        expected, doubt = self.prediction.expected(point[None])
+        return _Candidate(point, float(expected[0]), float(doubt[0]))
+
+
+@dataclass(frozen=True, eq=False)
 class _Region:
     """The state of a trust region, computed from notes and values.
 
@@ -112,12 +142,7 @@ class _Region:
 
 @dataclass(frozen=True, eq=False)
 class _History:
-    """What a choice follows from.
-
-    Attributes:
-        points, values, notes: the points ``(n, d)``, their values ``(n,)``, NaN if not known, and the notes on them.
-        others: pending and failed points ``(k, d)``, from which the choice keeps a distance.
-    """
+    """What a choice follows from: points, values and notes, and pending or failed points that it keeps away from."""
 
     points: Array
     values: Array
@@ -132,7 +157,6 @@ class TrustRegion(SequentialSearch):
     Args:
         optimism: kappa, the relative excess of a value over its prediction that is assumed if the doubt is 1.
         misses: number of executions without improvement after which a region is left.
-        settings: further settings, for studies; the defaults if None.
     """
 
     initial = 1
@@ -151,14 +175,12 @@ class TrustRegion(SequentialSearch):
         return options if usual else {**options, "settings": asdict(self._settings)}
 
     def reset(self, dimension: int, seed: int) -> None:
-        """Forget everything and start on the unit cube of this dimension."""
         super().reset(dimension, seed)
         self._prediction: Prediction | None = None
         self._fallback = BayesianOptimisation(initial=1)
         self._fallback.reset(dimension, seed)
 
     def use_prediction(self, prediction: Prediction | None) -> None:
-        """Take the prediction for the point that is asked for next; None if there is none."""
         self._prediction = prediction
 
     def propose(self, rng: np.random.Generator) -> Array:
@@ -195,7 +217,7 @@ class TrustRegion(SequentialSearch):
         if not self._settings.compare_with_surrogate or len(values) < self._settings.compared_from:
             return None
         rows = np.arange(len(values))[-self._settings.compared_on :]
-        error = log_error(prediction.left_out(rows), values[rows])
+        error = _log_error(prediction.left_out(rows), values[rows])
         if error <= self._settings.good_enough or error <= surrogate_error():
             return None
         return (
@@ -206,9 +228,11 @@ class TrustRegion(SequentialSearch):
         """Return the error of leave-one-out predictions by the surrogate, on the latest values."""
         known = np.isfinite(self.values)
         points, values = self.points[known], self.values[known]
-        kept = represented(points, values)  # it ends with the latest values, which are compared
+        kept = kept_rows(points, values, 150, long=150)  # they end with the latest values, which are compared
+        surrogate = fit_surrogate(points[kept], values[kept])
+        left_out = surrogate.shift + surrogate.scale * surrogate.process.left_out()[0]
         latest = slice(-min(len(values), self._settings.compared_on), None)
-        return log_error(left_out_by_surrogate(points[kept], values[kept])[latest], values[latest])
+        return _log_error(left_out[latest], values[latest])
 
     def _why_hedge(self) -> str | None:
         """Return why the surrogate chooses in place of the prediction, every second time; None if it does not."""
@@ -255,9 +279,9 @@ class TrustRegion(SequentialSearch):
 
     def _next(
         self, prediction: Prediction, history: _History, rng: np.random.Generator
-    ) -> tuple[Candidate | None, _Region]:
+    ) -> tuple[_Candidate | None, _Region]:
         """Return the next candidate after a history, None if no point can be predicted, and its region."""
-        settings, value = self._settings, OptimisticValue(prediction, self.optimism)
+        settings, value = self._settings, _OptimisticValue(prediction, self.optimism)
         if not settings.restrict:
             return self._best(value, _Region(), history, rng), _Region()
         region = self._state(history)
@@ -270,27 +294,25 @@ class TrustRegion(SequentialSearch):
         new = _Region(region.number + 1, settings.first_radius)
         return self._best(bold, _Region(), history, rng), new
 
-    def _is_worth(self, found: Candidate, best: float, largest: float) -> bool:
+    def _is_worth(self, found: _Candidate, best: float, largest: float) -> bool:
         """Return whether a value may exceed a region's best value and, with more optimism, the largest of all."""
-        return self._exceeds(found, 1.0, best) and self._exceeds(found, self._settings.patience, largest)
-
-    def _exceeds(self, found: Candidate, patience: float, other: float) -> bool:
-        """Return whether the value with so many times the usual optimism exceeds another by the least improvement."""
-        return found.optimistic(patience * self.optimism) > other * (1 + self._settings.improvement)
+        optimism, least = self.optimism, 1 + self._settings.improvement
+        patient = self._settings.patience * optimism
+        return found.optimistic(optimism) > best * least and found.optimistic(patient) > largest * least
 
     def _best(
-        self, value: OptimisticValue, region: _Region, history: _History, rng: np.random.Generator
-    ) -> Candidate | None:
+        self, value: _OptimisticValue, region: _Region, history: _History, rng: np.random.Generator
+    ) -> _Candidate | None:
         """Return the new point of largest optimistic value in a region; None if no point there can be predicted."""
         budget = min(value.prediction.budget, self._settings.points * self.dimension)
         ascent = Ascent(value, *region.box(self.dimension), budget, value.rough)
-        points, promised = ascent.run(best_first(history.points, history.values)[:_STARTS], rng)
+        points, promised = ascent.run(best_first(history.points, history.values)[:8], rng)
         points = points[self._is_new(points, history) & np.isfinite(promised)]
         steady = value.prediction.steady or (lambda point: True)
         best = next(filter(steady, points), points[0]) if len(points) else None
         return None if best is None else value.at(best)
 
-    def _noted(self, found: Candidate | None, region: _Region) -> Array | None:
+    def _noted(self, found: _Candidate | None, region: _Region) -> Array | None:
         """Return the next point of a region, and record the prediction for it in the note; None if there is none."""
         if found is None:
             return None
@@ -337,3 +359,11 @@ class TrustRegion(SequentialSearch):
         if value > region.best:
             region = replace(region, best=value, point=point)
         return replace(region, misses=region.misses + 1, radius=region.radius if right else region.radius / 2)
+
+
+def _log_error(expected: Array, values: Array) -> float:
+    """Return the mean error of the logarithm; small values count little."""
+    if not np.isfinite(expected).all():
+        return np.inf
+    floor = max(0.1 * float(np.median(values)), 1e-12)
+    return float(np.abs(np.log(np.maximum(expected, 0.0) + floor) - np.log(values + floor)).mean())

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from ctxval._util.registry import Registry
-from ctxval.core.simulated import Simulated
-from ctxval.core.system import System
+from ctxval.core.system import Simulated, System
 from ctxval.systems.fmu import FMU
 from ctxval.systems.function import Function
 from ctxval.systems.gymnasium import Gymnasium

@@ -12,9 +12,6 @@ from ctxval.core.task import Task
 from ctxval.core.trajectory import COMPLETE, Trajectory
 from ctxval.errors import InputError, ShapeError
 
-SAME_STATE = 1e-6
-"""Largest difference of a system's first state from the task's initial state, relative to the larger of 1 and it."""
-
 Advance = Callable[[Array], tuple[Array, str]]
 """One control step, ``u -> (x_next, reason)``; the reason why the episode ended is empty if it continues."""
 
@@ -24,9 +21,6 @@ def run_episode(advance: Advance, controller: Controller, task: Task, inputs: in
 
     All values after that step are NaN, and the reason is the trajectory's ``ended``. An episode that ends with the last
     step of the horizon is complete.
-
-    Args:
-        advance: function that applies an input ``(m,)`` for one step and returns the next state ``(n,)`` and a reason.
     """
     x = np.array(task.initial_state)
     states, applied = np.full((task.horizon + 1, len(x)), np.nan), np.full((task.horizon, inputs), np.nan)
@@ -50,15 +44,9 @@ def run_episode(advance: Advance, controller: Controller, task: Task, inputs: in
 
 
 def require_one(task: Task) -> None:
-    """Check that a task is one task, not a batch."""
+    """Refuse a batch of tasks."""
     if task.batch_shape:
         raise ShapeError(f"this system executes one task at a time, got a batch of shape {task.batch_shape}.")
-
-
-def require_time_step(task: Task, dt: float, what: str) -> None:
-    """Check that a task has the system's time step."""
-    if not np.isclose(task.dt, dt, rtol=1e-9, atol=0):
-        raise InputError(f"the task's dt must be {what}, {dt:g} s, got {task.dt:g} s.")
 
 
 def require_started(task: Task, state: Array) -> None:
@@ -66,5 +54,5 @@ def require_started(task: Task, state: Array) -> None:
     wanted = task.initial_state
     if state.shape != wanted.shape:
         raise ShapeError(f"the task must have the system's {state.size} states, got {wanted.size}.")
-    if not (np.abs(state - wanted) <= SAME_STATE * np.maximum(1.0, np.abs(wanted))).all():
+    if not (np.abs(state - wanted) <= 1e-6 * np.maximum(1.0, np.abs(wanted))).all():
         raise InputError(f"the system was set to the initial state {wanted.tolist()}, but stands at {state.tolist()}.")

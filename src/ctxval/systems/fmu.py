@@ -61,7 +61,10 @@ class FMU(ShortRepr):
         step: Seconds | None = None,
     ) -> None:
         self.path = Path(path).absolute()
-        self.states, self.inputs = _names("states", states), _names("inputs", inputs)
+        self.states, self.inputs = ((names,) if isinstance(names, str) else tuple(names) for names in (states, inputs))
+        for what, names in (("states", self.states), ("inputs", self.inputs)):
+            if len(set(names)) != len(names) or (what == "states" and not names):
+                raise InputError(f"{what} must be the names of different variables, got {list(names)}.")
         self.start = {name: name for name in self.states} | dict(start or {})
         self.parameters = dict(parameters or {})
         self.step = step
@@ -75,9 +78,8 @@ class FMU(ShortRepr):
         weakref.finalize(self, _clean, self._idle, self._unpacked, os.getpid())
         self._digest = hashlib.sha256(self.path.read_bytes()).hexdigest()[:16]
         known = {variable.name: variable for variable in self._description.modelVariables}
-        foreign = sorted(set(self.start) - set(self.states))
-        if foreign:
-            raise UnknownNameError.among("state", foreign[0], self.states)
+        for foreign in sorted(set(self.start) - set(self.states)):
+            raise UnknownNameError.among("state", foreign, self.states)
         for name in (*self.states, *self.inputs, *self.start.values(), *self.parameters):
             if name not in known:
                 raise UnknownNameError.among("variable of the FMU", name, known)
@@ -101,16 +103,10 @@ class FMU(ShortRepr):
             raise InputError(str(error)) from error
 
     def describe(self) -> dict[str, Any]:
-        """Return what identifies this system in a store."""
         fields = ("states", "inputs", "start", "parameters", "step")
         return {"fmu": self._digest, **{name: getattr(self, name) for name in fields}}
 
     def execute(self, controller: Controller, task: Task) -> Trajectory:
-        """Run the closed loop from the task's initial state over its horizon.
-
-        Raises:
-            ExecutionError: if the FMU refuses to start, or crashes when it starts.
-        """
         require_one(task)
         ratio = 1.0 if self.step is None else task.dt / self.step
         if ratio < 0.5 or not np.isclose(ratio, round(ratio), rtol=1e-9, atol=0):
@@ -181,7 +177,6 @@ class _Process:
             self._process.stdin.flush()
 
     def ask(self, act: str, *arguments: Any) -> Any:
-        """Send one request; return the value of its answer."""
         assert self._process.stdout is not None
         self._send([act, *arguments])
         line = self._process.stdout.readline()
@@ -204,7 +199,6 @@ class _Process:
         return np.full(self.size, np.nan) if state is None else np.array(state), reason
 
     def end(self) -> None:
-        """Kill the process, which holds no data to keep."""
         self._process.kill()
         self._process.wait()
         for pipe in (self._process.stdin, self._process.stdout):
@@ -222,7 +216,6 @@ def _clean(idle: dict[int, list[_Process]], unpacked: TemporaryFolder, owner: in
 
 
 def _unpacked(path: Path) -> tuple[Any, TemporaryFolder]:
-    """Return the model description and a new folder with the FMU's content."""
     fmpy = require_extra("fmpy", "fmu", "FMUs")
     try:
         require_regular_file(path)
@@ -241,13 +234,6 @@ def _unpacked(path: Path) -> tuple[Any, TemporaryFolder]:
         folder.remove()
         raise InputError(f"{path} cannot be unpacked: {error}") from error
     return description, folder
-
-
-def _names(what: str, names: Sequence[str]) -> tuple[str, ...]:
-    listed = (names,) if isinstance(names, str) else tuple(names)
-    if len(set(listed)) != len(listed) or (what == "states" and not listed):
-        raise InputError(f"{what} must be the names of different variables, got {list(listed)}.")
-    return listed
 
 
 def _references(known: Mapping[str, Any], names: Sequence[str]) -> list[int]:

@@ -64,20 +64,11 @@ class Unit:
         )
         # The campaign's process reports a wrong number of states.
         if x is not None and len(x) == len(self.start):
-            self._set_start(x)
-        self._initialise()
-        return self._state()
-
-    def _set_start(self, x: list[float]) -> None:
-        try:
-            self._set(self.start_references, x)
-        except Exception as error:
-            names = ", ".join(self.start)
-            raise Refused(
-                f"the FMU does not let the start values of {names} be set: {error}", input_is_wrong=True
-            ) from error
-
-    def _initialise(self) -> None:
+            try:
+                self._set(self.start_references, x)
+            except Exception as error:
+                sentence = f"the FMU does not let the start values of {', '.join(self.start)} be set: {error}"
+                raise Refused(sentence, input_is_wrong=True) from error
         try:
             enumeration = "Int64" if hasattr(self.fmu, "setInt64") else "Integer"
             for variable, value in self.parameters:
@@ -90,6 +81,7 @@ class Unit:
         except Exception as error:
             raise Refused(f"the FMU {self.name} cannot be initialised: {error}") from error
         self.initialised = True
+        return self._state()
 
     def _state(self) -> list[float]:
         return [float(value) for value in self._get(self.states)]

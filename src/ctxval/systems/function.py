@@ -18,12 +18,9 @@ from ctxval.errors import ExecutionError, InputError
 class Function(ShortRepr):
     """A plain function ``(controller, task) -> trajectory`` as the true system: a robot's own driver, a simulator.
 
-    For a function of one step, ``(x, u) -> x_next``, use a :class:`Simulated` system.
-
-    Args:
-        execute: function that runs the closed loop. It returns a trajectory, or the states ``(H + 1, n)`` and the
-            inputs ``(H, m)``. If it raises an exception, the execution has failed for that reason.
-        batched: whether the function takes a batch of tasks, and returns ``(..., H + 1, n)`` and ``(..., H, m)``.
+    It returns a trajectory, or the states ``(H + 1, n)`` and the inputs ``(H, m)``; a batched one takes a batch of
+    tasks. If it raises an exception, the execution has failed for that reason. For a function of one step, ``(x, u) ->
+    x_next``, use a :class:`Simulated` system.
     """
 
     def __init__(self, execute: Callable[[Controller, Task], Any], *, batched: bool = False) -> None:
@@ -33,11 +30,6 @@ class Function(ShortRepr):
         self.batched = batched
 
     def execute(self, controller: Controller, task: Task) -> Trajectory:
-        """Run one task, or a batch.
-
-        Raises:
-            ExecutionError: if the function does not return a trajectory of this task.
-        """
         returned = self.function(controller, task)
         if isinstance(returned, Trajectory):
             return returned

@@ -18,7 +18,7 @@ from ctxval.core.controller import Controller
 from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory
 from ctxval.errors import InputError, ShapeError
-from ctxval.systems.episode import require_one, require_started, require_time_step, run_episode
+from ctxval.systems.episode import require_one, require_started, run_episode
 
 StateGetter = Callable[[Any], Any]
 StateSetter = Callable[[Any, Array], None]
@@ -78,8 +78,14 @@ class Gymnasium(ShortRepr):
         if not np.issubdtype(space.dtype or object, np.floating) or not space.shape:
             raise InputError(f"the environment must have continuous actions, a Box, got {space}.")
         self.inputs = int(np.prod(space.shape))
-        self.dt = _time_step(first, dt)
         bare = first.unwrapped
+        own = getattr(bare, "dt", None)
+        step = own if dt is None else dt
+        if not isinstance(step, int | float | np.number) or not (np.isfinite(step) and step > 0):
+            raise InputError(f"dt must be the positive number of seconds in one step of the environment, got {step!r}.")
+        if own is not None and not np.isclose(own, step, rtol=1e-9, atol=0):
+            raise InputError(f"dt must be that of the environment, {own:g} s, got {step:g} s.")
+        self.dt = float(step)
         is_mujoco = (
             hasattr(bare, "set_state") and hasattr(bare, "model") and hasattr(getattr(bare, "data", None), "qpos")
         )
@@ -90,7 +96,6 @@ class Gymnasium(ShortRepr):
             )
 
     def describe(self) -> dict[str, Any]:
-        """Return what identifies this system in a store."""
         fields = ("environment", "options", "get_state", "set_state", "seed", "ignore_termination", "dt")
         return {name: getattr(self, name) for name in fields}
 
@@ -103,9 +108,9 @@ class Gymnasium(ShortRepr):
         return state
 
     def execute(self, controller: Controller, task: Task) -> Trajectory:
-        """Run the closed loop from the task's initial state over its horizon."""
         require_one(task)
-        require_time_step(task, self.dt, "that of the environment")
+        if not np.isclose(task.dt, self.dt, rtol=1e-9, atol=0):
+            raise InputError(f"the task's dt must be that of the environment, {self.dt:g} s, got {task.dt:g} s.")
         environment = self._idle.pop() if self._idle else self._made()
         try:
             self._start(environment, task)
@@ -157,9 +162,12 @@ class Gymnasium(ShortRepr):
         space = environment.action_space
         _, _, terminated, truncated, _ = environment.step(u.astype(space.dtype).reshape(space.shape))
         state = self._read(environment.unwrapped)
-        warning = _mujoco_warning(environment.unwrapped)
-        if warning:
-            return np.full_like(state, np.nan), f"MuJoCo warned of {warning}"
+        counts = getattr(getattr(getattr(environment.unwrapped, "data", None), "warning", None), "number", None)
+        if counts is not None and np.any(counts):
+            from mujoco import mjtWarning
+
+            kind = mjtWarning(int(np.argmax(np.asarray(counts) > 0))).name.removeprefix("mjWARN_")
+            return np.full_like(state, np.nan), f"MuJoCo warned of {kind}"
         if self.ignore_termination or not (terminated or truncated):
             return state, ""
         return state, f"the environment {'terminated' if terminated else 'truncated'} the episode"
@@ -167,23 +175,3 @@ class Gymnasium(ShortRepr):
     def __getstate__(self) -> dict[str, Any]:
         # Environments cannot be pickled; another process makes its own.
         return {**vars(self), "_idle": []}
-
-
-def _time_step(environment: Any, given: float | None) -> float:
-    own = getattr(environment.unwrapped, "dt", None)
-    dt = own if given is None else given
-    if not isinstance(dt, int | float | np.number) or not (np.isfinite(dt) and dt > 0):
-        raise InputError(f"dt must be the positive number of seconds in one step of the environment, got {dt!r}.")
-    if given is not None and own is not None and not np.isclose(own, given, rtol=1e-9, atol=0):
-        raise InputError(f"dt must be that of the environment, {own:g} s, got {given:g} s.")
-    return float(dt)
-
-
-def _mujoco_warning(bare: Any) -> str:
-    """Return the first kind of warning since the reset; empty if there is none, or if this is not MuJoCo."""
-    counts = getattr(getattr(getattr(bare, "data", None), "warning", None), "number", None)
-    if counts is None or not np.any(counts):
-        return ""
-    from mujoco import mjtWarning
-
-    return str(mjtWarning(int(np.argmax(np.asarray(counts) > 0))).name).removeprefix("mjWARN_")

@@ -18,8 +18,7 @@ from ctxval.errors import ExecutionError, InputError
 class Manual(ShortRepr):
     """A system whose tasks people execute: get a task with ``campaign.ask()``, report it with ``campaign.tell()``.
 
-    Attributes:
-        states, inputs: names of the components with their units, for files.
+    States and inputs are names of the components with their units, for files.
     """
 
     manual = True
@@ -35,11 +34,6 @@ class Manual(ShortRepr):
         self.dt = float(dt)
 
     def execute(self, controller: Controller, task: Task) -> NoReturn:
-        """Refuse to execute a task, because only people can do so.
-
-        Raises:
-            ExecutionError: always.
-        """
         raise ExecutionError(
             "a manual system is executed by people; get a task with campaign.ask() and report its result with "
             "campaign.tell() instead of campaign.run()."

@@ -19,9 +19,6 @@ from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory
 from ctxval.errors import InputError, ShapeError, UnknownNameError
 
-_SAME_POSITION = 1e-6
-"""Largest difference in metres between the given and the actual position of a site in an initial state."""
-
 
 @part(files=("mjcf",))
 class MuJoCo(ShortRepr):
@@ -40,7 +37,7 @@ class MuJoCo(ShortRepr):
         substeps: number of MuJoCo steps in one control step; a task's dt must be the model's timestep times this.
         sites: names of sites whose positions are part of the state, such as an end effector.
         axes: world coordinates of the sites that are part of the state, letters of ``"xyz"``.
-        threads: number of threads for a batch (MuJoCo 4 or later); the results do not depend on it.
+        threads: number of threads for a batch; the results do not depend on it.
     """
 
     batched = True
@@ -67,7 +64,6 @@ class MuJoCo(ShortRepr):
         return float(self._model.opt.timestep) * self.substeps
 
     def describe(self) -> dict[str, Any]:
-        """Return what identifies this system in a store."""
         return {"mjcf": self._digest, "substeps": self.substeps, "sites": self.sites, "axes": self.axes}
 
     def state(self, qpos: ArrayLike, qvel: ArrayLike | None = None) -> Array:
@@ -76,14 +72,13 @@ class MuJoCo(ShortRepr):
         velocities = np.zeros(self._model.nv) if qvel is None else as_finite("qvel", qvel)
         require_shape("qvel", velocities, (self._model.nv,))
         batch = np.broadcast_shapes(positions.shape[:-1], velocities.shape[:-1])
-        simulations = _simulations(self._model, int(np.prod(batch)), 1)
+        simulations = _Batch(self._model, int(np.prod(batch)), 1)
         simulations.qpos[:] = np.broadcast_to(positions, (*batch, self._model.nq)).reshape(-1, self._model.nq)
         simulations.qvel[:] = np.broadcast_to(velocities, (*batch, self._model.nv)).reshape(-1, self._model.nv)
         simulations.locate()
         return self._observed(simulations).reshape(*batch, -1)
 
     def execute(self, controller: Controller, task: Task) -> Trajectory:
-        """Run the closed loop from the task's initial state over its horizon."""
         if not np.isclose(task.dt, self.dt, rtol=1e-9, atol=0):
             raise InputError(
                 f"the task's dt must be the model's timestep times substeps, "
@@ -94,8 +89,7 @@ class MuJoCo(ShortRepr):
         ended = execution.failure or trajectory.ended
         return Trajectory(trajectory.times, trajectory.states, trajectory.inputs, ended)
 
-    def _started(self, task: Task) -> _Batch | _Loop:
-        """Return one simulation for each task, in its initial state."""
+    def _started(self, task: Task) -> _Batch:
         nq, nv, sites = self._model.nq, self._model.nv, self._coordinates[0].size * self._coordinates[1].size
         states = task.initial_state.reshape(-1, task.initial_state.shape[-1])
         if states.shape[1] != nq + nv + sites:
@@ -103,24 +97,21 @@ class MuJoCo(ShortRepr):
                 f"the task must have {nq + nv + sites} states, {nq} qpos, {nv} qvel and {sites} coordinates of sites, "
                 f"got {states.shape[1]}."
             )
-        simulations = _simulations(self._model, len(states), self.threads)
+        simulations = _Batch(self._model, len(states), self.threads)
         simulations.qpos[:], simulations.qvel[:] = states[:, :nq], states[:, nq : nq + nv]
         if sites:
-            self._require_located(states, simulations)
+            simulations.locate()
+            given, actual = states[:, nq + nv :], self._observed(simulations)[:, nq + nv :]
+            misses = np.abs(given - actual).max(axis=1)
+            if misses.max() > 1e-6:  # metres
+                worst = int(misses.argmax())
+                raise InputError(
+                    f"the initial state must end with the sites' positions at its qpos, {actual[worst].tolist()}, "
+                    f"got {given[worst].tolist()}; state(qpos, qvel) returns the whole state."
+                )
         return simulations
 
-    def _require_located(self, states: Array, simulations: _Batch | _Loop) -> None:
-        simulations.locate()
-        given, actual = (array[:, self._model.nq + self._model.nv :] for array in (states, self._observed(simulations)))
-        misses = np.abs(given - actual).max(axis=1)
-        if misses.max() > _SAME_POSITION:
-            worst = int(misses.argmax())
-            raise InputError(
-                f"the initial state must end with the sites' positions at its qpos, {actual[worst].tolist()}, "
-                f"got {given[worst].tolist()}; state(qpos, qvel) returns the whole state."
-            )
-
-    def _observed(self, simulations: _Batch | _Loop) -> Array:
+    def _observed(self, simulations: _Batch) -> Array:
         sites, axes = self._coordinates
         positions = simulations.site_positions[:, sites, axes]
         return np.concatenate([simulations.qpos, simulations.qvel, positions.reshape(len(positions), -1)], axis=1)
@@ -129,14 +120,13 @@ class MuJoCo(ShortRepr):
 class _Execution:
     """The simulations of a batch of tasks as a step function; it keeps their state between steps."""
 
-    def __init__(self, system: MuJoCo, simulations: _Batch | _Loop) -> None:
+    def __init__(self, system: MuJoCo, simulations: _Batch) -> None:
         self.system, self.simulations = system, simulations
         self.healthy: Mask = np.ones(len(simulations.qpos), dtype=bool)
         self.steps = 0
         self.failure = ""
 
     def step(self, x: Array, u: Array) -> Array:
-        """Apply inputs ``(..., m)`` for one control step; return states ``(..., n)``, NaN if a simulation failed."""
         ctrl = self.simulations.ctrl
         if u.shape[-1] != ctrl.shape[1]:
             raise ShapeError(f"the controller must return the model's {ctrl.shape[1]} inputs, got {u.shape[-1]}.")
@@ -161,19 +151,11 @@ class _Execution:
             self.healthy &= ~failed
 
 
-# Simulations of one model, one in each row: qpos ``(N, nq)``, qvel ``(N, nv)``, ctrl ``(N, nu)``, and the positions of
-# sites ``(N, nsite, 3)``, which are computed if they are wanted. Warnings are counted by simulation and by kind.
-
-
-def _simulations(model: Any, count: int, threads: int) -> _Batch | _Loop:
-    try:
-        return _Batch(model, count, threads)
-    except ImportError:
-        return _Loop(model, count)
-
-
 class _Batch:
-    """MuJoCo's own batch, from its version 4 on."""
+    """Simulations of one model, one in each row: qpos ``(N, nq)``, qvel ``(N, nv)`` and ctrl ``(N, nu)``.
+
+    The positions of sites, ``(N, nsite, 3)``, are computed if they are wanted.
+    """
 
     def __init__(self, model: Any, count: int, threads: int) -> None:
         from mujoco import mjtStage
@@ -186,6 +168,7 @@ class _Batch:
 
     @property
     def warnings(self) -> Rows:
+        """The numbers of warnings by simulation and by kind."""
         counts: Rows = self.batch.warning[:, :, 1]
         return counts
 
@@ -197,53 +180,8 @@ class _Batch:
         self.batch.step(ids, substeps, self.located if locate else self.moved)
 
 
-class _Loop:
-    """One MjData that serves all simulations in turn, for older versions: the same numbers, more slowly."""
-
-    def __init__(self, model: Any, count: int) -> None:
-        import mujoco
-
-        self.model, self.data = model, mujoco.MjData(model)
-        # Everything that the next step depends on, including the warm start of the constraint solver.
-        self.kind = int(mujoco.mjtState.mjSTATE_INTEGRATION)
-        row = np.empty(mujoco.mj_stateSize(model, self.kind))
-        mujoco.mj_getState(model, self.data, row, self.kind)
-        self.rows = np.tile(row, (count, 1))
-        kinds = mujoco.mjtState
-        self.qpos, self.qvel = self._columns(kinds.mjSTATE_QPOS), self._columns(kinds.mjSTATE_QVEL)
-        self.ctrl = self._columns(kinds.mjSTATE_CTRL)
-        self.site_positions = np.zeros((count, model.nsite, 3))
-        self.warnings: Rows = np.zeros((count, len(self.data.warning)), dtype=np.intp)
-
-    def _columns(self, component: Any) -> Array:
-        """Return a view of one component of the rows; they stand in the order of their bits."""
-        from mujoco import mj_stateSize
-
-        start = mj_stateSize(self.model, self.kind & (int(component) - 1))
-        return self.rows[:, start : start + mj_stateSize(self.model, int(component))]
-
-    def locate(self) -> None:
-        self.advance(0, np.ones(len(self.rows), dtype=bool), locate=True)
-
-    def advance(self, substeps: int, rows: Mask, *, locate: bool) -> None:
-        import mujoco
-
-        model, data = self.model, self.data
-        for i in np.flatnonzero(rows).tolist():
-            mujoco.mj_setState(model, data, self.rows[i], self.kind)
-            if substeps:
-                mujoco.mj_step(model, data, substeps)
-                mujoco.mj_getState(model, data, self.rows[i], self.kind)
-            if locate:
-                mujoco.mj_kinematics(model, data)
-                self.site_positions[i] = data.site_xpos
-            if data.warning.number.any():
-                self.warnings[i] = data.warning.number
-                mujoco.mj_resetData(model, data)  # so that the warning does not count for the other simulations
-
-
 def _coordinates(model: Any, sites: Sequence[str], axes: str) -> tuple[Rows, ...]:
-    """Return the indices of these sites' coordinates in positions ``(nsite, 3)``."""
+    """Return the indices of the coordinates of sites in positions ``(nsite, 3)``."""
     if not axes or not set(axes) <= set("xyz"):
         raise InputError(f"axes must be letters of 'xyz', got {axes!r}.")
     known = [model.site(i).name for i in range(model.nsite)]

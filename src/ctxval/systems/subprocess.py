@@ -11,7 +11,6 @@ import signal
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import IO
 
 import numpy as np
 
@@ -24,7 +23,7 @@ from ctxval.core.exchange import write_controller, write_task
 from ctxval.core.labels import require_names
 from ctxval.core.task import Task
 from ctxval.core.trajectory import COMPLETE, Trajectory
-from ctxval.errors import CtxvalError, ExecutionError, InputError
+from ctxval.errors import ExecutionError, InputError
 from ctxval.systems.episode import require_one
 from ctxval.systems.supervised import run_supervised
 
@@ -63,7 +62,13 @@ class Subprocess(ShortRepr):
         folder: str | Path | None = None,
     ) -> None:
         self.command = shlex.split(command) if isinstance(command, str) else [str(part) for part in command]
-        self._located = self.command if folder is None else _located(self.command, Path(folder).absolute())
+        self._located = self.command
+        if folder is not None:  # a program name without a path stays as it is
+            home = Path(folder).absolute()
+            self._located = [
+                str(home / part) if (i or os.path.dirname(part)) and (home / part).is_file() else part
+                for i, part in enumerate(self.command)
+            ]
         if not self.command or shutil.which(self._located[0]) is None:
             raise InputError(f"the command must begin with a program that can be run, got {self.command}.")
         self.timeout = timeout
@@ -85,20 +90,28 @@ class Subprocess(ShortRepr):
         return {"program": Path(self.command[0]).name, "files": digests, "states": self.states, "inputs": self.inputs}
 
     def execute(self, controller: Controller, task: Task) -> Trajectory:
-        """Run the command on one task.
-
-        Raises:
-            ExecutionError: if the command fails, takes too long, or writes no trajectory of this task.
-        """
         require_one(task)
         with self._folder() as folder:
             write_task(folder / "task.json", task, states=self.states)
             for kind in ("json", "npz"):
                 path = folder / f"controller.{kind}"
                 write_controller(path, controller, dt=task.dt, states=self.states, inputs=self.inputs)
-            # On another machine the folder may not exist.
-            _run([*self._located, str(folder)], self._home if self._home.is_dir() else None, folder, self.timeout)
-            return _of_task(_trajectory(folder, task), task)
+            self._run(folder)
+            return _trajectory(folder, task)
+
+    def _run(self, folder: Path) -> None:
+        home = self._home if self._home.is_dir() else None  # on another machine the folder may not exist
+        # Output goes to files, because a grandchild that keeps a pipe open would make us wait for it.
+        with (folder / "stdout.txt").open("wb") as stdout, (folder / "stderr.txt").open("w+b") as stderr:
+            status = run_supervised([*self._located, str(folder)], home, stdout, stderr, self.timeout)
+            if status is None:
+                raise ExecutionError(f"the command did not end within {self.timeout:g} s and was killed")
+            if status:
+                how = f"was ended by {signal_name(-status)}" if status < 0 else f"ended with status {status}"
+                # The file is not opened again, because its name may now stand for another file.
+                stderr.seek(max(0, stderr.seek(0, os.SEEK_END) - 4096))
+                lines = [line.strip() for line in stderr.read().decode("utf-8", "replace").splitlines() if line.strip()]
+                raise ExecutionError(f"the command {how}: {lines[-1][:300] if lines else 'nothing on stderr'}")
 
     @contextlib.contextmanager
     def _folder(self) -> Iterator[Path]:
@@ -110,25 +123,6 @@ class Subprocess(ShortRepr):
             yield folder
 
 
-def _located(command: Sequence[str], folder: Path) -> list[str]:
-    """Return a command with absolute paths of its files in the folder; a program name without a path stays as it is."""
-    return [
-        str(folder / part) if (i or os.path.dirname(part)) and (folder / part).is_file() else part
-        for i, part in enumerate(command)
-    ]
-
-
-def _run(command: Sequence[str], home: Path | None, folder: Path, timeout: float) -> None:
-    # Output goes to files, because a grandchild that keeps a pipe open would make us wait for it.
-    with (folder / "stdout.txt").open("wb") as stdout, (folder / "stderr.txt").open("w+b") as stderr:
-        status = run_supervised(command, home, stdout, stderr, timeout)
-        if status is None:
-            raise ExecutionError(f"the command did not end within {timeout:g} s and was killed")
-        if status:
-            how = f"was ended by {signal_name(-status)}" if status < 0 else f"ended with status {status}"
-            raise ExecutionError(f"the command {how}: {_last_line(stderr) or 'nothing on stderr'}")
-
-
 def signal_name(number: int) -> str:
     """Return the name of a signal."""
     try:
@@ -137,34 +131,23 @@ def signal_name(number: int) -> str:
         return f"signal {number}"
 
 
-def _last_line(file: IO[bytes]) -> str:
-    """Return the last line of an open file; it is not opened again, because its name may now stand for another file."""
-    file.seek(max(0, file.seek(0, os.SEEK_END) - 4096))
-    lines = [line.strip() for line in file.read().decode("utf-8", "replace").splitlines() if line.strip()]
-    return lines[-1][:300] if lines else ""
-
-
 def _trajectory(folder: Path, task: Task) -> Trajectory:
+    """Return the trajectory that the command wrote, if it has the shape and the times of the task."""
     shape = task.horizon + 1, task.initial_state.size
     try:
         if os.path.lexists(folder / "trajectory.npz"):
-            return Trajectory.from_npz(folder / "trajectory.npz", shape=shape)
-        if os.path.lexists(folder / "trajectory.csv"):
-            return Trajectory.from_csv(folder / "trajectory.csv", most_rows=shape[0])
-    except (CtxvalError, OSError, MemoryError) as error:
+            trajectory = Trajectory.from_npz(folder / "trajectory.npz", shape=shape)
+        elif os.path.lexists(folder / "trajectory.csv"):
+            trajectory = Trajectory.from_csv(folder / "trajectory.csv", most_rows=shape[0])
+        else:
+            raise ExecutionError("the command ended well but wrote neither trajectory.npz nor trajectory.csv")
+    except (InputError, OSError, MemoryError) as error:
         raise ExecutionError(f"the command's trajectory cannot be used: {error}") from error
-    raise ExecutionError("the command ended well but wrote neither trajectory.npz nor trajectory.csv")
-
-
-def _of_task(trajectory: Trajectory, task: Task) -> Trajectory:
-    """Return a trajectory after a check that it has the shape and the times of this task."""
     if trajectory.ended != COMPLETE:
         return trajectory
-    n = task.initial_state.size
-    if trajectory.states.shape != (task.horizon + 1, n):
+    if trajectory.states.shape != shape:
         raise ExecutionError(
-            f"the command's trajectory must have states of shape ({task.horizon + 1}, {n}), "
-            f"got {trajectory.states.shape}"
+            f"the command's trajectory must have states of shape {shape}, got {trajectory.states.shape}"
         )
     misses = np.abs(trajectory.times - trajectory.times[0] - task.times)
     if not (misses <= 0.01 * task.dt).all():

@@ -28,8 +28,7 @@ def run_supervised(
 ) -> int | None:
     """Run a command, and end all processes that it started, however this call ends.
 
-    Returns:
-        The exit status, negative for a signal; None if the command did not end in time and was killed.
+    Return the exit status, negative for a signal; None if the command did not end in time and was killed.
     """
     if os.name != "posix":
         return _run_alone(command, folder, stdout, stderr, timeout)
@@ -37,7 +36,19 @@ def run_supervised(
     # -I, because modules in the folder of the program have the same names as other modules. A session of its own,
     # because Ctrl-C is for the campaign, which ends after the running executions.
     program = [sys.executable, "-I", "-S", str(_PROGRAM), str(os.getpid()), *map(str, descriptors), *command]
-    supervisor = _started(program, cwd=folder, pass_fds=descriptors, start_new_session=True)
+    try:
+        supervisor = subprocess.Popen(
+            program,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            bufsize=0,  # because select does not see a line that was read ahead
+            cwd=folder,
+            pass_fds=descriptors,
+            start_new_session=True,
+        )
+    except OSError as error:
+        raise ExecutionError(f"the command cannot be started: {error}") from error
     assert supervisor.stdout is not None
     child = 0
     try:
@@ -55,16 +66,6 @@ def run_supervised(
         _end(supervisor, child)
 
 
-def _started(program: Sequence[str], **options: object) -> subprocess.Popen[bytes]:
-    try:
-        # Unbuffered, because select does not see a line that was read ahead.
-        return subprocess.Popen(  # type: ignore[call-overload, no-any-return]
-            program, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, bufsize=0, **options
-        )
-    except OSError as error:
-        raise ExecutionError(f"the command cannot be started: {error}") from error
-
-
 def _readable(stdout: IO[bytes], timeout: float) -> bool:
     deadline = time.monotonic() + timeout
     with selectors.DefaultSelector() as selector:
@@ -76,7 +77,7 @@ def _readable(stdout: IO[bytes], timeout: float) -> bool:
 
 
 def _end(supervisor: subprocess.Popen[bytes], child: int) -> None:
-    """Make the supervisor end the remaining processes; if it does not, kill it and the command's process group."""
+    """Make the supervisor end the remaining processes; if it does not, kill it and the command's group."""
     assert supervisor.stdin is not None
     assert supervisor.stdout is not None
     with contextlib.suppress(OSError):

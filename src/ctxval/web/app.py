@@ -5,16 +5,14 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import io
-import json
 import tempfile
 import zipfile
 from collections.abc import AsyncIterator, Awaitable, Callable
-from importlib.resources import files as resources
-from typing import Any
+from pathlib import Path
 
 from python_multipart.exceptions import FormParserError
 from starlette.applications import Starlette
-from starlette.datastructures import FormData, UploadFile
+from starlette.datastructures import UploadFile
 from starlette.exceptions import HTTPException
 from starlette.requests import Request
 from starlette.responses import HTMLResponse, RedirectResponse, Response, StreamingResponse
@@ -23,10 +21,8 @@ from starlette.routing import Route
 from ctxval._util.texts import shortened, visible
 from ctxval.errors import CampaignError, CtxvalError, InputError, StoreError
 from ctxval.web import forms
-from ctxval.web.access import Access
-from ctxval.web.desk import recording_in
 from ctxval.web.page import Page, Problem
-from ctxval.web.security import MOST_UPLOAD, Guard, Hosts
+from ctxval.web.security import MOST_UPLOAD, Access, Guard, Hosts
 from ctxval.web.service import CampaignService
 from ctxval.web.state import PageState
 
@@ -60,31 +56,28 @@ class PageRoutes:
 
     async def start(self, request: Request) -> Response:
         """Show the campaign, or ask for the token."""
-        session = self.access.session(request.cookies)
         token = request.query_params.get("token")
-        if token is not None:
-            return await self._enter(token)
-        if session is None and self.access.needs_token:
-            return HTMLResponse(self.page.enter(), 401)
-        if session is not None:
-            return HTMLResponse(self._campaign(request, session))
-        session, cookie = self._new_session()
-        return self._with_cookie(HTMLResponse(self._campaign(request, session)), cookie)
+        return await (self._inside(self._campaign)(request) if token is None else self._enter(token))
 
     async def enter(self, request: Request) -> Response:
         """Take the token from the form of the entrance."""
-        async with _form(request, max_files=0, max_fields=4) as form:
-            return await self._enter(_texts(form).get("token", "").strip())
+        async with _form(request, max_files=0, max_fields=4) as (fields, _):
+            return await self._enter(fields.get("token", "").strip())
 
     async def _enter(self, token: str) -> Response:
         if not self.access.needs_token:
             return RedirectResponse("/", 303)
         if not self.access.admits(token):
             await asyncio.sleep(0.5)
-            return HTMLResponse(self.page.enter("This is not the token of this server."), 401)
+            return HTMLResponse(self.page.render("enter.html", sentence="This is not the token of this server."), 401)
         # A redirect after a link from another site would not send the strict cookie; a page that goes on does.
-        page = self.page.message("Welcome", "The page of the campaign opens.", forward=True)
-        return self._with_cookie(HTMLResponse(page), self.access.new_session())
+        page = self._message("Welcome", "The page of the campaign opens.", 200, forward=True)
+        return self._with_cookie(page, self.access.new_session()[1])
+
+    def _message(self, title: str, sentence: str, status: int = 404, *, forward: bool = False) -> Response:
+        """Return a page with one sentence, and a link to the campaign; ``forward`` follows the link at once."""
+        page = self.page.render("message.html", title=title, sentence=sentence, forward=forward)
+        return HTMLResponse(page, status)
 
     def _with_cookie(self, response: Response, cookie: str) -> Response:
         response.set_cookie(self.access.cookie, cookie, httponly=True, samesite="strict", path="/")
@@ -102,35 +95,30 @@ class PageRoutes:
             if session is not None:
                 return await handler(request, session)
             if self.access.needs_token:
-                return HTMLResponse(self.page.enter("Your session has ended. Nothing was stored."), 401)
-            session, cookie = self._new_session()
+                ended = None if request.url.path == "/" else "Your session has ended. Nothing was stored."
+                return HTMLResponse(self.page.render("enter.html", sentence=ended), 401)
+            session, cookie = self.access.new_session()
             return self._with_cookie(await handler(request, session), cookie)
 
         return handle
 
-    def _new_session(self) -> tuple[str, str]:
-        """Return the name and the cookie of a new session."""
-        cookie = self.access.new_session()
-        session = self.access.session({self.access.cookie: cookie})
-        assert session is not None
-        return session, cookie
-
-    def _campaign(self, request: Request, session: str, problem: Problem | None = None) -> str:
+    async def _campaign(self, request: Request, session: str, problem: Problem | None = None) -> Response:
         self.state.shown = self.state.version
         replaces = problem is not None and "replace" in problem.fields
-        return self.page.campaign(
+        page = self.page.campaign(
             self.access.form_token(session),
             problem=problem,
             told=_number(request.query_params.get("told", "")),
             replaced=request.path_params["number"] if replaces else _number(request.query_params.get("replace", "")),
             all_="all" in request.query_params,
         )
+        return HTMLResponse(page, 200 if problem is None else problem.status)
 
     async def picture(self, request: Request, session: str) -> Response:
         """Return a picture of the campaign."""
         found = self.state.pictures.get(request.path_params["name"])
         if not isinstance(found, bytes):
-            return HTMLResponse(self.page.message("No picture", "There is no such picture yet."), 404)
+            return self._message("No picture", "There is no such picture yet.")
         # A picture has styles of its own, and must not run anything if it is opened alone.
         policy = {"Content-Security-Policy": "default-src 'none'; style-src 'unsafe-inline'; sandbox"}
         return Response(found, media_type=_TYPES[".svg"], headers=policy)
@@ -139,8 +127,7 @@ class PageRoutes:
         """Send an event for each change of the page."""
         if self.state.listeners >= 64:
             return Response("too many pages are open", 503, media_type="text/plain")
-        events = (_event(kind, content) async for kind, content in self.state.events())
-        return StreamingResponse(events, media_type="text/event-stream")
+        return StreamingResponse(self.state.events(), media_type="text/event-stream")
 
 
 class OperatorPage(PageRoutes):
@@ -165,30 +152,29 @@ class OperatorPage(PageRoutes):
 
     async def choose(self, request: Request, session: str) -> Response:
         """Start to choose a task."""
-        async with _form(request, max_files=0, max_fields=1_000, max_part_size=4096) as form:
-            fields = _texts(form)
-        if not self.access.allows_form(session, fields.get("token", "")):
-            return self._problem(request, session, Problem("choose", _OUT_OF_DATE, fields, 403))
+        async with _form(request, max_files=0, max_fields=1_000, max_part_size=4096) as (fields, _):
+            allowed = self.access.allows_form(session, fields.get("token", ""))
+        if not allowed:
+            return await self._campaign(request, session, Problem("choose", _OUT_OF_DATE, fields, 403))
         status = 422
         try:
-            wanted = forms.task_request(fields, self.service.description.space)
+            wanted = forms.task_request(fields, self.service.served.campaign.validation.space)
             status = 409
             self.service.choose(wanted)
         except InputError as error:
-            return self._problem(request, session, Problem("choose", str(error), fields, status))
+            return await self._campaign(request, session, Problem("choose", str(error), fields, status))
         return RedirectResponse("/#next", 303)
 
     async def tell(self, request: Request, session: str) -> Response:
         """Record the result of a trial."""
         number, kind = request.path_params["number"], request.path_params["kind"]
         if kind not in ("recording", "distance", "failure"):
-            return HTMLResponse(self.page.message("Not found", "There is no such page."), 404)
+            return self._message("Not found", "There is no such page.")
         fields: dict[str, str] = {}
         try:
-            async with _form(request, max_files=1, max_fields=20, max_part_size=65_536) as form:
-                fields = _texts(form)
+            async with _form(request, max_files=1, max_fields=20, max_part_size=65_536) as (fields, upload):
                 if self.access.allows_form(session, fields.get("token", "")):
-                    await self._tell(number, kind, form)
+                    await self._tell(number, kind, fields, upload)
                     return RedirectResponse(f"/?told={number}#message", 303)
             sentence, status = _OUT_OF_DATE, 403
         except HTTPException as error:
@@ -202,14 +188,13 @@ class OperatorPage(PageRoutes):
         snapshot = self.service.snapshot
         shown = [trial for trial in snapshot.trials if trial.told] if "replace" in fields else snapshot.waiting
         where = f"{kind}-{number}" if any(trial.number == number for trial in shown) else "trial"
-        return self._problem(request, session, Problem(where, sentence, fields, status))
+        return await self._campaign(request, session, Problem(where, sentence, fields, status))
 
-    async def _tell(self, number: int, kind: str, form: FormData) -> None:
-        fields, upload = _texts(form), form.get("file")
+    async def _tell(self, number: int, kind: str, fields: dict[str, str], upload: object) -> None:
         with tempfile.TemporaryDirectory(prefix="ctxval-") as folder:
             path = None
             if isinstance(upload, UploadFile) and upload.filename:
-                path = recording_in(folder, upload.filename)
+                path = forms.recording_in(folder, upload.filename)
                 path.write_bytes(await upload.read())
             try:
                 result = forms.result(kind, fields, path)
@@ -217,9 +202,6 @@ class OperatorPage(PageRoutes):
             except InputError as error:
                 # The operator knows the name of the file, not the folder in which it is read.
                 raise InputError(str(error).replace(f"{folder}/", "")) from error
-
-    def _problem(self, request: Request, session: str, problem: Problem) -> Response:
-        return HTMLResponse(self._campaign(request, session, problem), problem.status)
 
     # Files
 
@@ -229,7 +211,7 @@ class OperatorPage(PageRoutes):
         try:
             files = await self.service.files_of(number)
         except CtxvalError as error:
-            return HTMLResponse(self.page.message("No file", str(error)), 404)
+            return self._message("No file", str(error))
         if name is None:
             content = io.BytesIO()
             with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as archive:
@@ -238,7 +220,7 @@ class OperatorPage(PageRoutes):
             return _download(content.getvalue(), f"trial-{number}.zip")
         if name not in files:
             sentence = f"There is no file {visible(name)[:80]} of trial {number}; there are {', '.join(files)}."
-            return HTMLResponse(self.page.message("No file", sentence), 404)
+            return self._message("No file", sentence)
         return _download(files[name], f"trial-{number}-{name}")
 
 
@@ -246,29 +228,14 @@ def _number(text: str) -> int | None:
     return int(text) if text.isdecimal() and len(text) < 10 else None
 
 
-def _event(kind: str, content: Any) -> str:
-    if kind == "heartbeat":
-        return ": the server is there\n\n"
-    if kind == "work":
-        content = {
-            name: {"text": work.text, "done": work.stage.done, "expected": work.stage.expected, "seconds": work.seconds}
-            for name, work in content.items()
-        }
-    return f"event: {kind}\ndata: {json.dumps(content)}\n\n"
-
-
 @contextlib.asynccontextmanager
-async def _form(request: Request, **limits: int) -> AsyncIterator[FormData]:
-    """Yield the form of a request; not every version of starlette refuses a damaged one."""
+async def _form(request: Request, **limits: int) -> AsyncIterator[tuple[dict[str, str], object]]:
+    """Yield the texts and the file of a form; not every version of starlette refuses a damaged one."""
     try:
         async with request.form(**limits) as form:
-            yield form
+            yield {name: value for name, value in form.items() if isinstance(value, str)}, form.get("file")
     except FormParserError as error:
         raise HTTPException(400, "it is damaged") from error
-
-
-def _texts(form: FormData) -> dict[str, str]:
-    return {name: value for name, value in form.items() if isinstance(value, str)}
 
 
 def _download(content: bytes, name: str) -> Response:
@@ -276,7 +243,7 @@ def _download(content: bytes, name: str) -> Response:
     return Response(content, media_type="application/octet-stream", headers=headers)
 
 
-_STATIC = {file.name: file.read_bytes() for file in resources("ctxval.web").joinpath("static").iterdir()}
+_STATIC = {file.name: file.read_bytes() for file in (Path(__file__).parent / "static").iterdir()}
 
 
 async def static(request: Request) -> Response:

@@ -11,29 +11,16 @@ import sys
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from typing import Any
 
-from ctxval._util.progress import Progress, listening
+from ctxval._util.progress import Listener, Progress, listening, stage
 from ctxval._util.texts import reason_of
 from ctxval.errors import CampaignError, CtxvalError
 from ctxval.web.served import OpenCampaign, ServedCampaign
 
-
-@dataclass(frozen=True)
-class Stage:
-    """What is done at present: the beginning of a sentence, and how much of it; expected is None if not known."""
-
-    text: str
-    done: float = 0.0
-    expected: float | None = None
-    unit: str = ""
-
-
-TellStage = Callable[[Stage], None]
 Job = Callable[..., Any]
-"""A function of a module, called with the served campaign, a function that tells the stage, and the job's arguments."""
+"""A function of a module, called in the child process with the served campaign and the job's arguments."""
 
 
 class BackgroundProcess:
@@ -44,11 +31,11 @@ class BackgroundProcess:
 
     Args:
         open_campaign: opens the campaign in the child process; it must be picklable.
-        on_stage: called in another thread when the stage of the job changes.
+        on_progress: called in another thread with the progress of the job.
     """
 
-    def __init__(self, open_campaign: OpenCampaign, on_stage: TellStage) -> None:
-        self._open, self._on_stage = open_campaign, on_stage
+    def __init__(self, open_campaign: OpenCampaign, on_progress: Listener) -> None:
+        self._open, self._on_progress = open_campaign, on_progress
         self._thread = cf.ThreadPoolExecutor(1, "background")
         self._process: Any = None
         self._pipe: Connection | None = None
@@ -74,32 +61,26 @@ class BackgroundProcess:
             if self._closed:
                 raise CampaignError("the server is being stopped.")
             if self._process is None or not self._process.is_alive():
-                self._start()
+                # A forked child would inherit the threads and the database of the server.
+                context = multiprocessing.get_context("spawn")
+                self._pipe, other = context.Pipe()
+                self._process = context.Process(target=_serve, args=(other, self._open), name="ctxval serve")
+                self._process.start()
+                other.close()
         assert self._pipe is not None
         try:
             self._pipe.send((job, arguments))
-            return self._result(self._pipe)
+            while True:
+                kind, content = self._pipe.recv()
+                if kind == "done":
+                    return content
+                if kind == "failed":
+                    raise CampaignError(content)
+                self._on_progress(content)
         except (EOFError, OSError) as error:
             self._process.join()
             status = self._process.exitcode
             raise CampaignError(f"the background process ended with the status {status}. Try again.") from error
-
-    def _start(self) -> None:
-        # A forked child would inherit the threads and the database of the server.
-        context = multiprocessing.get_context("spawn")
-        self._pipe, other = context.Pipe()
-        self._process = context.Process(target=_serve, args=(other, self._open), name="ctxval serve")
-        self._process.start()
-        other.close()
-
-    def _result(self, pipe: Connection) -> Any:
-        while True:
-            kind, content = pipe.recv()
-            if kind == "done":
-                return content
-            if kind == "failed":
-                raise CampaignError(content)
-            self._on_stage(content)
 
 
 def _kill(process: int) -> None:
@@ -126,12 +107,11 @@ def _serve(pipe: Connection, open_campaign: OpenCampaign) -> None:
         while True:
             job, arguments = pipe.recv()
             try:
-                if served is None:
-                    pipe.send(("stage", Stage("loading the experiment")))
-                    served = open_campaign()
-                tell = StageSender(lambda stage: pipe.send(("stage", stage)))
-                with listening(tell.hear):
-                    reply = "done", job(served, tell, *arguments)
+                with listening(Innermost(lambda progress: pipe.send(("progress", progress)))):
+                    if served is None:
+                        with stage("loading the experiment"):
+                            served = open_campaign()
+                    reply = "done", job(served, *arguments)
             except CtxvalError as error:
                 reply = "failed", str(error)
             except BaseException as error:  # users' code may raise anything
@@ -139,27 +119,22 @@ def _serve(pipe: Connection, open_campaign: OpenCampaign) -> None:
             pipe.send(reply)
 
 
-class StageSender:
-    """Sends stages to somebody, and not too many of them."""
+class Innermost:
+    """Sends the innermost stage of long work to a listener, and not more than five times a second if it only counts."""
 
-    def __init__(self, send: TellStage) -> None:
-        self._send, self._text, self._at = send, "", 0.0
+    def __init__(self, send: Listener) -> None:
+        self._send, self._stage, self._at = send, "", 0.0
         self._running: dict[int, Progress] = {}
 
-    def __call__(self, stage: Stage) -> None:
-        """Send a stage, unless it only counts and was sent a moment ago."""
-        now = time.monotonic()
-        # Least number of seconds between two messages that only count.
-        if stage.text != self._text or now - self._at >= 0.2:
-            self._text, self._at = stage.text, now
-            self._send(stage)
-
-    def hear(self, progress: Progress) -> None:
-        """Send the innermost stage of long work."""
+    def __call__(self, progress: Progress) -> None:
+        """Hear the progress of any stage."""
         if progress.ended:
             self._running.pop(progress.depth, None)
         else:
             self._running[progress.depth] = progress
-        if self._running:
-            innermost = self._running[max(self._running)]
-            self(Stage(innermost.stage, innermost.done, innermost.expected, innermost.unit))
+        if not self._running:
+            return
+        innermost, now = self._running[max(self._running)], time.monotonic()
+        if innermost.stage != self._stage or now - self._at >= 0.2:
+            self._stage, self._at = innermost.stage, now
+            self._send(innermost)

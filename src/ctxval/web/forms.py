@@ -74,3 +74,10 @@ def _read(fields: Fields, field: str, sentence: str, kind: Callable[[str], Numbe
     except (ValueError, OverflowError):  # a whole number may be too large for a float
         pass
     raise InputError(f"{sentence}, got {given[:60]!r}.")
+
+
+def recording_in(folder: str, name: str) -> Path:
+    """Return the path for an uploaded recording: its own name without anything that is not plain."""
+    base = name.replace("\\", "/").rpartition("/")[2]
+    plain = "".join(letter if letter.isalnum() or letter in "._- " else "_" for letter in base)[-80:].lstrip(".")
+    return Path(folder) / (plain or "recording.csv")

@@ -9,16 +9,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ctxval._util.progress import stage
 from ctxval._util.texts import reason_of
 from ctxval.campaign.by_hand import write_files
 from ctxval.campaign.choices import OpenTrial
+from ctxval.campaign.plot import overview, worst_trajectories
 from ctxval.campaign.telling import parameters_of_trial
 from ctxval.certificates import Verdict
 from ctxval.certificates import judge as judge_trials
 from ctxval.core.labels import labels_of
 from ctxval.errors import InputError
-from ctxval.plot import overview, worst_trajectories
-from ctxval.web.background import Stage, TellStage
 from ctxval.web.served import ServedCampaign
 
 if TYPE_CHECKING:
@@ -37,8 +37,7 @@ class TaskRequest:
     """What the operator asks for: by default, the task that the search chooses.
 
     Attributes:
-        again: the number of an earlier trial whose task is executed again.
-        because: what was changed since that trial.
+        again: the number of an earlier trial whose task is executed again, ``because`` something was changed.
         draw: whether the task is an independent draw, for an audit.
         trials: the number of trials that the operator has seen; None to skip the check.
         decides: whether the task is the one that is expected to decide the verdict soonest.
@@ -60,15 +59,14 @@ class TaskRequest:
             )
 
 
-def warm_up(served: ServedCampaign, tell: TellStage) -> None:
+def warm_up(served: ServedCampaign) -> None:
     """Do nothing: the experiment is loaded now, and the first choice need not wait for it."""
 
 
-def choose(served: ServedCampaign, tell: TellStage, request: TaskRequest) -> tuple[int, Files] | None:
+def choose(served: ServedCampaign, request: TaskRequest) -> tuple[int, Files] | None:
     """Open the next trial; return its number and its files. None: the verdict is reached or the budget is spent."""
-    tell(Stage("choosing a task"))
     campaign = served.campaign
-    with campaign.store.sole_writer(60.0):
+    with stage("choosing a task"), campaign.store.sole_writer(60.0):
         campaign.refresh()
         request.require_current(len(campaign.trials))
         if request.decides:
@@ -84,10 +82,10 @@ def choose(served: ServedCampaign, tell: TellStage, request: TaskRequest) -> tup
     return None if opened is None else (opened.number, _files(served, opened))
 
 
-def files_of(served: ServedCampaign, tell: TellStage, number: int) -> Files:
+def files_of(served: ServedCampaign, number: int) -> Files:
     """Return the files of an open trial."""
-    tell(Stage(f"preparing the files of trial {number}"))
-    return _files(served, served.campaign.reopen(number))
+    with stage(f"preparing the files of trial {number}"):
+        return _files(served, served.campaign.reopen(number))
 
 
 def _files(served: ServedCampaign, opened: OpenTrial) -> Files:
@@ -96,7 +94,7 @@ def _files(served: ServedCampaign, opened: OpenTrial) -> Files:
         return {name: (Path(folder) / "trial" / name).read_bytes() for name in names}
 
 
-def judge(served: ServedCampaign, tell: TellStage) -> Verdict | None:
+def judge(served: ServedCampaign) -> Verdict | None:
     """Return the verdict on the trials that have ended; None if there is no threshold.
 
     A certificate refuses open trials, because somebody may have left open what failed. At a rig a trial is nearly
@@ -104,17 +102,17 @@ def judge(served: ServedCampaign, tell: TellStage) -> Verdict | None:
     """
     if served.threshold is None:
         return None
-    tell(Stage("computing the verdict"))
-    served.campaign.refresh()
-    ended = [trial for trial in served.campaign.trials if trial.state != "open"]
-    return judge_trials(ended, served.threshold, served.certificate, served.campaign.provenance)
+    with stage("computing the verdict"):
+        served.campaign.refresh()
+        ended = [trial for trial in served.campaign.trials if trial.state != "open"]
+        return judge_trials(ended, served.threshold, served.certificate, served.campaign.provenance)
 
 
-def draw(served: ServedCampaign, tell: TellStage) -> Pictures:
+def draw(served: ServedCampaign) -> Pictures:
     """Return the pictures of the present trials."""
-    tell(Stage("drawing the pictures"))
-    served.campaign.refresh()
-    return pictures_of(served)
+    with stage("drawing the pictures"):
+        served.campaign.refresh()
+        return pictures_of(served)
 
 
 def pictures_of(served: ServedCampaign) -> Pictures:

@@ -12,7 +12,7 @@ from ctxval.campaign.interval_search import IntervalSearch
 from ctxval.certificates import Certificate, Verdict
 from ctxval.core.trial import Trial
 from ctxval.web import jobs
-from ctxval.web.background import Stage, StageSender
+from ctxval.web.background import Innermost
 from ctxval.web.served import ServedCampaign
 from ctxval.web.state import PageState, Work
 
@@ -20,14 +20,16 @@ from ctxval.web.state import PageState, Work
 class LiveCampaign(PageState):
     """The state of a campaign that this process executes in another thread.
 
-    The thread of the campaign calls :meth:`hear`, :meth:`take` and :meth:`end`; the rest belongs to the server. There
+    The thread of the campaign calls ``hear``, :meth:`take` and :meth:`end`; the rest belongs to the server. There
     is no search if the campaign explores.
     """
 
+    live = True
+
     def __init__(self, served: ServedCampaign, search: IntervalSearch | None) -> None:
-        super().__init__(served.description(live=True), served.snapshot({}))
-        self._served, self._search = served, search
-        self._stages = StageSender(self._take_stage)
+        super().__init__(served, served.snapshot())
+        self._search = search
+        self.hear = Innermost(self._follow_progress("choosing"))
         self._drawn = self._cost = 0.0
         self.started = threading.Event()
 
@@ -39,23 +41,16 @@ class LiveCampaign(PageState):
 
     # In the thread of the campaign
 
-    def hear(self, progress: Progress) -> None:
-        """Show what the campaign does at present."""
-        self._stages.hear(progress)
-
-    def _take_stage(self, stage: Stage) -> None:
-        self._loop.call_soon_threadsafe(self._show_stage, stage)
-
     def take(self, trial: Trial) -> None:
         """Show the interval and the pictures after a trial has ended."""
         changes: dict[str, Any] = {}
         if self._search is not None:
             low, high = self._search.interval
             bound = "not known yet" if high is None else f"{high:.4g}"
-            changes["interval"] = f"from {low:.4g} to {bound} {self.description.units}".rstrip()
+            changes["interval"] = f"from {low:.4g} to {bound} {self.served.experiment.units}".rstrip()
         begun = time.monotonic()
         if begun - self._drawn >= 10 * self._cost:  # pictures take at most about a tenth of the time
-            changes["pictures"] = jobs.pictures_of(self._served)
+            changes["pictures"] = jobs.pictures_of(self.served)
             self._drawn = time.monotonic()
             self._cost = self._drawn - begun
         self._post(changes)
@@ -63,7 +58,7 @@ class LiveCampaign(PageState):
     def end(self, verdict: Verdict | None, certificate: Certificate | None, report: str | None) -> None:
         """Show the verdict, and the path of the report."""
         outcome = "the campaign has ended, and so will this page" + (f". The report is {report}" if report else "")
-        shown = {"verdict": verdict, "certificate": certificate, "pictures": jobs.pictures_of(self._served)}
+        shown = {"verdict": verdict, "certificate": certificate, "pictures": jobs.pictures_of(self.served)}
         self._post({**shown, "choosing": None, "interval": None, "outcome": outcome})
 
     def wait_until_seen(self) -> None:
@@ -79,17 +74,16 @@ class LiveCampaign(PageState):
 
     # In the event loop of the server
 
-    def _show_stage(self, stage: Stage) -> None:
+    def _progressed(self, kind: str, progress: Progress) -> None:
         if self.outcome is not None:
             return
-        present = self.choosing
-        if present is None or present.stage.text != stage.text:
-            self.update(choosing=Work.begun(stage.text))
-        self._set_stage("choosing", stage)
+        if self.choosing is None or self.choosing.progress.stage != progress.stage:
+            self.update(choosing=Work.begun(progress.stage))
+        super()._progressed(kind, progress)
 
     async def _watch(self) -> None:
         while True:
-            fresh = self._served.snapshot({})
+            fresh = self.served.snapshot()
             if (fresh.signature, fresh.executions) != (self.snapshot.signature, self.snapshot.executions):
                 self.snapshot = fresh
                 self.update()

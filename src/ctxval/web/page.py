@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import secrets
 import zlib
 from collections.abc import Mapping
@@ -10,15 +11,16 @@ from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 
-from ctxval._util.representation import counted
+from ctxval._util.representation import counted, line, number
+from ctxval._util.texts import shortened, visible
+from ctxval.campaign.dynamics import PREDICTION
 from ctxval.campaign.telling import result_sentence
-from ctxval.certificates import Certificate
 from ctxval.certificates.bounds import with_error
 from ctxval.core.trial import Trial
+from ctxval.learning import ExecutionPrediction
 from ctxval.web.jobs import Files
 from ctxval.web.security import MOST_UPLOAD
 from ctxval.web.state import PageState
-from ctxval.web.words import in_words, text, values_of, why
 
 
 @dataclass(frozen=True)
@@ -42,7 +44,9 @@ class Page:
     """Renders the templates of this package."""
 
     def __init__(self, state: PageState) -> None:
-        self._state = state
+        self._state, self._served = state, state.served
+        self._units = state.served.experiment.units
+        self._space = state.served.campaign.validation.space
         self._templates = Environment(
             loader=PackageLoader("ctxval.web"),
             autoescape=select_autoescape(),
@@ -62,14 +66,14 @@ class Page:
         all_: bool,
     ) -> str:
         """Return the page of the campaign, with the forms of a trial whose result is to be replaced."""
-        state, snapshot, description = self._state, self._state.snapshot, self._state.description
+        state, snapshot, space = self._state, self._state.snapshot, self._space
         certificate = state.certificate if state.verdict is None else state.verdict.certificate
         images = {name: data for name, data in state.pictures.items() if isinstance(data, bytes)}
-        space = description.space
         shown = snapshot.trials if all_ else snapshot.trials[-200:]  # a link shows all
-        return self._render(
+        return self.render(
             "campaign.html",
-            about=description,
+            about=self._served,
+            units=self._units,
             work=state,
             snapshot=snapshot,
             opened=[self._open_trial(trial) for trial in snapshot.waiting],
@@ -77,13 +81,10 @@ class Page:
             rows=[self._row(trial) for trial in reversed(shown)],
             left_out=len(snapshot.trials) - len(shown),
             again=[(trial.number, in_words(trial, space.units)) for trial in shown if trial.executed],
-            parameters=[
-                (place, text(label, 80), f"{low:.6g}", f"{high:.6g}")
-                for place, (label, low, high) in enumerate(zip(space.labels, space.low, space.high, strict=True))
-            ],
+            parameters=list(zip(space.labels, space.low, space.high, strict=True)),
             worst=None if snapshot.worst is None else self._row(snapshot.worst),
             certificate=certificate,
-            bound=None if certificate is None else self._bound(certificate),
+            bound=None if certificate is None else with_error(certificate.upper_bound, certificate.error),
             news=self._news(),
             told=None if told is None else self.ended(told),
             replaced=[self._row(trial) for trial in snapshot.trials if trial.told and trial.number == replaced],
@@ -95,57 +96,42 @@ class Page:
             submission=lambda: secrets.token_urlsafe(12),
         )
 
-    def enter(self, sentence: str | None = None) -> str:
-        """Return the page that asks for the token; the sentence says why the last one was not accepted."""
-        return self._render("enter.html", sentence=sentence)
-
-    def message(self, title: str, sentence: str, *, forward: bool = False) -> str:
-        """Return a page with one sentence, and a link to the campaign; ``forward`` follows the link at once."""
-        return self._render("message.html", title=title, sentence=sentence, forward=forward)
-
-    def _render(self, name: str, **values: Any) -> str:
+    def render(self, name: str, **values: Any) -> str:
+        """Return the page of a template: the campaign, ``enter.html`` or ``message.html``."""
         return self._templates.get_template(name).render(**values)
 
     def _open_trial(self, trial: Trial) -> dict[str, Any]:
         """Return what the page shows of an open trial; a program executes it if it has attempts."""
-        state, task = self._state, self._state.snapshot.tasks.get(trial.number)
-        found = state.files.get(trial.number)
-        files: Files = found if isinstance(found, dict) else {}
+        prepared = self._state.files.get(trial.number)
+        files: Files = prepared if isinstance(prepared, dict) else {}
         # The model's trajectory has the columns that a recording must have.
         header = files.get("model.csv", b"").partition(b"\n")[0].decode("utf-8", "replace").strip()
         return {
             "number": trial.number,
             "executing": bool(trial.attempts),
-            "parameters": values_of(trial.parameters, state.description.space.units),
-            "start": [] if task is None else [(text(name, 80), f"{value:.6g}") for name, value in task.start],
-            "task": task,
-            "why": why(trial, state.description.units),
+            "parameters": values_of(trial.parameters, self._space.units),
+            "task": self._state.snapshot.tasks.get(trial.number),
+            "why": why(trial, self._units),
             "files": list(files),
-            "files_error": text(found, 1_000) if isinstance(found, str) else None,
-            "columns": [text(name, 80) for name in header.split(",")] if header else [],
+            "files_error": prepared if isinstance(prepared, str) else None,
+            "columns": header.split(",") if header else [],
         }
 
-    def _bound(self, certificate: Certificate) -> str:
-        units = self._state.description.units
-        bound = f"{with_error(certificate.upper_bound, certificate.error)} {units}".rstrip()
-        return f"{bound}, with confidence {certificate.confidence:g}"
-
     def _row(self, trial: Trial) -> dict[str, Any]:
-        units = self._state.description.units
         return {
             "number": trial.number,
-            "task": in_words(trial, self._state.description.space.units),
+            "task": in_words(trial, self._space.units),
             "origin": trial.origin,
             "state": trial.state,
             "told": trial.told,
-            "distance": "" if trial.distance is None else f"{trial.distance:.4g} {units}".rstrip(),
+            "distance": "" if trial.distance is None else f"{trial.distance:.4g} {self._units}".rstrip(),
             "remark": "" if trial.failure is None else text(trial.failure),
         }
 
     def _news(self) -> str:
         """Return what is new, for a screen reader."""
         state = self._state
-        if state.description.live:
+        if state.live:
             return state.outcome or ""
         if state.choosing is not None:
             return "A task is being chosen."
@@ -157,15 +143,15 @@ class Page:
 
     def _enough(self) -> str | None:
         """Return why no further task is needed for the verdict; None if one may be."""
-        state, about = self._state, self._state.description
-        if not about.decides or state.snapshot.waiting or state.choosing is not None:
+        state, budget = self._state, self._served.budget
+        if not self._served.decides or state.snapshot.waiting or state.choosing is not None:
             return None
         if state.judged == state.snapshot.ended and state.verdict is not None and state.verdict.answer != "undecided":
             return f"The verdict is reached: {state.verdict.answer}. No further execution is needed for it."
         if not state.enough:
             return None
-        if state.snapshot.executions >= about.budget:
-            return f"The budget of {counted(about.budget, 'execution')} is spent."
+        if state.snapshot.executions >= budget:
+            return f"The budget of {counted(budget, 'execution')} is spent."
         return "The verdict is reached. No further execution is needed for it."
 
     def ended(self, number: int) -> str | None:
@@ -173,4 +159,67 @@ class Page:
         trials = self._state.snapshot.trials
         if not 0 <= number < len(trials) or trials[number].state == "open":
             return None
-        return text(result_sentence(trials[number], self._state.description.units), 1_000)
+        return text(result_sentence(trials[number], self._units), 1_000)
+
+
+# Trials in words
+
+
+_ORIGINS = {
+    "iid": "The task is an independent random draw.",
+    "spread": "The task tests a prediction where nobody chose to look.",
+    "initial": "The task is one of the first tasks of the search, which are spread over the task space.",
+    "acquisition": "The search expects to learn most about the largest distance from this task.",
+    "covering": "The certificate that is to decide needs this task.",
+    "manual": "A person chose this task.",
+}
+
+_SEARCHES = {
+    "initial": "The task is one of the first tasks of the search, which are spread over the task space.",
+    "filling": "The task is in the largest gap between the tasks so far.",
+    "improvement": "The search expects here the largest improvement over the largest distance so far.",
+    "bound": "The upper confidence bound of the distance is largest at this task.",
+}
+
+
+def why(trial: Trial, units: str) -> list[str]:
+    """Return sentences on the reason why the task of a trial was chosen, and on the prediction of its execution."""
+    note = trial.note or {}
+    sentences, expected = [_ORIGINS[trial.origin]], note.get("expected")
+    if trial.origin == "acquisition" and isinstance(expected, int | float) and abs(expected) < math.inf:
+        distance = f"{number(expected)} {text(units)}".rstrip()
+        sentences = [f"The search expects a distance of {distance} here, the largest in the region that it examines."]
+    elif trial.origin in ("acquisition", "initial"):
+        sentences = [_SEARCHES.get(str(note.get("how")), _ORIGINS[trial.origin])]
+    if isinstance(note.get("why"), str) and note.get("how") != "initial":
+        sentences.append(f"The search does not use the prediction of the learned dynamics: {text(note['why'])}.")
+    if trial.because is not None:
+        sentences.append(f"Since the last execution of this task: {text(trial.because)}.")
+    stored = note.get(PREDICTION)
+    prediction = ExecutionPrediction.from_json(stored) if isinstance(stored, dict) else None
+    if prediction is not None and math.isfinite(prediction.median):
+        median, upper = (f"{number(value)} {text(units)}".rstrip() for value in (prediction.median, prediction.upper))
+        sentences.append(f"Predicted distance: {median}; below {upper} with probability 0.95.")
+    return sentences
+
+
+def text(value: object, longest: int = 400) -> str:
+    """Return a text from elsewhere: shortened, with control characters written out."""
+    return visible(shortened(str(value), longest)).removesuffix(".")
+
+
+def values_of(parameters: Mapping[str, Any], units: Mapping[str, str]) -> list[tuple[str, str]]:
+    """Return the names of task parameters, and their values with units."""
+    return [
+        (line(name, 80), f"{_value(value)} {line(units.get(name, ''), 40)}".rstrip())
+        for name, value in parameters.items()
+    ]
+
+
+def _value(value: Any) -> str:
+    return f"[{', '.join(map(_value, value))}]" if isinstance(value, list) else f"{value:.6g}"
+
+
+def in_words(trial: Trial, units: Mapping[str, str]) -> str:
+    """Return the task of a trial in one line."""
+    return ", ".join(f"{name} = {value}" for name, value in values_of(trial.parameters, units))

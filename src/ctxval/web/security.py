@@ -1,12 +1,15 @@
-"""What is refused before a request reaches the page: other hosts, other sites, and bodies that are too large."""
+"""Who may use the page, and what is refused before: other hosts, other sites, and bodies that are too large."""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
+import hashlib
+import hmac
 import ipaddress
+import secrets
 import socket
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from html import escape
 from urllib.parse import urlsplit
@@ -16,7 +19,8 @@ from starlette.requests import ClientDisconnect, HTTPConnection
 from starlette.responses import HTMLResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from ctxval.web.access import Access
+from ctxval._util.representation import call
+from ctxval.errors import InputError
 
 MOST_UPLOAD = 64 * 2**20
 """Largest size of a recording in bytes."""
@@ -38,6 +42,54 @@ HEADERS = {
     "Permissions-Policy": "camera=(), geolocation=(), microphone=()",
     "Cache-Control": "no-store",
 }
+
+
+class Access:
+    """Who may use the page: the token of the server, sessions in signed cookies, and tokens of forms.
+
+    The key of the signatures lives as long as the server. Without a token, every browser on this computer may use the
+    page. Browsers share cookies among the ports of one computer.
+    """
+
+    def __init__(self, token: str | None, port: int) -> None:
+        if token is not None and (len(token) < 16 or not (token.isascii() and token.isprintable())):
+            raise InputError("the token must have at least 16 characters, all of them visible ASCII.")
+        self._token = token
+        self._key = secrets.token_bytes(32)
+        self.needs_token = token is not None
+        self.cookie = f"ctxval-session-{port}"
+
+    def admits(self, token: str) -> bool:
+        """Return whether this is the token of the server. The comparison takes the same time for every text."""
+        return self._token is not None and _same(self._token, token)
+
+    def new_session(self) -> tuple[str, str]:
+        """Return the name and the cookie of a new session."""
+        name = secrets.token_urlsafe(18)
+        return name, f"{name}.{self._signed('session', name)}"
+
+    def session(self, cookies: Mapping[str, str]) -> str | None:
+        """Return the name of the session of a request; None if it has no valid cookie."""
+        name, _, signature = cookies.get(self.cookie, "").partition(".")
+        return name if name and _same(self._signed("session", name), signature) else None
+
+    def form_token(self, session: str) -> str:
+        """Return the token that each form of a session must contain."""
+        return self._signed("form", session)
+
+    def allows_form(self, session: str, token: str) -> bool:
+        """Return whether a form is one of this session."""
+        return _same(self.form_token(session), token)
+
+    def _signed(self, purpose: str, text: str) -> str:
+        return hmac.new(self._key, f"{purpose}:{text}".encode("utf-8", "replace"), hashlib.sha256).hexdigest()
+
+    def __repr__(self) -> str:
+        return call(self, needs_token=self.needs_token)  # neither the key nor the token
+
+
+def _same(known: str, given: str) -> bool:
+    return hmac.compare_digest(known.encode(), given.encode("utf-8", "backslashreplace"))
 
 
 @dataclass(frozen=True)
@@ -150,7 +202,6 @@ class Guard:
             # There are no WebSockets here; only the start and the end of the server are left.
             await (self.app(scope, receive, send) if scope["type"] == "lifespan" else send({"type": "websocket.close"}))
             return
-        headers = Headers(scope=scope)
 
         async def guarded(message: Message) -> None:
             if message["type"] == "http.response.start":
@@ -159,23 +210,27 @@ class Guard:
                     stated.setdefault(name, value)
             await send(message)
 
-        reason = refusal(scope["method"], headers, self.hosts)
-        if reason is not None or len(scope["path"]) > 500:
-            response = _refused(414, "The address is too long.") if reason is None else _refused(403, reason)
-            await response(scope, receive, guarded)
-            return
-        body = _Body(receive, self._most(scope))
+        headers = Headers(scope=scope)
+        refused, reason = None, refusal(scope["method"], headers, self.hosts)
+        if reason is not None:
+            refused = 403, reason
+        elif len(scope["path"]) > 500:
+            refused = 414, "The address is too long."
+        else:
+            body = _Body(receive, self._most(scope))
 
-        async def sending(message: Message) -> None:
-            if body.refused is None:  # otherwise starlette sends that it has failed
-                await guarded(message)
+            async def sending(message: Message) -> None:
+                if body.refused is None:  # otherwise starlette sends that it has failed
+                    await guarded(message)
 
-        with contextlib.suppress(ClientDisconnect):
-            declared = headers.get("content-length", "0")
-            body.require(int(declared) if declared.isdecimal() else 0)
-            await self.app(scope, body, sending)
-        if body.refused is not None:
-            await _refused(*body.refused)(scope, receive, guarded)
+            with contextlib.suppress(ClientDisconnect):
+                declared = headers.get("content-length", "0")
+                body.require(int(declared) if declared.isdecimal() else 0)
+                await self.app(scope, body, sending)
+            refused = body.refused
+        if refused is not None:
+            page = _REFUSED.format(escape(refused[1]))
+            await HTMLResponse(page, refused[0], {"Connection": "close"})(scope, receive, guarded)
 
     def _most(self, scope: Scope) -> int:
         """Return the largest size of a request; one of a session lets its connection wait no longer."""
@@ -187,10 +242,8 @@ class Guard:
         return self.most if scope["path"].endswith("/recording") else min(self.most, 2**18)
 
 
-def _refused(status: int, sentence: str) -> HTMLResponse:
-    page = (
-        '<!doctype html><html lang="en"><head><meta charset="utf-8"><title>Refused</title>'
-        '<meta name="viewport" content="width=device-width"></head>'
-        f'<body><main><h1>Refused</h1><p>{escape(sentence)}</p><p><a href="/">To the page</a></p></main></body></html>'
-    )
-    return HTMLResponse(page, status, {"Connection": "close"})
+_REFUSED = (
+    '<!doctype html><html lang="en"><head><meta charset="utf-8"><title>Refused</title>'
+    '<meta name="viewport" content="width=device-width"></head>'
+    '<body><main><h1>Refused</h1><p>{}</p><p><a href="/">To the page</a></p></main></body></html>'
+)

@@ -4,68 +4,56 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import secrets
 import socket
 import threading
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from functools import partial
 from types import FrameType
+from typing import Any
 
 import uvicorn
+from uvicorn.protocols.http.h11_impl import H11Protocol
 
-from ctxval._util.representation import call
 from ctxval.errors import InputError
-from ctxval.web.access import Access, new_token
 from ctxval.web.app import application
-from ctxval.web.connections import Connection, Waiting
-from ctxval.web.desk import Desk
 from ctxval.web.live import LiveCampaign
-from ctxval.web.security import Hosts, is_loopback
+from ctxval.web.security import Access, Hosts, is_loopback
 from ctxval.web.served import OpenCampaign
 from ctxval.web.service import CampaignService
 from ctxval.web.state import PageState
 
 
-@dataclass(frozen=True, repr=False)
-class Address:
-    """Where the page is served, and who may use it.
-
-    Attributes:
-        host: the address to listen at; other computers reach the page only if it is not a loopback address.
-        port: the port; 0 for any free one.
-        token: the token that a browser must show once; None for a random one, or for none at a loopback address.
-        names: further names under which browsers may address the server.
-    """
-
-    host: str = "127.0.0.1"
-    port: int = 8765
-    token: str | None = None
-    names: Sequence[str] = ()
-
-    def __repr__(self) -> str:
-        return call(self, self.host, self.port)  # the token is secret
-
-
 def serve(
     open_campaign: OpenCampaign,
     reopen: OpenCampaign,
-    address: Address,
     on_start: Callable[[str, str | None], None],
+    *,
+    host: str = "127.0.0.1",
+    port: int = 8765,
+    token: str | None = None,
+    names: Sequence[str] = (),
 ) -> None:
     """Serve a campaign until the process gets SIGINT or SIGTERM.
 
     Args:
         open_campaign: opens the campaign of the server.
         reopen: opens the campaign in a child process; it must be picklable.
-        address: where the page is served.
         on_start: called with the address of the page and its token, if it has one, before the first request.
+        host: the address to listen at; other computers reach the page only if it is not a loopback address.
+        port: the port; 0 for any free one.
+        token: the token that a browser must show once; None for a random one, or for none at a loopback address.
+        names: further names under which browsers may address the server.
     """
-    with contextlib.closing(listening(address.host, address.port)) as listener:
-        token = address.token if address.token is not None or is_loopback(address.host) else new_token()
-        access = Access(token, listener.getsockname()[1])
-        service = CampaignService(Desk(open_campaign), reopen)
-        server = _server(service, access, Hosts.of(address.host, address.names))
-        on_start(page_address(address.host, listener.getsockname()[1]), token)
+    with contextlib.closing(listening(host, port)) as listener:
+        if token is None and not is_loopback(host):
+            token = secrets.token_urlsafe(24)
+        port = listener.getsockname()[1]
+        access = Access(token, port)
+        service = CampaignService(open_campaign, reopen)
+        server = _server(service, access, Hosts.of(host, names))
+        on_start(page_address(host, port), token)
         try:
             server.run(sockets=[listener])
         finally:
@@ -143,3 +131,66 @@ def page_address(host: str, port: int) -> str:
     """Return the address of the page for a browser; a wildcard becomes the name of this computer."""
     name = socket.gethostname() if host in ("0.0.0.0", "::", "") else host
     return f"http://[{name}]:{port}/" if ":" in name else f"http://{name}:{port}/"
+
+
+# Connections that wait
+
+
+class Waiting:
+    """The connections without a request of a session, in the order in which they began to wait.
+
+    If there are too many, the oldest one of the address with the most ends. A browser sends its request as a whole and
+    at once, so it does not wait long enough, even if it shares its address with those who do.
+    """
+
+    def __init__(self) -> None:
+        self._ends: dict[Connection, asyncio.TimerHandle] = {}
+
+    def add(self, connection: Connection) -> None:
+        """Let a connection wait, from now on."""
+        self.remove(connection)
+        self._ends[connection] = connection.loop.call_later(10.0, connection.transport.abort)
+        if len(self._ends) > 128:
+            ((busiest, _),) = Counter(waiting.address for waiting in self._ends).most_common(1)
+            oldest = next(waiting for waiting in self._ends if waiting.address == busiest)
+            self.remove(oldest)
+            oldest.transport.abort()
+
+    def remove(self, connection: Connection) -> None:
+        """Let a connection go on: it has a request of a session, or has ended."""
+        ends = self._ends.pop(connection, None)
+        if ends is not None:
+            ends.cancel()
+
+
+class Connection(H11Protocol):
+    """A connection of the server; h11 limits the size of headers, which httptools does not.
+
+    The application finds it as ``scope["state"]["connection"]``.
+    """
+
+    def __init__(self, waiting: Waiting, **options: Any) -> None:
+        super().__init__(**options)
+        self.waiting = waiting
+        self.app_state = {**self.app_state, "connection": self}
+
+    @property
+    def address(self) -> str | None:
+        """The address of the other side."""
+        return self.client[0] if self.client else None
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        """Begin to wait for a request."""
+        super().connection_made(transport)
+        self.waiting.add(self)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Wait no longer."""
+        self.waiting.remove(self)
+        super().connection_lost(exc)
+
+    def on_response_complete(self) -> None:
+        """Wait for the next request."""
+        if not self.transport.is_closing():
+            self.waiting.add(self)
+        super().on_response_complete()

@@ -3,31 +3,44 @@
 from __future__ import annotations
 
 import asyncio
+import concurrent.futures as cf
 from collections import OrderedDict
-from typing import Any
+from collections.abc import Callable
+from typing import Any, TypeVar
 
-from ctxval.campaign.telling import ToldResult
+from ctxval._util.texts import reason_of
+from ctxval.campaign.telling import ToldResult, tell_result
 from ctxval.core.trial import Trial
-from ctxval.errors import CtxvalError, InputError
+from ctxval.errors import CampaignError, CtxvalError, DistanceError, InputError
 from ctxval.web import jobs
-from ctxval.web.background import BackgroundProcess, Job, Stage
-from ctxval.web.desk import Desk
+from ctxval.web.background import BackgroundProcess, Job
 from ctxval.web.jobs import Files, TaskRequest
-from ctxval.web.served import OpenCampaign
+from ctxval.web.served import OpenCampaign, ServedCampaign
 from ctxval.web.state import PageState, Work
+
+Result = TypeVar("Result")
 
 
 class CampaignService(PageState):
-    """One campaign, with the work in progress, for any number of operators."""
+    """One campaign, with the work in progress, for any number of operators.
 
-    def __init__(self, desk: Desk, reopen: OpenCampaign) -> None:
-        super().__init__(desk.description, desk.first)
-        self._desk = desk
+    The server's own campaign lives in one thread, which reads the store and records results. Choosing, judging and
+    drawing are jobs of two background processes.
+    """
+
+    def __init__(self, open_campaign: OpenCampaign, reopen: OpenCampaign) -> None:
+        self._thread, self._closed = cf.ThreadPoolExecutor(1, "campaign"), False
+        try:
+            served = self._thread.submit(open_campaign).result()
+            super().__init__(served, self._thread.submit(served.read).result())
+        except BaseException:
+            self._thread.shutdown()
+            raise
         self._preparing: dict[int, asyncio.Task[None]] = {}
         self._submitted: OrderedDict[str, int] = OrderedDict()
         self._telling = asyncio.Lock()
-        self._chooser = BackgroundProcess(reopen, lambda stage: self._take_stage("choosing", stage))
-        self._judge = BackgroundProcess(reopen, lambda stage: self._take_stage("judging", stage))
+        self._chooser = BackgroundProcess(reopen, self._follow_progress("choosing"))
+        self._judge = BackgroundProcess(reopen, self._follow_progress("judging"))
 
     async def start(self) -> None:
         """Start the background processes and the observation of the store."""
@@ -43,8 +56,12 @@ class CampaignService(PageState):
 
     def close(self) -> None:
         """End the background processes, and close the store, at once; a second call does nothing."""
-        for part in (self._chooser, self._judge, self._desk):
-            part.close()
+        self._chooser.close()
+        self._judge.close()
+        if not self._closed:
+            self._closed = True
+            self._thread.submit(lambda: self.served.campaign.store.close()).result()
+            self._thread.shutdown()
 
     # What operators do
 
@@ -61,7 +78,7 @@ class CampaignService(PageState):
         async with self._telling:
             if not submission or self._submitted.get(submission) != number:
                 try:
-                    await self._desk.tell(number, result)
+                    await self._in_thread(lambda: _told(self.served, number, result))
                 finally:
                     await self._look()
                 self._submitted[submission] = number
@@ -80,9 +97,18 @@ class CampaignService(PageState):
 
     # Changes
 
-    def _take_stage(self, kind: str, stage: Stage) -> None:
-        """Take a stage from the thread of a background process."""
-        self._loop.call_soon_threadsafe(self._set_stage, kind, stage)
+    async def _in_thread(self, function: Callable[[], Result]) -> Result:
+        """Call a function in the thread of the campaign; errors of users' code become errors of ctxval."""
+
+        def guarded() -> Result:
+            try:
+                return function()
+            except CtxvalError:
+                raise
+            except Exception as error:
+                raise CampaignError(f"{reason_of(error)}.") from error
+
+        return await asyncio.get_running_loop().run_in_executor(self._thread, guarded)
 
     async def _background(self, process: BackgroundProcess, job: Job, *arguments: Any) -> Any:
         return await asyncio.wrap_future(process.submit(job, *arguments))
@@ -102,7 +128,8 @@ class CampaignService(PageState):
         while True:
             await asyncio.sleep(1.0)
             try:
-                if await self._desk.signature() == self.snapshot.signature and self.store_error is None:
+                signature = await self._in_thread(lambda: self.served.campaign.store.signature())
+                if signature == self.snapshot.signature and self.store_error is None:
                     continue
             except CtxvalError:
                 pass  # looking again says why
@@ -111,7 +138,7 @@ class CampaignService(PageState):
     async def _look(self) -> None:
         """Read the store; if it has changed, bring everything else up to date."""
         try:
-            snapshot = await self._desk.snapshot()
+            snapshot = await self._in_thread(self.served.read)
         except CtxvalError as error:
             if self.store_error != str(error):
                 self.update(store_error=str(error))
@@ -158,3 +185,14 @@ class CampaignService(PageState):
             else:
                 self.update(judged=ended, verdict=verdict, judgement_error=None)
         self.update(judging=None)
+
+
+def _told(served: ServedCampaign, number: int, result: ToldResult) -> Trial:
+    """Check and store the result of an open trial; return the trial, which may be unmeasured."""
+    try:
+        return tell_result(served.campaign, served.experiment, number, result)
+    except DistanceError:
+        trial = served.campaign.trials[number]
+        if trial.state != "unmeasured":
+            raise
+        return trial

@@ -4,87 +4,65 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import json
 import time
 from collections.abc import AsyncIterator
 from dataclasses import dataclass, replace
 from typing import Any
 
+from ctxval._util.progress import Listener, Progress
+from ctxval._util.progress_display import amount
 from ctxval.certificates import Certificate, Verdict
-from ctxval.web.background import Stage
 from ctxval.web.jobs import Files, Pictures
-from ctxval.web.served import Description, Snapshot
+from ctxval.web.served import ServedCampaign, Snapshot
 
 
 @dataclass(frozen=True)
 class Work:
-    """Work that is not done yet: its stage, and the starts of itself, of the stage and of its last count."""
+    """Work that is not done yet: its progress, its start, and that of the present stage."""
 
-    stage: Stage
+    progress: Progress
     started: float
     reached: float
-    counted: float
 
     @staticmethod
     def begun(stage: str) -> Work:
         """Return work that begins now."""
         now = time.monotonic()
-        return Work(Stage(stage), now, now, now)
+        return Work(Progress(stage, 0, None, ""), now, now)
 
-    def at(self, stage: Stage) -> Work:
+    def at(self, progress: Progress) -> Work:
         """Return the same work at a later stage, or at the same one with another count."""
-        now = time.monotonic()
-        reached = self.reached if stage.text == self.stage.text else now
-        return replace(self, stage=stage, reached=reached, counted=now)
+        same = progress.stage == self.progress.stage
+        return replace(self, progress=progress, reached=self.reached if same else time.monotonic())
 
-    @property
-    def seconds(self) -> int:
-        """Whole seconds since the start."""
-        return int(time.monotonic() - self.started)
-
-    @property
-    def left(self) -> int | None:
-        """Expected seconds until the end of the stage; None if they cannot be estimated."""
-        done, expected = self.stage.done, self.stage.expected
-        if expected is None or not 0 < done <= expected:
-            return None
-        left = (self.counted - self.reached) * (expected - done) / done - (time.monotonic() - self.counted)
-        return max(round(left), 0)
-
-    @property
-    def text(self) -> str:
-        """The stage, how much of it is done, and how long it takes, in words."""
-        stage, unit = self.stage, f" {self.stage.unit}".rstrip()
-        counted = "" if stage.expected is None else f", {stage.done:g} of {stage.expected:g}{unit}"
-        return f"{stage.text}{counted}" + ("" if self.left is None else f", about {self.left} s left")
+    def to_json(self) -> dict[str, Any]:
+        """Return the stage in words, how much of it is done, and the whole seconds since the start."""
+        now, progress = time.monotonic(), self.progress
+        counted = amount(progress, now - self.reached)
+        text = f"{progress.stage}, {counted}" if counted else progress.stage
+        return {"text": text, "done": progress.done, "expected": progress.expected, "seconds": int(now - self.started)}
 
 
 class PageState:
     """What the page shows, for any number of browsers. All of it belongs to the event loop of the server.
 
-    Args:
-        description: what does not change.
-        snapshot: the trials at the start.
-
     Attributes:
-        snapshot: the trials as they were last read.
-        choosing, judging: present work; None if there is none.
-        choice_error: why the last choice failed; None if it did not.
+        served: the campaign, of which only what does not change may be read here.
+        live: whether a command executes the tasks, so that the page only shows them.
+        choosing, judging: present work.
         enough: whether the last choice found that the verdict is reached or the budget is spent.
-        chosen: the number of the trial that was opened last from this page; None if none was.
-        verdict: the last verdict; None if there is none.
+        chosen: the number of the trial that was opened last from this page.
         certificate: the certificate of a campaign without a threshold, which has no verdict.
         judged: the trials that the verdict is about, as :attr:`Snapshot.ended`.
-        judgement_error: why there is no verdict; None if there is no reason.
-        pictures: the last pictures.
         files: the files of open trials by number; a text says why there are none.
-        store_error: why the store cannot be read at present; None if it can.
         interval: the largest executed distance and a preliminary bound, while a command executes the tasks.
-        outcome: how the command that executed the tasks has ended; None if it has not.
+        outcome: how the command that executed the tasks has ended.
         version: a number that grows with each change, also when the server is started again.
         shown: the version that was last sent to a browser.
-        listeners: the number of browsers that are kept up to date.
     """
 
+    live = False
     choosing: Work | None = None
     judging: Work | None = None
     choice_error: str | None = None
@@ -98,8 +76,8 @@ class PageState:
     interval: str | None = None
     outcome: str | None = None
 
-    def __init__(self, description: Description, snapshot: Snapshot) -> None:
-        self.description, self.snapshot = description, snapshot
+    def __init__(self, served: ServedCampaign, snapshot: Snapshot) -> None:
+        self.served, self.snapshot = served, snapshot
         self.pictures: Pictures = {}
         self.files: dict[int, Files | str] = {}
         self.version = time.time_ns()
@@ -119,22 +97,26 @@ class PageState:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
 
-    async def events(self) -> AsyncIterator[tuple[str, Any]]:
-        """Yield the version of the page after each change, the work in progress, and now and then a heartbeat."""
+    async def events(self) -> AsyncIterator[str]:
+        """Yield an event with the version of the page after each change, or with the work in progress.
+
+        A comment now and then shows that the connection is there.
+        """
         seen = None
         self.listeners += 1
         try:
             while not self._closing:
                 changed = self._changed
+                both = {"choosing": self.choosing, "judging": self.judging}
                 if seen != self.version:
                     seen = self.version
-                    yield "version", seen
+                    yield f"event: version\ndata: {seen}\n\n"
+                elif present := {name: work.to_json() for name, work in both.items() if work is not None}:
+                    yield f"event: work\ndata: {json.dumps(present)}\n\n"
                 else:
-                    both = {"choosing": self.choosing, "judging": self.judging}
-                    present = {name: work for name, work in both.items() if work is not None}
-                    yield ("work", present) if present else ("heartbeat", None)
+                    yield ": the server is there\n\n"
                 with contextlib.suppress(TimeoutError):
-                    async with asyncio.timeout(15):  # a heartbeat then shows that the connection is there
+                    async with asyncio.timeout(15):
                         await changed.wait()
         finally:
             self.listeners -= 1
@@ -154,11 +136,19 @@ class PageState:
         changed, self._changed = self._changed, asyncio.Event()
         changed.set()
 
-    def _set_stage(self, kind: str, stage: Stage) -> None:
+    def _follow_progress(self, kind: str) -> Listener:
+        """Return a listener for another thread, which shows how far choosing or judging is."""
+
+        def hear(progress: Progress) -> None:
+            self._loop.call_soon_threadsafe(self._progressed, kind, progress)
+
+        return hear
+
+    def _progressed(self, kind: str, progress: Progress) -> None:
         work: Work | None = getattr(self, kind)
         if work is not None:
-            setattr(self, kind, work.at(stage))
-            self.version += stage.text != work.stage.text
+            setattr(self, kind, work.at(progress))
+            self.version += progress.stage != work.progress.stage
             self._notify()
 
     def _spawn(self, work: Any) -> asyncio.Task[Any]:

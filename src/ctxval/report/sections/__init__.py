@@ -1,21 +1,20 @@
-"""The sections of a report: each is a small class with a title and a method ``render``."""
+"""The sections of a report: each has a title and a method ``render``."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from importlib.metadata import entry_points
 from typing import Protocol, runtime_checkable
 
 from ctxval._util.texts import reason_of
 from ctxval.errors import InputError
 from ctxval.report.context import ReportContext
-from ctxval.report.sections.appendix import AppendixSection
-from ctxval.report.sections.basis import BasisSection, InsightsSection
-from ctxval.report.sections.convergence import ConvergenceSection
-from ctxval.report.sections.repeat import RepeatSection
-from ctxval.report.sections.tasks import TasksSection
-from ctxval.report.sections.trials import TrialsSection
-from ctxval.report.sections.verdict import VerdictSection
+from ctxval.report.sections.appendix import for_the_file
+from ctxval.report.sections.distances import convergence, distances
+from ctxval.report.sections.repeat import repeat
+from ctxval.report.sections.trials import trials
+from ctxval.report.sections.verdict import basis, shown_insights, verdict
 
 GROUP = "ctxval.report_sections"
 """Group of the entry points by which installed packages add sections: each is a class or an object of a section."""
@@ -38,15 +37,21 @@ class Section(Protocol):
         """
 
 
+@dataclass
+class _Part:
+    title: str
+    render: Callable[[ReportContext], str]
+
+
 SECTIONS: tuple[Section, ...] = (
-    VerdictSection(),
-    BasisSection(),
-    InsightsSection(),
-    TasksSection(),
-    TrialsSection(),
-    ConvergenceSection(),
-    RepeatSection(),
-    AppendixSection(),
+    _Part("Verdict", verdict),
+    _Part("Assumptions and diagnostics", basis),
+    _Part("Insights", shown_insights),
+    _Part("Distance over the tasks", distances),
+    _Part("Trials", trials),
+    _Part("Convergence", convergence),
+    _Part("To repeat it", repeat),
+    _Part("For the file", for_the_file),
 )
 """The sections of every report, in their order."""
 

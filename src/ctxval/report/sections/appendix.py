@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 from markupsafe import Markup
 
-from ctxval._util.representation import ShortRepr
+from ctxval._util.arrays import Array
+from ctxval._util.version import VERSION
 from ctxval.certificates.bounds import at_most, with_error
 from ctxval.report.context import ReportContext, distance_of
-from ctxval.report.diagnostics import diagnostics, not_tested
-from ctxval.report.findings import WORDS
+from ctxval.report.diagnostics import WORDS, diagnostics, not_tested
 from ctxval.report.markup import UNCUT, joined, number, paragraph, quantity, table, text
 from ctxval.report.sections.repeat import command_of, digest
-from ctxval.version import VERSION
 
 _NASA, _V10, _V20 = "NASA-STD-7009B", "ASME V&V 10", "ASME V&V 20"
 
@@ -29,151 +29,126 @@ class Entry:
     content: str
 
 
-class AppendixSection(ShortRepr):
-    """What a file on the credibility of a model holds, as far as this campaign knows it."""
-
-    title = "For the file"
-
-    def render(self, context: ReportContext) -> Markup:
-        """Return the entries as a table."""
-        rows = [(entry.term, text(entry.content, UNCUT), entry.standard) for entry in appendix(context)]
-        return joined(
-            [
-                paragraph(
-                    "The entries use the vocabulary of the named standards. They state what this campaign knows; they "
-                    "are no claim of conformance."
-                ),
-                table("Appendix for the file", ("Term", "Content", "Vocabulary of"), rows, class_="facts"),
-            ]
-        )
+def for_the_file(context: ReportContext) -> Markup:
+    """Return what a file on the credibility of a model holds, as far as this campaign knows it, as a table."""
+    rows = [(entry.term, text(entry.content, UNCUT), entry.standard) for entry in appendix(context)]
+    return joined(
+        [
+            paragraph(
+                "The entries use the vocabulary of the named standards. They state what this campaign knows; they "
+                "are no claim of conformance."
+            ),
+            table("Appendix for the file", ("Term", "Content", "Vocabulary of"), rows, class_="facts"),
+        ]
+    )
 
 
 def appendix(context: ReportContext) -> list[Entry]:
     """Return the entries of the appendix."""
-    changes = [f"{change.at[:19]} {change.what}: {change.why}" for change in context.changes]
-    certificate = context.certificate
-    assumptions = "None beyond the recorded executions" if certificate is None else "; ".join(certificate.assumptions)
-    return [
-        Entry("Intended use", f"{_NASA}, {_V10}", _intended_use(context)),
-        Entry("Response quantity of interest and validation metric", f"{_V10}, {_V20}", _metric(context)),
-        Entry("Acceptance criterion (accuracy requirement)", f"{_NASA}, {_V10}", _criterion(context)),
-        Entry("Referent data", f"{_NASA}, {_V10}", _referent(context)),
-        Entry("Comparison error E = S \u2212 D (here: M \u2212 S)", _V20, _error(context)),
-        Entry("Domain of validation, and what lies outside it", f"{_NASA}, {_V10}, {_V20}", _domain(context)),
-        Entry("Uncertainty characterization", f"{_NASA}, {_V10}, {_V20}", _uncertainty(context)),
-        Entry("Results robustness (sensitivity)", _NASA, _robustness(context)),
-        Entry("Assumptions", f"{_NASA}, {_V10}", f"{assumptions}."),
-        Entry("Limits of the assessment: what was not tested", f"{_NASA}, {_V10}", " ".join(not_tested(context))),
-        Entry("Verification", f"{_NASA}, {_V10}", _verification(context)),
-        Entry("Changes during the campaign", _NASA, "; ".join(changes) or "None is recorded."),
-        Entry(
-            "Provenance",
-            _NASA,
-            f"Store {context.store.name}; ctxval {VERSION}; command: {command_of(context) or 'none'}; digest of the "
-            f"description of the model: {_part_digest(context, 'model')}.",
-        ),
-        Entry("Conclusion", f"{_NASA}, {_V10}", str(context.verdict or "No verdict, because no threshold was stated.")),
-    ]
+    return [*_purpose(context), *_evidence(context), *_limits(context)]
 
 
-def _intended_use(context: ReportContext) -> str:
-    space = context.space
-    ranges = "; ".join(
-        f"{label} from {number(low)} to {number(high)}"
-        for label, low, high in zip(space.labels, space.low.tolist(), space.high.tolist(), strict=True)
-    )
-    spread = context.provenance.distribution
-    how = "uniform" if spread is None else spread
+def _purpose(context: ReportContext) -> Iterator[Entry]:
+    """Yield what the model is for, what is compared, and what is required."""
+    space, units = context.space, context.labels.units
     synthesizer = None if context.validation is None else type(context.validation.synthesizer).__name__
     design = "" if synthesizer is None else f", with the synthesizer {synthesizer}"
-    return (
+    yield Entry(
+        "Intended use",
+        f"{_NASA}, {_V10}",
         f"The model predicts closed loops under controllers that are designed on it{design}, for the tasks of "
-        f"{context.name or 'this experiment'}: {ranges}. Distribution of tasks: {how}."
+        f"{context.name or 'this experiment'}: {_box(context, space.low, space.high)}. Distribution of tasks: "
+        f"{context.provenance.distribution or 'uniform'}.",
     )
-
-
-def _metric(context: ReportContext) -> str:
     parts = context.description.get("validation")
     described = parts.get("distance") if isinstance(parts, dict) else None
     kind = described.get("type", "a function") if isinstance(described, dict) else described or "not known"
-    return (
-        f"The context-specific distance d(p) between the trajectories of model and system under the same controller "
-        f"({kind}{f', in {context.labels.units}' if context.labels.units else ''}); the quantity of interest is its "
-        "largest value d* over all tasks."
+    yield Entry(
+        "Response quantity of interest and validation metric",
+        f"{_V10}, {_V20}",
+        "The context-specific distance d(p) between the trajectories of model and system under the same controller "
+        f"({kind}{f', in {units}' if units else ''}); the quantity of interest is its largest value d* over all tasks.",
     )
+    criterion, certificate = "None was stated.", context.certificate
+    if context.verdict is not None:
+        confidence = "" if certificate is None else f", with confidence {number(certificate.confidence)}"
+        criterion = f"d* is at most {quantity(context.verdict.threshold, units)}{confidence}."
+    yield Entry("Acceptance criterion (accuracy requirement)", f"{_NASA}, {_V10}", criterion)
 
 
-def _criterion(context: ReportContext) -> str:
-    if context.verdict is None:
-        return "None was stated."
-    tau, certificate = quantity(context.verdict.threshold, context.labels.units), context.certificate
-    confidence = "" if certificate is None else f", with confidence {number(certificate.confidence)}"
-    return f"d* is at most {tau}{confidence}."
-
-
-def _referent(context: ReportContext) -> str:
+def _evidence(context: ReportContext) -> Iterator[Entry]:
+    """Yield what was executed, the errors, and where."""
     origins = Counter(trial.origin for trial in context.trials)
     listed = ", ".join(f"{count} {origin}" for origin, count in sorted(origins.items()))
-    return (
+    yield Entry(
+        "Referent data",
+        f"{_NASA}, {_V10}",
         f"{context.executions} executions of the system in {len(context.trials)} trials ({listed or 'none'}), of which "
         f"{len(context.completed)} gave a distance and {len(context.recordings)} a recorded trajectory. Digest of the "
-        f"description of the system: {_part_digest(context, 'system')}."
+        f"description of the system: {_part_digest(context, 'system')}.",
     )
+    error, executed = "No distance is known.", "Nothing was executed."
+    if context.completed:
+        units, worst = context.labels.units, context.worst_first[0]
+        error = (
+            f"Largest distance {quantity(distance_of(worst), units)} (trial {worst.number}), median "
+            f"{quantity(float(np.median(context.distances)), units)}, smallest "
+            f"{quantity(float(context.distances.min()), units)}, over {len(context.distances)} executed tasks. The "
+            "tasks were chosen by a search for large distances, so the median is not that of all tasks."
+        )
+        points = context.coordinates(context.completed)
+        ranges = _box(context, points.min(axis=0), points.max(axis=0))
+        executed = f"Executed: {ranges}. Nothing is said about tasks outside the intended use."
+    yield Entry("Comparison error E = S \u2212 D (here: M \u2212 S)", _V20, error)
+    yield Entry("Domain of validation, and what lies outside it", f"{_NASA}, {_V10}, {_V20}", executed)
 
 
-def _error(context: ReportContext) -> str:
-    if not context.completed:
-        return "No distance is known."
-    units, values = context.labels.units, context.distances
-    worst = context.worst_first[0]
-    return (
-        f"Largest distance {quantity(distance_of(worst), units)} (trial {worst.number}), median "
-        f"{quantity(float(np.median(values)), units)}, smallest {quantity(float(values.min()), units)}, over "
-        f"{len(values)} executed tasks. The tasks were chosen by a search for large distances, so the median is not "
-        "that of all tasks."
-    )
-
-
-def _domain(context: ReportContext) -> str:
-    if not len(context.points):
-        return "Nothing was executed."
-    low, high = context.coordinates(context.completed).min(axis=0), context.coordinates(context.completed).max(axis=0)
-    executed = "; ".join(
-        f"{label} from {number(a)} to {number(b)}"
-        for label, a, b in zip(context.space.labels, low.tolist(), high.tolist(), strict=True)
-    )
-    return f"Executed: {executed}. Nothing is said about tasks outside the intended use."
-
-
-def _uncertainty(context: ReportContext) -> str:
-    certificate = context.certificate
-    if certificate is None:
-        return "No certificate was computed, so no uncertainty is stated for tasks that were not executed."
-    bound = with_error(certificate.upper_bound, certificate.error)
-    except_for = f", except for {at_most(100 * certificate.volume, 3)} % of the tasks" if certificate.volume else ""
-    withdrawn = "" if certificate.doubt is None else f" The certificate is withdrawn: {certificate.doubt}."
-    return (
-        f"By the certificate {certificate.kind}, d* is at most {bound} with confidence "
-        f"{number(certificate.confidence)}{except_for}. The uncertainty of the measured trajectories themselves is not "
-        f"part of it.{withdrawn}"
-    )
-
-
-def _robustness(context: ReportContext) -> str:
-    model = context.distance_model
-    if model is None:
-        return "Not known: fewer than two distances."
-    order = np.argsort(-model.sensitivity, kind="stable")[:5]
-    listed = "; ".join(f"{context.space.labels[j]} {number(float(model.sensitivity[j]), 2)}" for j in order)
-    return f"Total Sobol indices of the predicted distance, the largest first: {listed}."
-
-
-def _verification(context: ReportContext) -> str:
-    lights = [f"{finding.name}: {WORDS[finding.light]}" for finding in diagnostics(context)]
-    return (
+def _limits(context: ReportContext) -> Iterator[Entry]:
+    """Yield how certain the result is, what it assumes, what was not tested, and the conclusion."""
+    certificate, model = context.certificate, context.distance_model
+    uncertainty = "No certificate was computed, so no uncertainty is stated for tasks that were not executed."
+    assumptions, robustness = "None beyond the recorded executions", "Not known: fewer than two distances."
+    if certificate is not None:
+        bound, volume = with_error(certificate.upper_bound, certificate.error), certificate.volume
+        except_for = f", except for {at_most(100 * volume, 3)} % of the tasks" if volume else ""
+        withdrawn = "" if certificate.doubt is None else f" The certificate is withdrawn: {certificate.doubt}."
+        uncertainty = (
+            f"By the certificate {certificate.kind}, d* is at most {bound} with confidence "
+            f"{number(certificate.confidence)}{except_for}. The uncertainty of the measured trajectories themselves is "
+            f"not part of it.{withdrawn}"
+        )
+        assumptions = "; ".join(certificate.assumptions)
+    if model is not None:
+        order = np.argsort(-model.sensitivity, kind="stable")[:5]
+        listed = "; ".join(f"{context.space.labels[j]} {number(float(model.sensitivity[j]), 2)}" for j in order)
+        robustness = f"Total Sobol indices of the predicted distance, the largest first: {listed}."
+    lights = "; ".join(f"{finding.name}: {WORDS[finding.light]}" for finding in diagnostics(context))
+    changes = "; ".join(f"{change.at[:19]} {change.what}: {change.why}" for change in context.changes)
+    yield Entry("Uncertainty characterization", f"{_NASA}, {_V10}, {_V20}", uncertainty)
+    yield Entry("Results robustness (sensitivity)", _NASA, robustness)
+    yield Entry("Assumptions", f"{_NASA}, {_V10}", f"{assumptions}.")
+    yield Entry("Limits of the assessment: what was not tested", f"{_NASA}, {_V10}", " ".join(not_tested(context)))
+    yield Entry(
+        "Verification",
+        f"{_NASA}, {_V10}",
         "Software and solution verification of the model itself are not part of this campaign. Diagnostics of the "
-        f"campaign: {'; '.join(lights) or 'nothing is unusual'}."
+        f"campaign: {lights or 'nothing is unusual'}.",
     )
+    yield Entry("Changes during the campaign", _NASA, changes or "None is recorded.")
+    yield Entry(
+        "Provenance",
+        _NASA,
+        f"Store {context.store.name}; ctxval {VERSION}; command: {command_of(context) or 'none'}; digest of the "
+        f"description of the model: {_part_digest(context, 'model')}.",
+    )
+    conclusion = str(context.verdict or "No verdict, because no threshold was stated.")
+    yield Entry("Conclusion", f"{_NASA}, {_V10}", conclusion)
+
+
+def _box(context: ReportContext, low: Array, high: Array) -> str:
+    """Return the ranges of the task parameters."""
+    ends = zip(context.space.labels, low.tolist(), high.tolist(), strict=True)
+    return "; ".join(f"{label} from {number(first)} to {number(last)}" for label, first, last in ends)
 
 
 def _part_digest(context: ReportContext, part: str) -> str:

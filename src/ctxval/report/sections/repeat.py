@@ -14,59 +14,50 @@ import numpy as np
 import scipy
 from markupsafe import Markup
 
-from ctxval._util.representation import ShortRepr
+from ctxval._util.version import VERSION
 from ctxval.certificates import RESOLUTION
 from ctxval.certificates.options import CONFIDENCE, WITHIN
+from ctxval.certificates.prediction_tests import TESTS
 from ctxval.core.trial import Trial
 from ctxval.report.context import ReportContext, distance_of
-from ctxval.report.markup import code, heading, joined, number, paragraph, table
+from ctxval.report.markup import code, heading, joined, paragraph, quantity, table
 from ctxval.searches import DEFAULT as DEFAULT_SEARCH
-from ctxval.version import VERSION
-
-_SAME = (
-    "The command makes the same choices again, into a new store, with the same versions of the libraries on the same "
-    "kind of processor. The option thinking of the search auto must then be a number, fast or thorough: balanced "
-    "measures times."
-)
-_FILE = (
-    "The experiment is described in a file. The store keeps its content, but not its name, so its name is assumed here."
-)
 
 
-class RepeatSection(ShortRepr):
-    """How to repeat the campaign, and each of the worst tasks."""
-
-    title = "To repeat it"
-
-    def render(self, context: ReportContext) -> Markup:
-        """Return the command, the seed, the versions, the digests and a snippet for each of the worst tasks."""
-        command = repeating_command(context)
-        parts = [
-            paragraph(_SAME) if command else paragraph("No command made this store, so there is none that repeats it."),
-            code(command, "Command that repeats the campaign") if command else Markup(""),
-            paragraph(_FILE) if command and not context.settings.get("experiment") else Markup(""),
-            table("What identifies this campaign", ("Name", "Value"), identity(context).items(), class_="facts"),
-            heading("The worst tasks"),
-            paragraph(
-                "Each snippet executes the system once. For a system that people operate, the command opens the task "
-                "again as a new trial, and writes its controller to files."
-            ),
+def repeat(context: ReportContext) -> Markup:
+    """Return the command, the seed, the versions, the digests and a snippet for each of the worst tasks."""
+    command = repeating_command(context)
+    parts = [paragraph("No command made this store, so there is none that repeats it.")]
+    if command:
+        same = (
+            "The command makes the same choices again, into a new store, with the same versions of the libraries on "
+            "the same kind of processor. The option thinking of the search auto must then be a number, fast or "
+            "thorough: balanced measures times."
+        )
+        parts = [paragraph(same), code(command, "Command that repeats the campaign")]
+        if not context.settings.get("experiment"):
+            named = "The store keeps its content, but not its name, so its name is assumed here."
+            parts.append(paragraph(f"The experiment is described in a file. {named}"))
+    parts += [
+        table("What identifies this campaign", ("Name", "Value"), identity(context).items(), class_="facts"),
+        heading("The worst tasks"),
+        paragraph(
+            "Each snippet executes the system once. For a system that people operate, the command opens the task "
+            "again as a new trial, and writes its controller to files."
+        ),
+    ]
+    for trial in context.worst_tasks(5):
+        parts += [
+            heading(f"Trial {trial.number}, distance {quantity(distance_of(trial), context.labels.units)}", 4),
+            code(python_snippet(context, trial), f"Python for trial {trial.number}"),
+            code(command_snippet(context, trial), f"Command for trial {trial.number}"),
         ]
-        for trial in context.worst_tasks(5):
-            distance = f"{number(distance_of(trial))} {context.labels.units}".rstrip()
-            parts += [
-                heading(f"Trial {trial.number}, distance {distance}", 4),
-                code(python_snippet(context, trial), f"Python for trial {trial.number}"),
-                code(command_snippet(context, trial), f"Command for trial {trial.number}"),
-            ]
-        return joined(parts)
+    return joined(parts)
 
 
 def identity(context: ReportContext) -> dict[str, str]:
     """Return the seed, the versions and the digests by name."""
-    described = context.description
-    search = described.get("search")
-    parts = described.get("validation")
+    search, parts = context.description.get("search"), context.description.get("validation")
     digests = {
         f"digest of the {name}": digest(part)
         for name, part in (parts.items() if isinstance(parts, Mapping) else ())
@@ -75,7 +66,7 @@ def identity(context: ReportContext) -> dict[str, str]:
     return {
         "store": str(context.store.name),
         "search": str(search.get("type")) if isinstance(search, Mapping) else "not known",
-        "seed": str(described.get("seed", "not known")),
+        "seed": str(context.description.get("seed", "not known")),
         "version of ctxval": VERSION,
         "version of Python": platform.python_version(),
         "version of numpy": np.__version__,
@@ -112,21 +103,22 @@ def command_of(context: ReportContext, budget: int | None = None, *others: str) 
     # A store may hold anything.
     tables = {name: table for name, table in settings.items() if isinstance(table, Mapping)}
     search, certificate, options = (tables.get(name, {}) for name in ("search", "certificate", "options"))
-    given = {
-        "--search": search.get("name") if not named else _unless(DEFAULT_SEARCH, search.get("name")),
-        "--seed": settings.get("seed") if not named else _unless(0, settings.get("seed")),
-        "--budget": budget or settings.get("budget") or context.budget,
-        "--threshold": settings.get("threshold"),
-        "--confidence": _unless(CONFIDENCE, settings.get("confidence")),
-        "--resolution": _unless(RESOLUTION, certificate.get("resolution")),
-        "--within": _unless(WITHIN, settings.get("within")),
+    # The value of each option, and its default, with which it is left out.
+    values = {
+        "--search": (search.get("name"), DEFAULT_SEARCH if named else None),
+        "--seed": (settings.get("seed"), 0 if named else None),
+        "--budget": (budget or settings.get("budget") or context.budget, None),
+        "--threshold": (settings.get("threshold"), None),
+        "--confidence": (settings.get("confidence"), CONFIDENCE),
+        "--resolution": (certificate.get("resolution"), RESOLUTION),
+        "--tests": (certificate.get("tests"), TESTS),
+        "--within": (settings.get("within"), WITHIN),
     }
-    for option, value in given.items():
-        words += [option, str(value)] if value is not None else []
+    for option, (value, default) in values.items():
+        words += [] if value is None or value == default else [option, str(value)]
     flags = {
         "--explore": settings.get("explore"),
         "--decide": settings.get("explore") is False,
-        "--audited": settings.get("audited"),
         "--stochastic": certificate.get("stochastic"),
     }
     words += [flag for flag, wanted in flags.items() if wanted is True]
@@ -135,16 +127,12 @@ def command_of(context: ReportContext, budget: int | None = None, *others: str) 
     return shlex.join([*words, *others])
 
 
-def _unless(default: object, value: Any) -> Any:
-    return None if value == default else value
-
-
 def python_snippet(context: ReportContext, trial: Trial) -> str:
     """Return Python that executes the task of a trial once. Texts of the store are literals in it."""
     made = "validation = ...  # the Validation of the campaign"
     if context.settings:
         made = (
-            "from ctxval import Store\nfrom ctxval.config.stored_settings import trusted_settings\n\n"
+            "from ctxval import Store\nfrom ctxval.cli.config.stored_settings import trusted_settings\n\n"
             f"store = Store.existing({str(path_of(context))!r})\n"
             "validation = trusted_settings(store).load().validation"
         )

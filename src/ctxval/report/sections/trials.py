@@ -1,26 +1,26 @@
-"""The trials: a table that can be sorted, the trajectories of each, and the five worst at once."""
+"""The trials: a table that can be sorted, the trajectories of each as data of the page, and the five worst at once."""
 
 from __future__ import annotations
 
+import base64
 import json
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from markupsafe import Markup
 
-from ctxval._util.arrays import Array
-from ctxval._util.representation import ShortRepr, counted
-from ctxval._util.texts import parted
+from ctxval._util.arrays import Array, Rows
+from ctxval._util.representation import counted
+from ctxval._util.texts import parted, shortened, visible
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import Trial
 from ctxval.report.charts import SMALL, Axis, Chart, Kind, small_charts
 from ctxval.report.context import ReportContext
-from ctxval.report.markup import cell, details, element, heading, joined, paragraph, quantity
-from ctxval.report.recorded_lines import RecordedLines, recorded_lines
+from ctxval.report.markup import cell, details, element, heading, joined, paragraph, quantity, scrolling
 
 _ROWS = 1000  # largest number of trials in the table: those with the largest distances, and those without a distance
 
-_WORST = 5
 _LINES: dict[Kind, str] = {
     "reference": "reference",
     "corrected": "corrected model",
@@ -29,33 +29,23 @@ _LINES: dict[Kind, str] = {
 }
 
 
-class TrialsSection(ShortRepr):
-    """All trials, and what S and M did in them."""
-
-    title = "Trials"
-
-    def render(self, context: ReportContext) -> Markup:
-        """Return the table, the place for one trial, its data, and the worst trials."""
-        if not context.trials:
-            return paragraph("There are no trials.")
-        lines = recorded_lines(context)
-        return joined(
-            [
-                _left_out(context, lines),
-                _table(context, lines),
-                element("div", id="trial", aria_live="polite", class_="needs-script"),
-                data_element("trial-data", lines.data),
-                _worst(context),
-            ]
-        )
-
-
-def data_element(identifier: str, data: Any) -> Markup:
-    """Return data for the page's script. The element is no script itself, and its content cannot end it."""
-    plain = json.dumps(data, allow_nan=False, separators=(",", ":"))
-    for character in "<>&":
-        plain = plain.replace(character, f"\\u{ord(character):04x}")
-    return element("script", Markup(plain), type="application/json", id=identifier)
+def trials(context: ReportContext) -> Markup:
+    """Return the table of all trials, the place for one trial, its data, and the worst trials."""
+    if not context.trials:
+        return paragraph("There are no trials.")
+    lines = recorded_lines(context)
+    # Data for the page's script: the element is no script itself, and its content cannot end it.
+    plain = json.dumps(lines.data, allow_nan=False, separators=(",", ":"))
+    escaped = Markup(plain.translate({ord(character): f"\\u{ord(character):04x}" for character in "<>&"}))
+    return joined(
+        [
+            _left_out(context, lines),
+            _table(context, lines),
+            element("div", id="trial", aria_live="polite", class_="needs-script"),
+            element("script", escaped, type="application/json", id="trial-data"),
+            _worst(context),
+        ]
+    )
 
 
 def _left_out(context: ReportContext, lines: RecordedLines) -> Markup:
@@ -76,29 +66,22 @@ def _left_out(context: ReportContext, lines: RecordedLines) -> Markup:
 
 def _table(context: ReportContext, lines: RecordedLines) -> Markup:
     shown = [*context.worst_first, *(trial for trial in context.trials if trial.distance is None)][:_ROWS]
-    headers = (
-        *("trial", "distance", "state", "origin"),
-        *context.space.labels,
-        *("time [s]", "attempts", "remarks"),
-    )
+    headers = ("trial", "distance", "state", "origin", *context.space.labels, "time [s]", "attempts", "remarks")
     heads = element("tr", *(element("th", label, scope="col") for label in headers))
     points = context.coordinates(shown)
     rows = [_row(trial, point, trial.number in lines.kept) for trial, point in zip(shown, points, strict=True)]
     caption = f"Trials, the largest distance first{'' if len(shown) == len(context.trials) else f' ({_ROWS} of them)'}"
     inside = element("caption", caption), element("thead", heads), element("tbody", *rows)
     whole = element("table", *inside, class_="sortable", id="trials")
-    return element("div", whole, class_="scroll tall", tabindex="0", role="region", aria_label="Table of trials")
+    return scrolling(whole, "Table of trials", "scroll tall")
 
 
 def _row(trial: Trial, point: Array, recorded: bool) -> Markup:
-    first: object = trial.number
-    if recorded:
-        first = element(
-            "button", str(trial.number), type="button", data_trial=trial.number, aria_label=f"Show trial {trial.number}"
-        )
+    number, shows = trial.number, f"Show trial {trial.number}"
+    button = element("button", str(number), type="button", data_trial=number, aria_label=shows) if recorded else number
     remarks = "; ".join(filter(None, (trial.failure, trial.because)))
     values = (trial.distance, trial.state, trial.origin, *point.tolist(), trial.seconds, trial.attempts, remarks)
-    cells = [element("th", cell(first), scope="row", data_value=trial.number)]
+    cells = [element("th", cell(button), scope="row", data_value=number)]
     for value in values:
         exact = repr(float(value)) if isinstance(value, int | float) else None
         cells.append(element("td", cell(value) if value != "" else "", data_value=exact))
@@ -107,7 +90,7 @@ def _row(trial: Trial, point: Array, recorded: bool) -> Markup:
 
 def _worst(context: ReportContext) -> Markup:
     """Return the trajectories of the worst trials, drawn without a script."""
-    worst = context.worst_tasks(_WORST, recorded=True)
+    worst = context.worst_tasks(recorded=True)
     if not worst:
         return paragraph("No trajectories are recorded, so the worst tasks cannot be drawn.")
     parts = [heading(f"The {counted(len(worst), 'worst task')}")]
@@ -149,3 +132,77 @@ def _signals(context: ReportContext, trial: int) -> list[Chart]:
             chart.line(times[: len(values)][rows], values[rows], kind, _LINES[kind])
         charts.append(chart)
     return charts
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedLines:
+    """The lines of as many trials as fit, ready for JSON, the worst first, and the largest number of their points."""
+
+    data: dict[str, Any]
+    kept: tuple[int, ...]
+    left_out: tuple[int, ...]
+    points: int
+    thinned: bool
+
+
+def recorded_lines(context: ReportContext, most: int = 850_000) -> RecordedLines:
+    """Return the lines of the trials, with fewer points or fewer trials if they have too many characters together."""
+    numbers, points = list(context.recordings), 0
+    lines: dict[int, dict[str, Any]] = {}
+    for points in (200, 120, 70):
+        lines, used = {}, 0
+        for number in numbers:
+            of_trial = lines_of(context, number, points)
+            parts = [of_trial["t"], *of_trial["m"], *of_trial["e"], *of_trial.get("c", ()), *of_trial.get("r", ())]
+            used += sum(len(part.get("data", "")) + 60 for part in parts if part)
+            if used > most:
+                break
+            lines[number] = of_trial
+        if len(lines) == len(numbers):
+            break
+    kinds = zip(("state", "input"), context.signals, strict=True)
+    signals = [{"label": shortened(visible(name), 120), "kind": kind} for kind, names in kinds for name in names]
+    longest = max((run.system.horizon + 1 for run in context.recordings.values()), default=0)
+    data = {"signals": signals, "trials": {str(number): of_trial for number, of_trial in lines.items()}}
+    return RecordedLines(data, tuple(lines), tuple(numbers[len(lines) :]), points, longest > points)
+
+
+def lines_of(context: ReportContext, number: int, points: int) -> dict[str, Any]:
+    """Return the lines of one trial: times, M, S minus M, corrected M minus M, and the reference.
+
+    Differences are stored, because a small error of M would vanish in the steps of the values.
+    """
+    model, system = context.recordings[number].model, context.recordings[number].system
+    rows: Rows = np.arange(system.horizon + 1)
+    if len(rows) > points:  # evenly spread, and those of the largest error of each state
+        peaks = np.abs(system.states - model.states).argmax(axis=0)
+        rows = np.unique(np.concatenate([np.linspace(0, system.horizon, points).astype(np.intp), peaks]))
+    inner = rows[rows < system.horizon]
+
+    def columns(states: Array, inputs: Array) -> list[dict[str, Any]]:
+        return [packed(column) for column in (*states[rows].T, *inputs[inner].T)]
+
+    lines: dict[str, Any] = {
+        "t": packed(system.times[rows]),
+        "m": columns(model.states, model.inputs),
+        "e": columns(system.states - model.states, system.inputs - model.inputs),
+    }
+    replay = context.replays.get(number)
+    if replay is None:
+        return lines
+    corrected, reference = replay.corrected, replay.task.reference
+    if corrected is not None and corrected.states.shape == model.states.shape:
+        lines["c"] = columns(corrected.states - model.states, corrected.inputs - model.inputs)
+    if reference.shape == model.states.shape:
+        lines["r"] = [packed(column) if column.any() else None for column in reference[rows].T]
+    return lines
+
+
+def packed(values: Array) -> dict[str, Any]:
+    """Return numbers ``(k,)`` as their smallest value, a step, and multiples of the step in 16 bits each as base64."""
+    low, high = (float(values.min()), float(values.max())) if len(values) else (0.0, 0.0)
+    step = (high - low) / 65_535
+    if not (np.isfinite(step) and step > 0):
+        return {"low": low if np.isfinite(low) else 0.0, "step": 0.0, "n": len(values)}
+    levels = np.rint((values - low) / step).astype("<u2")
+    return {"low": low, "step": step, "data": base64.b64encode(levels.tobytes()).decode()}

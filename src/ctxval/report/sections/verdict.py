@@ -1,4 +1,4 @@
-"""The first screen: the verdict in one sentence, the distance over the tasks, and what to do next."""
+"""The first screen: the verdict, the distance over the tasks and what to do next; and what the verdict rests on."""
 
 from __future__ import annotations
 
@@ -6,47 +6,58 @@ import shlex
 
 from markupsafe import Markup
 
-from ctxval._util.representation import ShortRepr, counted
+from ctxval._util.representation import counted
+from ctxval.campaign.storage.other_stores import other_stores
 from ctxval.certificates import Certificate
-from ctxval.certificates.bounds import at_most, with_error
+from ctxval.certificates.bounds import as_text, at_most, with_error
 from ctxval.report.context import ReportContext, distance_of
-from ctxval.report.diagnostics import diagnostics
-from ctxval.report.findings import WORDS
+from ctxval.report.diagnostics import WORDS, Finding, diagnostics, not_tested
 from ctxval.report.insights import insights
-from ctxval.report.markup import code, element, heading, joined, paragraph, percent, quantity, table
-from ctxval.report.sections.convergence import distances_in_order
+from ctxval.report.markup import (
+    UNCUT,
+    bullets,
+    code,
+    details,
+    element,
+    heading,
+    joined,
+    paragraph,
+    percent,
+    quantity,
+    table,
+    text,
+)
+from ctxval.report.sections.distances import distance_over_task, distances_in_order
 from ctxval.report.sections.repeat import command_of, path_of
-from ctxval.report.sections.tasks import distance_over_task
 from ctxval.report.sections.trials import task_of
-from ctxval.storage.other_stores import other_stores
 
-# A shape for each verdict, because colours alone tell nothing in grey print.
-_SHAPES = {"validated": "\u2714", "falsified": "\u2718", "undecided": "?", "no verdict": "\u2013"}
+# A shape for each verdict and each light, because colours alone tell nothing in grey print.
+_SHAPES = {
+    **{"validated": "\u2714", "falsified": "\u2718", "undecided": "?", "no verdict": "\u2013"},
+    **{"good": "\u25cf", "note": "\u25c6", "attention": "\u25b2", "bad": "\u25a0", "unknown": "\u25cb"},
+}
 
+_TESTS = 22
+"""Number of tests that is advised if an error would be costly."""
 _MORE = 10  # number of further executions that are advised if none can be forecast
 
 
-class VerdictSection(ShortRepr):
-    """The verdict, with the picture that shows it best."""
-
-    title = "Verdict"
-
-    def render(self, context: ReportContext) -> Markup:
-        """Return the verdict, its sentence, the picture, the next step and the numbers."""
-        answer = "no verdict" if context.verdict is None else context.verdict.answer
-        shape = element("span", _SHAPES[answer], class_="shape", aria_hidden="true")
-        word = element("p", shape, " ", answer.capitalize(), class_="word")
-        chart = (distance_over_task(context) if context.space.dimension == 1 else None) or distances_in_order(context)
-        drawn = paragraph("No distance is known yet.") if chart is None else chart
-        advice, command = _next(context)
-        block = code(command, "Next command") if command else None
-        beside = element("div", heading("What next"), paragraph(advice), block, _facts(context), *_remarks(context))
-        return joined(
-            [
-                element("div", word, paragraph(_sentence(context), class_="sentence"), class_=f"answer {answer}"),
-                element("div", element("div", drawn, class_="picture"), beside, class_="first"),
-            ]
-        )
+def verdict(context: ReportContext) -> Markup:
+    """Return the first screen: the verdict, its sentence, the picture, the next step and the numbers."""
+    answer = "no verdict" if context.verdict is None else context.verdict.answer
+    shape = element("span", _SHAPES[answer], class_="shape", aria_hidden="true")
+    word = element("p", shape, " ", answer.capitalize(), class_="word")
+    chart = (distance_over_task(context) if context.space.dimension == 1 else None) or distances_in_order(context)
+    drawn = paragraph("No distance is known yet.") if chart is None else chart
+    advice, command = _next(context)
+    block = code(command, "Next command") if command else None
+    beside = element("div", heading("What next"), paragraph(advice), block, _facts(context), *_remarks(context))
+    return joined(
+        [
+            element("div", word, paragraph(_sentence(context), class_="sentence"), class_=f"answer {answer}"),
+            element("div", element("div", drawn, class_="picture"), beside, class_="first"),
+        ]
+    )
 
 
 def _sentence(context: ReportContext) -> str:
@@ -56,11 +67,15 @@ def _sentence(context: ReportContext) -> str:
         return "No threshold was given."
     if verdict.answer != "validated" or certificate is None or certificate.kind != "dynamics":
         return f"{verdict.reason[:1].upper()}{verdict.reason[1:]}"
+    drawn = certificate.details["tests"]["drawn"]
+    tested = "No prediction was tested where nobody chose to look."
+    if drawn:
+        tested = f"{drawn} tasks that were drawn over the whole task space tested the predictions."
     designs = "" if context.designs is None else f" Note: {context.designs}."
     return (
         f"Every task keeps the threshold of {quantity(verdict.threshold, units)}: the largest distance is at most "
         f"{_bound(context, certificate)} with {percent(certificate.confidence)} confidence, if what M misses depends "
-        f"on the recorded state and input alone, alike in every task.{designs}"
+        f"on the recorded state and input alone, alike in every task. {tested}{designs}"
         f"{context.provenance.caution(verdict.threshold)}"
     )
 
@@ -78,11 +93,13 @@ def _next(context: ReportContext) -> tuple[str, str]:
             "Use the model for these tasks. Validate it again if the system, the model, the design of the controllers "
             "or the tasks change."
         )
-        budget = max(context.budget or 0, context.executions + _MORE)
-        command = command_of(context, budget, "--audited", "--store", path)
-        if not command or context.settings.get("audited") or getattr(verdict.certificate, "kind", "") != "dynamics":
+        tests = {} if verdict.certificate is None else verdict.certificate.details.get("tests", {})
+        drawn = tests.get("drawn", _TESTS)
+        budget = max(context.budget or 0, context.executions + _TESTS - drawn)
+        command = command_of(context, budget, "--tests", str(_TESTS), "--store", path)
+        if not command or drawn >= _TESTS:
             return advice, ""
-        return f"{advice} If an error would be costly, test the assumptions with eight fresh random tasks:", command
+        return f"{advice} If an error would be costly, test the predictions at {_TESTS} drawn tasks:", command
     if verdict.answer == "falsified":
         largest = quantity(distance_of(context.worst_first[0]), context.labels.units)
         advice = (
@@ -143,8 +160,52 @@ def _remarks(context: ReportContext) -> list[Markup]:
         remarks.append(paragraph(f"The experiment is not loaded: {context.missing}", class_="note"))
     others = [] if context.store.path is None else other_stores(context.store.path)
     if others:
-        count = counted(len(others), "other store")
-        names = [other.name for other in others[:5]]
-        sentence = f"The folder contains {count} of this experiment: {', '.join(names)}. The best result of several "
-        remarks.append(paragraph(f"{sentence}campaigns is wrong more often than its confidence states.", class_="note"))
+        count, first = counted(len(others), "other store"), ", ".join(other.name for other in others[:5])
+        sentence = (
+            f"The folder contains {count} of this experiment: {first}. The best result of several campaigns is wrong "
+            "more often than its confidence states."
+        )
+        remarks.append(paragraph(sentence, class_="note"))
     return remarks
+
+
+def basis(context: ReportContext) -> Markup:
+    """Return what the verdict rests on: the assumptions, the diagnostics and what was not tested."""
+    rests_on = None if context.verdict is None else context.verdict.rests_on
+    return joined(
+        [
+            *([] if context.certificate is None else _assumptions(context.certificate)),
+            *([] if rests_on is None else [paragraph(text(rests_on, UNCUT))]),
+            heading("Diagnostics"),
+            lights(diagnostics(context)),
+            heading("What was not tested"),
+            bullets(not_tested(context)),
+        ]
+    )
+
+
+def shown_insights(context: ReportContext) -> Markup:
+    """Return what the trials show of M, of the controllers and of the tasks."""
+    return lights(insights(context))
+
+
+def _assumptions(certificate: Certificate) -> list[Markup]:
+    rows = ((name.replace("_", " "), as_text(value)) for name, value in certificate.numbers.items())
+    return [
+        heading(f"What the certificate {certificate.kind} assumes"),
+        paragraph(certificate.statement if certificate.doubt is None else f"It is withdrawn: {certificate.doubt}."),
+        bullets(text(f"{words[:1].upper()}{words[1:]}.", UNCUT) for words in certificate.assumptions),
+        details("Numbers of the certificate", table("Numbers of the certificate", ("Name", "Value"), rows)),
+    ]
+
+
+def lights(findings: list[Finding]) -> Markup:
+    """Return findings as a list with their lights: a shape, a colour and a word."""
+    if not findings:
+        return paragraph("Nothing is unusual.")
+    items = []
+    for finding in findings:
+        shape = element("span", _SHAPES[finding.light], class_="shape", aria_hidden="true")
+        word = element("span", shape, " ", WORDS[finding.light], class_=f"light {finding.light}")
+        items.append(element("li", word, " ", element("strong", f"{finding.name}."), " ", finding.text))
+    return element("ul", *items, class_="lights")

@@ -1,0 +1,100 @@
+"""How often is `validated` false on systems that nobody tuned to? Campaigns as a user runs them, until decided.
+
+``python benchmarks/calibrate_strangers.py reporting`` runs what is not stored yet and prints a table by family. Each
+campaign has the default certificate and search, and a threshold of a known share of d*. Rules may be chosen on the
+development half of ``strangers_development.py`` alone.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections import Counter
+from typing import Any
+
+from calibrate import RESULTS, all_of
+from ctxval import Campaign
+from ctxval._util.arrays import single_threaded
+from ctxval._util.json_lines import JsonLines
+from dynamics_truths import digest
+from strangers_development import DEVELOPMENT
+from strangers_reporting import REPORTING
+from strangers_truths import TRUTHS
+
+RULE = 1
+"""Version of the rule by which campaigns are run: eight tests, and tasks beside a test that failed."""
+
+BUDGET, SEEDS = 25, 2
+FALSE, TRUE = (0.8, 0.95, 0.99), (1.1, 1.25, 1.5)
+"""Thresholds as shares of d*: those that must not be validated, and those that should be on regular systems."""
+
+HALVES = {"development": DEVELOPMENT, "reporting": REPORTING}
+ENTRIES = {**DEVELOPMENT, **REPORTING}
+STORED = JsonLines(RESULTS / "strangers.jsonl", ("rule", "entry", "seed", "share"))
+
+
+def decide(run: tuple[str, int, float]) -> dict[str, Any]:
+    """Return what is stored of one campaign that was run until it was decided."""
+    name, seed, share = run
+    started, entry = time.process_time(), ENTRIES[name]
+    largest = TRUTHS[name, seed, digest(entry.make)]["distance"]
+    with single_threaded():
+        campaign = Campaign(entry(seed).validation, seed=seed).run(BUDGET, share * largest)
+        verdict = campaign.verdict(share * largest)
+    return {
+        "rule": RULE,
+        "entry": name,
+        "seed": seed,
+        "share": share,
+        "answer": verdict.answer,
+        "executions": campaign.executions,
+        "origins": [trial.origin for trial in campaign.trials],
+        "largest": max(trial.distance or 0.0 for trial in campaign.trials) / largest,
+        "kind": None if verdict.certificate is None else verdict.certificate.kind,
+        "bound": None if verdict.bound is None else verdict.bound / largest,
+        "reason": verdict.reason[:300],
+        "seconds": round(time.process_time() - started, 1),
+    }
+
+
+def table(half: str) -> str:
+    """Return how many campaigns of each family were validated, of those with thresholds below and above d*."""
+    lines = [
+        "| family | below d*: validated, falsified, undecided | above d*, regular: validated of |",
+        "|---|---|---|",
+    ]
+    of_half = [line for line in STORED.select(rule=RULE) if line["entry"] in HALVES[half]]
+    for family in sorted({entry.family for entry in HALVES[half].values()}):
+        lines.append(_row(family, [line for line in of_half if ENTRIES[line["entry"]].family == family]))
+    return "\n".join([*lines, _row("all", of_half)])
+
+
+def _row(family: str, results: list[dict[str, Any]]) -> str:
+    below = Counter(line["answer"] for line in results if line["share"] < 1)
+    regular = [line["answer"] for line in results if line["share"] > 1 and not ENTRIES[line["entry"]].misleading]
+    counts = ", ".join(str(below[answer]) for answer in ("validated", "falsified", "undecided"))
+    return f"| {family} | {counts} | {regular.count('validated')} of {len(regular)} |"
+
+
+def main() -> None:
+    """Run what is missing, and print the table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("half", choices=HALVES)
+    parser.add_argument("--seeds", type=int, default=SEEDS)
+    parser.add_argument("--shares", nargs="*", type=float, default=[*FALSE, *TRUE])
+    parser.add_argument("--workers", type=int, default=2)
+    options = parser.parse_args()
+    runs = [
+        (name, seed, share)
+        for seed in range(options.seeds)
+        for share in options.shares
+        for name in HALVES[options.half]
+    ]
+    for result in all_of(decide, [run for run in runs if (RULE, *run) not in STORED], options.workers):
+        STORED.append(result)
+        print(*(result[key] for key in ("entry", "seed", "share", "answer", "executions", "seconds")), flush=True)
+    print(table(options.half))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,343 @@
+"""Figures of a campaign. The functions only read results and never execute anything.
+
+A function that draws one plot has the argument ``ax`` and returns the matplotlib axes. By default, these are new axes
+of ``matplotlib.pyplot``, so that notebooks and ``pyplot.show()`` show them. A function that draws several panels
+returns a figure. Names and units are those of the validation, unless the arguments state others. A campaign must have
+at least one distance, and two for a surrogate. If a threshold tau or a bound on d* is given, it is drawn as a line.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+
+from ctxval._util.arrays import Array
+from ctxval._util.files import MADE_BY, written_whole
+from ctxval._util.representation import ShortRepr
+from ctxval.core.labels import labels_of
+from ctxval.core.trajectory import Trajectory
+from ctxval.core.trial import Trial
+from ctxval.core.validation import Validation
+from ctxval.errors import InputError
+from ctxval.gp.surrogate import Surrogate
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+# Okabe and Ito's colours survive colour blindness; the line styles and the markers survive grey print.
+_BLUE, _ORANGE, _BLACK, _GREY = "#0072B2", "#D55E00", "#000000", "#B0B0B0"
+
+
+class Results(Protocol):
+    """The results that a figure reads: a :class:`ctxval.Campaign`, or another object with the same results."""
+
+    @property
+    def validation(self) -> Validation:
+        """The map p -> d(p); only its tasks are read."""
+
+    @property
+    def trials(self) -> Sequence[Trial]:
+        """All trials in the order of asking."""
+
+    @property
+    def completed(self) -> Sequence[Trial]:
+        """The trials with a distance."""
+
+    @property
+    def worst(self) -> Trial | None:
+        """The completed trial with the largest distance."""
+
+    def surrogate(self) -> Surrogate:
+        """Return the Gaussian process of the distance."""
+
+    def trajectories(self, trial: Trial) -> tuple[Trajectory | None, Trajectory | None]:
+        """Return the trajectories of the model and of the system in a trial."""
+
+
+@dataclass(frozen=True, eq=False)
+class Curve(ShortRepr):
+    """A known distance over a one-dimensional task space: points ``(N,)`` in its units and values ``(N,)``."""
+
+    points: Array
+    values: Array
+
+
+def overview(
+    campaign: Results,
+    *,
+    units: str = "",
+    threshold: float | None = None,
+    bound: float | None = None,
+    ax: Axes | None = None,
+) -> Axes:
+    """Draw the most informative single plot of a campaign.
+
+    It is the surrogate if there is one task parameter and two distances are known, and :func:`convergence` otherwise.
+    """
+    if campaign.validation.space.dimension == 1 and len(campaign.completed) >= 2:
+        return surrogate_slice(campaign, units=units, threshold=threshold, bound=bound, ax=ax)
+    return convergence(campaign, units=units, threshold=threshold, bound=bound, ax=ax)
+
+
+def convergence(
+    campaign: Results,
+    *,
+    units: str = "",
+    threshold: float | None = None,
+    bound: float | None = None,
+    ax: Axes | None = None,
+) -> Axes:
+    """Draw the distance of each trial and the largest distance so far, and mark the trials without a distance."""
+    from matplotlib.ticker import MaxNLocator
+
+    _worst(campaign)
+    axes = _axes(ax)
+    numbers, distances = [trial.number for trial in campaign.completed], list(map(_known, campaign.completed))
+    last = len(campaign.trials) - 1
+    so_far = np.maximum.accumulate(distances)
+    axes.step([*numbers, last], [*so_far, so_far[-1]], where="post", color=_BLUE, linewidth=1.8, label="largest so far")
+    _draw_samples(axes, campaign, lambda trial: trial.number)
+    without = [trial.number for trial in campaign.trials if trial.state in ("failed", "unmeasured")]
+    if without:
+        bottom = axes.get_xaxis_transform()
+        axes.plot(without, [0.03] * len(without), "x", color=_ORANGE, transform=bottom, label="no distance is known")
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    axes.set_xlim(-0.3, max(last, 1) + 0.3)
+    axes.set_xlabel("trial")
+    return _finished(axes, campaign, units, threshold, bound)
+
+
+def surrogate_slice(
+    campaign: Results,
+    axis: int = 0,
+    *,
+    truth: Curve | None = None,
+    units: str = "",
+    threshold: float | None = None,
+    bound: float | None = None,
+    ax: Axes | None = None,
+) -> Axes:
+    """Draw the Gaussian process along one task parameter, through the worst executed task, with its 95 % band.
+
+    Args:
+        axis: index of the scalar task parameter, from 0.
+        truth: the true distance, which is drawn if the task space has one dimension.
+    """
+    space = campaign.validation.space
+    if not 0 <= axis < space.dimension:
+        raise InputError(f"axis must be from 0 to {space.dimension - 1}, one of {', '.join(space.names)}, got {axis}.")
+    fitted, worst = campaign.surrogate(), _worst(campaign)
+    axes = _axes(ax)
+    _draw_slice(axes, campaign, fitted, worst, axis, truth)
+    return _finished(axes, campaign, units, threshold, bound)
+
+
+def surrogate(
+    campaign: Results,
+    *,
+    truth: Curve | None = None,
+    units: str = "",
+    threshold: float | None = None,
+    bound: float | None = None,
+) -> Figure:
+    """Draw the Gaussian process over the task space with its 95 % band, the samples and the maximum.
+
+    For one task parameter, the figure shows the complete function and the true distance, if that is given. For several,
+    it shows a slice along each axis through the worst task. This is the converged Gaussian process in the paper's
+    figures.
+    """
+    fitted = campaign.surrogate()
+    worst = _worst(campaign)
+    space = campaign.validation.space
+    columns = min(space.dimension, 4)
+    rows = int(np.ceil(space.dimension / columns))
+    figure = _figure(max(6.4, 3.2 * columns), max(4.0, 2.6 * rows))
+    for axis in range(space.dimension):
+        axes = figure.add_subplot(rows, columns, axis + 1)
+        _draw_slice(axes, campaign, fitted, worst, axis, truth)
+        _draw_limits(axes, threshold, bound)
+        if axis % columns == 0:
+            axes.set_ylabel(_distance_label(campaign, units))
+    figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=3, fontsize=8)
+    return figure
+
+
+def _finished(axes: Axes, campaign: Results, units: str, threshold: float | None, bound: float | None) -> Axes:
+    _draw_limits(axes, threshold, bound)
+    axes.set_ylabel(_distance_label(campaign, units))
+    axes.legend(loc="best", fontsize=8, framealpha=0.9)
+    return axes
+
+
+def _draw_slice(axes: Axes, campaign: Results, fitted: Surrogate, worst: Trial, axis: int, truth: Curve | None) -> None:
+    space = campaign.validation.space
+    unit = np.tile(worst.unit_point, (401, 1))
+    unit[:, axis] = np.linspace(0, 1, len(unit))
+    x = space.from_unit(unit)[:, axis]
+    mean, deviation = fitted.predict(unit)
+    # A distance is never below 0, but the Gaussian process does not know it.
+    low, high = (np.maximum(mean + sign * 1.96 * deviation, 0.0) for sign in (-1, 1))
+    axes.fill_between(x, low, high, color=_GREY, alpha=0.6, linewidth=0, label="95 % band of the GP")
+    axes.plot(x, np.maximum(mean, 0.0), color=_BLUE, linewidth=1.8, label="GP mean")
+    if space.dimension == 1:
+        _draw_samples(axes, campaign, lambda trial: space.from_unit(trial.unit_point)[axis])
+    at = space.from_unit(worst.unit_point)[axis]
+    axes.plot(
+        [at], [_known(worst)], "*", color=_ORANGE, markeredgecolor=_BLACK, markersize=14, label="worst task executed"
+    )
+    if truth is not None and space.dimension == 1:
+        axes.plot(truth.points, truth.values, color=_ORANGE, linestyle="--", linewidth=1.6, label="true distance")
+    axes.set_xlabel(space.labels[axis])
+
+
+def _draw_limits(axes: Axes, threshold: float | None, bound: float | None) -> None:
+    """Draw the threshold and the bound as horizontal lines, which differ in style and not only in colour."""
+    if threshold is not None:
+        axes.axhline(threshold, color=_ORANGE, linestyle="-.", linewidth=1.4, label=f"threshold {threshold:.4g}")
+    if bound is not None:
+        axes.axhline(bound, color=_BLACK, linestyle=":", linewidth=1.6, label="bound on d*")
+
+
+def _draw_samples(axes: Axes, campaign: Results, place: Callable[[Trial], float]) -> None:
+    """Draw the known distances of the trials, with a different marker for each origin."""
+    styles = (
+        ("initial samples", ("iid", "spread", "initial", "manual"), "white"),
+        ("covering samples", ("covering",), _GREY),
+        ("acquired samples", ("acquisition",), _BLACK),
+    )
+    for label, origins, face in styles:
+        trials = [trial for trial in campaign.completed if trial.origin in origins]
+        if trials:
+            x, y = [place(trial) for trial in trials], [_known(trial) for trial in trials]
+            axes.plot(x, y, "o", markersize=5, markerfacecolor=face, markeredgecolor=_BLACK, label=label)
+
+
+def worst_trajectories(campaign: Results, *, states: Sequence[str] = (), inputs: Sequence[str] = ()) -> Figure:
+    """Draw the trajectories of M and of S for the worst executed task, with these axis labels."""
+    worst = _worst(campaign)
+    model, system = campaign.trajectories(worst)
+    if model is None or system is None:
+        raise InputError(f"the trajectories of trial {worst.number} are not in the store.")
+    space = campaign.validation.space
+    reference = campaign.validation.task(space.parameters(space.from_unit(worst.unit_point))).reference
+    named = campaign.validation.names(model.states.shape[-1], model.inputs.shape[-1])
+    own_states, own_inputs = map(labels_of, named)
+    figure = trajectories(model, system, reference=reference, states=states or own_states, inputs=inputs or own_inputs)
+    distance = f"{_known(worst):.4g} {campaign.validation.labels.units}".rstrip()
+    task = ", ".join(
+        f"{name} = [{', '.join(f'{item:.3g}' for item in value)}]"
+        if isinstance(value, list)
+        else f"{name} = {value:.4g}"
+        for name, value in worst.parameters.items()
+    )
+    figure.suptitle(f"worst task executed: {task} (distance {distance})", fontsize=10)
+    return figure
+
+
+def trajectories(
+    model: Trajectory,
+    system: Trajectory,
+    *,
+    reference: Array | None = None,
+    states: Sequence[str] = (),
+    inputs: Sequence[str] = (),
+) -> Figure:
+    """Draw two trajectories of one task over time, one panel for each state and input.
+
+    The reference of the states, ``(H + 1, n)``, is drawn for a state if it is not zero everywhere.
+    """
+    n, m = model.states.shape[-1], model.inputs.shape[-1]
+    names = [
+        *(states[i] if i < len(states) else f"state {i}" for i in range(n)),
+        *(inputs[i] if i < len(inputs) else f"input {i}" for i in range(m)),
+    ]
+    figure = _figure(6.4, 1.0 + 1.7 * len(names))
+    first: Axes | None = None
+    for row, name in enumerate(names):
+        axes = figure.add_subplot(len(names), 1, row + 1, sharex=first)
+        first = axes if first is None else first
+        signal(model, system, row, label=name, reference=reference, ax=axes)
+        axes.set_xlabel("")
+    figure.axes[-1].set_xlabel("time [s]")
+    figure.axes[0].legend(loc="best", fontsize=8, framealpha=0.9)
+    return figure
+
+
+def signal(
+    model: Trajectory,
+    system: Trajectory,
+    component: int,
+    *,
+    label: str = "",
+    reference: Array | None = None,
+    ax: Axes | None = None,
+) -> Axes:
+    """Draw one state or input of two trajectories of one task over time.
+
+    Args:
+        component: index of the state from 0; the inputs follow the n states.
+        label: label of the vertical axis, with the unit.
+        reference: the reference of the states, ``(H + 1, n)``; it is drawn for a state if it is not zero everywhere.
+    """
+    n, m = model.states.shape[-1], model.inputs.shape[-1]
+    if not 0 <= component < n + m:
+        raise InputError(f"component must be from 0 to {n + m - 1}, the {n} states and {m} inputs, got {component}.")
+    axes = _axes(ax)
+    if reference is not None and component < n and reference[:, component].any():
+        axes.plot(model.times, reference[:, component], color=_BLACK, linestyle=":", linewidth=1.2, label="reference")
+    for run, color, style, width, name in (
+        (system, _ORANGE, "-", 1.8, "system S"),
+        (model, _BLUE, "--", 1.6, "model M"),
+    ):
+        values = run.states[:, component] if component < n else run.inputs[:, component - n]
+        axes.plot(run.times[: len(values)], values, style, color=color, linewidth=width, label=name)
+    axes.set_xlabel("time [s]")
+    axes.set_ylabel(label)
+    axes.grid(alpha=0.25)
+    return axes
+
+
+def save(figure: Figure, path: str | Path) -> Path:
+    """Write a figure as PNG or SVG; the suffix of the path decides."""
+    metadata = {"Software" if Path(path).suffix.lower() == ".png" else "Creator": MADE_BY}
+    try:
+        with written_whole(path) as file:
+            figure.savefig(file, dpi=150, format=Path(path).suffix[1:] or "png", metadata=metadata)
+    except ValueError as error:
+        raise InputError(f"the figure {path} cannot be written: {error}.") from error
+    return Path(path)
+
+
+def _figure(width: float, height: float) -> Figure:
+    from matplotlib.figure import Figure  # imported here: loading it takes longer than a short campaign
+
+    return Figure(figsize=(width, height), layout="constrained")
+
+
+def _axes(ax: Axes | None) -> Axes:
+    """Return the given axes, or new ones of pyplot."""
+    if ax is not None:
+        return ax
+    from matplotlib import pyplot
+
+    return pyplot.subplots(layout="constrained")[1]
+
+
+def _distance_label(campaign: Results, units: str) -> str:
+    known = units or campaign.validation.labels.units
+    return f"distance [{known}]" if known else "distance"
+
+
+def _worst(campaign: Results) -> Trial:
+    if campaign.worst is None:
+        raise InputError("there is nothing to draw: no distance is known yet.")
+    return campaign.worst
+
+
+def _known(trial: Trial) -> float:
+    return float("nan") if trial.distance is None else trial.distance

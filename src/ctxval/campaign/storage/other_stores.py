@@ -1,0 +1,60 @@
+"""Search for other stores of the same experiment beside a store.
+
+A verdict that is chosen among several stores is wrong more often than one verdict.
+"""
+
+from __future__ import annotations
+
+import json
+import sqlite3
+from contextlib import closing, suppress
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+from ctxval._util.describe import first_difference
+from ctxval.campaign.storage import schema
+from ctxval.campaign.storage.rows import MOST_CHARACTERS
+
+STORE_SUFFIXES = (".sqlite", ".sqlite3", ".db")
+"""Suffixes of files that are taken for stores."""
+_UNREADABLE = (sqlite3.Error, OSError, ValueError, TypeError, OverflowError, MemoryError, RecursionError)
+
+
+def other_stores(path: Path) -> list[Path]:
+    """Return the other stores in a store's folder with trials of the same validation and model, of any search and seed.
+
+    Nothing is built, run or written. Files that cannot be read are skipped.
+    """
+    others = []
+    with suppress(*_UNREADABLE):
+        validation = _validation_of(path)
+        beside = sorted(file for file in path.absolute().parent.iterdir() if file.suffix in STORE_SUFFIXES)[:500]
+        for file in beside:
+            with suppress(*_UNREADABLE):
+                same = file.is_file() and first_difference(validation, _validation_of(file)) is None
+                if same and file.name != path.name:
+                    others.append(path.with_name(file.name))
+    return others
+
+
+def _validation_of(path: Path) -> dict[str, Any]:
+    """Return a store's description of its validation, and the number that depends on its model."""
+    with path.open("rb") as file:
+        header = file.read(72)  # which ends with the application_id
+    if not header.startswith(b"SQLite format 3\0") or header[-4:] != b"ctxv":
+        raise ValueError(f"{path} is not a store")
+    uri = f"file:{quote(str(path.absolute()))}?mode=ro&immutable=1"  # takes no lock and replays no journal
+    with closing(sqlite3.connect(uri, uri=True, factory=schema.Guarded)) as connection:
+        tables = schema.plain_tables(connection, ("experiment", "trials"))
+        if len(tables) < 2 or not {"key", "value", "executed"} <= set().union(*tables.values()):
+            raise ValueError(f"{path} is not a store")
+        rows = connection.execute(
+            "SELECT key, value FROM experiment WHERE key IN ('validation', 'draws') AND length(value) <= ?",
+            (MOST_CHARACTERS,),
+        ).fetchall()
+        executed = connection.execute("SELECT EXISTS (SELECT 1 FROM trials WHERE executed)").fetchone()[0]
+    experiment = {str(key): json.loads(value) for key, value in rows}
+    if not isinstance(experiment.get("validation"), dict) or not executed:
+        raise ValueError(f"{path} has no executed trials of an experiment")
+    return experiment

@@ -1,0 +1,371 @@
+"""Trials in a SQLite file, which stays intact if the process dies at any moment."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+import os
+from collections.abc import Iterable, Sequence
+from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import Any
+
+from ctxval._util.checked import checked
+from ctxval._util.representation import Shown, call
+from ctxval._util.version import VERSION
+from ctxval.campaign.storage import rows, schema
+from ctxval.campaign.storage.database import Database, now
+from ctxval.campaign.storage.rows import COLUMNS, checksum_of, read_trial, real, row_of
+from ctxval.campaign.storage.trajectories import Side, StoredTrajectories
+from ctxval.core.trajectory import Trajectory
+from ctxval.core.trial import Change, Trial
+from ctxval.errors import CtxvalError, ForeignStoreError, InputError, StoreAccessError, StoreMismatchError
+
+_DRAWS = "draws"
+"""Key in the table experiment that is not part of the description of the experiment."""
+
+_CONTENT = (
+    "SELECT key, value FROM experiment ORDER BY key",
+    "SELECT number, checksum FROM trials ORDER BY number",
+    "SELECT trial, side, checksum FROM trajectories ORDER BY trial, side",
+    "SELECT number, what, why, content FROM history ORDER BY number",
+)
+"""Queries of all that results follow from."""
+
+_ENDED = "state = ?, distance = ?, failure = ?, executed = ?, checksum = ?"
+"""The assignments that take the values of :func:`_ended`."""
+
+
+@checked
+class Store:
+    """A file with the trials of one experiment.
+
+    Every change is one transaction, which is on the disk before the call returns.
+
+    Args:
+        path: the file; it is created if it does not exist. None keeps the trials in memory.
+
+    Raises:
+        StoreAccessError: if the file cannot be opened or written.
+        ForeignStoreError: if the file is not a store, or a store of another version.
+    """
+
+    def __init__(self, path: str | Path | None = None) -> None:
+        self._database = self._opened(path)
+        self._trajectories = StoredTrajectories(self._database)
+        self.path: Path | None = self._database.path
+        """The absolute path of the file; None if the trials are in memory."""
+        self.name = self._database.name
+        """The name of the store in messages."""
+
+    def _opened(self, path: str | Path | None) -> Database:
+        return Database(path)
+
+    @classmethod
+    def existing(cls, path: str | Path) -> Store:
+        """Open a store that must exist already.
+
+        Raises:
+            StoreAccessError: if there is no such file, or it cannot be read.
+            ForeignStoreError: if the file is not a store, or a store of another version.
+        """
+        schema.require_files(Path(path))
+        if not os.path.exists(path):
+            raise StoreAccessError(f"there is no store at {path}.")
+        if not os.access(path, os.R_OK):
+            raise StoreAccessError(f"{path} cannot be read as a store: you do not have permission to read it.")
+        if not os.path.getsize(path):
+            raise ForeignStoreError(f"{path} is an empty file, not a store.")
+        return cls(path)
+
+    def close(self) -> None:
+        """Close the file."""
+        self._database.close()
+
+    def sole_writer(self, wait: float = 0.0) -> AbstractContextManager[None]:
+        """Prevent other processes from running this store. The lock is released when the process ends, however it ends.
+
+        Args:
+            wait: seconds to wait for another process that is about to end.
+
+        Raises:
+            StoreAccessError: if another process is running the store.
+        """
+        return self._database.sole_writer(wait)
+
+    def snapshot(self) -> AbstractContextManager[None]:
+        """Make all reads inside see the store at one moment. Keep them short: other processes wait to write."""
+        return self._database.snapshot()
+
+    # The experiment
+
+    def describe_first(self, description: dict[str, Any]) -> dict[str, Any]:
+        """Store the description of the experiment if there is none yet; return the stored description."""
+        with self._database.transaction():
+            if not self.description():
+                self._write_description(description)
+            return self.description()
+
+    def describe_anew(self, description: dict[str, Any], change: Change) -> None:
+        """Replace the description of the experiment, and record in the history what has changed and why."""
+        with self._database.transaction():
+            self._write_description(description)
+            self._insert_change(change)
+
+    def _write_description(self, description: dict[str, Any]) -> None:
+        self._database.execute("DELETE FROM experiment WHERE key != ?", (_DRAWS,))
+        self._insert_pairs("experiment", description)
+
+    def description(self) -> dict[str, Any]:
+        """Return the stored description of the experiment; empty in a new store."""
+        return {key: value for key, value in self._pairs("experiment").items() if key != _DRAWS}
+
+    def draws(self) -> int | None:
+        """Return the number that seeds independent draws together with the seed. Returns None if none is stored."""
+        kept = self._pairs("experiment").get(_DRAWS)
+        return kept if isinstance(kept, int) else None
+
+    def keep_draws(self, number: int) -> None:
+        """Store the number that seeds independent draws; a number that is stored already stays."""
+        with self._database.transaction():
+            self._database.execute("INSERT OR IGNORE INTO experiment VALUES (?, ?)", (_DRAWS, json.dumps(number)))
+
+    def keep_settings(self, settings: dict[str, Any]) -> None:
+        """Store the settings that make the experiment again, for commands that get only the store."""
+        if self.settings() == json.loads(json.dumps(settings)):
+            return
+        with self._database.transaction():
+            self._database.execute("DELETE FROM settings")
+            self._insert_pairs("settings", settings)
+
+    def settings(self) -> dict[str, Any]:
+        """Return the settings that make the experiment again; empty if no command made the store."""
+        return self._pairs("settings")
+
+    def _insert_pairs(self, table: str, pairs: dict[str, Any]) -> None:
+        for pair in pairs.items():
+            self._database.execute(f"INSERT INTO {table} VALUES (?, ?)", rows.pair_of(*pair))
+
+    def _pairs(self, table: str) -> dict[str, Any]:
+        bounded = (f"CASE WHEN length({cell}) <= {rows.MOST_CHARACTERS} THEN {cell} END" for cell in ("key", "value"))
+        with self._database.rows(f"SELECT {', '.join(bounded)} FROM {table} ORDER BY rowid") as found:
+            try:
+                return rows.read_pairs(found)
+            except InputError as error:
+                raise self._database.damaged(f"the {table} in it cannot be read") from error
+
+    # The history
+
+    def history(self) -> list[Change]:
+        """Return the later changes of the store in order, each with its reason."""
+        with self._database.rows("SELECT what, why, content, at FROM history ORDER BY number") as found:
+            try:
+                return [Change(str(what), str(why), rows.read_json(text), str(at)) for what, why, text, at in found]
+            except InputError as error:
+                raise self._database.damaged("its history cannot be read") from error
+
+    def _insert_change(self, change: Change) -> None:
+        self._database.execute(
+            "INSERT INTO history (at, what, why, content) VALUES (?, ?, ?, ?)",
+            (now(), change.what, change.why, json.dumps(change.content)),
+        )
+
+    def remeasure(
+        self, trials: Sequence[Trial], description: dict[str, Any], change: Change, seen: tuple[int, int, int]
+    ) -> bool:
+        """Store trials with new distances, and the description of the new distance, in one transaction.
+
+        Returns False, and stores nothing, if the :meth:`signature` of the store is not the one that was seen when the
+        trials were read. The change, for the history, has the previous distances.
+        """
+        with self._database.transaction():
+            if self.signature() != seen:
+                return False
+            for trial in trials:
+                self._database.execute(f"UPDATE trials SET {_ENDED} WHERE number = ?", (*_ended(trial), trial.number))
+            self._write_description(description)
+            self._insert_change(change)
+        return True
+
+    def _require_unchanged(self, changes: int | None) -> None:
+        """Check that the experiment of the store has not changed since a campaign opened it."""
+        if changes is not None and self.signature()[2] != changes:
+            raise StoreMismatchError(
+                f"{self.name} has changed since the campaign was opened, by remeasure or by accept_change; open the "
+                "campaign again with the present experiment."
+            )
+
+    # Trials
+
+    def open_trial(self, trial: Trial, model_trajectory: Trajectory, *, changes: int | None = None) -> None:
+        """Store a new trial with its model trajectory, before its execution starts."""
+        with self._database.transaction():
+            self._require_unchanged(changes)
+            self._insert(trial)
+            self._trajectories.write(trial.number, "model", model_trajectory)
+
+    def record_failed_plan(self, trial: Trial, *, changes: int | None = None) -> None:
+        """Store a new trial that failed before an execution of S."""
+        with self._database.transaction():
+            self._require_unchanged(changes)
+            self._insert(trial)
+
+    def record_known(
+        self, ended: Iterable[tuple[Trial, Trajectory, Trajectory | None]], *, changes: int | None = None
+    ) -> None:
+        """Store new trials that have ended already, with the trajectories of model and system, in one transaction."""
+        with self._database.transaction():
+            self._require_unchanged(changes)
+            for trial, model_trajectory, system_trajectory in ended:
+                self._insert(trial)
+                self._trajectories.write(trial.number, "model", model_trajectory)
+                if system_trajectory is not None:
+                    self._trajectories.write(trial.number, "system", system_trajectory)
+
+    def _insert(self, trial: Trial) -> None:
+        row = row_of(trial)
+        closed_at = None if trial.state == "open" else now()
+        places = ", ".join("?" * (len(row) + 3))
+        self._database.execute(
+            f"INSERT INTO trials ({COLUMNS}, checksum, opened_at, closed_at) VALUES ({places})",
+            (*row, checksum_of(row), now(), closed_at),
+        )
+
+    def begin_attempt(self, trial: Trial, *, changes: int | None = None) -> None:
+        """Record one more attempt, which the trial counts, before the execution starts.
+
+        Raises:
+            StoreMismatchError: if the store has another number of changes than ``changes``; None skips the check.
+        """
+        with self._database.transaction():
+            self._require_unchanged(changes)
+            changed = self._database.execute(
+                "UPDATE trials SET attempts = ?, checksum = ? WHERE number = ? AND state = 'open'",
+                (trial.attempts, checksum_of(row_of(trial)), trial.number),
+            ).rowcount
+            if changed != 1:
+                raise self._not_open(trial.number)
+
+    def close_trial(self, trial: Trial, system_trajectory: Trajectory | None, *, changes: int | None = None) -> None:
+        """Store the result of an open trial; of two results for one trial, the first is stored.
+
+        Raises:
+            StoreMismatchError: if the store has another number of changes than ``changes``.
+        """
+        with self._database.transaction():
+            self._require_unchanged(changes)
+            changed = self._database.execute(
+                f"UPDATE trials SET {_ENDED}, seconds = ?, closed_at = ? "
+                "WHERE number = ? AND state = 'open' AND attempts = ?",
+                (*_ended(trial), real(trial.seconds), now(), trial.number, trial.attempts),
+            ).rowcount
+            if changed != 1:
+                raise self._not_open(trial.number)
+            if system_trajectory is not None:
+                self._trajectories.write(trial.number, "system", system_trajectory)
+
+    def replace_result(
+        self, before: Trial, after: Trial, trajectory: Trajectory | None, why: str, *, changes: int | None = None
+    ) -> None:
+        """Replace the result of a trial; the history keeps the earlier one, with its trajectory as NPZ in base 64.
+
+        Raises:
+            StoreMismatchError: if the store has another number of changes than ``changes``.
+        """
+        executed = self.trajectory(before.number, "system")
+        npz = None if executed is None else base64.b64encode(executed.to_npz()).decode()
+        result = {"state": before.state, "distance": before.distance, "failure": before.failure, "npz": npz}
+        with self._database.transaction():
+            self._require_unchanged(changes)
+            self._database.execute(
+                f"UPDATE trials SET {_ENDED}, closed_at = ? WHERE number = ?",
+                (*_ended(after), now(), after.number),
+            )
+            self._trajectories.remove(after.number, "system")
+            if trajectory is not None:
+                self._trajectories.write(after.number, "system", trajectory)
+            self._insert_change(Change("replaced", why, {"before": {str(before.number): result}}))
+
+    def _not_open(self, number: int) -> InputError:
+        row = self._database.execute("SELECT state FROM trials WHERE number = ?", (number,)).fetchone()
+        state = "not open" if row is None else "being executed by another process" if row[0] == "open" else row[0]
+        return InputError(f"trial {number} is {state}, so nothing more can be told of it.")
+
+    def trials(self) -> list[Trial]:
+        """Return all trials in their order. Raises a :class:`ForeignStoreError` if one is damaged."""
+        trials: list[Trial] = []
+        with self._database.rows(f"SELECT {COLUMNS}, checksum FROM trials ORDER BY number") as cursor:
+            for *row, checksum in cursor:
+                trial = read_trial(tuple(row), checksum)
+                if trial is None or not rows.follows(trial, trials):
+                    raise self._database.damaged(f"its trial {len(trials)} cannot be read")
+                trials.append(trial)
+        return trials
+
+    def signature(self) -> tuple[int, int, int]:
+        """Return the numbers of trials, of open trials and of changes, to notice what another process has changed."""
+        with self._database.translated_errors():
+            row = self._database.execute(
+                "SELECT count(*), coalesce(sum(state = 'open'), 0), (SELECT count(*) FROM history) FROM trials"
+            ).fetchone()
+        return int(row[0]), int(row[1]), int(row[2])
+
+    def digest(self) -> str:
+        """Return a digest of all that results follow from: trials, trajectories, the experiment, and this version."""
+        digest = hashlib.sha256(VERSION.encode())
+        with self._database.snapshot():
+            for query in _CONTENT:
+                with self._database.rows(query) as content:
+                    for row in content:
+                        digest.update(repr(row).encode())
+        return digest.hexdigest()
+
+    def computed(self, key: str) -> Any:
+        """Return what was computed from the present content and kept under a key; None if nothing was."""
+        query = f"SELECT value, digest FROM computed WHERE key = ? AND length(value) <= {rows.MOST_CHARACTERS}"
+        with self._database.translated_errors():
+            row = self._database.execute(query, (key,)).fetchone()
+        try:
+            return rows.read_json(row[0], finite=False) if row is not None and row[1] == self.digest() else None
+        except InputError:
+            return None  # it can be computed again
+
+    def keep_computed(self, key: str, value: Any, digest: str) -> None:
+        """Keep what was computed from the content with a digest, and forget what other content gave."""
+        with self._database.transaction():
+            self._database.execute("DELETE FROM computed WHERE digest != ?", (digest,))
+            key, text = rows.pair_of(key, value)
+            self._database.execute("INSERT OR REPLACE INTO computed VALUES (?, ?, ?)", (key, digest, text))
+
+    def trajectory(self, number: int, side: Side) -> Trajectory | None:
+        """Return a stored trajectory of a trial, whose arrays may be changed. Returns None if there is none.
+
+        Raises:
+            ForeignStoreError: if the trajectory is damaged.
+        """
+        trajectory = self.trajectories([number], side).get(number)
+        # Some distances change the arrays that they are given.
+        return None if trajectory is None else trajectory.copy()
+
+    def trajectories(self, numbers: Iterable[int], side: Side) -> dict[int, Trajectory]:
+        """Return stored trajectories by the numbers of their trials; a trial without one is left out.
+
+        Those of the system are kept in memory, up to 512 MiB, so that they are read once. Their arrays are read-only.
+
+        Raises:
+            ForeignStoreError: if a trajectory is damaged.
+        """
+        return self._trajectories.read(numbers, side)
+
+    def __repr__(self) -> str:
+        place = Shown("in memory") if self.path is None else self.path
+        try:
+            trials, waiting, _ = self.signature()
+        except CtxvalError:
+            return call(self, place, Shown("cannot be read"))
+        return call(self, place, trials=trials, open=waiting)
+
+
+def _ended(trial: Trial) -> tuple[Any, ...]:
+    return (trial.state, real(trial.distance), trial.failure, int(trial.executed), checksum_of(row_of(trial)))

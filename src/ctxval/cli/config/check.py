@@ -1,0 +1,330 @@
+"""Checks that the parts of an experiment fit together; the system is executed only on request."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from ctxval._util.arrays import Array
+from ctxval._util.progress import stage
+from ctxval._util.texts import reason_of
+from ctxval.campaign.costs import ThinkingCosts
+from ctxval.certificates.bounds import of_tasks
+from ctxval.core.controller import converged_of
+from ctxval.core.experiment import Experiment, mixed_units_sentence
+from ctxval.core.labels import labels_of, names_of
+from ctxval.core.plan import Plan
+from ctxval.core.soundness import MISSED, SATURATED, goal_misses
+from ctxval.core.task import Task
+from ctxval.core.trajectory import Trajectory
+from ctxval.core.validation import Validation
+from ctxval.errors import ConformanceError, CtxvalError
+from ctxval.studies.aspect1 import Aspect1Report
+from ctxval.testing import check_distance, check_model, check_synthesizer
+
+FindingState = Literal["ok", "noted", "failed", "skipped"]
+Findings = Iterator[tuple[FindingState, str]]
+
+
+@dataclass(frozen=True)
+class Checked:
+    """The result of one check: a sentence, and whether it is ok, failed, not made, or to be read by the user."""
+
+    check: str
+    state: FindingState
+    text: str
+
+
+def check_experiment(experiment: Experiment, *, execute: bool = False, seed: int = 0) -> list[Checked]:
+    """Check that the parts of an experiment fit together."""
+    validation = experiment.validation
+    plans: list[Plan] = []
+    findings = [*_checked("space", lambda: _space(validation))]
+    findings += _checked("tasks", lambda: _tasks(validation, seed, plans))
+    if not plans:
+        return findings
+    counts = {
+        "states": plans[0].model_trajectory.states.shape[-1],
+        "inputs": plans[0].model_trajectory.inputs.shape[-1],
+    }
+    checks: dict[str, Callable[[], Findings]] = {
+        "controller on the model": lambda: _goals(validation, plans),
+        "convergence of the designs": lambda: _convergence_of(validation, plans),
+        "names": lambda: _names(experiment, counts),
+        "system": lambda: _system(validation, plans[0], counts),
+        "model": lambda: _model(validation, counts),
+        "batches": lambda: _batches(validation, plans),
+        "distance": lambda: _distance(experiment, plans),
+        "execution": lambda: _executions(validation, plans[1], execute),
+        "cost": lambda: _cost(validation, plans),
+    }
+    for name, check in checks.items():
+        findings += _checked(name, check)
+    return findings
+
+
+def _checked(name: str, check: Callable[[], Findings]) -> Iterator[Checked]:
+    try:
+        for state, text in check():
+            yield Checked(name, state, text)
+    except Exception as error:  # a user's own part may raise anything
+        yield Checked(name, "failed", str(error) if isinstance(error, CtxvalError) else reason_of(error))
+
+
+def _space(validation: Validation) -> Findings:
+    space = validation.space
+    without = [name for name, label in zip(space.names, space.labels, strict=True) if name == label]
+    missing = f"; no unit for {', '.join(without)}" if without else ""
+    text = f"{space.dimension} task parameters: {', '.join(space.labels)}{missing}"
+    yield "noted" if without else "ok", text
+
+
+def _tasks(validation: Validation, seed: int, plans: list[Plan]) -> Findings:
+    """Plan the lowest, the middle, the highest and eight random tasks."""
+    space = validation.space
+    corners = np.stack([space.low, 0.5 * (space.low + space.high), space.high])
+    points = np.concatenate([corners, space.iid(8, np.random.default_rng(seed))])
+    plans.extend([validation.plan(point) for point in points])
+    task, on_model = plans[0].task, plans[0].model_trajectory
+    sizes = f"{on_model.states.shape[-1]} states, {on_model.inputs.shape[-1]} inputs"
+    yield "ok", f"{len(plans)} tasks planned: {sizes}, {task.horizon} steps of {task.dt:g} s"
+
+
+def _goals(validation: Validation, plans: Sequence[Plan]) -> Findings:
+    """State how far M ends from its goals: in the worst state if it is known which are to reach them, or in all."""
+    if not plans[0].task.has_goal:
+        return
+    on_model, goals = [plan.model_trajectory for plan in plans], [plan.task.goal for plan in plans]
+    missed = goal_misses(validation, on_model, goals)
+    if missed is None:
+        errors = [np.abs(run.final_state - goal).sum() for run, goal in zip(on_model, goals, strict=True)]
+        starts = [np.abs(plan.task.initial_state - plan.task.goal).sum() for plan in plans]
+        row, reached = int(np.argmax(errors)), max(errors) <= MISSED * max(starts)
+        how = f"{errors[row]:.3g} from the goal (1-norm of the states)"
+    else:
+        (row, column), reached = missed.worst, not missed.missed.any()
+        names = labels_of(validation.names(on_model[0].states.shape[-1], on_model[0].inputs.shape[-1])[0])
+        how = f"{missed.misses[row, column]:.3g} from the goal in {names[int(missed.states[column])]}"
+    text = f"ends at most {how}, at {task_text(validation.space.describe_point(plans[row].parameters.points))}"
+    if not reached:
+        text += "; a controller that fails on the model itself cannot be expected to work on the system: see --aspect1"
+    yield "ok" if reached else "noted", text
+
+
+def _convergence_of(validation: Validation, plans: Sequence[Plan]) -> Findings:
+    known = [(plan, converged) for plan in plans if (converged := converged_of(plan.controller)) is not None]
+    failed = [validation.space.describe_point(plan.parameters.points) for plan, converged in known if not converged]
+    if known:
+        yield from _convergence(failed, len(known))
+
+
+def _convergence(failed: Sequence[dict[str, Any]], designs: int) -> Findings:
+    """State how many designs converged."""
+    if not designs:
+        yield "skipped", "the controllers do not tell whether they converged"
+    elif not failed:
+        yield "ok", f"all {designs} designs converged"
+    else:
+        examples = "; ".join(map(task_text, failed[:3]))
+        yield "noted", f"{len(failed)} of {designs} designs did not converge, such as {examples}"
+
+
+def task_text(parameters: dict[str, Any]) -> str:
+    """Return the parameters of a task as a text."""
+
+    def number(value: Any) -> str:
+        return f"[{', '.join(map(number, value))}]" if isinstance(value, list) else f"{value:.4g}"
+
+    return ", ".join(f"{name} = {number(value)}" for name, value in parameters.items())
+
+
+def _names(experiment: Experiment, counts: Mapping[str, int]) -> Findings:
+    for kind, labels in (("states", experiment.states), ("inputs", experiment.inputs)):
+        if labels and len(labels) != counts[kind]:
+            names = f"the number of names is {len(labels)}: {', '.join(labels)}"
+            yield "failed", f"there are {counts[kind]} {kind}, but {names}"
+    for kind, named in zip(counts, experiment.names(*counts.values()), strict=True):
+        bare = [name for name, unit in named.items() if not unit]
+        missing = f"; no unit for {', '.join(bare)}" if bare else ""
+        yield "noted" if bare else "ok", f"{kind}: {', '.join(labels_of(named)) or 'none'}{missing}"
+    if not experiment.units:
+        yield "noted", "the distance has no units"
+
+
+def _system(validation: Validation, plan: Plan, counts: Mapping[str, int]) -> Findings:
+    """Compare the time step, the states and the inputs of the system with those of the task and the model."""
+    system, task = validation.system, plan.task
+    dt = getattr(system, "dt", None)
+    if isinstance(dt, int | float) and not np.isclose(dt, task.dt, rtol=1e-9, atol=0):
+        yield "failed", f"the time step of the system is {dt:g} s, that of the task is {task.dt:g} s"
+    for kind, count in counts.items():
+        own = names_of(system, kind)
+        if own and len(own) != count:
+            yield "failed", f"the system has {len(own)} {kind}, the model has {count}: {', '.join(own)}"
+
+
+def _model(validation: Validation, counts: Mapping[str, int]) -> Findings:
+    try:
+        check_model(validation.model, **counts)
+        yield "ok", "batches and single states give the same; the Jacobian, if there is one, is the derivative"
+    except ConformanceError:
+        check_model(validation.model, **counts, tolerance=1e-5)
+        yield "noted", "its results for batches and single states agree only to single precision"
+
+
+def _batches(validation: Validation, plans: Sequence[Plan]) -> Findings:
+    points = np.stack([plan.parameters.points for plan in plans])
+    try:
+        batch = validation.task(validation.space.parameters(points))
+        same = isinstance(batch, Task) and batch.batch_shape == (len(points),)
+    except Exception:
+        same = False
+    if not same:
+        yield "noted", "the task function takes one point at a time, so --truth is slower"
+        return
+    for index, plan in enumerate(plans):
+        row = batch[index]
+        if _differ(row.reference, plan.task.reference) or _differ(row.initial_state, plan.task.initial_state):
+            yield "failed", f"task {index} of a batch differs from the same task alone: check the task function"
+            return
+    few = Task(batch.initial_state[:4], horizon=batch.horizon, dt=batch.dt, reference=batch.reference[:4])
+    check_synthesizer(validation.synthesizer, few, validation.model)
+    yield "ok", "task function and synthesizer give the same results in a batch as alone"
+
+
+def _differ(values: Array, alone: Array) -> bool:
+    """Return whether two arrays differ by more than rounding: algebra of a batch sums in another order."""
+    most = 1e-12 * np.abs(alone).max(initial=0)
+    return values.shape != alone.shape or not np.allclose(values, alone, rtol=0, atol=most)
+
+
+def _distance(experiment: Experiment, plans: Sequence[Plan]) -> Findings:
+    validation, trajectories = experiment.validation, [plan.model_trajectory for plan in plans]
+    if experiment.mixed_units:
+        yield "noted", mixed_units_sentence(experiment.mixed_units).removesuffix(".")
+    states, inputs = (np.stack([getattr(run, name) for run in trajectories]) for name in ("states", "inputs"))
+    model, shifted = (Trajectory(trajectories[0].times, states + shift, inputs) for shift in (0.0, 0.01))
+    tasks = [plan.task for plan in plans]
+    starts, references = (np.stack([getattr(task, name) for task in tasks]) for name in ("initial_state", "reference"))
+    task = Task(starts, horizon=tasks[0].horizon, dt=tasks[0].dt, reference=references)
+    try:
+        check_distance(validation.distance, model, shifted, task)
+        yield "ok", "finite, not negative, and the same in a batch as alone"
+    except Exception:
+        for plan in plans:
+            validation.measure(plan, plan.model_trajectory)
+        yield "noted", "the distance takes one task at a time, so --truth is slower"
+    largest = max(validation.measure(plan, plan.model_trajectory) for plan in plans)
+    if largest > 0:
+        yield "noted", f"the distance between a trajectory and itself is up to {largest:.3g}, not 0"
+
+
+def _executions(validation: Validation, plan: Plan, execute: bool) -> Findings:
+    """Execute one task twice, and check the initial state and the repeatability."""
+    if getattr(validation.system, "manual", False):
+        yield "skipped", "people execute this system: see `ctxval ask`"
+        return
+    if not execute:
+        yield "skipped", "give --execute to execute one task twice"
+        return
+    first, second = validation.execute(plan), validation.execute(plan)
+    for trajectory in (first, second):
+        gap = float(np.abs(trajectory.states[0] - plan.task.initial_state).max())
+        if gap > 1e-6:
+            yield "failed", f"the execution starts {gap:.3g} away from the initial state of the task"
+    noise = float(np.abs(first.states - second.states).max())
+    one, other = validation.measure(plan, first), validation.measure(plan, second)
+    if noise == 0:
+        yield "ok", f"two executions of one task are the same; the distance is {one:.4g}"
+        return
+    yield (
+        "noted",
+        f"two executions of one task differ by up to {noise:.3g} in a state and {abs(one - other):.3g} in the "
+        "distance: the system is stochastic; give --stochastic, or stochastic = true in [certificate]",
+    )
+
+
+def _cost(validation: Validation, plans: Sequence[Plan]) -> Findings:
+    """State what designs, closed loops on M and a suggestion of ``auto`` cost in CPU time."""
+    with stage("measuring what a suggestion costs"):
+        thinking = ThinkingCosts.measured(validation, [plan.parameters.points for plan in plans[:3]])
+    text = f"a design takes {thinking.design:.2g} s of CPU, a closed loop on the model {thinking.closed_loop:.2g} s"
+    if thinking.choice is not None:
+        text += f"; the choice of a task takes about {thinking.choice:.2g} s, and the verdict {thinking.verdict:.2g} s"
+    if thinking.suggestion is not None:
+        text += (
+            f"; with --explore, a suggestion takes about {thinking.suggestion:.2g} s if it thinks thoroughly "
+            f"({thinking.designs} designs) and {thinking.fast:.2g} s if it thinks fast"
+        )
+    # Seconds for a suggestion that the user should know of.
+    yield "noted" if max(thinking.choice or 0.0, thinking.suggestion or 0.0) >= 30.0 else "ok", text
+
+
+# Aspect 1
+
+
+def aspect1_findings(report: Aspect1Report) -> list[Checked]:
+    """Return what simulations of M show of its tasks and controllers, as sentences."""
+    checks: dict[str, Callable[[], Findings]] = {
+        "tasks on the model": lambda: _completion(report),
+        "neighbouring tasks": lambda: _flips(report),
+        "limits of the inputs": lambda: _saturated(report),
+        "convergence of the designs": lambda: _convergence(report.not_converged, report.designs),
+    }
+    return [finding for name, check in checks.items() for finding in _checked(name, check)]
+
+
+def _completion(report: Aspect1Report) -> Findings:
+    count, worst = len(report.simulated), report.worst
+    at = task_text(worst.parameters)
+
+    def number(value: float | None) -> str:
+        return f"{value:.4g} {report.units}".rstrip()
+
+    if report.failed:
+        loops = f"M has no closed loop in {len(report.failed)} of {count} tasks"
+        yield "failed", f"{loops}, for example at {at}: {worst.reason}"
+        return
+    ends = f"the worst of {count} tasks is {at}, with an error of {number(worst.error)}"
+    if report.threshold is None:
+        yield "noted", f"{ends}; give a threshold to judge it"
+    elif report.exceeding:
+        limit = number(report.threshold)
+        yield "failed", f"M does not complete {report.exceeding} of {count} tasks within {limit}: {ends}"
+    else:
+        bound = None if report.verdict is None else report.verdict.bound
+        held = f"; the error over all tasks is at most {number(bound)}" if bound is not None else ""
+        tasks = "of all tasks" if report.distribution is None else of_tasks(report.distribution)
+        share = f"; with confidence 0.95 it does not complete at most {100 * (report.share or 0):.3g} % {tasks}"
+        yield "ok", f"M completes all of them: {ends}{share}{held}"
+
+
+def _flips(report: Aspect1Report) -> Findings:
+    flips = report.flips
+    if flips is None or report.flipped is None:
+        return
+    largest = f"{100 * flips.largest:.3g} % of the range of the inputs"
+    if not flips.flipped:
+        yield "ok", f"the inputs on M of {flips.pairs} pairs of neighbouring tasks differ by at most {largest}"
+        return
+    pairs = f"{flips.flipped} of {flips.pairs} pairs of neighbouring tasks"
+    between = " and ".join(map(task_text, report.flipped))
+    yield (
+        "noted",
+        f"{pairs} have controllers that differ abruptly, such as {between}, whose inputs on M differ by {largest}",
+    )
+
+
+def _saturated(report: Aspect1Report) -> Findings:
+    if report.saturation is None:
+        return
+    at_limit = dict(zip(report.inputs, report.saturation.shares.tolist(), strict=True))
+    named = [f"{name} in {100 * share:.3g} %" for name, share in at_limit.items() if share >= SATURATED]
+    how = "" if report.saturation.known else "; the synthesizer states no limits, so repeated extreme values count"
+    if named:
+        yield "noted", f"at a limit: {', '.join(named)} of the steps on M{how}"
+    else:
+        yield "ok", "the inputs stay off their limits on M"

@@ -1,0 +1,309 @@
+"""The parts of an experiment, made from the tables of an experiment file.
+
+A table names a part of a registry, or ``module:attr``. Only the latter, and parts of installed packages, are code.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, get_args, get_origin, get_type_hints
+
+from pydantic import ConfigDict, TypeAdapter, ValidationError
+from pydantic.errors import PydanticUserError
+from pydantic_core import SchemaError
+
+from ctxval import cases, controllers, distances, models, systems
+from ctxval._util.files import read_bytes
+from ctxval._util.npz import Archive
+from ctxval._util.registry import Declaration, Registry, construct, declaration_of
+from ctxval._util.texts import reason_of
+from ctxval.cli.config.references import accepts, is_function, reference, require_function, require_part
+from ctxval.core.experiment import Experiment
+from ctxval.core.model import Model
+from ctxval.core.space import Parameters, TaskSpace
+from ctxval.core.task import Task
+from ctxval.core.task_distribution import Normal
+from ctxval.core.trajectory import Transitions
+from ctxval.core.validation import Validation
+from ctxval.data import LogMapping, read_recordings
+from ctxval.errors import CtxvalError, InputError, ShapeError, UnknownNameError
+from ctxval.models.saved import stored_transitions
+
+REGISTRIES: dict[str, Registry[Any]] = {
+    registry.kind: registry
+    for registry in (systems.REGISTRY, models.REGISTRY, controllers.REGISTRY, distances.REGISTRY)
+}
+"""Where the parts that an experiment file describes are found, by the name of their table."""
+
+
+def part(kind: str, given: str | Mapping[str, Any], folder: Path | None = None) -> Any:
+    """Return a system, model, synthesizer or distance."""
+    registry = REGISTRIES[kind]
+    table = {"type": given} if isinstance(given, str) else dict(given)
+    name = table.pop("type", None)
+    if not isinstance(name, str):
+        raise InputError(f"[{kind}] needs a type, such as {registry.built_in[0]!r} or 'module:attr'.")
+    what = f"the {kind} {name}"
+    if ":" in name:
+        arguments = {key: argument(value, folder) for key, value in table.items()}
+        return _referenced(registry, what, reference(name, folder), arguments, folder)
+    build = registry.find(name)
+    declared = declaration_of(build) or Declaration(name)
+    placed = dict(table)
+    if folder is not None and declared.folder is not None:
+        placed[declared.folder] = str(folder / str(table.get(declared.folder, "")))
+    for key in declared.files if folder is not None else ():
+        file = table.get(key)
+        if isinstance(file, str) and "<" not in file:  # "<" begins a MuJoCo model that is given as text
+            placed[key] = str(Path(folder or "") / file)
+    arguments = {key: argument(value, folder) for key, value in placed.items()}
+    for key, value in arguments.items():
+        if key in declared.functions and isinstance(table[key], Mapping) and not isinstance(value, Model):
+            require_function(f"{key} of {what}", value, declared.functions[key])
+    return registry.require_made(name, _built(kind, what, build, arguments, folder))
+
+
+def _referenced(registry: Registry[Any], what: str, found: Any, arguments: dict[str, Any], folder: Path | None) -> Any:
+    """Return the part that a reference names, or that the named class or function makes.
+
+    The class or function is checked before it is called.
+    """
+    # A model or a distance may be a function itself, rather than a function that makes one.
+    count = {"model": 2, "distance": 3}.get(registry.kind)
+    makes = inspect.isfunction(found) and (bool(arguments) or count is None or not accepts(found, count))
+    if isinstance(found, type) or (makes and not arguments and not accepts(found, 0)):
+        require_part(registry, what, found)  # raises an error with the reason
+    if isinstance(found, type) or makes:
+        found = _built(registry.kind, what, found, arguments, folder)
+    elif arguments:
+        raise InputError(f"{what} is an object already, so it takes no arguments, got {', '.join(arguments)}.")
+    return require_part(registry, what, found)
+
+
+def _built(kind: str, what: str, build: Any, arguments: dict[str, Any], folder: Path | None) -> Any:
+    if kind == "model" and "data" in arguments and (hasattr(build, "fit") or declaration_of(build) is not None):
+        # A part that cannot be learned here, such as a network, keeps the data, so that searches begin with them.
+        build, arguments = getattr(build, "fit", build), {**arguments, "data": recorded(arguments["data"], folder)}
+    return construct(what, build, arguments)
+
+
+def argument(value: Any, folder: Path | None = None) -> Any:
+    """Return an argument unchanged, or the object that ``{ref = "module:attr"}`` names."""
+    if isinstance(value, Mapping):
+        if set(value) == {"ref"}:
+            found = reference(str(value["ref"]), folder)
+            if inspect.ismodule(found) or (inspect.isroutine(found) and not inspect.isfunction(found)):
+                raise InputError(
+                    f"{value['ref']} must be an object, a class or a function written in Python, got {found!r}."
+                )
+            return found
+        return {key: argument(item, folder) for key, item in value.items()}
+    return value
+
+
+def recorded(files: Any, folder: Path | None = None) -> Transitions:
+    """Return the transitions in recorded trajectories, in logs, or in an NPZ file with x, u and x_next."""
+    mapping = None
+    if isinstance(files, Mapping):
+        mapping = LogMapping.from_table({key: value for key, value in files.items() if key != "logs"})
+        files = files.get("logs")
+    paths = [files] if isinstance(files, str) else files
+    if not isinstance(paths, list) or not paths or not all(isinstance(path, str) for path in paths):
+        raise InputError(f"data must be a file of recorded trajectories or a list of files, got {files!r}.")
+    parts, logs = list[Transitions](), dict[str, list[Path]]()
+    for path in (Path(folder or "", path) for path in paths):
+        stored = None if mapping is not None or path.suffix != ".npz" else _transitions(path)
+        if stored is not None:
+            parts.append(stored)
+        else:  # arrays in NPZ files have other names than columns
+            logs.setdefault("" if mapping is not None else path.suffix, []).append(path)
+    return Transitions.joined([*parts, *(read_recordings(each, mapping).transitions()[0] for each in logs.values())])
+
+
+def _transitions(path: Path) -> Transitions | None:
+    """Return the transitions in an NPZ file with x, u and x_next; None if the file is another one."""
+    try:
+        return stored_transitions(Archive(read_bytes(path)))
+    except ShapeError:
+        raise
+    except InputError as error:
+        raise InputError(f"{path} cannot be read as recorded data: {error}.") from error
+
+
+# Tasks
+
+
+@dataclass(frozen=True)
+class TaskTable:
+    """A task function without code: every component is a number, or a task parameter by name."""
+
+    initial_state: tuple[float | str, ...]
+    goal: tuple[float | str, ...] | None
+    horizon: int
+    dt: float
+
+    def __call__(self, p: Parameters) -> Task:
+        """Return the task, or the batch of tasks."""
+        start = [_component(entry, p) for entry in self.initial_state]
+        goal = None if self.goal is None else [_component(entry, p) for entry in self.goal]
+        return Task(start, goal=goal, horizon=self.horizon, dt=self.dt)
+
+
+def _component(entry: float | str, p: Parameters) -> Any:
+    if not isinstance(entry, str):
+        return entry
+    name, _, index = entry.removeprefix("-").partition("[")
+    value = p[name.strip()]
+    if index:
+        value = value[..., int(index.removesuffix("]"))]
+    return -value if entry.startswith("-") else value
+
+
+def task_function(given: str | Mapping[str, Any], space: TaskSpace, system: Any, folder: Path | None = None) -> Any:
+    """Return the map p -> task of an experiment file, from ``module:attr`` or from a table."""
+    if isinstance(given, str):
+        return require_function(f"the task {given}", reference(given, folder), "p -> Task")
+    for key in given:
+        if key not in TaskTable.__dataclass_fields__:
+            raise UnknownNameError.among("entry of [task]", key, TaskTable.__dataclass_fields__)
+    table = {"goal": None, "dt": getattr(system, "dt", None), **given}
+    missing = [key for key in ("initial_state", "horizon", "dt") if table.get(key) is None]
+    if missing:
+        raise InputError(f"[task] needs {', '.join(missing)}.")
+    for name in ("initial_state", "goal"):
+        entries = table[name]
+        if name == "goal" and entries is None:
+            continue
+        plain = isinstance(entries, list) and all(type(entry) in (int, float, str) for entry in entries)
+        if not plain or not entries:
+            raise InputError(f"{name} of [task] must be a list of numbers and of names of parameters, got {entries!r}.")
+        table[name] = tuple(entries)
+    made = TaskTable(**table)
+    try:
+        made(space.parameters(space.low))
+    except CtxvalError:
+        raise
+    except (ValueError, IndexError, TypeError) as error:
+        raise InputError(f"[task] cannot be used: {error}.") from error
+    return made
+
+
+# Options of plain types
+
+
+def require_types(what: str, function: Any, options: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the options, with lists converted to tuples."""
+    target = getattr(function, "__init__") if isinstance(function, type) else function  # noqa: B009
+    try:
+        hints = get_type_hints(target)
+    except (NameError, TypeError):
+        return dict(options)
+    return {name: _typed(f"{what}: {name}", hints.get(name, Any), value) for name, value in options.items()}
+
+
+def _typed(what: str, hint: Any, value: Any) -> Any:
+    try:
+        adapter = TypeAdapter(hint, config=ConfigDict(arbitrary_types_allowed=True))
+    except (PydanticUserError, SchemaError, TypeError):
+        # The annotation is a protocol, which no plain value fulfils.
+        if isinstance(value, str | int | float | list | dict):
+            raise InputError(
+                f"{what} must be an object in Python, written as {{ ref = 'module:attr' }}, got {value!r}."
+            ) from None
+        return value
+    given = tuple(value) if isinstance(value, list) else value
+    try:
+        return adapter.validate_python(given, strict=True)
+    except ValidationError as error:
+        message = error.errors()[0]["msg"].lower()
+        raise InputError(f"{what}: {message}, got {value!r}.") from error
+
+
+def space_of(bounds: Mapping[str, Sequence[Any]]) -> TaskSpace:
+    """Return a task space from ``name = [low, high, "unit"]``."""
+    return TaskSpace(**{name: tuple(bound) for name, bound in bounds.items()})
+
+
+def with_distribution(
+    space: TaskSpace, tables: Mapping[str, Mapping[str, Any]], folder: Path | None = None
+) -> TaskSpace:
+    """Return a task space with the distribution of tasks of an experiment file.
+
+    The tables are, for each parameter, ``{type = "normal", mean = ..., deviation = ...}``, ``{type = "uniform"}`` or
+    ``{ref = "module:attr"}`` of a frozen distribution of scipy.stats; or only ``sampler``, the reference of a function
+    ``(rng, n) -> tasks (n, d)``.
+    """
+    if set(tables) == {"sampler"} and set(tables["sampler"]) == {"ref"} and "sampler" not in space.names:
+        return space.sampled(argument(tables["sampler"], folder))
+    for name in tables:
+        space.columns(name)
+    stated = {name: table for name, table in tables.items() if table.get("type") != "uniform"}
+    found = {name: _distribution(name, table, folder) for name, table in stated.items()}
+    return space.distributed(**found) if found else space
+
+
+def _distribution(name: str, table: Mapping[str, Any], folder: Path | None) -> Any:
+    if set(table) == {"ref"}:
+        return argument(table, folder)
+    given = dict(table)
+    kind = given.pop("type", None)
+    if kind != "normal":
+        raise UnknownNameError.among(f"distribution of {name}", str(kind), ("normal", "uniform"))
+    for key in given.keys() - {"mean", "deviation"}:
+        raise UnknownNameError.among(f"argument of the distribution of {name}", key, ("mean", "deviation"))
+    if len(given) < 2:
+        raise InputError(f"the normal distribution of {name} needs a mean and a deviation, got {given!r}.")
+    return Normal(**given)
+
+
+# Experiments that are not described in a file
+
+
+def named_experiment(text: str, seed: int, options: dict[str, Any], folder: Path | None = None) -> Experiment:
+    """Return the experiment of a case, or of a reference, which runs the code of its module."""
+    if ":" not in text:
+        if options:
+            options = require_types(f"case {text!r}", cases.REGISTRY.find(text), options)
+        return cases.by_name(text, seed, **options)
+    made = reference(text, folder)
+    if is_function(made) and not isinstance(made, Validation | Experiment):
+        if not accepts(made, 1, **options):
+            given = f" {', '.join(options)}" if options else ""
+            takes = f"it takes {inspect.signature(made)}"
+            raise InputError(f"{text} must be callable with a seed and its options{given}; {takes}.")
+        try:
+            made = made(seed, **options)
+        except CtxvalError:
+            raise
+        except Exception as error:
+            raise InputError(f"{text} failed: {reason_of(error)}.") from error
+    if isinstance(made, Validation):
+        return Experiment(text.partition(":")[2], made)
+    if not isinstance(made, Experiment):
+        raise InputError(
+            f"{text} must be an Experiment or a Validation, or a function of a seed that makes one, "
+            f"got {type(made).__name__}."
+        )
+    return made
+
+
+def plain_options(case: str) -> dict[str, Any]:
+    """Return the options of a case that a file or a command line can set, with their defaults.
+
+    The default of an option that must be given is None.
+    """
+    try:
+        hints = get_type_hints(cases.REGISTRY.find(case))
+    except InputError:
+        raise
+    except Exception:  # annotations that are texts are evaluated, and anything may stand in them
+        hints = {}
+
+    def is_plain(hint: Any) -> bool:
+        return get_origin(hint) is Literal or bool({hint, *get_args(hint)} & {str, int, float, bool})
+
+    options = {name: default for name, default in cases.options_of(case).items() if is_plain(hints.get(name, str))}
+    return {name: None if default is inspect.Parameter.empty else default for name, default in options.items()}

@@ -1,0 +1,184 @@
+"""References ``module:attr``: the search for the module, and the checks of the object before it is called."""
+
+from __future__ import annotations
+
+import functools
+import importlib
+import inspect
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib.machinery import PathFinder
+from pathlib import Path
+from typing import Any
+
+from ctxval._util.registry import Registry, has_method
+from ctxval._util.texts import reason_of
+from ctxval.errors import CtxvalError, InputError
+
+_added: set[str] = set()
+"""Folders of experiments that this module has put on ``sys.path``."""
+
+
+def reference(text: str, folder: Path | None = None) -> Any:
+    """Import ``module:attr``; this runs the module's code."""
+    module, colon, attribute = text.partition(":")
+    if not (colon and attribute and all(name.isidentifier() for name in module.split("."))):
+        raise InputError(f"a reference must be module:attr, such as 'my_rig:experiment', got {text!r}.")
+    with _searched_first(os.path.realpath(folder or _here())) as home:
+        _require_place(text, module.partition(".")[0], home)
+        try:
+            return getattr(importlib.import_module(module), attribute)
+        except (ImportError, AttributeError, ValueError, TypeError) as error:
+            raise InputError(f"{text} cannot be loaded: {error}.") from error
+        except CtxvalError:
+            raise
+        except Exception as error:
+            raise InputError(f"{module} failed while it was loaded: {reason_of(error)}.") from error
+
+
+@contextmanager
+def _searched_first(home: str) -> Iterator[str]:
+    """Put a folder first on ``sys.path``. It stays there, because a module may import others when it is called.
+
+    Meanwhile neither the current folder, which ``python -m`` adds, nor the folder of another experiment is searched.
+    """
+    before = list(sys.path)
+    if home not in before:
+        _added.add(home)
+    stated = {os.path.realpath(path) for path in os.environ.get("PYTHONPATH", "").split(os.pathsep) if path}
+    others = {home, os.path.realpath(_here()), *_added} - stated
+    sys.path[:] = [home, *(entry for entry in before if os.path.realpath(entry or _here()) not in others)]
+    try:
+        yield home
+    finally:
+        sys.path.extend(entry for entry in before if entry not in sys.path)
+
+
+def _here() -> str:
+    try:
+        return os.getcwd()
+    except OSError:  # it was deleted
+        return os.devnull
+
+
+def _require_place(text: str, module: str, home: str) -> None:
+    """Check that a top-level module is found, and that no other module of this name is already loaded."""
+    importlib.invalidate_caches()
+    found = _found(module)
+    own = found is not None and os.path.dirname(found) in (home, os.path.join(home, module))
+    if module in sys.stdlib_module_names and not own:
+        raise InputError(f"{text} is in Python's standard library, which contains no part of an experiment.")
+    loaded = sys.modules.get(module)
+    if loaded is None and found is None:
+        raise InputError(
+            f"{text} cannot be loaded: no module named {module!r} is in {home} or installed. The modules of an "
+            "experiment file must be in the folder of the file, and those of the command line in the current one."
+        )
+    clashes = list[tuple[str, str | None, str]]()
+    used = _place(getattr(loaded, "__file__", None), getattr(loaded, "__path__", None))
+    if used not in (None, found):
+        other = f"none of this name is in {home} or installed" if found is None else f"the reference means {found}"
+        clashes.append((module, used, other))
+    # No loaded module of another experiment's folder may have the name of any module in this folder.
+    others = _added - {home}
+    for name, each in list(sys.modules.items()):
+        used = getattr(each, "__file__", None)
+        folder = os.path.dirname(used or "")
+        apart = "." in name or used is None or not {folder, os.path.dirname(folder)} & others
+        if not apart and PathFinder.find_spec(name, [home]) is not None:
+            clashes.append((name, used, f"there is one in {home} too"))
+    for name, used, other in clashes:
+        raise InputError(
+            f"{text} cannot be loaded: a module named {name!r} is already in use, {used}, and {other}. Rename one of "
+            "them, or use another process."
+        )
+
+
+def _found(module: str) -> str | None:
+    """Return the file or folder that would be imported; None if there is none, as for built-in modules."""
+    for finder in sys.meta_path:
+        spec = finder.find_spec(module, None)
+        if spec is not None:
+            return _place(spec.origin if spec.has_location else None, spec.submodule_search_locations)
+    return None
+
+
+def _place(file: str | None, folders: Any) -> str | None:
+    where = file or next(iter(folders or ()), None)
+    return None if where is None else os.path.realpath(where)
+
+
+# Checks of the object that a reference names
+
+
+def require_part(registry: Registry[Any], what: str, found: Any) -> Any:
+    """Return an object or a class if it can be a part of the kind.
+
+    It must have the method of the kind; a model or a distance may also be a function.
+    """
+    kind, method = registry.kind, str(registry.method)
+    if isinstance(found, type):
+        has = has_method(found, method)
+    elif kind == "distance":
+        has = is_function(found) and accepts(found, 3)
+    else:
+        has = callable(getattr(found, method, None)) or (kind == "model" and is_function(found) and accepts(found, 2))
+    if not has:
+        if kind == "distance":
+            wanted = "a function (model_trajectory, system_trajectory, task) -> d written in Python"
+            raise InputError(f"{what} must be {wanted}, got {_named(found)}.")
+        raise InputError(f"{what} must be a {kind}, got {_named(found)}, which has no {method}.")
+    return found
+
+
+def require_function(what: str, found: Any, form: str) -> Any:
+    """Return a function if it takes the arguments of a form such as ``(x, u) -> x_next``; it is not called here."""
+    count = form.partition("->")[0].count(",") + 1
+    if not is_function(found):
+        raise InputError(f"{what} must be a function {form} written in Python, got {_named(found)}.")
+    if not accepts(found, count):
+        raise InputError(f"{what} must be a function {form}; it takes {inspect.signature(found)}.")
+    return found
+
+
+def is_function(found: Any) -> bool:
+    """Return whether an object is a function written in Python, or has a ``__call__`` that is one.
+
+    Builtin functions and methods of other libraries' objects do not count: no user wrote them for an experiment.
+    """
+    if isinstance(found, functools.partial):
+        return is_function(found.func)
+    if inspect.isfunction(_unwrapped(found)):
+        return True
+    if isinstance(found, type):
+        return False
+    return any(inspect.isfunction(_unwrapped(vars(base).get("__call__"))) for base in type(found).__mro__)
+
+
+def _unwrapped(found: Any) -> Any:
+    """Return the function inside decorators, such as those of compilers."""
+    try:
+        return inspect.unwrap(found)
+    except (ValueError, AttributeError):
+        return found
+
+
+def accepts(function: Any, count: int, /, **named: Any) -> bool:
+    """Return whether a function can be called with this number of positional arguments and these named ones."""
+    try:
+        inspect.signature(function).bind(*range(count), **named)
+    except TypeError:
+        return False
+    except ValueError:  # the function has no signature
+        return True
+    return True
+
+
+def _named(found: Any) -> str:
+    if isinstance(found, type):
+        return f"the class {found.__module__}.{found.__qualname__}"
+    if inspect.isroutine(found):
+        return f"the {'function' if inspect.isfunction(found) else 'builtin or method'} {found.__name__}"
+    return f"an object of the class {type(found).__module__}.{type(found).__qualname__}"

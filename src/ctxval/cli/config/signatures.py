@@ -1,0 +1,183 @@
+"""Signatures of the settings in a store, and the settings that would run code.
+
+A command that writes settings signs them with a secret key of its user. Settings that were edited, or that come from
+somebody else, do not verify. A store keeps the signatures of several users.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import hmac
+import json
+import os
+import secrets
+import stat
+import tempfile
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from ctxval import cases, searches
+from ctxval.certificates import KINDS
+from ctxval.cli.config.parts import REGISTRIES
+from ctxval.errors import InputError
+
+SIGNATURES = "signatures"
+"""The key of the signatures in the settings of a store."""
+
+_BYTES = 32
+
+
+def key_path() -> Path:
+    """Return the path of this user's secret key: ``$XDG_STATE_HOME/ctxval/key``, or in %LOCALAPPDATA% on Windows."""
+    base = os.environ.get("LOCALAPPDATA" if os.name == "nt" else "XDG_STATE_HOME", "")
+    if os.path.isabs(base):
+        return Path(base) / "ctxval" / "key"
+    try:
+        return Path.home() / ".local" / "state" / "ctxval" / "key"
+    except RuntimeError as error:
+        raise OSError(None, "there is no home folder") from error
+
+
+def signed(settings: Mapping[str, Any], before: Mapping[str, Any]) -> dict[str, Any]:
+    """Return settings with a signature of this user; without one if the user's key cannot be made."""
+    plain = _plain(settings)
+    others = _signatures(before) if _plain(before) == plain else []
+    try:
+        own = _signature(_made_key(), plain)
+    except OSError:
+        own = None
+    if own is not None and own not in others:
+        others = [own, *others]
+    # Largest number of signatures that settings keep, one for each user and computer.
+    return {**plain, **({SIGNATURES: others[:16]} if others else {})}
+
+
+def verifies(settings: Mapping[str, Any]) -> bool:
+    """Return whether settings carry a valid signature of this user."""
+    signatures = _signatures(settings)
+    try:
+        key = _read_key(key_path()) if signatures else None
+    except OSError:
+        return False
+    return key is not None and any(hmac.compare_digest(_signature(key, settings), each) for each in signatures)
+
+
+def unsigned(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Return settings without their signatures."""
+    return {key: value for key, value in settings.items() if key != SIGNATURES}
+
+
+def why_no_key() -> str | None:
+    """Return why this user cannot sign; None if there is a key or one can be made."""
+    try:
+        _made_key()
+    except OSError as error:
+        return f"the key in {error.filename or 'the home folder'} cannot be used: {error.strerror}"
+    return None
+
+
+def _plain(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Return settings without signatures, in the form in which a store returns them."""
+    plain: dict[str, Any] = json.loads(json.dumps(unsigned(settings)))
+    return plain
+
+
+def _signatures(settings: Mapping[str, Any]) -> list[str]:
+    kept = settings.get(SIGNATURES)
+    return [each for each in kept if isinstance(each, str) and each.isascii()] if isinstance(kept, list) else []
+
+
+def _signature(key: bytes, settings: Mapping[str, Any]) -> str:
+    canonical = json.dumps(unsigned(settings), sort_keys=True, separators=(",", ":"))
+    return hmac.new(key, f"ctxval settings 1\n{canonical}".encode(), hashlib.sha256).hexdigest()
+
+
+def _made_key() -> bytes:
+    """Return the user's key, and make it if there is none; if two processes make it, both return the same one."""
+    path = key_path()
+    with suppress(FileNotFoundError):
+        return _read_key(path)
+    path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+    handle, name = tempfile.mkstemp(prefix=".key-", dir=path.parent)  # with mode 0600
+    try:
+        with os.fdopen(handle, "wb") as file:
+            file.write(secrets.token_bytes(_BYTES))
+            file.flush()
+            os.fsync(file.fileno())
+        try:
+            os.link(name, path)
+        except FileExistsError:
+            pass  # another process was faster
+        except OSError:
+            # This disk has no hard links. If two processes make a key at the same moment, the last one is kept, and the
+            # store of the other process asks the user again.
+            if not path.exists():
+                os.replace(name, path)
+    finally:
+        with suppress(FileNotFoundError):
+            os.unlink(name)
+    return _read_key(path)
+
+
+def _read_key(path: Path) -> bytes:
+    with path.open("rb") as file:
+        mode = os.fstat(file.fileno()).st_mode
+        key = file.read(_BYTES + 1)
+    again = "a new key is made, and for stores that carry the old signature the question is asked again"
+    if os.name == "posix" and mode & 0o077:
+        who = f"other users (mode {stat.filemode(mode)}), who may have signed stores with it"
+        raise InputError(f"the key {path} can be read or written by {who}. Delete it: {again}.")
+    if len(key) != _BYTES:
+        size = len(key) if len(key) < _BYTES else "more"
+        raise InputError(f"the key {path} is damaged: it must have {_BYTES} bytes, got {size}. Delete it: {again}.")
+    return key
+
+
+# Settings that would run code
+
+
+def code_named(settings: Mapping[str, Any]) -> list[str]:
+    """Return the settings whose code would run if the experiment were built, each as a text to show.
+
+    Everything that is not known to be data counts as code: every reference, a task by name, a part of this package that
+    runs programs or other libraries, and every case, part, search and certificate that this package does not have. An
+    installed package may have it, and its code would be imported. This function does not search the packages.
+    """
+    try:
+        code = [_shown("task", settings["task"])] if isinstance(settings.get("task"), str) else []
+        for key, name_key, is_data in _NAMED:
+            given = settings.get(key)
+            name = given.get(name_key) if name_key and isinstance(given, Mapping) else given
+            if name is not None and not is_data(name):
+                code.append(_shown(key, given))
+        return [*code, *_references("", settings)]
+    except RecursionError:
+        return ["settings that are nested too deeply to be checked"]
+
+
+_NAMED: tuple[tuple[str, str | None, Callable[[Any], bool]], ...] = (
+    ("experiment", None, cases.REGISTRY.is_data),
+    *((kind, "type", registry.is_data) for kind, registry in REGISTRIES.items()),
+    ("search", "name", searches.REGISTRY.is_data),
+    ("certificate", "kind", KINDS.is_data),
+)
+"""Settings that name a part: the key, the key of the name if it is a table, and whether a name is known to be data."""
+
+
+def _references(where: str, value: Any) -> Iterator[str]:
+    if isinstance(value, Mapping):
+        if "ref" in value:
+            yield _shown(where, value["ref"])
+        for key, item in value.items():
+            yield from _references(f"{where}.{key}" if where else str(key), item)
+    elif isinstance(value, list):
+        for item in value:
+            yield from _references(where, item)
+
+
+def _shown(where: str, value: Any) -> str:
+    """Return a setting as text, shortened and with control characters escaped."""
+    text = f"{ascii(where)[1:-1]} = {value!a}"
+    return text if len(text) <= 160 else f"{text[:80]}...{text[-80:]}"

@@ -1,6 +1,0 @@
-"""Comparison of models, controllers or distances on one system, with executions as the cost."""
-
-from ctxval.comparison.compare import compare
-from ctxval.comparison.result import CandidateResult, Comparison, PairResult
-
-__all__ = ["CandidateResult", "Comparison", "PairResult", "compare"]

@@ -1,0 +1,1 @@
+"""The paper: its systems, and every figure of it."""

@@ -1,0 +1,285 @@
+"""The paper's Example 1, in which four frameworks compare M and S of the running example.
+
+Two frameworks compare open loops, by whole trajectories (OLDT) or by final states (OLCD). The other two compare closed
+loops, by whole trajectories (CCDT) or by final states (CuSTOM).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ctxval import Validation, distances, systems
+from ctxval._util.arrays import Array, Rows, single_threaded, vector_norm
+from ctxval.core.model import Model, linearize
+from ctxval.core.rollout import rollout
+from ctxval.core.task import Task
+from ctxval.core.trajectory import Trajectory
+from ctxval.distances import FinalState, WholeTrajectory
+from ctxval.errors import ModelError
+from ctxval.paper.cases import pendulum
+
+WHOLE, FINAL = distances.WholeTrajectory(norm=np.inf), distances.FinalState(norm=1)
+"""The distance of OLDT and CCDT, and that of OLCD and CuSTOM."""
+
+PAPERS_GOAL = 0.04
+"""The goal angle of the paper's Fig. 2, rad, where CCDT is largest in the paper."""
+
+BOUND = pendulum.Settings().torque
+"""Bound of the open-loop torques, N m. It is that of the training data, so that the model does not extrapolate.
+
+The paper leaves the torque unbounded, but then no largest open-loop distance exists. The distance grows with the bound:
+if it exceeds the closed-loop distance here, it also does so with the far larger torques of the closed loops.
+"""
+
+
+def frameworks(seed: int = 0, *, per_axis: int = 2001, restarts: int = 64) -> dict[str, Any]:
+    """Return the goal angles, and the distance between M and S in each framework, as a stored result has them.
+
+    Those of CCDT and CuSTOM are for each goal; those of OLDT and OLCD, which are the same for every goal, are for each
+    restart of the search, largest first.
+    """
+    validation = pendulum.experiment(seed).validation
+    goals = validation.space.grid(per_axis)
+    task = validation.task(validation.space.parameters(goals))
+    on_model, on_system = closed_loops(validation, task)
+    hanging = validation.task(validation.space.parameters([0.0]))
+    assert isinstance(validation.system, systems.Simulated)  # as in the running example
+    steps = validation.system.model, validation.model
+    open_loops = [
+        worst_open_loop(*steps, hanging, BOUND, distance, restarts=restarts, seed=seed)[1].tolist()
+        for distance in (WHOLE, FINAL)
+    ]
+    return {
+        "goals": goals[:, 0].tolist(),
+        "ccdt": WHOLE(on_model, on_system, task).tolist(),
+        "custom": FINAL(on_model, on_system, task).tolist(),
+        "oldt": open_loops[0],
+        "olcd": open_loops[1],
+        "bound": BOUND,
+        "closed_loop_torque": max(float(np.abs(loop.inputs).max()) for loop in (on_model, on_system)),
+    }
+
+
+def closed_loops(validation: Validation, task: Task) -> tuple[Trajectory, Trajectory]:
+    """Return the closed loops on M and on S for a batch of tasks."""
+    controller = validation.synthesizer.design(task, validation.model)
+    on_model = systems.Simulated(validation.model).execute(controller, task)
+    return on_model, validation.system.execute(controller, task)
+
+
+# Open-loop validation (the paper's eq. 1): the inputs under which M and S differ the most.
+#
+# There is no feedback here, so the distance is maximised over all input sequences within a bound. The search follows
+# the gradient to sequences at the bound. The maximum is there if M and S are linear, because the distance is then
+# convex; it is mostly there if both are affine in the input, by Pontryagin's principle. Many restarts and a test of
+# every single switch guard against poor local maxima. The result is a lower bound of the true maximum.
+
+
+def worst_open_loop(
+    system: Model,
+    model: Model,
+    task: Task,
+    bound: float,
+    distance: FinalState | WholeTrajectory,
+    *,
+    restarts: int = 64,
+    seed: int = 0,
+) -> tuple[Array, Array]:
+    """Maximise the distance between M and S over the inputs ``|u| <= bound``, from the task's initial state.
+
+    With ``WholeTrajectory(norm=inf)`` it is the paper's OLDT, with ``FinalState(norm=1)`` its OLCD. A restart depends
+    only on the seed and on its own number, so that more restarts never find less, except for rounding.
+
+    Args:
+        system: the step of a simulated S, which is the ``model`` of ``systems.Simulated``; it has one input.
+        distance: one of the two distances, with norm 1 or infinity.
+        restarts: number R of sequences that are improved.
+
+    Returns:
+        The best inputs ``(H, 1)``, and the final distance of each restart, largest first, shape ``(R,)``.
+    """
+    pair = _Pair(system, model, task, bound)
+    counts = np.ones((task.horizon + 1, task.initial_state.size))
+    if isinstance(distance, FinalState):
+        counts[:-1] = 0.0
+    norm = _Norm(distance.norm, counts)
+    with single_threaded():
+        U = _first_inputs(pair, restarts, seed)
+        U = _ascend(pair, U, _Fixed(norm.directions(restarts)), _by_gradient)
+        U = _ascend(pair, U, norm, _by_gradient)
+        U = _ascend(pair, U, norm, _by_trial)
+        values = norm.value(pair.gap(U), np.arange(restarts))
+    return U[np.argmax(values)], np.sort(values)[::-1]
+
+
+@dataclass(frozen=True, eq=False)
+class _Pair:
+    """M and S under the same inputs ``(..., H, 1)``."""
+
+    system: Model
+    model: Model
+    task: Task
+    bound: float
+
+    def run(self, model: Model, U: Array) -> Trajectory:
+        x = np.broadcast_to(self.task.initial_state, (*U.shape[:-2], self.task.initial_state.shape[-1]))
+        task = Task(x, horizon=self.task.horizon, dt=self.task.dt)
+        trajectory = rollout(model.step, lambda t, x: U[..., t, :], task)
+        if not trajectory.finite.all():
+            raise ModelError("M or S is not finite under inputs within the bound, so their distance has no maximum.")
+        return trajectory
+
+    def gap(self, U: Array) -> Array:
+        """Return the states of S minus those of M, shape ``(..., H + 1, n)``."""
+        return self.run(self.system, U).states - self.run(self.model, U).states
+
+    def gradient(self, U: Array, weights: Array) -> Array:
+        """Gradient of ``sum(weights * gap)`` with respect to the inputs, shape ``(..., H, 1)``."""
+        return self._pulled_back(self.system, U, weights) - self._pulled_back(self.model, U, weights)
+
+    def _pulled_back(self, model: Model, U: Array, weights: Array) -> Array:
+        """Propagate the weights of the states back to the inputs by the adjoint ``l_t = w_t + A_t' l_(t+1)``."""
+        A, B = linearize(model, self.run(model, U).states[..., :-1, :], U)
+        A = np.broadcast_to(A, (*U.shape[:-1], *A.shape[-2:]))
+        B = np.broadcast_to(B, (*U.shape[:-1], *B.shape[-2:]))
+        gradient = np.empty_like(U)
+        adjoint = weights[..., -1, None, :]
+        for t in reversed(range(self.task.horizon)):
+            gradient[..., t, :] = (adjoint @ B[..., t, :, :])[..., 0, :]
+            adjoint = weights[..., t, None, :] + adjoint @ A[..., t, :, :]
+        return gradient
+
+
+# Objectives: convex functions of the gap (..., N, H + 1, n) of the restarts ``rows``, and a subgradient of each
+
+
+@dataclass(frozen=True, eq=False)
+class _Fixed:
+    """One linear function of the gap for each restart, ``W`` of shape ``(R, H + 1, n)``."""
+
+    W: Array
+
+    def value(self, gap: Array, rows: Rows) -> Array:
+        return np.asarray((self.W[rows] * gap).sum(axis=(-1, -2)))
+
+    def weights(self, gap: Array, rows: Rows) -> Array:
+        return self.W[rows]
+
+
+@dataclass(frozen=True, eq=False)
+class _Norm:
+    """The norm, of order 1 or infinity, of the gap's entries that count, shape ``(H + 1, n)``."""
+
+    order: float
+    counts: Array
+
+    def value(self, gap: Array, rows: Rows) -> Array:
+        return vector_norm(self._flat(gap), self.order)
+
+    def weights(self, gap: Array, rows: Rows) -> Array:
+        """Return w of unit dual norm with ``sum(w * gap) = ||gap||``."""
+        flat = self._flat(gap)
+        if self.order == 1:
+            return np.sign(flat).reshape(gap.shape) * self.counts
+        largest = np.abs(flat).argmax(axis=-1)[..., None]
+        chosen = np.zeros_like(flat)
+        np.put_along_axis(chosen, largest, np.sign(np.take_along_axis(flat, largest, axis=-1)), axis=-1)
+        return chosen.reshape(gap.shape) * self.counts
+
+    def _flat(self, gap: Array) -> Array:
+        return (gap * self.counts).reshape(*gap.shape[:-2], -1)
+
+    def directions(self, count: int) -> Array:
+        """Return the linear functions below the norm that the restarts maximise first, shape ``(R, H + 1, n)``.
+
+        The norm is the maximum of such functions. For the infinity norm each of them is one state at one time, with a
+        sign; for the other norm it has a sign for each state. The first few cover every state, every sign and the
+        final time.
+        """
+        times, n = np.flatnonzero(self.counts.any(axis=1)), self.counts.shape[1]
+        directions = np.zeros((count, *self.counts.shape))
+        for r in range(count):
+            if self.order == np.inf:
+                index, sign = divmod(r, 2)
+                level, component = divmod(index, n)
+                # 0, 1/2, 1/4, 3/4, 1/8, ... (van der Corput): each entry falls into the largest gap.
+                share = sum((level >> j & 1) * 0.5 ** (j + 1) for j in range(level.bit_length()))
+                directions[r, times[-1 - int(share * len(times))], component] = 1 - 2 * sign
+            else:
+                directions[r] = [1 - 2 * (r >> j & 1) for j in range(n)]
+        return directions * self.counts
+
+
+# Maximisation
+
+_Objective = _Fixed | _Norm
+# A proposal returns a target for each entry of the inputs, and the gain of the objective by that entry alone.
+_Proposal = Callable[[_Pair, Array, _Objective, Rows], tuple[Array, Array]]
+
+
+def _first_inputs(pair: _Pair, restarts: int, seed: int) -> Array:
+    """Return random sequences at the bound, with few to many switches, shape ``(R, H, 1)``."""
+    sequences = []
+    for r in range(restarts):
+        rng = np.random.default_rng(np.random.SeedSequence([seed, r]))
+        switches = rng.random((pair.task.horizon, 1)) < rng.uniform() ** 3
+        start = rng.integers(2, size=1)
+        sequences.append(1.0 - 2.0 * ((start + switches.cumsum(axis=0)) % 2))
+    return np.array(sequences) * pair.bound
+
+
+def _ascend(pair: _Pair, U: Array, objective: _Objective, proposal: _Proposal) -> Array:
+    """Improve each restart's inputs ``(R, H, 1)`` until no proposal improves them, at most 200 times."""
+    U = U.copy()
+    rows = np.arange(len(U))
+    values = objective.value(pair.gap(U), rows)
+    for _ in range(200):
+        if not len(rows):
+            break
+        candidates = _moves(U[rows], *proposal(pair, U[rows], objective, rows))
+        reached = objective.value(pair.gap(candidates), rows)
+        best, columns = reached.argmax(axis=0), np.arange(len(rows))
+        improved = reached[best, columns] > values[rows] + 1e-10 * np.abs(values[rows])
+        best, columns, rows = best[improved], columns[improved], rows[improved]
+        U[rows], values[rows] = candidates[best, columns], reached[best, columns]
+    return U
+
+
+def _moves(U: Array, targets: Array, gains: Array) -> Array:
+    """Return moves of the inputs towards the targets, shape ``(K, N, H, 1)``.
+
+    Either the 1, 2, 4, ... entries with the largest gains move all the way, or all entries move a part of the way.
+    """
+    size = U[0].size
+    order = np.argsort(-gains.reshape(len(U), -1), axis=1, kind="stable")
+    rank = np.argsort(order, axis=1).reshape(U.shape)
+    counts = [*(2**j for j in range(size.bit_length()) if 2**j < size), size]
+    whole = [np.where(rank < count, targets, U) for count in counts]
+    return np.stack([*whole, *(U + share * (targets - U) for share in 0.5 ** np.arange(1, 7))])
+
+
+def _by_gradient(pair: _Pair, U: Array, objective: _Objective, rows: Rows) -> tuple[Array, Array]:
+    """Propose the bound in the direction of the gradient, as the Frank-Wolfe method does."""
+    gradient = pair.gradient(U, objective.weights(pair.gap(U), rows))
+    targets = np.where(gradient == 0, U, np.copysign(pair.bound, gradient))
+    return targets, gradient * (targets - U)
+
+
+def _by_trial(pair: _Pair, U: Array, objective: _Objective, rows: Rows) -> tuple[Array, Array]:
+    """Propose the opposite bound, with the true gain of each single switch."""
+    targets = -np.copysign(pair.bound, U)
+    step = max(1, 4096 // U[0].size)  # rollouts in one batch
+    gains = []
+    for i in range(0, len(U), step):
+        batch, some = U[i : i + step], rows[i : i + step]
+        flat = batch.reshape(len(batch), -1)
+        entries = np.arange(flat.shape[1])
+        trials = np.repeat(flat[None], len(entries), axis=0)
+        trials[entries, :, entries] = targets[i : i + step].reshape(flat.shape).T
+        switched = objective.value(pair.gap(trials.reshape(-1, *batch.shape)), some)
+        gains.append((switched - objective.value(pair.gap(batch), some)).T.reshape(batch.shape))
+    return targets, np.concatenate(gains)

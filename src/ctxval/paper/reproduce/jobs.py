@@ -1,0 +1,248 @@
+"""The single runs that the paper's figures are made of: each stored as a line of a file, run in parallel processes."""
+
+from __future__ import annotations
+
+import functools
+import importlib
+import inspect
+import re
+from collections.abc import Callable, Iterable
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass, replace
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ctxval import cases, searches
+from ctxval._util.arrays import Array, single_threaded
+from ctxval._util.code_digest import module_digest
+from ctxval._util.json_lines import JsonLines
+from ctxval.campaign.campaign import Campaign
+from ctxval.core.experiment import Experiment
+from ctxval.distances import TrackingError
+from ctxval.errors import InputError
+from ctxval.gp.kernels import Matern
+from ctxval.gp.surrogate import fit_surrogate
+from ctxval.paper.cases import arm
+from ctxval.paper.reproduce.frameworks import PAPERS_GOAL, closed_loops, frameworks
+from ctxval.paper.reproduce.revision import provenance
+
+Result = dict[str, Any]
+
+DISCARDED = 5  # the paper's k in sampling and discarding
+
+
+@dataclass(frozen=True)
+class Job:
+    """One run, completely defined by its fields.
+
+    Attributes:
+        kind: a key of :data:`KINDS`.
+        seed: seed of the data, the model and the search.
+        options: options of the case, as pairs of name and value.
+        search: the name of the search, for the kind ``search``.
+        budget: the number of executions, or of grid points on each axis.
+    """
+
+    kind: str
+    case: str
+    seed: int
+    options: tuple[tuple[str, Any], ...] = ()
+    search: str = ""
+    budget: int = 0
+
+    @property
+    def key(self) -> str:
+        """A readable name, by which the result is stored."""
+        options = [f"{name}-{value}" for name, value in self.options]
+        budget = f"{self.budget}" if self.budget else ""
+        parts = [self.kind, self.case, *options, self.search, budget, f"seed{self.seed}"]
+        return re.sub(r"[^a-zA-Z0-9._-]+", "-", "_".join(filter(None, parts)))
+
+    def experiment(self) -> Experiment:
+        """Return the case that the job runs on."""
+        return cases.by_name(self.case, self.seed, **dict(self.options))
+
+
+def _search(job: Job) -> Result:
+    """Return the points and distances of one campaign in order, or only the records for independent draws."""
+    experiment = job.experiment()
+    search = _informed(job) if job.search in INFORMED else searches.by_name(job.search)
+    if searches.BaseSearch.of(search).iid:
+        # The points do not depend on the distances, so all of them are executed in one batch.
+        search.reset(experiment.validation.space.dimension, job.seed)
+        unit = search.ask(job.budget)
+        points = experiment.validation.space.from_unit(unit)
+        return {"executions": job.budget, "records": records(experiment.validation.distances(points))}
+    campaign = Campaign(experiment.validation, search=search, seed=job.seed, name=experiment.name)
+    campaign.run(job.budget, explore=True)
+    points = experiment.validation.space.from_unit(np.array([trial.unit_point for trial in campaign.trials]))
+    distances = [np.nan if trial.distance is None else trial.distance for trial in campaign.trials]
+    return {"points": points.tolist(), "distances": distances}
+
+
+INFORMED = ("gp-ucb-prior-mean", "gp-ucb-hyperprior")
+"""Searches that know the distance of another trial's model, for a one-dimensional task space."""
+
+
+def _informed(job: Job) -> searches.Search:
+    """Return GP-UCB whose prior mean is the distance of the next seed's model, or with about its length-scale."""
+    before = replace(job, seed=job.seed + 1).experiment().validation
+    goals = before.space.grid(101)
+    distances = before.distances(goals)
+    if job.search == "gp-ucb-prior-mean":
+        known = before.space.unit_function(lambda p: np.interp(p.goal, goals[:, 0], distances))
+        return searches.GPUCB(prior_mean=known)
+    surrogate = fit_surrogate(before.space.to_unit(goals), distances)
+    length = float(np.exp(surrogate.process.theta[1]))
+    return searches.GPUCB(kernel=Matern(1.5, length_scale=(length / 1.5, length * 1.5)))
+
+
+def records(distances: Array) -> list[list[float]]:
+    """Return ``[index, distance]`` of each distance that is among the six largest up to its index.
+
+    The estimates of SC and of SD with k = 5 depend on no other distances.
+    """
+    largest: list[float] = []
+    pairs = []
+    for index, distance in enumerate(distances.tolist()):
+        if distance > (largest[-1] if len(largest) > DISCARDED else -np.inf):
+            largest = sorted([*largest, distance], reverse=True)[: DISCARDED + 1]
+            pairs.append([index, distance])
+    return pairs
+
+
+def distances_of(result: Result) -> Array:
+    """Return the distances of a search in order; NaN for distances that are not records."""
+    if "distances" in result:
+        return np.array(result["distances"], dtype=np.float64)
+    distances = np.full(result["executions"], np.nan)
+    for index, distance in result["records"]:
+        distances[int(index)] = distance
+    return distances
+
+
+def _truth(job: Job) -> Result:
+    """Return the largest distance that the case's own method finds."""
+    find = job.experiment().truth
+    assert find is not None  # each case of the paper has one
+    truth = find()
+    return {"distance": truth.distance, "point": truth.parameters.points.tolist(), "method": truth.method}
+
+
+def _profile(job: Job) -> Result:
+    """Return the distance on a grid of a one-dimensional task space."""
+    validation = job.experiment().validation
+    points = validation.space.grid(job.budget)
+    return {"points": points[:, 0].tolist(), "distances": validation.distances(points).tolist()}
+
+
+def _aspects(job: Job) -> Result:
+    """Return how far model and system are from completing their tasks (Remark 1).
+
+    For the arm, it is the final distance from a grid of targets. For other cases, it is the mean distance of the
+    position from the reference of random tasks, beside that of a car that goes straight ahead.
+    """
+    if job.case == "arm":
+        errors = arm.aspects(job.seed, **dict(job.options), per_axis=job.budget)
+        return {"model_error": errors.model_error.tolist(), "system_error": errors.system_error.tolist()}
+    validation = job.experiment().validation
+    points = validation.space.iid(job.budget, np.random.default_rng(job.seed))
+    missed = TrackingError(components=(0, 1), over="mean")
+    references = validation.task(validation.space.parameters(points)).reference
+    return {
+        "model_error": validation.on_model(missed).distances(points).tolist(),
+        "system_error": validation.with_distance(missed).distances(points).tolist(),
+        "size": np.abs(references[..., 1:, 1]).mean(axis=-1).tolist(),
+    }
+
+
+def _loops(job: Job) -> Result:
+    """Return how far the closed loops on M and on S go below the paper's goal, and how far they are apart."""
+    validation = job.experiment().validation
+    model, system = closed_loops(validation, validation.task(validation.space.parameters([PAPERS_GOAL])))
+    gap = np.abs(system.states - model.states)
+    return {
+        "model_undershoot": PAPERS_GOAL - float(model.states[:, 0].min()),
+        "system_undershoot": PAPERS_GOAL - float(system.states[:, 0].min()),
+        "apart": float(gap.max()),
+        "end": float(gap[-1].sum()),
+    }
+
+
+KINDS: dict[str, Callable[[Job], Result]] = {
+    "search": _search,
+    "truth": _truth,
+    "profile": _profile,
+    "frameworks": lambda job: frameworks(job.seed, per_axis=job.budget),
+    "aspects": _aspects,
+    "loops": _loops,
+}
+"""The kinds of jobs, each with the function that runs it."""
+
+
+def run_job(job: Job) -> Result:
+    """Run one job on one thread."""
+    if job.kind not in KINDS:
+        raise InputError(f"there is no kind of job {job.kind!r}.")
+    with single_threaded():
+        return KINDS[job.kind](job)
+
+
+class Results:
+    """Stored results, a file of JSON lines for each kind of job; those of a case that has changed since do not count.
+
+    A change of the searches makes no result invalid: the table says which results were measured before it.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self._files: dict[str, JsonLines] = {}
+
+    def __contains__(self, job: Job) -> bool:
+        result = self._of_kind(job.kind).get((job.key,))
+        return result is not None and result["case_digest"] == case_digest(job.case)
+
+    def __getitem__(self, job: Job) -> Result:
+        return self._of_kind(job.kind)[job.key,]
+
+    def fill(self, jobs: Iterable[Job], workers: int, on_done: Callable[[Job], None]) -> None:
+        """Run the jobs that are not stored yet, in parallel; each result is stored as soon as it is complete."""
+        missing = [job for job in dict.fromkeys(jobs) if job not in self]
+        if not missing:
+            return
+        # New interpreters, because a forked one would inherit locks of threads that it does not have.
+        with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
+            waiting = {pool.submit(run_job, job): job for job in missing}
+            try:
+                for future in as_completed(waiting):
+                    job, result = waiting[future], _rounded(future.result())
+                    stored = {"key": job.key, **result, "case_digest": case_digest(job.case), **provenance()}
+                    self._of_kind(job.kind).append(stored)
+                    on_done(job)
+            except BaseException:
+                pool.shutdown(wait=False, cancel_futures=True)
+                raise
+
+    def _of_kind(self, kind: str) -> JsonLines:
+        if kind not in self._files:
+            self._files[kind] = JsonLines(self.folder / f"{kind}.jsonl", ("key",))
+        return self._files[kind]
+
+
+@functools.cache
+def case_digest(case: str) -> str:
+    """Return a digest of what a case's source computes, whatever its imports, docstrings, annotations and layout."""
+    return module_digest(inspect.getsource(importlib.import_module(f"ctxval.paper.cases.{case}")))
+
+
+def _rounded(value: Any) -> Any:
+    if isinstance(value, float):
+        return float(f"{value:.10g}")  # more digits than any figure shows, at half the size
+    if isinstance(value, list):
+        return [_rounded(item) for item in value]
+    if isinstance(value, dict):
+        return {key: _rounded(item) for key, item in value.items()}
+    return value

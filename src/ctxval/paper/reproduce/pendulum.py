@@ -1,0 +1,345 @@
+"""The four figures of the running example: frameworks, trajectories, techniques, and the converged GP."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ctxval import cases, plot
+from ctxval._util.arrays import Array, Mask
+from ctxval.core.trajectory import Trajectory
+from ctxval.gp.surrogate import fit_surrogate
+from ctxval.paper.reproduce.frameworks import PAPERS_GOAL, closed_loops
+from ctxval.paper.reproduce.jobs import INFORMED, Job, Result, Results, distances_of
+from ctxval.paper.reproduce.study import (
+    BLACK,
+    BLUE,
+    GREEN,
+    GREY,
+    ORANGE,
+    PINK,
+    TECHNIQUES,
+    Claim,
+    Columns,
+    Scale,
+    Study,
+    agreement,
+    draw_quartiles,
+    ranged,
+    running_estimate,
+    spread,
+)
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+SHOWN = 0  # the seed of figures that show a single trial
+_BUDGET = 100
+_COMMON = 5  # number of common first samples
+_NEAR = 2.5  # per cent of d*: the paper says of SC that it is so near after 60 samples
+
+
+class FourFrameworks(Study):
+    """The paper's Fig. 1: the distance in each framework over the goal angle."""
+
+    name = "frameworks"
+    title = "Pendulum: four frameworks"
+    case = "pendulum"
+    axes = "goal angle [rad]", "distance between M and S [rad, rad/s]\n(below 0.001 drawn at 0.001)"
+
+    def jobs(self, scale: Scale) -> list[Job]:
+        seeds = range(scale.trials)
+        return [Job("frameworks", "pendulum", seed, budget=scale.of(1001)) for seed in seeds] + [
+            Job("profile", "pendulum", seed, (("variant", "biased"),), budget=scale.of(1001)) for seed in seeds
+        ]
+
+    def fill(self, axes: Axes, results: Results, scale: Scale) -> None:
+        """Draw the four profiles of the first trial."""
+        profile = results[self.jobs(scale)[SHOWN]]
+        goals = np.array(profile["goals"])
+        for label, values, colour, line in (
+            ("OLDT: open loop, trajectories", np.full(len(goals), profile["oldt"][0]), GREEN, "-."),
+            ("OLCD: open loop, final states", np.full(len(goals), profile["olcd"][0]), PINK, ":"),
+            ("CCDT: closed loop, trajectories", profile["ccdt"], ORANGE, "--"),
+            ("CuSTOM: closed loop, final states", profile["custom"], BLUE, "-"),
+        ):
+            axes.semilogy(goals, np.maximum(values, 1e-3), color=colour, linestyle=line, linewidth=1.8, label=label)
+
+    def data(self, results: Results, scale: Scale) -> Columns:
+        found = results[self.jobs(scale)[SHOWN]]
+        count = len(found["goals"])
+        open_loops = {name: [found[name][0]] * count for name in ("oldt", "olcd")}
+        return {"goal_rad": found["goals"], **open_loops, "ccdt": found["ccdt"], "custom": found["custom"]}
+
+    def claims(self, results: Results, scale: Scale) -> list[Claim]:
+        stored = [results[job] for job in self.jobs(scale)]
+        trials, biased = stored[: scale.trials], stored[scale.trials :]
+        profiles = [(np.array(trial["goals"]), np.array(trial["custom"])) for trial in trials]
+        of_half = [(np.array(trial["points"]), np.array(trial["distances"])) for trial in biased]
+        return [
+            _worst_goal("worst distance 0.3 rad near a goal of 2 rad", profiles),
+            _worst_goal("... with a bias in the training data, here only of angles from -pi to 0", of_half),
+            _two_regions("the profile is asymmetric, and poor around pi/2 and -pi/2", profiles),
+            _two_regions("... with this bias in the training data", of_half),
+            _ccdt_maximum(trials),
+            _open_loop_is_higher(trials),
+        ]
+
+
+def _worst_goal(paper: str, profiles: list[tuple[Array, Array]]) -> Claim:
+    size = [float(distances.max()) for _, distances in profiles]
+    place = [abs(float(goals[distances.argmax()])) for goals, distances in profiles]
+    right = [abs(spread(size)[0] - 0.3) < 0.1, abs(spread(place)[0] - 2) < 0.1]
+    wrong = " and ".join(name for name, agrees in zip(("the size", "the place"), right, strict=True) if not agrees)
+    return Claim(
+        paper,
+        f"{ranged(size, 3)} rad at |goal| {ranged(place, 2)} rad",
+        agreement(all(right), any(right)),
+        f"{wrong} differs; it depends on the cost, the data and dt, none of which the paper gives",
+    )
+
+
+def _two_regions(paper: str, profiles: list[tuple[Array, Array]]) -> Claim:
+    lower, places = [], []
+    for goals, distances in profiles:
+        left, right = goals < 0, goals > 0
+        ends = [distances[left].max(), distances[right].max()]
+        lower.append(100 * (1 - min(ends) / max(ends)))
+        places.append([goals[left][distances[left].argmax()], goals[right][distances[right].argmax()]])
+    # The paper calls its own worst goal, 2 rad, around pi/2.
+    near = np.abs(np.abs(np.median(places, axis=0)) - np.pi / 2) < 0.5
+    return Claim(
+        paper,
+        f"largest at {ranged([left for left, _ in places], 2)} rad and at {ranged([right for _, right in places], 2)} "
+        f"rad; the lower one of these is {ranged(lower, 0)} % lower",
+        agreement(bool(near.all()) and spread(lower)[0] > 1, bool(near.any())),
+        "of a model that is wrong on one half, the largest distance on the other half is elsewhere",
+    )
+
+
+def _ccdt_maximum(trials: list[Result]) -> Claim:
+    goals = [trial["goals"][int(np.argmax(trial["ccdt"]))] for trial in trials]
+    return Claim(
+        f"CCDT is largest near a goal of {PAPERS_GOAL} rad",
+        f"largest at {ranged(goals, 2)} rad, where it is {ranged([max(trial['ccdt']) for trial in trials], 2)}",
+        agreement(max(abs(goal - PAPERS_GOAL) for goal in goals) < 0.1),
+    )
+
+
+def _open_loop_is_higher(trials: list[Result]) -> Claim:
+    oldt, olcd = ([trial[name][0] for trial in trials] for name in ("oldt", "olcd"))
+    over = [min(o / max(f["ccdt"]), c / max(f["custom"])) for o, c, f in zip(oldt, olcd, trials, strict=True)]
+    gaps = [100 * (1 - np.median(trial[name]) / trial[name][0]) for trial in trials for name in ("oldt", "olcd")]
+    return Claim(
+        "OLDT and OLCD are flat, and much higher than CCDT and CuSTOM",
+        f"OLDT {spread(oldt)[0]:.1f}, OLCD {spread(olcd)[0]:.1f} with |u| <= {trials[0]['bound']:g} N m, a bound of "
+        f"ours, without which there is no maximum: at least {min(over):.0f} times the closed-loop maximum; median "
+        f"restart within {max(gaps):.1f} % of the best",
+        agreement(min(over) > 2),
+    )
+
+
+class Trajectories(Study):
+    """The paper's Fig. 2: the closed loops of M and S at the paper's goal with the largest CCDT distance."""
+
+    name = "trajectories"
+    title = "Pendulum: closed-loop trajectories"
+    case = "pendulum"
+
+    def jobs(self, scale: Scale) -> list[Job]:
+        return [Job("loops", "pendulum", seed) for seed in range(scale.trials)]
+
+    def _loops(self) -> tuple[Trajectory, Trajectory]:
+        validation = cases.by_name("pendulum", SHOWN).validation
+        return closed_loops(validation, validation.task(validation.space.parameters([PAPERS_GOAL])))
+
+    def draw(self, results: Results, scale: Scale) -> Figure:
+        model, system = self._loops()
+        figure = plot.trajectories(model, system, states=("angle [rad]", "rate [rad/s]"), inputs=("torque [N m]",))
+        figure.suptitle(f"goal {PAPERS_GOAL} rad", fontsize=10)
+        return figure
+
+    def data(self, results: Results, scale: Scale) -> Columns:
+        model, system = self._loops()
+        names = ["t_s", "model_angle_rad", "model_rate_rad_per_s", "system_angle_rad", "system_rate_rad_per_s"]
+        values = [model.times.tolist(), *model.states.T.tolist(), *system.states.T.tolist()]
+        return dict(zip(names, values, strict=True))
+
+    def claims(self, results: Results, scale: Scale) -> list[Claim]:
+        trials = [results[job] for job in self.jobs(scale)]
+        names = ("apart", "end", "model_undershoot", "system_undershoot")
+        apart, end, model, system = ([trial[name] for trial in trials] for name in names)
+        larger = sum(s > m + 0.01 for m, s in zip(model, system, strict=True))
+        return [
+            Claim(
+                f"at a goal of {PAPERS_GOAL} rad, M and S move differently but reach the same final state",
+                f"they are {ranged(apart, 2)} apart on the way and {ranged(end, 3)} at the end",
+                agreement(spread(end)[0] < 0.1 * spread(apart)[0], spread(end)[0] < spread(apart)[0]),
+            ),
+            Claim(
+                "the controller leads to a larger undershoot on S than on M",
+                f"the angle goes {ranged(np.maximum(system, 0.0), 3)} rad below the goal on S and "
+                f"{ranged(np.maximum(model, 0.0), 3)} rad on M; more than 0.01 rad farther on S in {larger} of "
+                f"{len(trials)} trials",
+                agreement(larger > len(trials) / 2, larger > 0),
+                "the weight of the rate damps the loops, so that neither of them goes below the goal",
+            ),
+        ]
+
+
+class Techniques(Study):
+    """The paper's Fig. 3: the error of the estimated d* against samples, for the three techniques."""
+
+    name = "techniques"
+    title = "Pendulum: three techniques"
+    case = "pendulum"
+    axes = (
+        "executions of S",
+        "error of the estimated d* [%], median and quartiles\n(below 0.001 % drawn at 0.001 %)",
+    )
+    legend = 3
+
+    def jobs(self, scale: Scale) -> list[Job]:
+        seeds, names = range(scale.trials), (*TECHNIQUES, *INFORMED)
+        searches = [Job("search", "pendulum", seed, search=name, budget=_BUDGET) for name in names for seed in seeds]
+        truths = [Job("truth", "pendulum", seed) for seed in seeds]
+        return [*searches, *truths, *FourFrameworks().jobs(scale)[: scale.trials]]
+
+    def errors(self, results: Results, scale: Scale, search: str) -> Array:
+        """Return the errors in per cent, shape ``(trials, budget)``."""
+        rows = []
+        for seed in range(scale.trials):
+            truth = results[Job("truth", "pendulum", seed)]["distance"]
+            distances = distances_of(results[Job("search", "pendulum", seed, search=search, budget=_BUDGET)])
+            rows.append(100 * (1 - running_estimate(distances, search) / truth))
+        return np.array(rows)
+
+    def fill(self, axes: Axes, results: Results, scale: Scale) -> None:
+        draw_quartiles(axes, {name: np.maximum(self.errors(results, scale, name), 1e-3) for name in TECHNIQUES})
+        axes.set_yscale("log")
+        axes.axvline(5.5, color=GREY, linewidth=1)
+        axes.annotate("five common first samples", (5.7, 60), fontsize=7, color=BLACK)
+        axes.axhline(1, color=GREY, linewidth=0.8, linestyle=":")
+        axes.set_ylim(1e-3, 110)
+
+    def data(self, results: Results, scale: Scale) -> Columns:
+        columns: Columns = {"executions": range(1, _BUDGET + 1)}
+        for search in TECHNIQUES:
+            quartiles = np.percentile(self.errors(results, scale, search), [25, 50, 75], axis=0)
+            names = (f"{search}_{part}_percent" for part in ("lower_quartile", "median", "upper_quartile"))
+            columns |= zip(names, quartiles.tolist(), strict=True)
+        return columns
+
+    def claims(self, results: Results, scale: Scale) -> list[Claim]:
+        names = (*TECHNIQUES, *INFORMED)
+        errors = {name: self.errors(results, scale, name) for name in names}
+        ucb, sc, sd = (np.median(errors[name], axis=0) for name in TECHNIQUES)
+        within = {name: [_first(row <= 1.0) - _COMMON for row in errors[name]] for name in ("gp-ucb", *INFORMED)}
+        median = {name: spread(counts)[0] for name, counts in within.items()}
+        beyond = {name: ranged(counts, 1).replace(".0", "") for name, counts in within.items()}
+        near = _first(sc <= _NEAR)
+        as_near = int((errors["random"][:, -1] <= ucb[19]).sum())
+        profiles = [results[job]["custom"] for job in FourFrameworks().jobs(scale)[: scale.trials]]
+        broad = 100 * np.median([np.mean(np.array(d) >= (1 - _NEAR / 100) * max(d)) for d in profiles])
+        return [
+            Claim(
+                "CuSTOM is within 1 % after 3 samples beyond five common first ones, and at 0 % by 20",
+                f"within 1 % after {beyond['gp-ucb']} beyond the five; median error at 20: {ucb[19]:.4f} %",
+                agreement(median["gp-ucb"] <= 3 and ucb[19] < 0.05, median["gp-ucb"] <= 3 or ucb[19] < 0.05),
+            ),
+            Claim(
+                f"SC is within {_NEAR} % only after 60 samples",
+                f"within {_NEAR} % after {near:g}; median error {sc[19]:.2f} % at 20, {sc[59]:.2f} % at 60",
+                agreement(30 <= near <= 90, near > median["gp-ucb"] + _COMMON),
+                f"random samples fall near a broad maximum sooner: {broad:.1f} % of the goals "
+                f"are within {_NEAR} % of d*",
+            ),
+            Claim(
+                "SC does not find the maximum even in 100 samples",
+                f"median error {sc[99]:.4f} % at 100; {as_near} of {scale.trials} trials are as near as CuSTOM at 20",
+                agreement(sc[99] > ucb[19]),
+            ),
+            Claim(
+                f"SD is not close even after 100 samples (the paper calls SC close from {_NEAR} % on)",
+                f"median error {sd[59]:.1f} % at 60, {sd[99]:.1f} % at 100",
+                agreement(sd[99] > _NEAR, sd[59] > _NEAR),
+                "the sixth largest of 100 samples is near a broad maximum too",
+            ),
+            Claim(
+                "CuSTOM and SC outperform SD",
+                f"median errors at 100: {ucb[99]:.4f} %, {sc[99]:.4f} %, {sd[99]:.1f} %",
+                agreement(max(ucb[99], sc[99]) < sd[99], min(ucb[99], sc[99]) < sd[99]),
+            ),
+            Claim(
+                "a prior mean generally leads to a faster convergence, here the distance of another trial's model",
+                f"within 1 % after {beyond['gp-ucb-prior-mean']} beyond the five, against {beyond['gp-ucb']}",
+                agreement(median["gp-ucb-prior-mean"] < median["gp-ucb"]),
+                "the other model is worst at another goal",
+            ),
+            Claim(
+                "a prior of the hyperparameters helps (Algorithm 1), here a length-scale near that of another trial",
+                f"within 1 % after {beyond['gp-ucb-hyperprior']} beyond the five, against {beyond['gp-ucb']}",
+                agreement(median["gp-ucb-hyperprior"] <= median["gp-ucb"]),
+                "a few values teach the length-scale, and that of another trial differs",
+            ),
+        ]
+
+
+def _first(reached: Mask) -> float:
+    """Return the number of the first execution at which something is reached; infinity for never."""
+    return float(np.argmax(reached) + 1) if reached.any() else np.inf
+
+
+class ConvergedGP(Study):
+    """The paper's Fig. 4: the converged GP over the true distance."""
+
+    name = "converged-gp"
+    title = "Pendulum: converged GP"
+    case = "pendulum"
+    axes = "goal angle [rad]", "distance [rad]"
+    legend = 3
+
+    campaign = Job("search", "pendulum", SHOWN, search="gp-ucb", budget=25)
+    curve = Job("profile", "pendulum", SHOWN, budget=801)
+
+    def jobs(self, scale: Scale) -> list[Job]:
+        return [self.campaign, self.curve]
+
+    def fill(self, axes: Axes, results: Results, scale: Scale) -> None:
+        """Draw the GP with its band, the truth, the samples and the maximum."""
+        x, y = np.ravel(results[self.campaign]["points"]), np.array(results[self.campaign]["distances"])
+        goals, truth, mean, deviation = (np.array(column) for column in self.data(results, scale).values())
+        low, high = mean - 1.96 * deviation, mean + 1.96 * deviation
+        axes.fill_between(goals, low, high, color=GREY, alpha=0.5, linewidth=0, label="95 % band of the GP")
+        axes.plot(goals, mean, color=BLUE, linewidth=1.8, label="GP mean")
+        axes.plot(goals, truth, color="#D55E00", linestyle="--", linewidth=1.6, label="true distance")
+        marks: dict[str, Any] = {"marker": "o", "linestyle": "", "markeredgecolor": BLACK, "markersize": 5}
+        axes.plot(x[:5], y[:5], **marks, color="white", label="first samples")
+        axes.plot(x[5:], y[5:], **marks, color=BLACK, label="acquired samples")
+        best = y.argmax()
+        axes.plot(x[best], y[best], "*", color=ORANGE, markeredgecolor=BLACK, markersize=14, label="maximum found")
+        axes.grid(False)
+
+    def data(self, results: Results, scale: Scale) -> Columns:
+        found, curve = results[self.campaign], results[self.curve]
+        space = cases.by_name("pendulum", SHOWN).validation.space
+        surrogate = fit_surrogate(space.to_unit(np.array(found["points"])), np.array(found["distances"]))
+        mean, deviation = surrogate.predict(space.to_unit(np.array(curve["points"])[:, None]))
+        known = {"goal_rad": curve["points"], "true_distance": curve["distances"]}
+        return known | {"gp_mean": mean.tolist(), "gp_standard_deviation": deviation.tolist()}
+
+    def claims(self, results: Results, scale: Scale) -> list[Claim]:
+        goals, truth, mean, deviation = (np.array(column) for column in self.data(results, scale).values())
+        inside = np.abs(truth - mean) <= 1.96 * deviation + 1e-9
+        near = np.abs(goals - goals[truth.argmax()]) < 0.3
+        gap = 100 * np.abs(mean - truth)[near].max() / truth.max()
+        return [
+            Claim(
+                "the GP does not hold the whole truth in its 95 % band, but it holds the region of the maximum",
+                f"{100 * inside.mean():.0f} % of the goals are inside the band; within 0.3 rad of the maximum the mean "
+                f"is at most {gap:.2f} % of d* off",
+                agreement(gap < 5 and not inside.all(), gap < 5),
+            )
+        ]

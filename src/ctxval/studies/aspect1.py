@@ -1,0 +1,265 @@
+"""Aspect 1 of the paper's Remark 1: whether the model itself completes the tasks, by simulation only.
+
+>>> from ctxval import aspect1  # doctest: +SKIP
+>>> print(aspect1.check(experiment.validation, threshold=0.05))  # doctest: +SKIP
+"""
+
+from __future__ import annotations
+
+import contextlib
+import warnings
+from dataclasses import asdict, dataclass
+from typing import Annotated, Any
+
+import numpy as np
+
+from ctxval._util.arrays import Array
+from ctxval._util.checked import Must, NonNegativeInt, PositiveFloat, checked
+from ctxval._util.progress import advance, stage
+from ctxval._util.texts import text_of
+from ctxval.campaign.campaign import Campaign
+from ctxval.campaign.goals_of_model import GoalWarning
+from ctxval.certificates import CertificateOptions, Posterior
+from ctxval.certificates.options import CONFIDENCE
+from ctxval.certificates.scenario import volume_bound
+from ctxval.certificates.verdict import Verdict
+from ctxval.core.controller import converged_of
+from ctxval.core.distance import Distance
+from ctxval.core.plan import Plan
+from ctxval.core.soundness import Flips, Saturation, aimed_states, flips, saturation
+from ctxval.core.task import Task
+from ctxval.core.validation import Validation
+from ctxval.distances import GoalError, MeanDeviation, StateNorm, TrackingError
+from ctxval.errors import CtxvalError, DesignError, InputError, ModelError
+from ctxval.searches import Search, by_name
+
+__all__ = ["Aspect1Report", "SimulatedTask", "check", "completion"]
+
+TASKS = 100  # number of simulated tasks, unless another one is given
+SEARCH = "bayesian-optimisation"
+"""The search, unless another one is given. Learned dynamics could not teach it anything, because M is known."""
+
+_NEIGHBOURS = 20  # number of tasks beside which another one is planned: the worst ones and spread ones, half of each
+
+
+@dataclass(frozen=True, eq=False)
+class SimulatedTask:
+    """A task on M.
+
+    Attributes:
+        parameters: the task parameters.
+        error: how far M is from completing it; None if no controller could be designed, or if M diverges.
+        reason: why there is no error; empty if there is one.
+    """
+
+    parameters: dict[str, Any]
+    error: float | None
+    reason: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class Aspect1Report:
+    """What simulations of M show of its tasks and controllers. The system is never executed.
+
+    Attributes:
+        distance: the distance between the trajectory of M and its task.
+        units: its units; empty if they are not known.
+        threshold: the largest error with which a task counts as completed; None if there is none.
+        simulated: all tasks, the worst first; tasks without an error come before those with one.
+        verdict: the verdict on M against the threshold, with a bound over all tasks; None if there is no threshold.
+        share: the share of all tasks that M does not complete is at most this with confidence 0.95, because so many of
+            the independent draws among the simulated tasks exceed the threshold; None if there is no threshold.
+        distribution: the distribution of tasks as a text, under which the share is a probability; None if it is
+            uniform.
+        flips: how much the controllers of neighbouring tasks differ; None if no tasks are neighbours.
+        flipped: the parameters of two such tasks.
+        saturation: the share of the steps at which each input is at a limit; None if there are no inputs.
+        inputs: the labels of the inputs.
+        not_converged: the tasks whose design did not converge.
+        designs: the number of designs that tell whether they converged.
+    """
+
+    distance: Distance
+    units: str
+    threshold: float | None
+    simulated: tuple[SimulatedTask, ...]
+    verdict: Verdict | None
+    share: float | None
+    distribution: str | None
+    flips: Flips | None
+    flipped: tuple[dict[str, Any], dict[str, Any]] | None
+    saturation: Saturation | None
+    inputs: tuple[str, ...]
+    not_converged: tuple[dict[str, Any], ...]
+    designs: int
+
+    @property
+    def worst(self) -> SimulatedTask:
+        """The task that M completes worst."""
+        return self.simulated[0]
+
+    @property
+    def failed(self) -> tuple[SimulatedTask, ...]:
+        """The tasks without an error."""
+        return tuple(task for task in self.simulated if task.error is None)
+
+    @property
+    def exceeding(self) -> int:
+        """The number of simulated tasks that M does not complete: those above the threshold, and those that failed."""
+        limit = np.inf if self.threshold is None else self.threshold
+        return sum(task.error is None or task.error > limit for task in self.simulated)
+
+    @property
+    def completes(self) -> bool | None:
+        """Whether M completed all simulated tasks; None without a threshold, unless a task failed."""
+        return None if self.threshold is None and not self.failed else not self.exceeding
+
+    def to_json(self) -> dict[str, Any]:
+        """Return all results as plain values."""
+        shares = None if self.saturation is None else self.saturation.shares.tolist()
+        return {
+            "distance": repr(self.distance),
+            "units": self.units,
+            "threshold": self.threshold,
+            "tasks": len(self.simulated),
+            "worst": asdict(self.worst),
+            "exceeding": self.exceeding if self.threshold is not None or self.failed else None,
+            "completes": self.completes,
+            "failed": [asdict(task) for task in self.failed],
+            "verdict": None if self.verdict is None else self.verdict.answer,
+            "bound": None if self.verdict is None else self.verdict.bound,
+            "share_at_most": self.share,
+            "distribution": self.distribution,
+            "flips": None if self.flips is None else {**asdict(self.flips), "example": self.flipped},
+            "saturation": None if shares is None else dict(zip(self.inputs, shares, strict=False)),
+            "not_converged": list(self.not_converged),
+            "designs": self.designs,
+        }
+
+
+@checked
+def check(
+    validation: Validation,
+    *,
+    threshold: PositiveFloat | None = None,
+    distance: Distance | None = None,
+    tasks: Annotated[int, Must("an integer >= 2", lambda value: value >= 2)] = TASKS,
+    search: Search | None = None,
+    seed: NonNegativeInt = 0,
+) -> Aspect1Report:
+    """Search for the task that M itself completes worst, and look at the controllers. S is never executed.
+
+    Half of the tasks are independent draws from the distribution of tasks, and the search chooses the others.
+
+    Args:
+        validation: the map p -> d(p).
+        threshold: the largest error with which a task counts as completed, in the units of ``distance``.
+        distance: how far the trajectory of M is from completing its task; that of :func:`completion` by default.
+        tasks: number of simulated tasks.
+        search: chooses the tasks; Bayesian optimisation by default.
+        seed: seed of the search.
+    """
+    measured = completion(validation) if distance is None else distance
+    on_model = validation.on_model(measured, units=None if distance is None else "")
+    campaign = Campaign(on_model, search=by_name(SEARCH) if search is None else search, seed=seed)
+    with stage("simulating tasks on the model", tasks, "tasks"):
+        while (done := len(campaign.trials)) < tasks:  # a task without a closed loop counts, too
+            with warnings.catch_warnings(), contextlib.suppress(DesignError, ModelError):  # stored with the reason
+                warnings.simplefilter("ignore", GoalWarning)  # which is what the report says in detail
+                if done < tasks // 2:
+                    campaign.audit(tasks // 2, lambda _: advance(), progress=False)
+                left = campaign.executions + tasks - len(campaign.trials)
+                campaign.run(left, on_trial=lambda _: advance(), explore=True, progress=False)
+    return _report(campaign, measured, threshold, seed)
+
+
+def completion(validation: Validation) -> Distance:
+    """Return the distance of M from completing its task that belongs to the distance of a validation.
+
+    It has the norm, the states, the weights and the scales of that distance. For tasks with a goal it is
+    :class:`ctxval.distances.GoalError`, and for tasks with a changing reference
+    :class:`ctxval.distances.TrackingError`. If the distance compares all states, those are left out that the
+    synthesizer does not bring to a goal.
+    """
+    space, distance = validation.space, validation.distance
+    task = validation.task(space.parameters(0.5 * (space.low + space.high)))
+    if not isinstance(task, Task) or not task.has_goal:
+        raise InputError(
+            "the tasks have neither a goal nor a reference, so the model has nothing to complete: give a goal, or a "
+            "distance that measures how far a trajectory is from completing its task."
+        )
+    if isinstance(distance, GoalError | TrackingError):
+        return distance
+    shared: dict[str, Any] = {"norm": 2}
+    if isinstance(distance, StateNorm):
+        shared = {name: getattr(distance, name) for name in ("norm", "components", "weights", "scales", "angles")}
+    n = task.initial_state.shape[-1]
+    aimed = aimed_states(validation, n)
+    if shared.get("components") is None and shared.get("weights") is None and shared.get("scales") is None:
+        shared["components"] = tuple(aimed.tolist()) if 0 < len(aimed) < n else None
+    if (task.reference == task.goal[..., None, :]).all():
+        return GoalError(**shared)
+    return TrackingError(**shared, over="mean" if isinstance(distance, MeanDeviation) else "maximum")
+
+
+def _report(campaign: Campaign, distance: Distance, threshold: float | None, seed: int) -> Aspect1Report:
+    validation, share, verdict = campaign.validation, None, None
+    if threshold is not None and campaign.completed:
+        verdict = campaign.verdict(threshold, certificate=CertificateOptions(Posterior()))
+    if threshold is not None:  # the upper bound of Clopper and Pearson (1934)
+        drawn = [trial for trial in campaign.trials if trial.origin == "iid"]
+        missed = sum(trial.distance is None or trial.distance > threshold for trial in drawn)
+        share = volume_bound(len(drawn), missed, 1 - CONFIDENCE) if missed < len(drawn) else 1.0
+    ordered = sorted(campaign.trials, key=lambda trial: -np.inf if trial.distance is None else -trial.distance)
+    done = np.array([trial.unit_point for trial in ordered if trial.distance is not None])
+    points = _with_neighbours(done.reshape(-1, validation.space.dimension), np.random.default_rng([seed, 1]))
+    plans = _planned(validation, points)
+    inputs, rows = [plan.model_trajectory.inputs for plan in plans.values()], list(plans)
+    flipped = flips(points[rows], inputs) if len(rows) > 1 else None
+    where = [validation.space.describe_point(validation.space.from_unit(points[row])) for row in rows]
+    converged = [converged_of(plan.controller) for plan in plans.values()]
+    return Aspect1Report(
+        distance,
+        validation.labels.units,
+        threshold,
+        tuple(SimulatedTask(trial.parameters, trial.distance, text_of(trial.failure or "")) for trial in ordered),
+        verdict,
+        share,
+        campaign.provenance.distribution,
+        flipped,
+        None if flipped is None else (where[flipped.example[0]], where[flipped.example[1]]),
+        saturation(inputs, validation.synthesizer),
+        tuple(validation.names(0, inputs[0].shape[-1])[1]) if inputs else (),
+        tuple(task for task, ok in zip(where, converged, strict=True) if ok is not None and not ok),
+        sum(ok is not None for ok in converged),
+    )
+
+
+def _with_neighbours(points: Array, rng: np.random.Generator) -> Array:
+    """Return points of the unit cube ``(N, d)``, the worst first, after neighbours of the worst and of spread ones."""
+    if not len(points):
+        return points
+    half = _NEIGHBOURS // 2
+    chosen = np.concatenate([points[:half], points[:: max(1, len(points) // half)][:half]])
+    directions = rng.normal(size=chosen.shape)
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    # 0.03 diagonals of the task space; a step that would leave the cube goes the other way.
+    step = 0.03 * np.sqrt(points.shape[1]) * directions
+    beside = np.where((chosen + step < 0) | (chosen + step > 1), chosen - step, chosen + step)
+    return np.concatenate([beside.clip(0, 1), chosen, points])
+
+
+def _planned(validation: Validation, points: Array) -> dict[int, Plan]:
+    """Return the plans of points by row, without those that fail; only the chosen ones if designs are slow."""
+    batched = bool(getattr(validation.synthesizer, "batched", False))
+    rows = list(range(len(points) if batched else min(len(points), 2 * _NEIGHBOURS)))
+    space = validation.space
+    try:
+        return dict(zip(rows, validation.plans(space.from_unit(points[rows])), strict=True)) if rows else {}
+    except CtxvalError:
+        pass
+    plans = dict[int, Plan]()
+    for row in rows:
+        with contextlib.suppress(DesignError, ModelError):
+            plans[row] = validation.plan(space.from_unit(points[row]))
+    return plans

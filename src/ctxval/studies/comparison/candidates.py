@@ -1,0 +1,223 @@
+"""The candidates of a comparison: campaigns on one system, what their stores keep of it, and their predictions."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+from pydantic import TypeAdapter, ValidationError
+
+from ctxval._util.arrays import Array
+from ctxval._util.describe import describe, differences
+from ctxval._util.progress import stage
+from ctxval.campaign.campaign import Campaign
+from ctxval.campaign.history import executed_trials
+from ctxval.campaign.trials import TrialRecorder
+from ctxval.core.trajectory import Trajectory
+from ctxval.core.trial import Trial
+from ctxval.core.validation import Validation
+from ctxval.errors import InputError
+from ctxval.learning import DynamicsStudy
+from ctxval.searches import Prediction
+
+Question = Literal["worst", "mean"]
+
+Executed = Sequence[tuple[Array, Trajectory]]
+"""Executed tasks, points of the unit cube ``(d,)``, with the system's trajectories."""
+
+
+@dataclass(frozen=True)
+class Decision:
+    """A decision that one candidate has the smaller d*.
+
+    Attributes:
+        smaller, larger: the names of the candidates.
+        bound: what d* of the smaller one is at most.
+        distance: the executed distance of the larger one that this bound does not exceed.
+        certificate: the kind of the certificate of the bound.
+        executions: the number of executions of all candidates, when it was decided.
+    """
+
+    smaller: str
+    larger: str
+    bound: float
+    distance: float
+    certificate: str
+    executions: int
+
+
+@dataclass(frozen=True)
+class TrialNote:
+    """What a comparison stores with a trial, before its execution.
+
+    Attributes:
+        step: the number of the execution among those of all candidates, from 0; a shared execution has one number.
+        question: the question that the execution answers.
+        draw: the number of the task among the independent draws; None if the task is no draw.
+        predicted: the distance that was predicted for a draw before it was drawn; None if nothing was predicted.
+        centre: the mean of this prediction over other tasks.
+        shared: the name of the candidate that executed the task and the number of its trial; None if this one did.
+        decided: what had been decided about the largest distances.
+    """
+
+    step: int
+    question: Question
+    draw: int | None = None
+    predicted: float | None = None
+    centre: float | None = None
+    shared: tuple[str, int] | None = None
+    decided: tuple[Decision, ...] = ()
+
+    def to_note(self) -> dict[str, Any]:
+        """Return the note of the trial."""
+        return {"comparison": {name: value for name, value in asdict(self).items() if value is not None}}
+
+    @staticmethod
+    def of(trial: Trial) -> TrialNote | None:
+        """Return what a comparison stored with a trial; None if it stored nothing."""
+        try:
+            return _NOTES.validate_python((trial.note or {}).get("comparison"))
+        except ValidationError:
+            return None
+
+
+_NOTES = TypeAdapter(TrialNote)
+
+
+@dataclass(eq=False)
+class Candidate:
+    """One model, controller or distance, with its campaign.
+
+    The system is the same for all candidates, so its distances are predicted from the executions of all: each execution
+    teaches the residual of each model, whatever controller was used.
+    """
+
+    name: str
+    campaign: Campaign
+    seed: int
+    _trajectories: dict[int, Trajectory] = field(default_factory=dict, init=False)
+    _last: tuple[tuple[int, ...], Prediction | None] | None = field(default=None, init=False)
+
+    def __post_init__(self) -> None:
+        validation = self.campaign.validation
+        self._space, self._study = validation.space, DynamicsStudy(validation, self.seed)
+        self._batched = bool(getattr(validation.synthesizer, "batched", False))
+
+    @property
+    def recorder(self) -> TrialRecorder:
+        """The recorder of the trials."""
+        return self.campaign.recorder
+
+    @property
+    def trials(self) -> tuple[Trial, ...]:
+        """All trials in the order of asking."""
+        return self.recorder.trials
+
+    @property
+    def noted(self) -> list[tuple[Trial, TrialNote]]:
+        """The trials that a comparison has opened, with their notes."""
+        return [(trial, note) for trial in self.trials if (note := TrialNote.of(trial)) is not None]
+
+    @property
+    def largest(self) -> float:
+        """The largest executed distance; 0 if there is none."""
+        return max((trial.distance for trial in self.trials if trial.distance is not None), default=0.0)
+
+    def executed(self, *, shared: bool = False) -> list[Trial]:
+        """Return the trials whose execution has ended, with or without success: its own, or those of others."""
+        return [trial for trial in self.trials if trial.executed and is_shared(trial) == shared]
+
+    def trajectories(self) -> Iterator[tuple[Trial, Trajectory]]:
+        """Yield the completed trials with a recorded trajectory; each trajectory is read once."""
+        completed = [trial for trial in self.trials if trial.state == "completed"]
+        unread = [trial for trial in completed if trial.number not in self._trajectories]
+        if unread:
+            read = executed_trials(self.campaign.store, unread)
+            self._trajectories.update((trial.number, trajectory) for trial, trajectory in read)
+        for trial in completed:
+            if trial.number in self._trajectories:
+                yield trial, self._trajectories[trial.number]
+
+    def highest(self, executed: Executed) -> tuple[float, Array] | None:
+        """Return the largest predicted distance and its task ``(d,)``; None if nothing can be predicted."""
+        prediction = self._prediction(executed)
+        if prediction is None:
+            return None
+        # The number identifies a random stream, which is none of those of trials.
+        rng, count = np.random.default_rng([self.seed, 0x706F]), 400 if self._batched else 48
+        points = rng.random((count, self._space.dimension))
+        snapped = rng.random(points.shape) < 0.5 * (np.arange(count) % 2)[:, None]  # maxima often lie at bounds
+        points = np.where(snapped, np.round(points), points)
+        with stage("predicting distances", count, "designs"):
+            expected = prediction.expected(points)[0]
+        if not np.isfinite(expected).any():
+            return None
+        best = int(np.nanargmax(np.where(np.isfinite(expected), expected, np.nan)))
+        return float(expected[best]), points[best]
+
+    def of_draw(self, executed: Executed, point: Array, draw: int, most: float | None) -> tuple[float, float] | None:
+        """Return the prediction of a draw and its mean over other tasks; None if nothing can be predicted.
+
+        The mean is over new independent tasks for each draw, so that its error has the expectation 0.
+        """
+        prediction = self._prediction(executed)
+        if prediction is None:
+            return None
+        rng = np.random.default_rng([self.seed, draw, 0x6365])  # the number identifies a random stream, as above
+        others = self._space.unit_draws(200 if self._batched else 24, rng)
+        with stage("predicting distances", len(others) + 1, "designs"):
+            expected = prediction.expected(np.concatenate([others, point[None]]))[0]
+        # Learned dynamics may diverge.
+        limit = most if most is not None else (2.0 * self.largest if self.largest > 0 else np.inf)
+        usual = 0.5 * limit if np.isfinite(limit) else 0.0
+        values = np.clip(np.where(np.isfinite(expected), expected, usual), 0.0, limit)
+        return float(values[-1]), float(values[:-1].mean())
+
+    def _prediction(self, executed: Executed) -> Prediction | None:
+        key = tuple(id(trajectory) for _, trajectory in executed)
+        if self._last is None or self._last[0] != key:
+            try:
+                prediction = self._study.predict(list(executed))
+            except Exception:  # the user's parts, at states that no execution has reached, must not end a comparison
+                prediction = None
+            self._last = key, prediction
+        return self._last[1]
+
+
+def is_shared(trial: Trial) -> bool:
+    """Return whether the execution of a trial is that of another candidate."""
+    note = TrialNote.of(trial)
+    return note is not None and note.shared is not None
+
+
+def require_comparable(candidates: Mapping[str, Validation]) -> None:
+    """Check that the candidates have the same system, the same tasks and distances of the same unit."""
+    if len(candidates) < 2:
+        raise InputError(f"a comparison needs at least two candidates, got {len(candidates)}.")
+    if any(getattr(candidate.system, "manual", False) for candidate in candidates.values()):
+        raise InputError("candidates cannot be compared on a system that people execute.")
+
+    def described(validation: Validation) -> dict[str, Any]:
+        space = validation.space
+        probes = (space.low, 0.5 * (space.low + space.high), space.high)
+        tasks = [describe(validation.task(space.parameters(point))) for point in probes]
+        return {**validation.describe(), "tasks": tasks}
+
+    (first, expected), *others = candidates.items()
+    of_first = described(expected)
+    for other, validation in others:
+        of_other = described(validation)
+        for part, what in (("space", "task spaces"), ("tasks", "tasks"), ("system", "systems")):
+            unequal = next(differences(of_first[part], of_other[part], part), None)
+            if unequal is not None:
+                raise InputError(
+                    f"{first} and {other} must have the same {what}, but {unequal[0]} differs: only models, "
+                    "controllers and distances on one system can be compared."
+                )
+        if validation.labels.units != expected.labels.units:
+            raise InputError(
+                f"the distances of {first} and {other} must have the same unit, got "
+                f"{expected.labels.units or 'none'!r} and {validation.labels.units or 'none'!r}."
+            )

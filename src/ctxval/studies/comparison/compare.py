@@ -1,0 +1,192 @@
+"""``ctxval.compare``: which of several models, controllers or distances is better on one system."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from contextlib import ExitStack
+from dataclasses import dataclass
+from itertools import combinations
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from ctxval._util.checked import NonNegativeInt, PositiveFloat, PositiveInt, Probability, checked
+from ctxval._util.progress import advance, stage
+from ctxval._util.progress_display import progress_shown
+from ctxval.campaign.campaign import Campaign
+from ctxval.certificates.options import CONFIDENCE, require_confidence
+from ctxval.core.experiment import Experiment
+from ctxval.core.task_distribution import distribution_text
+from ctxval.core.validation import Validation
+from ctxval.errors import InputError
+from ctxval.searches import Auto
+from ctxval.studies.comparison.candidates import Candidate, Question, require_comparable
+from ctxval.studies.comparison.executions import Executions, OnTrial
+from ctxval.studies.comparison.questions import MeanQuestion, WorstQuestion
+from ctxval.studies.comparison.result import CandidateResult, Comparison
+
+BUDGET = 100
+"""Default of the largest number of executions."""
+
+Compared = Validation | Experiment | Campaign
+
+
+@checked
+def compare(
+    candidates: Mapping[str, Compared],
+    *,
+    question: Literal["worst", "mean", "both"] = "both",
+    budget: PositiveInt = BUDGET,
+    confidence: Probability = CONFIDENCE,
+    seed: NonNegativeInt = 0,
+    stores: str | Path | None = None,
+    largest_possible: PositiveFloat | None = None,
+    stochastic: bool = False,
+    on_trial: OnTrial | None = None,
+    progress: bool | None = None,
+) -> Comparison:
+    """Compare models, controllers or distances on one system, with as few executions of it as possible.
+
+    Two questions can be asked: which candidate has the smaller largest distance d*, and which has the smaller expected
+    distance over the distribution of tasks of the task space. The comparison stops when all pairs are decided, or when
+    the budget is spent. It can be interrupted, and continues from the stores.
+
+    An execution counts once, and is recorded for all candidates whose controllers would have given the same inputs.
+    All executions teach the dynamics of the system to all candidates.
+
+    Args:
+        candidates: the candidates by name. They must have the same system and the same tasks. A campaign keeps its
+            search and its store.
+        question: ``worst`` for d*, ``mean`` for the expected distance, or ``both``.
+        budget: the largest total number of executions, including earlier ones in the stores.
+        confidence: the probability with which all decisions hold together; it is divided between pairs and questions.
+        seed: the seed of the random numbers.
+        stores: the folder of the stores, one for each candidate; in memory by default.
+        largest_possible: a number that no distance can exceed, if one is known. Decisions on expected distances are
+            then valid for any number of tasks; otherwise they are asymptotic. A failed execution counts as this
+            distance.
+        stochastic: whether two executions of one task may differ; then only the question ``mean`` can be asked.
+        on_trial: called with the name of the candidate and each trial that has ended.
+        progress: whether to show the progress on standard error; None to show it at a terminal and in a notebook.
+    """
+    if stochastic and question != "mean":
+        raise InputError(
+            f"question must be mean for a stochastic system, got {question!r}: an execution may have a larger "
+            "distance than the largest expected one, so executed distances do not tell which d* is larger."
+        )
+    require_confidence(confidence)
+
+    def campaign(name: str, compared: Compared) -> Campaign:
+        if isinstance(compared, Campaign):
+            return compared
+        validation = compared.validation if isinstance(compared, Experiment) else compared
+        path = None if stores is None else Path(stores) / f"{store_name(name)}.sqlite"
+        return Campaign(validation, search=Auto(thinking="fast"), store=path, seed=seed, name=name)
+
+    made = [Candidate(str(name), campaign(str(name), one), seed) for name, one in candidates.items()]
+    require_comparable({candidate.name: candidate.campaign.validation for candidate in made})
+    questions: tuple[Question, ...] = ("worst", "mean") if question == "both" else (question,)
+    each = 1 - (1 - confidence) / len(questions)
+    executions = Executions(made, largest_possible, on_trial)
+    worst = WorstQuestion(executions, each, budget, stochastic)
+    race = _Race(questions, executions, worst, MeanQuestion(executions, each, seed), budget, confidence)
+    with progress_shown(progress):
+        return race.run()
+
+
+def store_name(name: str) -> str:
+    """Return the name of a candidate as a part of a file name."""
+    return "".join(letter if letter.isalnum() or letter in "-_." else "-" for letter in name).strip(".") or "candidate"
+
+
+@dataclass(eq=False)
+class _Race:
+    """A comparison in progress. What it does next follows from the stores alone, so it can be interrupted."""
+
+    questions: tuple[Question, ...]
+    executions: Executions
+    worst: WorstQuestion
+    mean: MeanQuestion
+    budget: int
+    confidence: float
+
+    def run(self) -> Comparison:
+        """Execute the task that is expected to decide most, until all pairs are decided or the budget is spent."""
+        self._require_possible()
+        with ExitStack() as stack:
+            for candidate in self.executions.candidates:
+                stack.enter_context(candidate.campaign.store.sole_writer())
+            with stage("comparing", self.budget, "executions", done=self.executions.count):
+                self.executions.resume()
+                while self._step():
+                    advance()
+        candidates = self.executions.candidates
+        asked: dict[Question, WorstQuestion | MeanQuestion] = {"worst": self.worst, "mean": self.mean}
+        pairs = tuple(asked[name].pair(*pair) for name in self.questions for pair in combinations(candidates, 2))
+        results, units = tuple(map(self._result, candidates)), candidates[0].campaign.validation.labels.units
+        count = self.executions.count
+        return Comparison(results, pairs, self.confidence, count, self.budget, units, self._assumptions())
+
+    def _step(self) -> bool:
+        """Execute one task; return False if nothing is left to do."""
+        self._require_possible()
+        left = self.budget - self.executions.count
+        if left <= 0:
+            return False
+        worst = "worst" in self.questions and bool(self.worst.undecided)
+        noted = [pair for candidate in self.executions.candidates for pair in candidate.noted]
+        spent = sum(trial.executed and note.shared is None and note.question == "worst" for trial, note in noted)
+        last = "mean" not in self.questions
+        # Share of the budget before the other question is answered.
+        if worst and (last or spent < 0.5 * self.budget) and self.worst.step():
+            return True
+        if not last and self.mean.step(left):
+            return True
+        return worst and not last and self.worst.step()
+
+    def _require_possible(self) -> None:
+        """Check that no executed distance refutes the stated largest one, with which decisions would be false."""
+        largest, most = max(candidate.largest for candidate in self.executions.candidates), self.executions.most
+        if most is not None and largest > most:
+            raise InputError(f"largest_possible is {most:g}, but a distance of {largest:.6g} was executed.")
+
+    def _result(self, candidate: Candidate) -> CandidateResult:
+        worst = candidate.campaign.worst
+        bounds = [decision.bound for decision in self.worst.decisions if decision.smaller == candidate.name]
+        drawn = [trial.distance for trial, _ in self.mean.draws_of(candidate).values() if trial.distance is not None]
+        return CandidateResult(
+            candidate.name,
+            len(candidate.executed()),
+            len(candidate.executed(shared=True)),
+            len(candidate.campaign.failed),
+            None if worst is None else worst.distance,
+            None if worst is None else worst.parameters,
+            min(bounds, default=None),
+            len(drawn),
+            float(np.mean(drawn)) if drawn else None,
+        )
+
+    def _assumptions(self) -> tuple[str, ...]:
+        assumed = ["the candidates were fixed before the comparison, and the system does not change during it"]
+        if "worst" in self.questions:
+            assumed.append(
+                f"each bound on d* holds with confidence {self.worst.options.confidence:.6g} under the prior that its "
+                "certificate states (dynamics or posterior); it is a probability given the executions, so neither the "
+                "changing threshold nor the time of stopping costs confidence"
+            )
+        if "mean" in self.questions:
+            described = self.executions.candidates[0].campaign.validation.space.distribution
+            over = "uniform over the task space" if described is None else distribution_text(described.describe())
+            assumed.append(f"tasks are independent draws ({over})")
+            assumed.append(
+                f"no distance can exceed {self.executions.most:g}; the decisions on expected distances are then valid "
+                "for any number of tasks"
+                if self.executions.most is not None
+                else "no largest possible distance is stated, so the decisions on expected distances are exact only if "
+                "corrected differences are symmetric about their mean, and asymptotic otherwise: rare large distances "
+                "that were not drawn can make them wrong"
+            )
+        if self.worst.stochastic:
+            assumed.append("executions of one task may differ, and the questions are about expected distances of tasks")
+        return tuple(assumed)

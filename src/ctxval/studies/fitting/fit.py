@@ -1,0 +1,236 @@
+"""``fit``: models that are learned from recordings, each with its errors on recordings that were held out."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any, Literal, get_args
+
+import numpy as np
+
+from ctxval._util.arrays import Array, single_threaded
+from ctxval._util.representation import ShortRepr, counted
+from ctxval.core.model import Model, require_time_step
+from ctxval.core.trajectory import Trajectory, Transitions
+from ctxval.data.recordings import Recording, Recordings
+from ctxval.errors import InputError, ModelError, UnknownNameError
+from ctxval.models import FeedforwardReLU, GaussianProcessModel, Linear
+from ctxval.models.parametric import ParametricStep
+from ctxval.studies.fitting.least_squares import FittedParameter, as_bounds, fit_parameters
+from ctxval.studies.replay.accuracy import RecordedSteps, StepError, step_errors
+from ctxval.studies.replay.report import plain_numbers
+
+Kind = Literal["linear", "network", "gaussian-process", "parameters", "given"]
+KINDS: tuple[Kind, ...] = get_args(Kind)[:4]
+STEPS = (1, 20)
+"""Numbers of steps after which the held-out errors are computed, unless others are given."""
+HOLD_OUT = 0.25
+"""Share of the recordings that is held out, unless another one is given."""
+
+
+@dataclass(frozen=True, eq=False)
+class FittedModel(ShortRepr):
+    """A model that was learned from recordings.
+
+    Attributes:
+        kind: its kind; ``given`` for a model that existed before.
+        model: the model, with the transitions that it was learned from.
+        errors: its errors on the held-out recordings.
+        parameters: the parameters of the user's function; none for other kinds.
+        notes: sentences on the fit, such as how well the recordings determine a linear model.
+    """
+
+    kind: Kind
+    model: Model
+    errors: tuple[StepError, ...]
+    parameters: tuple[FittedParameter, ...] = ()
+    notes: tuple[str, ...] = ()
+
+    @property
+    def relative(self) -> float:
+        """The largest one-step error of a state on held-out recordings, as a share of its recorded change."""
+        return max((error.relative for error in self.errors if error.steps == 1), default=float("inf"))
+
+    @property
+    def useless(self) -> str | None:
+        """Why the model is no better than no model, in one sentence; None if it is.
+
+        After one step, or after the largest number of steps, its error in a state is at least the recorded change.
+        """
+        last = max((error.steps for error in self.errors), default=0)
+        counted_here = [error for error in self.errors if error.steps in (1, last)]
+        worst = max(counted_here, key=lambda error: error.relative, default=None)
+        if worst is None or worst.relative < 1:
+            return None
+        return (
+            f"the {self.kind} model is no better than to predict no change: its held-out error of {worst.state} after "
+            f"{counted(worst.steps, 'step')} is {100 * worst.relative:.3g} % of the recorded change"
+        )
+
+
+@dataclass(frozen=True)
+class FailedFit(ShortRepr):
+    """A kind of model that could not be learned from recordings."""
+
+    kind: Kind
+    reason: str
+
+
+@dataclass(frozen=True, eq=False)
+class FitReport(ShortRepr):
+    """Models that were learned from the same recordings, with their errors on the same held-out recordings.
+
+    Attributes:
+        fitted: the models, the most accurate first: that with the smallest error after the largest number of steps.
+        failed: the kinds that could not be learned.
+        learned_from, held_out: the recordings that models were learned from, and those that were held out.
+    """
+
+    fitted: tuple[FittedModel, ...]
+    failed: tuple[FailedFit, ...]
+    learned_from: Recordings
+    held_out: Recordings
+
+    def to_json(self) -> dict[str, Any]:
+        """Return all results but the models as plain values; numbers that are not finite are None."""
+        fitted = [
+            {
+                "kind": model.kind,
+                "errors": [{**asdict(error), "relative": error.relative} for error in model.errors],
+                "parameters": [asdict(parameter) for parameter in model.parameters],
+                "notes": list(model.notes),
+                "useless": model.useless,
+            }
+            for model in self.fitted
+        ]
+        parts = {"learned_from": self.learned_from, "held_out": self.held_out}
+        sizes = {name: {"recordings": len(part.runs), "steps": part.steps} for name, part in parts.items()}
+        report = plain_numbers({"fitted": fitted, "failed": [asdict(kind) for kind in self.failed], **sizes})
+        return {**report, "dt": self.held_out.dt, "notes": list(self.held_out.notes)}
+
+
+def fit(
+    recordings: Recordings,
+    kinds: Sequence[Kind] = KINDS[:3],
+    *,
+    step: ParametricStep | None = None,
+    bounds: Mapping[str, tuple[float, float]] | None = None,
+    vectorized: bool = False,
+    given: Model | None = None,
+    hold_out: float = HOLD_OUT,
+    steps: Sequence[int] = STEPS,
+    seed: int = 0,
+) -> FitReport:
+    """Learn models from recordings; a part of the recordings is held out and never learned from.
+
+    Args:
+        recordings: the recordings.
+        kinds: the kinds of models.
+        step: the user's function ``(x, u, theta) -> x_next``, for the kind ``parameters``.
+        bounds: the bounds of its parameters by name.
+        vectorized: whether this function takes whole batches.
+        given: a model that exists already, such as one that ``mujoco.sysid`` identified; its errors stand beside those
+            of the others. It may have been learned from the recordings that are held out here.
+        hold_out: the share of the recordings that is held out; of a single recording, its last part.
+        steps: numbers of steps after which errors are computed.
+        seed: seed of all random numbers.
+    """
+    if unknown := [str(kind) for kind in kinds if kind not in KINDS]:
+        raise UnknownNameError.among("kind of model", unknown[0], KINDS)
+    if not kinds:
+        raise InputError(f"at least one kind of model is needed: {', '.join(KINDS)}.")
+    if "parameters" in kinds:
+        if step is None or not bounds:
+            raise InputError("the kind 'parameters' needs a function (x, u, theta) -> x_next and the bounds of theta.")
+        as_bounds(bounds)
+    learned_from, held_out = split(recordings, hold_out, seed)
+    data, _ = learned_from.transitions()
+    recorded = RecordedSteps(held_out, range(len(held_out.runs)))
+    fitted: list[FittedModel] = []
+    failed: list[FailedFit] = []
+
+    def add(kind: Kind, model: Model, parameters: tuple[FittedParameter, ...] = ()) -> None:
+        notes = identifiability(data, [*recordings.states, *recordings.inputs]) if kind == "linear" else []
+        errors = step_errors(model, recorded, sorted(set(steps)))
+        fitted.append(FittedModel(kind, model, errors, parameters, tuple(notes)))
+
+    with single_threaded():
+        # Before anything is learned, because what is named must be usable.
+        if given is not None:
+            require_time_step(given, recordings.dt, "the recording")
+            add("given", given)
+        for kind in dict.fromkeys(kinds):
+            try:
+                if kind == "parameters":
+                    assert step is not None
+                    add(kind, *fit_parameters(step, bounds or {}, data, vectorized=vectorized, seed=seed))
+                else:  # of too many transitions, a network learns from every second, third, ...
+                    every = max(1, -(-len(data) // 20_000)) if kind == "network" else 1
+                    add(kind, learned_model(kind, data if every == 1 else data[::every], 400, seed))
+            except (InputError, ModelError) as error:
+                failed.append(FailedFit(kind, str(error)))
+
+    def rank(model: FittedModel) -> tuple[float, bool]:
+        last = max((error.steps for error in model.errors), default=0)
+        relative = max((error.relative for error in model.errors if error.steps == last), default=np.inf)
+        return relative if np.isfinite(relative) else np.inf, model.kind == "given"
+
+    return FitReport(tuple(sorted(fitted, key=rank)), tuple(failed), learned_from, held_out)
+
+
+def learned_model(kind: str, data: Transitions, centres: int, seed: int) -> Model:
+    """Return the linear model, the network or the Gaussian process that is learned from transitions."""
+    if kind == "linear":
+        return Linear.fit(data)
+    if kind == "network":
+        return FeedforwardReLU.fit(data, (32, 32), seed=seed, restarts=2)
+    return GaussianProcessModel.fit(data, centres, seed=seed)
+
+
+def split(recordings: Recordings, share: float, seed: int) -> tuple[Recordings, Recordings]:
+    """Return the recordings to learn from, and those that are held out.
+
+    Whole recordings are held out, drawn at random. Of a single recording, the last part is held out.
+    """
+    if not isinstance(share, int | float) or not 0 < share < 1:
+        raise InputError(f"the share that is held out must be between 0 and 1, got {share!r}.")
+    runs = recordings.runs
+    if len(runs) == 1:
+        horizon = runs[0].trajectory.horizon
+        cut = round((1 - share) * horizon)
+        if not 1 <= cut < horizon:
+            raise InputError(f"the only recording has {counted(horizon, 'step')}: too few to hold a part out.")
+        first, last = _part(runs[0], 0, cut), _part(runs[0], cut, horizon)
+        return replace(recordings, runs=(first,)), replace(recordings, runs=(last,))
+    count = min(max(1, round(share * len(runs))), len(runs) - 1)
+    chosen = set(np.random.default_rng(seed).permutation(len(runs))[:count].tolist())
+    kept = tuple(run for number, run in enumerate(runs) if number not in chosen)
+    return replace(recordings, runs=kept), replace(recordings, runs=tuple(runs[number] for number in sorted(chosen)))
+
+
+def _part(run: Recording, first: int, last: int) -> Recording:
+    whole = run.trajectory
+    times: Array = whole.times[first : last + 1] - whole.times[first]
+    part = Trajectory(times, whole.states[first : last + 1], whole.inputs[first:last])
+    return Recording(run.source, run.start + float(whole.times[first]), part)
+
+
+def identifiability(data: Transitions, names: Sequence[str]) -> list[str]:
+    """Return sentences on how well transitions determine a linear model: the variance inflation of each regressor."""
+    Z = np.concatenate([data.x, data.u], axis=1)
+    deviations = Z.std(axis=0)
+    still = [name for name, size in zip(names, deviations, strict=True) if size <= 0]
+    if still:
+        return [f"{', '.join(still)} never changes, so its coefficients are not determined"]
+    inflation = np.sqrt(np.diag(np.linalg.pinv(np.corrcoef(Z, rowvar=False).reshape(len(names), -1))))
+    weak = [name for name, ratio in zip(names, inflation, strict=True) if ratio > 30.0]
+    worst = float(inflation.max())
+    if weak:
+        return [
+            f"{' and '.join(weak)} nearly depend on each other in these recordings: the standard errors of their "
+            f"coefficients are up to {worst:.2g} times those of independent excitation"
+        ]
+    return [
+        f"all states and inputs vary independently enough: standard errors of coefficients are at most {worst:.2g} "
+        "times those of independent excitation"
+    ]

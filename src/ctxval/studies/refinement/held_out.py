@@ -1,0 +1,310 @@
+"""What the executions of all rounds teach, and the errors of a model on those that it was not learned from.
+
+These errors by regions of states and inputs are what a robust controller must assume.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from ctxval._util.arrays import Array, Mask, Rows
+from ctxval._util.representation import ShortRepr
+from ctxval._util.texts import aligned
+from ctxval.core.model import Model
+from ctxval.core.trajectory import Trajectory, Transitions
+from ctxval.errors import CtxvalError, InputError
+
+
+@dataclass(frozen=True, eq=False)
+class Records(ShortRepr):
+    """Executions of the system, and transitions that belong to none of them.
+
+    Attributes:
+        executed: the trajectories of the system, in the order of the rounds.
+        own: the data of the first model; None if it has none.
+    """
+
+    executed: tuple[Trajectory, ...]
+    own: Transitions | None = None
+
+    def __post_init__(self) -> None:
+        if not self.executed and (self.own is None or not len(self.own)):
+            raise InputError(
+                "there is nothing to learn from: no execution is stored with its trajectory, and the model carries no "
+                "data. Record the states and inputs of the executions, or give the model its data."
+            )
+
+    @classmethod
+    def of(cls, model: Model, executed: Sequence[Trajectory]) -> Records:
+        """Return the records of executions, and the data of the first model."""
+        data = getattr(model, "data", None)
+        return cls(tuple(executed), data if isinstance(data, Transitions) and len(data) else None)
+
+    @property
+    def transitions(self) -> Transitions:
+        """All transitions, those of the first model first."""
+        return Transitions.joined([*filter(None, [self.own]), *(run.transitions() for run in self.executed)])
+
+    @property
+    def sources(self) -> Rows:
+        """The execution of each transition; -1 for the data of the first model."""
+        count = 0 if self.own is None else len(self.own)
+        of = np.repeat(np.arange(len(self.executed)), [run.horizon for run in self.executed])
+        return np.concatenate([np.full(count, -1), of])
+
+    def folds(self) -> list[tuple[Records, Records]]:
+        """Return pairs of records: those to learn from, and those that are held out.
+
+        One execution is held out at a time. If there is only one and the model carries no data, its halves are; if
+        there is none, halves of the data.
+        """
+        count = len(self.executed)
+        if count == 0 and self.own is not None:
+            halves = np.array_split(np.random.default_rng(0).permutation(len(self.own)), 2)
+            first, second = (Records((), self.own[half]) for half in halves)
+            return [(first, second), (second, first)]
+        if count == 1 and self.own is None:
+            run, middle = self.executed[0], self.executed[0].horizon // 2
+            if middle < 1:
+                raise InputError("the only execution has one step: too few to hold a part out.")
+            first = Records((Trajectory(run.times[: middle + 1], run.states[: middle + 1], run.inputs[:middle]),))
+            second = Records((Trajectory(run.times[middle:], run.states[middle:], run.inputs[middle:]),))
+            return [(first, second), (second, first)]
+        parts = min(count, 10)  # of more executions, some are held out together
+        return [
+            (
+                replace(self, executed=tuple(run for k, run in enumerate(self.executed) if k % parts != part)),
+                Records(self.executed[part::parts]),
+            )
+            for part in range(parts)
+        ]
+
+
+@dataclass(frozen=True, eq=False)
+class HeldOut(ShortRepr):
+    """One-step errors ``S(x, u) - M(x, u)`` on N transitions that the model was not learned from.
+
+    Attributes:
+        pairs: the states and inputs, shape ``(N, n + m)``.
+        errors: those of the learned model, shape ``(N, n)``.
+        before: those of the first model, shape ``(N, n)``.
+        changes: the recorded changes of the states in one step, shape ``(N, n)``.
+        groups: the part that was held out together with each transition, shape ``(N,)``.
+    """
+
+    pairs: Array
+    errors: Array
+    before: Array
+    changes: Array
+    groups: Array
+
+    @property
+    def better(self) -> Mask:
+        """The states whose error became smaller, in the root mean square, shape ``(n,)``.
+
+        A correction of the states that are chosen by these errors is also reported with them, so the reported errors
+        are slightly too small. Those of the last round's executions, which chose nothing, are not.
+        """
+        return np.asarray((self.errors**2).mean(axis=0) < (self.before**2).mean(axis=0))
+
+    @property
+    def rms(self) -> Array:
+        """The root mean square of each state's error, shape ``(n,)``."""
+        return np.asarray(np.sqrt((self.errors**2).mean(axis=0)))
+
+    @property
+    def rms_before(self) -> Array:
+        """That of the first model, shape ``(n,)``."""
+        return np.asarray(np.sqrt((self.before**2).mean(axis=0)))
+
+    def kept(self, chosen: Mask) -> HeldOut:
+        """Return the errors if only the chosen states ``(n,)`` are corrected."""
+        return replace(self, errors=np.where(chosen, self.errors, self.before))
+
+    def with_executions(self, model: Model, before: Model, executed: tuple[Trajectory, ...]) -> HeldOut:
+        """Return these errors and those on executions that the model itself was not learned from."""
+        if not executed:
+            return self
+        first = int(self.groups.max(initial=-1)) + 1
+        parts = [_compared(run.transitions(), model, before, k) for k, run in enumerate(executed, first)]
+        return _joined([self, *parts])
+
+
+def held_out(learn: Callable[[Records], Model], before: Model, records: Records) -> HeldOut:
+    """Return the errors on each part of the records, of the model that is learned from the other parts.
+
+    Transitions on which a model is not finite count with the error of the first model, and so do parts that leave too
+    few records to learn from.
+    """
+    parts = []
+    for group, (known, held) in enumerate(records.folds()):
+        try:
+            model = learn(known)
+        except CtxvalError:
+            model = before
+        parts.append(_compared(held.transitions, model, before, group))
+    return _joined(parts)
+
+
+def _compared(data: Transitions, model: Model, before: Model, group: int) -> HeldOut:
+    with np.errstate(all="ignore"):
+        errors, first = (data.x_next - one.step(data.x, data.u) for one in (model, before))
+    usable = np.isfinite(first).all(axis=1)
+    errors = np.where(np.isfinite(errors), errors, first)
+    pairs, changes = np.concatenate([data.x, data.u], axis=1), data.x_next - data.x
+    groups = np.full(len(data), group)
+    return HeldOut(*(array[usable] for array in (pairs, errors, first, changes, groups)))
+
+
+def _joined(parts: list[HeldOut]) -> HeldOut:
+    return HeldOut(*(np.concatenate(arrays) for arrays in zip(*(vars(part).values() for part in parts), strict=True)))
+
+
+@dataclass(frozen=True, eq=False)
+class ResidualRegion(ShortRepr):
+    """The magnitude of the residual in one region.
+
+    Attributes:
+        low, high: the box of states and inputs, shapes ``(n + m,)``; infinite where it has no end.
+        steps: number of held-out transitions in it.
+        quantile: 0.95 quantile of the residual of each state in one step, shape ``(n,)``.
+        largest: its maximum, shape ``(n,)``.
+    """
+
+    low: Array
+    high: Array
+    steps: int
+    quantile: Array
+    largest: Array
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredResidual(ShortRepr):
+    """The residual ``S(x, u) - M'(x, u)`` of one step, measured on transitions that M' was not learned from.
+
+    It is measured and not guaranteed: another state or input may have a larger one.
+
+    Attributes:
+        states, inputs: the names of states and inputs with their units.
+        whole: the residual in all regions together, whose box is the range of the records.
+        regions: disjoint regions that cover all states and inputs, those with small residuals first.
+    """
+
+    states: dict[str, str]
+    inputs: dict[str, str]
+    whole: ResidualRegion
+    regions: tuple[ResidualRegion, ...]
+
+    @property
+    def text(self) -> str:
+        """The table as plain text."""
+        units = [f"{name} [{unit}]" if unit else name for name, unit in self.states.items()]
+        rows = [["region", "steps", *(f"{unit}: 95 %" for unit in units), *(f"{unit}: largest" for unit in units)]]
+        for region, where in [*((region, self._where(region)) for region in self.regions), (self.whole, "all records")]:
+            sizes = (*region.quantile.tolist(), *region.largest.tolist())
+            rows.append([where, str(region.steps), *(f"{value:.3g}" for value in sizes)])
+        return aligned(rows, right=True)
+
+    @property
+    def range_text(self) -> str:
+        """The range of the records in one line; nothing was measured outside."""
+        named = zip({**self.states, **self.inputs}.items(), self.whole.low, self.whole.high, strict=True)
+        return ", ".join(f"{name} {low:.3g} to {high:.3g} {unit}".rstrip() for (name, unit), low, high in named)
+
+    def _where(self, region: ResidualRegion) -> str:
+        parts = []
+        ends = zip((*self.states, *self.inputs), region.low.tolist(), region.high.tolist(), strict=True)
+        for name, low, high in ends:
+            if np.isfinite(low) and np.isfinite(high):
+                parts.append(f"{low:.3g} < {name} <= {high:.3g}")
+            elif np.isfinite(low):
+                parts.append(f"{name} > {low:.3g}")
+            elif np.isfinite(high):
+                parts.append(f"{name} <= {high:.3g}")
+        return ", ".join(parts) or "everywhere"
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return all numbers as plain values; an end that is infinite is None."""
+
+        def plain(region: ResidualRegion) -> dict[str, Any]:
+            ends = zip((*self.states, *self.inputs), region.low.tolist(), region.high.tolist(), strict=True)
+            return {
+                "range": {name: [end if np.isfinite(end) else None for end in pair] for name, *pair in ends},
+                "steps": region.steps,
+                "quantile": dict(zip(self.states, region.quantile.tolist(), strict=True)),
+                "largest": dict(zip(self.states, region.largest.tolist(), strict=True)),
+            }
+
+        return {
+            "quantile_level": 0.95,
+            "units": {**self.states, **self.inputs},
+            "whole": plain(self.whole),
+            "regions": [plain(region) for region in self.regions],
+            "guaranteed": False,
+        }
+
+
+def measure_residual(held: HeldOut, states: dict[str, str], inputs: dict[str, str]) -> MeasuredResidual:
+    """Return the residual by regions, from errors on transitions that were held out.
+
+    The regions are those of a small regression tree: each split explains most of the spread of the logarithm of the
+    error, in units of the typical change of each state.
+
+    Args:
+        held: the errors.
+        states, inputs: the names of states and inputs with their units.
+    """
+
+    def region(inside: Mask, low: Array, high: Array) -> ResidualRegion:
+        chosen = np.abs(held.errors)[inside]
+        return ResidualRegion(low, high, len(chosen), np.quantile(chosen, 0.95, axis=0), chosen.max(axis=0))
+
+    sizes = np.maximum(held.changes.std(axis=0), 1e-300)
+    error = np.sqrt(((held.errors / sizes) ** 2).mean(axis=1))
+    logs = np.log(np.maximum(error, 1e-12 * max(float(error.max(initial=0.0)), 1e-300)))
+    regions = [region(*box) for box in _split(held.pairs, logs)]
+    whole = region(np.ones(len(logs), dtype=bool), held.pairs.min(axis=0), held.pairs.max(axis=0))
+    ordered = sorted(regions, key=lambda one: float((one.quantile / sizes).max()))
+    return MeasuredResidual(states, inputs, whole, tuple(ordered))
+
+
+def _split(pairs: Array, logs: Array) -> list[tuple[Mask, Array, Array]]:
+    """Return boxes with the transitions in them: the box whose split explains most is split first."""
+    k = pairs.shape[1]
+    boxes = [(np.ones(len(pairs), dtype=bool), np.full(k, -np.inf), np.full(k, np.inf))]
+    # A split must explain a share of the spread, and more than rounding.
+    least = max(0.1 * float(((logs - logs.mean()) ** 2).sum()), 1e-6 * len(logs))
+    while len(boxes) < 6:
+        splits = [_best_split(pairs, logs, box[0]) for box in boxes]
+        best = max(range(len(boxes)), key=lambda i: splits[i][0])
+        gain, column, place = splits[best]
+        if not gain > least:
+            break
+        inside, low, high = boxes.pop(best)
+        below: Mask = np.asarray(pairs[:, column] <= place)
+        lower_end, upper_end = high.copy(), low.copy()
+        lower_end[column] = upper_end[column] = place
+        boxes += [(inside & below, low, lower_end), (inside & ~below, upper_end, high)]
+    return boxes
+
+
+def _best_split(pairs: Array, logs: Array, inside: Mask) -> tuple[float, int, float]:
+    """Return the spread that the best split of a box explains, with its column and its place."""
+    best = (0.0, 0, 0.0)
+    chosen = logs[inside]
+    total = float(((chosen - chosen.mean()) ** 2).sum())
+    for column in range(pairs.shape[1]):
+        values = pairs[inside, column]
+        # Rounded, so that they can be written down.
+        for place in (float(f"{cut:.3g}") for cut in np.quantile(values, (0.25, 0.5, 0.75))):
+            below = values <= place
+            # The 0.95 quantile of fewer would be their largest value.
+            if min(int(below.sum()), int((~below).sum())) < 40:
+                continue
+            left = sum(float(((part - part.mean()) ** 2).sum()) for part in (chosen[below], chosen[~below]))
+            best = max(best, (total - left, column, place))
+    return best

@@ -1,0 +1,253 @@
+"""The methods by which a model is learned again from executions."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal, get_args
+
+import numpy as np
+
+from ctxval._util.arrays import Mask, single_threaded
+from ctxval._util.representation import ShortRepr
+from ctxval._util.texts import reason_of
+from ctxval.core.model import Model, Step, as_model
+from ctxval.core.trajectory import Transitions
+from ctxval.errors import CtxvalError, InputError, ModelError, UnknownNameError
+from ctxval.learning import DynamicsPosterior, PosteriorSettings, learn_posterior
+from ctxval.models import Corrected, Correction, FeedforwardReLU, GaussianProcessModel, Linear, Parametric
+from ctxval.models.parametric import ParametricStep
+from ctxval.studies.fitting import FittedParameter, fit_parameters
+from ctxval.studies.fitting.fit import learned_model
+from ctxval.studies.fitting.least_squares import as_bounds
+from ctxval.studies.refinement.held_out import HeldOut, Records, held_out
+from ctxval.studies.replay.accuracy import stepped
+
+_CENTRES = 300  # largest number of transitions that a correction is conditioned on
+
+RefitKind = Literal["linear", "network", "gaussian-process"]
+NAMES = ("residual", *get_args(RefitKind), "parameters", "fit")
+"""The names of the methods on the command line."""
+
+
+@dataclass(frozen=True, eq=False)
+class Learned(ShortRepr):
+    """A model that was learned from records.
+
+    Attributes:
+        model: the model.
+        errors: its errors on records that were held out.
+        notes: sentences on what was learned.
+        parameters: the parameters of the user's function; none for other methods.
+    """
+
+    model: Model
+    errors: HeldOut
+    notes: tuple[str, ...] = ()
+    parameters: tuple[FittedParameter, ...] = ()
+
+
+class Method(ABC):
+    """A method that learns a model from records. It is a function of the model and the records.
+
+    Attributes:
+        name: its name.
+        makes: the type of the models that it learns; None if it may be any.
+    """
+
+    name: str
+    makes: type[Model] | None = None
+
+    @abstractmethod
+    def learn(self, model: Model, records: Records) -> Learned:
+        """Return the model that is learned from records; ``model`` is the first one, which is corrected or replaced.
+
+        Raises:
+            InputError: if the records do not suffice.
+            ModelError: if the learned model is not usable.
+        """
+
+
+@dataclass(frozen=True)
+class ResidualCorrection(ShortRepr, Method):
+    """The first model with a correction: the mean of Gaussian processes of its residual.
+
+    A state is corrected only if this lowers the error on executions that are held out. Outside the range of the
+    records the correction fades, so that the model is as before.
+
+    Attributes:
+        centres: largest number of transitions that the correction is conditioned on.
+    """
+
+    centres: int = _CENTRES
+    name: str = field(default="residual", init=False)
+    makes = Corrected
+
+    def learn(self, model: Model, records: Records) -> Learned:
+        """Return the corrected model."""
+
+        def correction(some: Records) -> Correction | None:
+            # Matern 5/2 that does not grow with the inputs.
+            settings = PosteriorSettings(
+                hyperparameters=1, centres=self.centres, families=((2.5, 0.0),), of_steps=False
+            )
+            posterior = learn_posterior(model, some.transitions, some.sources, settings=settings)
+            return None if posterior is None else correction_of(posterior)
+
+        def corrected(some: Records) -> Model:
+            learned = correction(some)
+            return model if learned is None else Corrected(model, learned)
+
+        errors = held_out(corrected, model, records)
+        better = errors.better
+        whole = correction(records)
+        if whole is None or not better.any():
+            raise InputError(
+                "no state can be corrected: on executions that were held out, the residual of the model is not "
+                "predicted from state and input. A state may be missing, such as a temperature or a delay, or the "
+                "executions have too little in common."
+            )
+        worth: Mask = np.asarray(errors.rms_before > 1e-7 * errors.changes.std(axis=0))
+        rows = ", ".join(str(i) for i in np.flatnonzero(worth & ~better).tolist())
+        notes = (
+            (f"not corrected, because the error on held-out executions would not fall: state {rows}",) if rows else ()
+        )
+        return Learned(Corrected(model, whole.of_states(better), data=records.transitions), errors.kept(better), notes)
+
+
+def correction_of(posterior: DynamicsPosterior) -> Correction:
+    """Return a learned residual as a correction, with the box of the records that it was learned from."""
+    # At least 24 centres are kept, if they predict the others with a relative error of 0.005: design on the model is
+    # then faster.
+    data, mean = posterior.data, posterior.with_few_centres(24, 0.005)
+    low, high = data.pairs.min(axis=0), data.pairs.max(axis=0)
+    values = np.exp(mean.hyperparameters.theta)
+    scales, constant, slope = values[:-2], values[-2], values[-1]
+    weights = np.zeros((len(mean.centres), len(data.units)))
+    weights[:, data.learned] = mean.weights[0]
+    weights *= data.units
+    linear = np.concatenate([slope * mean.centres.T @ weights, constant * weights.sum(axis=0, keepdims=True)])
+    # A coordinate that the residual does not depend on fades the correction within one more range of the records.
+    fade = np.minimum(scales, np.maximum(high - low, 1.0))
+    limit = posterior.limit * data.units
+    return Correction(data.shift, data.scale, mean.centres, scales, weights, linear, low, high, fade, limit)
+
+
+class _Replacement(Method):
+    """A method whose model takes the place of the first one."""
+
+    @abstractmethod
+    def _fit(self, model: Model, data: Transitions) -> tuple[Model, tuple[FittedParameter, ...]]: ...
+
+    def learn(self, model: Model, records: Records) -> Learned:
+        """Return the new model, which gives finite states of the right shape at recorded pairs."""
+        data = records.transitions
+        learned, parameters = self._fit(model, data)
+        rows = np.linspace(0, len(data) - 1, min(50, len(data))).astype(int)
+        if not np.isfinite(stepped(learned, data.x[rows], data.u[rows])).all():
+            raise ModelError("the learned model returns NaN or infinity on recorded states and inputs.")
+        errors = held_out(lambda some: self._fit(model, some.transitions)[0], model, records)
+        return Learned(learned, errors, parameters=parameters)
+
+
+@dataclass(frozen=True)
+class Refit(ShortRepr, _Replacement):
+    """A new model of a kind of :func:`ctxval.studies.fitting.fit`, in place of the first model.
+
+    Attributes:
+        kind: ``linear``, ``network`` or ``gaussian-process``.
+        seed: seed of all random numbers.
+    """
+
+    kind: RefitKind
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.kind not in get_args(RefitKind):
+            raise UnknownNameError.among("kind of model", str(self.kind), get_args(RefitKind))
+
+    @property
+    def name(self) -> str:  # type: ignore[override]
+        """Its kind."""
+        return self.kind
+
+    @property
+    def makes(self) -> type[Model]:  # type: ignore[override]
+        """The type of the models of its kind."""
+        return {"linear": Linear, "network": FeedforwardReLU, "gaussian-process": GaussianProcessModel}[self.kind]
+
+    def _fit(self, model: Model, data: Transitions) -> tuple[Model, tuple[FittedParameter, ...]]:
+        with single_threaded():
+            return learned_model(self.kind, data, _CENTRES, self.seed), ()
+
+
+@dataclass(frozen=True, eq=False)
+class ParameterFit(ShortRepr, _Replacement):
+    """New values of the parameters of a user's function ``(x, u, theta) -> x_next``, by least squares.
+
+    Attributes:
+        bounds: the bounds of each parameter by name, in the order of theta.
+        step: the function; None for that of the first model, which must then be a ``Parametric``.
+        vectorized: whether ``step`` takes whole batches.
+        seed: seed of the starting points.
+    """
+
+    bounds: Mapping[str, tuple[float, float]]
+    step: ParametricStep | None = None
+    vectorized: bool = False
+    seed: int = 0
+    name: str = field(default="parameters", init=False)
+    makes = Parametric
+
+    def __post_init__(self) -> None:
+        as_bounds(self.bounds)
+
+    def _fit(self, model: Model, data: Transitions) -> tuple[Model, tuple[FittedParameter, ...]]:
+        if self.step is not None:
+            return fit_parameters(self.step, self.bounds, data, vectorized=self.vectorized, seed=self.seed)
+        if not isinstance(model, Parametric):
+            raise InputError(
+                "the method 'parameters' needs the function step (--step), because the model is not a Parametric."
+            )
+        return fit_parameters(model.function, self.bounds, data, vectorized=model.vectorized, seed=self.seed)
+
+
+@dataclass(frozen=True, eq=False)
+class UserFit(ShortRepr, _Replacement):
+    """The user's own function ``fit(data) -> model``.
+
+    Attributes:
+        fit: the function of the transitions; it must always return the same for the same data.
+    """
+
+    fit: Callable[[Transitions], Model | Step]
+    name: str = field(default="fit", init=False)
+
+    def __post_init__(self) -> None:
+        if not callable(self.fit):
+            raise InputError(f"fit must be a function (data) -> model, got {self.fit!r}.")
+
+    def _fit(self, model: Model, data: Transitions) -> tuple[Model, tuple[FittedParameter, ...]]:
+        try:
+            return as_model(self.fit(data)), ()
+        except (Exception, SystemExit) as error:
+            why = str(error) if isinstance(error, CtxvalError) else f"{reason_of(error)}."
+            raise InputError(f"the fit failed: {why}") from error
+
+
+def method_of(method: str | Method | Callable[[Transitions], Any], *, seed: int = 0) -> Method:
+    """Return a method by its name, a method unchanged, and a function ``fit(data) -> model`` as a method."""
+    if isinstance(method, Method):
+        return method
+    if not isinstance(method, str):
+        return UserFit(method)
+    if method == "residual":
+        return ResidualCorrection()
+    if method in get_args(RefitKind):
+        return Refit(method, seed)  # type: ignore[arg-type]
+    if method == "parameters":
+        raise InputError("the method 'parameters' needs bounds: give refinement.ParameterFit({'mass': (0.5, 2.0)}).")
+    if method == "fit":
+        raise InputError("the method 'fit' needs a function: give the function fit(data) -> model itself.")
+    raise UnknownNameError.among("method of refinement", method, NAMES)

@@ -1,0 +1,247 @@
+"""``refine``: learn a model again from the executions that falsified it, and validate it, until it is validated."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from ctxval._util.checked import PositiveFloat, PositiveInt, checked
+from ctxval._util.progress import stage
+from ctxval._util.progress_display import progress_shown
+from ctxval.campaign.campaign import Campaign
+from ctxval.campaign.history import executed_trials
+from ctxval.certificates import CertificateOptions
+from ctxval.certificates.verdict import Verdict, counterexample
+from ctxval.core.model import Model, Step
+from ctxval.core.trajectory import Trajectory, Transitions
+from ctxval.core.trial import Trial
+from ctxval.core.validation import Validation
+from ctxval.errors import CtxvalError, InputError
+from ctxval.models import Refined, read_refined, write_model
+from ctxval.models.corrected import before_refinement
+from ctxval.models.saved import is_savable, read_note
+from ctxval.studies.refinement.design import SameControllers, same_controllers, with_best_jacobian
+from ctxval.studies.refinement.held_out import MeasuredResidual, Records, measure_residual
+from ctxval.studies.refinement.methods import Learned, Method, method_of
+from ctxval.studies.refinement.rounds import Refinement, Round
+
+OpensRound = Callable[[Validation, Path | None, Path | None, CertificateOptions], Campaign]
+"""A function that makes the campaign of a round, from its validation, its store, the file of its model and options."""
+
+
+@checked
+def refine(
+    campaign: Campaign,
+    threshold: PositiveFloat,
+    budget: PositiveInt,
+    *,
+    method: str | Method | Callable[[Transitions], Model | Step] = "residual",
+    certificate: CertificateOptions | None = None,
+    on_trial: Callable[[Trial], None] | None = None,
+    open_round: OpensRound | None = None,
+    progress: bool | None = None,
+    **execution: Any,
+) -> Refinement:
+    """Learn a model again from executions and validate it, round by round, until it is validated or the budget ends.
+
+    A round ends as soon as its model is falsified; the next model learns from the executions of all rounds. Each model
+    has a store of its own next to that of the campaign, such as ``cart.round-1.sqlite``, and a file such as
+    ``cart.round-1.npz``. If these files exist, the refinement is resumed, with the same choices as without an
+    interruption.
+
+    An execution counts for one model only, that on which its controller was designed. The k-th refined model is judged
+    with confidence ``1 - alpha / (k (k + 1))``, so that all of them together are wrong with probability at most alpha.
+
+    Args:
+        campaign: the campaign of the first model. It is run until it is decided, if it is not yet.
+        threshold: tau, in the units of the distance.
+        budget: largest total number of executions of all rounds, including those of the campaign.
+        method: ``residual``, ``linear``, ``network`` or ``gaussian-process``; a method of ``ctxval.refinement``; or a
+            function ``fit(data) -> model`` that always returns the same model for the same data.
+        certificate: the kind and options of the certificates, with the confidence ``1 - alpha``; ``auto`` by default.
+        on_trial: called with each trial that has ended.
+        open_round: makes the campaign of a round; by default, like the given campaign.
+        progress: whether to show the progress on standard error; None to show it at a terminal and in a notebook.
+        execution: ``workers``, ``executor`` and ``timeout`` of :meth:`ctxval.Campaign.run`.
+    """
+    if budget < campaign.executions:
+        raise InputError(
+            f"the campaign has {campaign.executions} executions already, and the budget of {budget} is a total: give "
+            "more."
+        )
+    chosen, options = method_of(method, seed=campaign.seed), certificate or CertificateOptions()
+
+    def same_settings(
+        validation: Validation, store: Path | None, model_file: Path | None, certificate: CertificateOptions
+    ) -> Campaign:
+        search = copy.deepcopy(campaign.search)
+        return Campaign(validation, search=search, store=store, seed=campaign.seed, name=campaign.name)
+
+    execution |= {"on_trial": on_trial, "progress": progress}
+    loop = _Loop(campaign, float(threshold), int(budget), chosen, options, open_round or same_settings, execution)
+    with progress_shown(progress):
+        return loop.run()
+
+
+@dataclass(eq=False)
+class _Loop:
+    """The rounds so far. Everything but the executions is a function of the stores, so an interrupted loop resumes."""
+
+    first: Campaign
+    threshold: float
+    budget: int
+    method: Method
+    options: CertificateOptions
+    open_round: OpensRound
+    execution: dict[str, Any]
+    rounds: list[Round] = field(default_factory=list)
+    _last: tuple[int, Learned] | None = field(default=None, init=False)
+
+    def __post_init__(self) -> None:
+        # The model that is corrected or replaced; of a model that was refined before, the one before.
+        self._base = before_refinement(self.first.validation.model)
+
+    def run(self) -> Refinement:
+        """Run the rounds until one is validated, or nothing more can be done."""
+        verdict = self._judged(self.first, self.options)
+        self.rounds.append(Round(0, "given", self.first, verdict, self.options.confidence))
+        ended = self._why_ended()
+        while ended is None:
+            ended = self._next_round() or self._why_ended()
+        number = self.rounds[-1].number
+        learned, residual = self._measured(number) if number else (None, None)
+        accuracy = {}
+        if learned is not None and residual is not None:
+            rms = zip(learned.errors.rms_before.tolist(), learned.errors.rms.tolist(), strict=True)
+            accuracy = dict(zip(residual.states, rms, strict=False))
+        return Refinement(
+            tuple(self.rounds),
+            self.threshold,
+            self.options.confidence,
+            self.budget,
+            ended,
+            residual,
+            accuracy,
+            () if learned is None else learned.parameters,
+            self.first.validation.labels.units,
+        )
+
+    def _judged(self, campaign: Campaign, options: CertificateOptions) -> Verdict:
+        """Execute tasks of a campaign until it is decided or the budget ends; people execute theirs themselves."""
+        falsified = counterexample(campaign.trials, self.threshold) is not None
+        left = self.budget - sum(item.executions for item in self.rounds)
+        if not falsified and not getattr(campaign.validation.system, "manual", False) and left >= 1:
+            campaign.run(left, self.threshold, certificate=options, **self.execution)
+        return campaign.verdict(self.threshold, certificate=options)
+
+    def _why_ended(self) -> str | None:
+        """Return why there is no further round; None if there is one."""
+        last, spent = self.rounds[-1], sum(item.executions for item in self.rounds)
+        if last.verdict.answer == "validated":
+            which = "the given model" if not last.number else f"the model of round {last.number}"
+            return f"{which} is validated"
+        if last.verdict.answer == "undecided":
+            if getattr(last.campaign.validation.system, "manual", False):
+                return (
+                    f"people execute the tasks of this system: get them with `ctxval ask {last.store}`, tell their "
+                    "results, and refine again"
+                )
+            return f"the verdict on the model of round {last.number} is undecided after {spent} executions"
+        return f"the budget of {self.budget} executions is spent" if spent >= self.budget else None
+
+    def _next_round(self) -> str | None:
+        """Run one more round; return why there is none."""
+        number = len(self.rounds)
+        confidence = confidence_of_round(self.options.confidence, number)
+        options = replace(self.options, confidence=confidence)
+        file = self._beside(number, ".npz")
+        if file is not None and file.exists():
+            model, notes = self._stored(number, file)
+        else:
+            try:
+                model, notes, file = self._learned_model(number, file)
+            except InputError as error:
+                if number == 1:
+                    raise
+                return f"no better model can be learned: {str(error).removesuffix('.')}"
+        validation = self.first.validation.with_model(model)
+        same = SameControllers()
+        if not getattr(self.options.kind, "stochastic", False):
+            same = same_controllers(validation, list(self._executed(self.rounds)))
+        if same.worst is not None and same.worst > self.threshold:
+            return (
+                f"the model that round {number} would learn has the distance {same.worst:.4g} on a task that it has "
+                "learned from, with the controller that was executed: another method is needed"
+            )
+        campaign = self.open_round(validation, self._beside(number, ".sqlite"), file, options)
+        verdict, name = self._judged(campaign, options), self.method.name
+        self.rounds.append(Round(number, name, campaign, verdict, confidence, len(model.data), file, notes, same))
+        return None
+
+    def _stored(self, number: int, file: Path) -> tuple[Refined, tuple[str, ...]]:
+        """Return the model of a round from its file, with its notes."""
+        note = read_note(file)
+        if note.get("method") != self.method.name:
+            raise InputError(
+                f"{file} was learned by the method {note.get('method')!r}: give this method, or move the files of the "
+                "rounds away."
+            )
+        model = read_refined(file, self._base)
+        data = model.data or self._records(number).transitions
+        return Refined(model, data, self._base), tuple(map(str, note.get("notes", [])))
+
+    def _learned_model(self, number: int, file: Path | None) -> tuple[Refined, tuple[str, ...], Path | None]:
+        """Return the model of a round, learned from the executions before, with its notes; write its file."""
+        data = self._records(number).transitions
+        with stage("learning the model again"):
+            learned = self._learned(number)
+            refined, of_design = with_best_jacobian(self.first.validation, Refined(learned.model, data, self._base))
+        notes = learned.notes if of_design is None else (*learned.notes, of_design)
+        if file is None or not is_savable(refined):
+            return refined, notes, None
+        write_model(file, refined, {"method": self.method.name, "notes": list(notes)})
+        # What a resumed refinement reads is what this one uses, to the last bit.
+        return Refined(read_refined(file, self._base), refined.data, self._base), notes, file
+
+    def _executed(self, rounds: list[Round]) -> Iterator[tuple[Trial, Trajectory]]:
+        for item in rounds:
+            yield from executed_trials(item.campaign.store, item.campaign.trials)
+
+    def _learned(self, number: int) -> Learned:
+        """Return what the rounds before a number teach; the result needs it after the round, too."""
+        if self._last is None or self._last[0] != number:
+            self._last = number, self.method.learn(self._base, self._records(number))
+        return self._last[1]
+
+    def _records(self, before: int) -> Records:
+        """Return what the rounds before a number have recorded."""
+        executed = [trajectory for _, trajectory in self._executed(self.rounds[:before])]
+        return Records.of(self.first.validation.model, executed)
+
+    def _beside(self, number: int, suffix: str) -> Path | None:
+        """Return the path of a file of a round, next to the store of the first model."""
+        store = self.first.store.path
+        return None if store is None else store.with_name(f"{store.stem}.round-{number}{suffix}")
+
+    def _measured(self, number: int) -> tuple[Learned | None, MeasuredResidual | None]:
+        """Return the errors of the last model on executions that it was not learned from."""
+        with stage("measuring the residual"):
+            try:
+                learned = self._learned(number)
+            except CtxvalError:  # the file of the model is there, but its executions are not
+                return None, None
+            last = tuple(trajectory for _, trajectory in self._executed(self.rounds[number:]))
+            whole = learned.errors.with_executions(self.rounds[number].model, self._base, last)
+            names = self.first.validation.names(whole.errors.shape[1], whole.pairs.shape[1] - whole.errors.shape[1])
+            return replace(learned, errors=whole), measure_residual(whole, *names)
+
+
+def confidence_of_round(confidence: float, number: int) -> float:
+    """Return the confidence with which the k-th refined model is judged, ``1 - alpha / (k (k + 1))``.
+
+    The shares sum up to alpha, so all rounds together are wrong with probability at most alpha.
+    """
+    return 1 - (1 - confidence) / (number * (number + 1))

@@ -1,0 +1,238 @@
+"""The results of a refinement: what each round showed, and what follows for the refined model."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from ctxval._util.describe import describe
+from ctxval._util.files import MADE_BY, write_text
+from ctxval._util.representation import ShortRepr, Shown, call, counted, line, lines, table
+from ctxval._util.texts import aligned
+from ctxval.campaign.campaign import Campaign
+from ctxval.certificates.verdict import Answer, Verdict
+from ctxval.core.model import Model
+from ctxval.errors import InputError
+from ctxval.models import Refined
+from ctxval.studies.fitting import FittedParameter
+from ctxval.studies.fitting.model_file import write_model_file
+from ctxval.studies.refinement.design import SameControllers
+from ctxval.studies.refinement.held_out import MeasuredResidual
+
+
+@dataclass(frozen=True, eq=False)
+class Round(ShortRepr):
+    """One model, and what its executions showed.
+
+    Attributes:
+        number: 0 for the first model, then 1, 2, ...
+        method: the method by which the model was learned; ``given`` for the first one.
+        campaign: the campaign of the model, whose store belongs to it alone.
+        verdict: the verdict on the model, with the confidence of this round.
+        confidence: the confidence of this round.
+        learned_from: number of transitions that the model was learned from.
+        model_file: the file of the model; None if there is none.
+        notes: sentences on the model.
+        unchanged: executed tasks of earlier rounds whose controllers have not changed.
+    """
+
+    number: int
+    method: str
+    campaign: Campaign
+    verdict: Verdict
+    confidence: float
+    learned_from: int = 0
+    model_file: Path | None = None
+    notes: tuple[str, ...] = ()
+    unchanged: SameControllers = field(default_factory=SameControllers)
+
+    @property
+    def model(self) -> Model:
+        """The model of the round."""
+        return self.campaign.validation.model
+
+    @property
+    def executions(self) -> int:
+        """The number of executions under controllers that were designed on this model."""
+        return self.campaign.executions
+
+    @property
+    def worst(self) -> float | None:
+        """The largest distance that was executed; None if there is none."""
+        return None if self.campaign.worst is None else self.campaign.worst.distance
+
+    @property
+    def task(self) -> Mapping[str, Any] | None:
+        """The task of the largest distance; None if there is none."""
+        return None if self.campaign.worst is None else self.campaign.worst.parameters
+
+    @property
+    def store(self) -> Path | None:
+        """The store of the round; None if it is in memory."""
+        return self.campaign.store.path
+
+    @property
+    def cells(self) -> tuple[str, ...]:
+        """Number, method, executions, largest distance and verdict as texts."""
+        worst = "-" if self.worst is None else f"{self.worst:.4g}"
+        return str(self.number), self.method, str(self.executions), worst, self.verdict.answer
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain values."""
+        certificate = self.verdict.certificate
+        return {
+            "round": self.number,
+            "method": self.method,
+            "model": repr(self.model),
+            "model_file": self.model_file and str(self.model_file),
+            "store": self.store and str(self.store),
+            "learned_from": self.learned_from,
+            "executions": self.executions,
+            "worst": None if self.worst is None else {"task": self.task, "distance": self.worst},
+            "verdict": self.verdict.answer,
+            "reason": self.verdict.reason,
+            "confidence": self.confidence,
+            "bound": self.verdict.bound,
+            "certificate": None if certificate is None else certificate.to_json(),
+            "notes": list(self.notes),
+            "unchanged_controllers": asdict(self.unchanged),
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class Refinement:
+    """A sequence of models of one system, each validated by executions under its own controllers.
+
+    Attributes:
+        rounds: the first model and the refined ones.
+        threshold: tau, in the units of the distance.
+        confidence: the confidence of the whole sequence.
+        budget: the largest total number of executions.
+        ended: why the sequence ended, in one sentence.
+        residual: the measured residual of the last model; None if no model was learned.
+        accuracy: the one-step errors on held-out executions, before and after, for each state; empty if no model was
+            learned.
+        parameters: the parameters of the user's function in the last model; none for other methods.
+        units: the units of the distance.
+    """
+
+    rounds: tuple[Round, ...]
+    threshold: float
+    confidence: float
+    budget: int
+    ended: str
+    residual: MeasuredResidual | None = None
+    accuracy: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    parameters: tuple[FittedParameter, ...] = ()
+    units: str = ""
+
+    @property
+    def last(self) -> Round:
+        """The last round."""
+        return self.rounds[-1]
+
+    @property
+    def model(self) -> Model:
+        """The model of the last round, without the records that it carries."""
+        model = self.last.model
+        return model.model if isinstance(model, Refined) else model
+
+    @property
+    def answer(self) -> Answer:
+        """The verdict on the last model."""
+        return self.last.verdict.answer
+
+    @property
+    def executions(self) -> int:
+        """The number of executions of all rounds."""
+        return sum(item.executions for item in self.rounds)
+
+    @property
+    def statement(self) -> str:
+        """What the last verdict means: the executions that it counts, and its confidence after several rounds."""
+        others = self.executions - self.last.executions
+        counted_here = counted(self.last.executions, "execution")
+        counts = f"The verdict on the model of round {self.last.number} counts {counted_here} under its own controllers"
+        if others:
+            counts += (
+                f"; {counted(others, 'execution')} under controllers of other models taught the model, and "
+                f"{'proves' if others == 1 else 'prove'} nothing of it"
+            )
+        if self.answer != "validated" or not self.last.number:
+            return f"{counts}."
+        return (
+            f"{counts}. Its confidence is {self.last.confidence:.6g}: the k-th refined model may be validated wrongly "
+            f"with probability {1 - self.confidence:.3g} / (k (k + 1)), so the whole sequence is wrong with "
+            f"probability at most {1 - self.confidence:.3g}, however many models were tried. This holds for one "
+            "refinement: if several refinements begin with the same stores or executions, the probability that any of "
+            "them validates a model wrongly is larger."
+        )
+
+    @property
+    def head(self) -> tuple[str, ...]:
+        """What the cells of a round are."""
+        return "round", "model", "executions", f"worst distance{f' [{self.units}]' if self.units else ''}", "verdict"
+
+    @property
+    def text(self) -> str:
+        """The rounds as a table of plain text."""
+        return aligned([self.head, *(item.cells for item in self.rounds)])
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return everything but the models as plain values."""
+        return {
+            "verdict": self.answer,
+            "threshold": self.threshold,
+            "confidence": self.confidence,
+            "units": self.units,
+            "budget": self.budget,
+            "executions": self.executions,
+            "ended": self.ended,
+            "statement": self.statement,
+            "distance_before": self.rounds[0].worst,
+            "distance_after": self.last.worst,
+            "rounds": [item.to_dict() for item in self.rounds],
+            "one_step_error": {
+                name: {"before": before, "after": after} for name, (before, after) in self.accuracy.items()
+            },
+            "parameters": [vars(parameter) for parameter in self.parameters],
+            "residual": None if self.residual is None else self.residual.to_dict(),
+        }
+
+    def to_json(self) -> str:
+        """Return :meth:`to_dict` as a text in JSON."""
+        return json.dumps(describe(self.to_dict(), depth=12), indent=1)
+
+    def __repr__(self) -> str:
+        head = call(self, Shown(self.answer), threshold=self.threshold, executions=self.executions)
+        return lines(head, f"ended: {line(self.ended)}", *(line(row) for row in self.text.splitlines()[1:4]))
+
+    def _repr_html_(self) -> str:
+        rows = [(f"round {one.number}: {one.method}", ", ".join(one.cells[2:])) for one in self.rounds]
+        return table(f"Refinement: {self.answer}", [*rows, ("ended", self.ended), ("statement", self.statement)])
+
+
+def write_refined(path: str | Path, refinement: Refinement, step: str | None = None) -> list[str]:
+    """Write the last model of a refinement, and next to it its residual as JSON and as a table; return the paths."""
+    if not refinement.last.number:
+        raise InputError("no model was refined, so there is none to write.")
+    target = Path(path)
+    written = write_model_file(target, refinement.model, step)
+    if refinement.residual is None:
+        return written
+    names = ("verdict", "threshold", "units", "statement", "residual")
+    about = {"made_by": MADE_BY, "model": target.name, **{name: refinement.to_dict()[name] for name in names}}
+    remark = (
+        f"{MADE_BY}. Residual S(x, u) - M(x, u) of one step, measured on executions that the model was not learned "
+        f"from, and not guaranteed.\nMeasured for {refinement.residual.range_text}.\nA robust controller must assume "
+        "at least these disturbances."
+    )
+    described = json.dumps(describe(about, 12), indent=1, allow_nan=False)
+    return [
+        *written,
+        str(write_text(target.with_suffix(".residual.json"), f"{described}\n")),
+        str(write_text(target.with_suffix(".residual.txt"), f"{refinement.residual.text}\n\n{remark}\n")),
+    ]

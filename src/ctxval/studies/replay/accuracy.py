@@ -1,0 +1,222 @@
+"""How accurate a model is on recordings: errors over one and several steps, and where they are large."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ctxval._util.arrays import Array, Mask, Rows
+from ctxval._util.representation import ShortRepr
+from ctxval.core.model import Model
+from ctxval.data.recordings import Recordings
+from ctxval.errors import CtxvalError, ModelError
+
+
+@dataclass(frozen=True)
+class StepError(ShortRepr):
+    """The error of one state after a number of steps.
+
+    Attributes:
+        state, unit: the state and its unit.
+        steps: the number of steps.
+        rms: root mean square of the error.
+        lowest, highest: the smallest and the largest root mean square over the recordings.
+        median, upper, largest: median, 0.95 quantile and maximum of the magnitude of the error.
+        change: root mean square of the recorded change of the state over the steps. A model that predicts no change
+            has this error.
+        count: number of predictions.
+        diverged: share of the predictions in which the model diverged; they are left out of the numbers above.
+    """
+
+    state: str
+    unit: str
+    steps: int
+    rms: float
+    lowest: float
+    highest: float
+    median: float
+    upper: float
+    largest: float
+    change: float
+    count: int
+    diverged: float
+
+    @property
+    def relative(self) -> float:
+        """The error as a share of the recorded change; 1 or more means that the model predicts nothing."""
+        return self.rms / self.change if self.change > 0 else (0.0 if self.rms == 0 else float("inf"))
+
+
+@dataclass(frozen=True)
+class Region(ShortRepr):
+    """The one-step error in a range of one state or input.
+
+    Attributes:
+        variable, unit: the state or input and its unit.
+        low, high: the range.
+        count: number of recorded steps in it.
+        error: root mean square over the states of the one-step error, as a share of the typical change of each state.
+        ratio: this error, divided by that over all steps.
+    """
+
+    variable: str
+    unit: str
+    low: float
+    high: float
+    count: int
+    error: float
+    ratio: float
+
+
+class RecordedSteps:
+    """The steps of some recordings.
+
+    If there is only one recording, it is divided into five parts of equal length, which take the place of recordings.
+    """
+
+    def __init__(self, recordings: Recordings, used: Sequence[int]) -> None:
+        self.recordings = recordings
+        runs = [recordings.runs[number].trajectory for number in used]
+        self.all_states = np.concatenate([run.states for run in runs])
+        self.all_inputs = np.concatenate([run.inputs for run in runs])
+        self._horizons = [run.horizon for run in runs]
+        self.first_input = np.cumsum([0, *self._horizons[:-1]])
+        self.first_state = self.first_input + np.arange(len(runs))
+
+    def windows(self, before: int, after: int, most: int = 40_000) -> Windows:
+        """Return places with so many recorded steps before and after them; of too many, every second, third, ..."""
+        runs, places, groups = [], [], []
+        for number, horizon in enumerate(self._horizons):
+            at = np.arange(before, horizon - after + 1)
+            runs.append(np.full(len(at), number))
+            places.append(at)
+            groups.append(np.full(len(at), number) if len(self._horizons) > 1 else (5 * at) // (horizon + 1))
+        joined = [np.concatenate(part).astype(np.intp) for part in (runs, places, groups)]
+        every = max(1, -(-len(joined[0]) // most))
+        return Windows(self, *(part[::every] for part in joined))
+
+
+@dataclass(frozen=True, eq=False)
+class Windows:
+    """The places in recordings from which so many steps before and after are recorded.
+
+    Attributes:
+        recorded: the steps of the recordings.
+        runs, places: the recording, and the step in it, shape ``(N,)``.
+        groups: the part of the recordings in which each lies, shape ``(N,)``.
+    """
+
+    recorded: RecordedSteps
+    runs: Rows
+    places: Rows
+    groups: Rows
+
+    def __len__(self) -> int:
+        return len(self.runs)
+
+    def __getitem__(self, chosen: Mask) -> Windows:
+        return Windows(self.recorded, self.runs[chosen], self.places[chosen], self.groups[chosen])
+
+    def states(self, shift: int = 0) -> Array:
+        """Return the recorded states so many steps later, shape ``(N, n)``."""
+        return np.asarray(self.recorded.all_states[self.recorded.first_state[self.runs] + self.places + shift])
+
+    def inputs(self, shift: int = 0) -> Array:
+        """Return the recorded inputs so many steps later, shape ``(N, m)``."""
+        return np.asarray(self.recorded.all_inputs[self.recorded.first_input[self.runs] + self.places + shift])
+
+
+def predicted(model: Model, where: Windows, steps: int) -> tuple[Array, Array]:
+    """Return predicted minus recorded states after a number of steps, and the recorded changes, both ``(N, n)``.
+
+    The predictions start at recorded states and have the recorded inputs; they are not finite if the model diverges.
+    """
+    x = start = where.states()
+    for k in range(steps):
+        x = stepped(model, x, where.inputs(k))
+    reached = where.states(steps)
+    return x - reached, reached - start
+
+
+def stepped(model: Model, x: Array, u: Array) -> Array:
+    """Return the next states of a model, ``(N, n)``."""
+    try:
+        with np.errstate(all="ignore"):
+            x_next = np.asarray(model.step(x, u), dtype=np.float64)
+        if x_next.shape != x.shape:
+            raise ModelError(f"it returned the shape {x_next.shape}")
+    except (Exception, SystemExit) as error:  # the user's model
+        why = str(error) if isinstance(error, CtxvalError) else f"{type(error).__name__}: {str(error)[:200]}"
+        raise ModelError(
+            f"the model cannot predict a step of the recordings, which have {x.shape[1]} states and {u.shape[1]} "
+            f"inputs: {why.removesuffix('.')}."
+        ) from error
+    return x_next
+
+
+def root_mean_square(values: Array) -> Array:
+    """Return the root mean square over the first axis, without rows whose squares are not finite; NaN if none is."""
+    with np.errstate(over="ignore"):
+        squares = values**2
+    finite = np.isfinite(squares).all(axis=tuple(range(1, values.ndim)))
+    if not finite.any():
+        return np.full(values.shape[1:], np.nan)
+    return np.asarray(np.sqrt(squares[finite].mean(axis=0)))
+
+
+def step_errors(model: Model, recorded: RecordedSteps, steps: Sequence[int]) -> tuple[StepError, ...]:
+    """Return the errors of all states after numbers of steps for which a recording is long enough."""
+    results: list[StepError] = []
+    for count in steps:
+        where = recorded.windows(0, count, min(40_000, max(200, 400_000 // count)))
+        if not len(where):
+            continue
+        errors, changes = predicted(model, where, count)
+        finite: Mask = np.asarray(np.isfinite(errors).all(axis=1))
+        rms, change = root_mean_square(errors), root_mean_square(changes)
+        by_group = np.array([root_mean_square(errors[where.groups == k]) for k in np.unique(where.groups)])
+        known = by_group[np.isfinite(by_group).all(axis=1)] if np.isfinite(by_group).any() else by_group
+        sizes = np.abs(errors[finite]) if finite.any() else np.full((1, errors.shape[1]), np.nan)
+        spread = [known.min(axis=0), known.max(axis=0)]
+        typical = [np.median(sizes, axis=0), np.quantile(sizes, 0.95, axis=0), sizes.max(axis=0)]
+        columns = np.stack([rms, *spread, *typical, change], axis=1).tolist()
+        diverged = float(1 - finite.mean())
+        for (name, unit), numbers in zip(recorded.recordings.states.items(), columns, strict=True):
+            results.append(StepError(name, unit, count, *[*numbers, len(finite), diverged]))
+    return tuple(results)
+
+
+def normalised(errors: Array, changes: Array) -> Array:
+    """Return errors as shares of the typical change of each state, the root mean square over the states, ``(N,)``.
+
+    States that never change are left out.
+    """
+    sizes = changes.std(axis=0)
+    moving = sizes > 1e-12 * max(float(sizes.max(initial=0.0)), 1e-300)
+    if not moving.any():
+        return np.zeros(len(errors))
+    return np.asarray(np.sqrt(((errors[:, moving] / sizes[moving]) ** 2).mean(axis=1)))
+
+
+def regions(model: Model, recorded: RecordedSteps) -> tuple[Region, ...]:
+    """Return the one-step error in five ranges of each state and input that have equally many steps."""
+    where = recorded.windows(0, 1)
+    error = normalised(*predicted(model, where, 1)) if len(where) else np.empty(0)
+    known = np.isfinite(error)
+    if not known.any():
+        return ()
+    overall = float(np.sqrt((error[known] ** 2).mean()))
+    values = np.concatenate([where.states(), where.inputs()], axis=1)[known]
+    labels = recorded.recordings.states | recorded.recordings.inputs
+    results: list[Region] = []
+    for (name, unit), column in zip(labels.items(), values.T, strict=True):
+        edges = np.unique(np.quantile(column, np.linspace(0, 1, 6)))
+        bins = np.clip(np.searchsorted(edges, column, side="right") - 1, 0, max(len(edges) - 2, 0))
+        for k in range(len(edges) - 1):
+            inside = error[known][bins == k]
+            rms = float(np.sqrt((inside**2).mean())) if len(inside) else 0.0
+            ratio = rms / overall if overall > 0 else 1.0
+            results.append(Region(name, unit, float(edges[k]), float(edges[k + 1]), len(inside), rms, ratio))
+    return tuple(results)

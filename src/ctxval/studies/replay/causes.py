@@ -1,0 +1,285 @@
+"""Causes of the error of a model: what state and input explain of it, and mistakes of timing.
+
+A change of timing is suggested only if the errors on recordings that did not choose it clearly fall.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from ctxval._util.arrays import Array, Mask, Rows, single_threaded
+from ctxval._util.representation import ShortRepr
+from ctxval.core.model import Model
+from ctxval.core.trajectory import Transitions
+from ctxval.learning import PosteriorSettings, learn_posterior
+from ctxval.studies.replay.accuracy import RecordedSteps, Windows, stepped
+
+# Delays of the inputs that are tried in whole steps; tenths of a step are tried around the best of them.
+_SHIFTS = tuple(range(-3, 11))
+
+
+@dataclass(frozen=True)
+class ResidualShare(ShortRepr):
+    """How much of the one-step residual of a state can be explained, measured on held-out recordings.
+
+    Attributes:
+        state, unit: the state and its unit.
+        rms: root mean square of the residual.
+        linear: share of its mean square that an affine function of state and input explains; at least 0.
+        explained: share that a Gaussian process of state and input explains, or the affine function if that is more;
+            at least 0.
+        history: share of the rest that the previous state, input and residual explain; at least 0. If it is large, the
+            system has a state that is not recorded, or a delay.
+        correlation: correlation of the rest with itself one step earlier.
+        rest: root mean square of what state and input do not explain.
+    """
+
+    state: str
+    unit: str
+    rms: float
+    linear: float
+    explained: float
+    history: float
+    correlation: float
+    rest: float
+
+
+def residual_shares(model: Model, recorded: RecordedSteps, seed: int) -> tuple[ResidualShare, ...]:
+    """Return how much of the residual of each state can be explained; none if there are too few recorded steps."""
+    where = recorded.windows(1, 1, 12_000)
+    pairs, earlier = (np.concatenate([where.states(k), where.inputs(k)], axis=1) for k in (0, -1))
+    residuals, earlier_residuals = (
+        where.states(k + 1) - stepped(model, where.states(k), where.inputs(k)) for k in (0, -1)
+    )
+    past = np.concatenate([pairs, earlier, earlier_residuals], axis=1)
+    finite: Mask = np.asarray((np.isfinite(residuals) & np.isfinite(earlier_residuals)).all(axis=1))
+    where, pairs, past, residuals = where[finite], pairs[finite], past[finite], residuals[finite]
+    groups = np.unique(where.groups)
+    folds = np.searchsorted(groups, where.groups) * min(4, len(groups)) // max(len(groups), 1)
+    if len(residuals) < 20 or len(np.unique(folds)) < 2:
+        return ()
+    rest, linear, history = (np.zeros_like(residuals) for _ in range(3))
+    for fold in np.unique(folds):
+        held = folds == fold
+        linear[held] = _affine(pairs, residuals, held)
+        rest[held] = residuals[held] - _learned(model, where, folds, held, seed)
+    affine = residuals - linear
+    better = (affine**2).mean(axis=0) < (rest**2).mean(axis=0)
+    rest[:, better] = affine[:, better]
+    for fold in np.unique(folds):
+        held = folds == fold
+        history[held] = _affine(past, rest, held)
+    follows: Mask = (np.diff(where.runs) == 0) & (np.diff(where.places) == 1)
+
+    def share(errors: Array, size: float) -> float:
+        """Return which share of a mean square is explained if these errors are left."""
+        return max(0.0, 1.0 - float((errors**2).mean()) / size) if size > 0 else 0.0
+
+    def correlation(values: Array) -> float:
+        """Return the correlation of values with those one step earlier; 0 if no steps follow each other."""
+        first, second = values[:-1][follows], values[1:][follows]
+        if len(first) < 3 or first.std() == 0 or second.std() == 0:
+            return 0.0
+        return float(np.corrcoef(first, second)[0, 1])
+
+    size, left = (residuals**2).mean(axis=0).tolist(), (rest**2).mean(axis=0).tolist()
+    return tuple(
+        ResidualShare(
+            *(name, unit, math.sqrt(size[i]), share(affine[:, i], size[i]), share(rest[:, i], size[i])),
+            *(share(rest[:, i] - history[:, i], left[i]), correlation(rest[:, i]), math.sqrt(left[i])),
+        )
+        for i, (name, unit) in enumerate(recorded.recordings.states.items())
+    )
+
+
+def _affine(features: Array, targets: Array, held: Mask) -> Array:
+    """Return the held-out predictions of an affine function of features, by regularised least squares."""
+    shift, scale = features[~held].mean(axis=0), np.maximum(features[~held].std(axis=0), 1e-12)
+    Z = np.column_stack([np.ones(len(features)), (features - shift) / scale])
+    G = Z[~held].T @ Z[~held]
+    G += 1e-6 * np.trace(G) / len(G) * np.eye(len(G))
+    return np.asarray(Z[held] @ np.linalg.solve(G, Z[~held].T @ targets[~held]))
+
+
+def _learned(model: Model, where: Windows, folds: Rows, held: Mask, seed: int) -> Array:
+    """Return the residual that a Gaussian process predicts for held-out steps."""
+    transitions = Transitions(where.states(), where.inputs(), where.states(1))
+    rows = np.flatnonzero(~held)
+    if len(rows) > 1500:
+        rows = np.sort(np.random.default_rng(seed).permutation(rows)[:1500])
+    x, u = transitions.x[held], transitions.u[held]
+    with single_threaded():
+        settings = PosteriorSettings(hyperparameters=1, centres=250)
+        posterior = learn_posterior(model, transitions[rows], folds[rows], settings=settings)
+        if posterior is None:
+            return np.zeros_like(x)
+        # What is learned may be a linear model of the system, without M.
+        return np.asarray(posterior.mean.model_of(0).step(x, u) - model.step(x, u))
+
+
+@dataclass(frozen=True)
+class Suggestion(ShortRepr):
+    """A change of timing with which the model predicts held-out recordings clearly better.
+
+    Attributes:
+        kind: ``delay`` or ``time step``.
+        value: the delay in seconds, or the time step of the model in seconds.
+        ratio: the held-out one-step error with the change, divided by that without it.
+        agreeing: share of the recordings in which the error falls.
+        sentence: what it means.
+    """
+
+    kind: Literal["delay", "time step"]
+    value: float
+    ratio: float
+    agreeing: float
+    sentence: str
+
+
+def suggestions(model: Model, recorded: RecordedSteps) -> tuple[Suggestion, ...]:
+    """Return the change of timing with which the model predicts held-out recordings clearly better, if there is one.
+
+    Of two, only the better one is returned, because one mistake can look like another one.
+    """
+    changes = filter(None, (_time_step(model, recorded), _delay(model, recorded)))
+    return tuple(sorted(changes, key=lambda change: change.ratio)[:1])
+
+
+def _delay(model: Model, recorded: RecordedSteps) -> Suggestion | None:
+    """Suggest a delay if the model, or an affine model of the recordings themselves, predicts better with it."""
+    if not recorded.recordings.inputs:
+        return None
+    where = recorded.windows(max(_SHIFTS) + 1, 1 - min(_SHIFTS), 8000)
+    if not len(where):
+        return None
+    x, reached = where.states(), where.states(1)
+    changes, of_delay = reached - x, (0.85, 0.5)
+
+    def delayed(shift: float) -> Array:
+        """Return the mean input of each step if an input acts so many steps later."""
+        whole = math.floor(shift)
+        part = shift - whole
+        now = where.inputs(-whole)
+        return now + part * (where.inputs(-whole - 1) - now) if part else now
+
+    by_model = _over_shifts(lambda shift: _errors(stepped(model, x, delayed(shift)) - reached, changes))
+    chosen, of_model = _chosen(by_model, where.groups, 0.0, *of_delay), True
+    if chosen is None:
+        groups, of_model = where.groups, False
+        fitted = _over_shifts(lambda shift: _errors(_affine_errors(x, delayed(shift), reached, groups), changes))
+        chosen = _chosen(fitted, groups, 0.0, *of_delay)
+        # A model that predicts better than these affine models was not learned with inputs of another time.
+        if chosen is None or by_model[0].mean() <= fitted[chosen[0]].mean():
+            return None
+    shift, ratio, agreeing = chosen
+    delay = shift * recorded.recordings.dt
+    when = (
+        f"if the inputs act {abs(delay):.3g} s ({abs(shift):g} steps) {'after' if shift > 0 else 'before'} the time at "
+        "which they are taken here"
+    )
+    sentence = (
+        f"the one-step error falls to {100 * ratio:.0f} % {when}: add {delay:.3g} to delay in the mapping of the "
+        "recordings, or let the model have this delay"
+        if of_model
+        else f"an affine model that is fitted to the recordings has {100 * ratio:.0f} % of the error {when}; the model "
+        "was perhaps learned with inputs of another time"
+    )
+    return Suggestion("delay", delay, ratio, agreeing, sentence)
+
+
+def _over_shifts(errors_of: Callable[[float], Array]) -> dict[float, Array]:
+    """Return the errors for all delays in whole steps, and in tenths of steps around the best of them."""
+    errors = {float(shift): errors_of(shift) for shift in _SHIFTS}
+    best = min(errors, key=lambda shift: errors[shift].mean())
+    around = {round(best + k / 10, 1) for k in range(-9, 10)} - {best}
+    return errors | {s: errors_of(s) for s in sorted(around) if min(_SHIFTS) <= s <= max(_SHIFTS)}
+
+
+def _time_step(model: Model, recorded: RecordedSteps) -> Suggestion | None:
+    """Suggest another time step of the model if it then predicts better."""
+    multiples = (2, 3, 4, 5, 10)
+    where = recorded.windows(0, max(multiples), 8000)
+    if not len(where):
+        return None
+    errors: dict[float, Array] = {1.0: _relative(model, where, 1, 1)}
+    for k in multiples:
+        errors[1 / k] = _relative(model, where, k, 1)
+        errors[float(k)] = _relative(model, where, 1, k)
+    chosen = _chosen(errors, where.groups, 1.0, 0.7, 0.0)
+    if chosen is None:
+        return None
+    factor, ratio, agreeing = chosen
+    dt = factor * recorded.recordings.dt
+    sentence = (
+        f"the error relative to the motion falls to {100 * ratio:.0f} % if one step of the model takes {dt:g} s "
+        f"instead of {recorded.recordings.dt:g} s: check the time step of the model, or give dt = {dt:g}"
+    )
+    return Suggestion("time step", dt, ratio, agreeing, sentence)
+
+
+def _relative(model: Model, where: Windows, of_model: int, steps: int) -> Array:
+    """Return squared errors relative to the recorded change, if so many steps of each take the same time."""
+    x = start = where.states()
+    held = np.mean([where.inputs(k) for k in range(steps)], axis=0)
+    for _ in range(of_model):
+        x = stepped(model, x, held)
+    reached = where.states(steps)
+    return _errors(x - reached, reached - start)
+
+
+def _errors(errors: Array, changes: Array) -> Array:
+    """Return the mean over the states of squared errors relative to their changes, ``(N,)``; large if not finite."""
+    sizes = np.sqrt((changes**2).mean(axis=0))
+    sizes[sizes == 0] = np.inf
+    with np.errstate(all="ignore"):
+        return np.asarray(np.nan_to_num(((errors / sizes) ** 2).mean(axis=1), nan=1e30, posinf=1e30).clip(max=1e30))
+
+
+def _affine_errors(x: Array, u: Array, reached: Array, groups: Rows) -> Array:
+    """Return held-out errors of an affine model of the recordings; every second group is held out in turn."""
+    Z = np.column_stack([np.ones(len(x)), x, u])
+    Z = Z / np.maximum(np.abs(Z).max(axis=0), 1e-12)
+    odd = np.searchsorted(np.unique(groups), groups) % 2 == 1
+    errors = np.zeros_like(reached)
+    for held in (odd, ~odd):
+        if held.any() and (~held).sum() > Z.shape[1]:
+            weights = np.linalg.lstsq(Z[~held], (reached - x)[~held], rcond=1e-10)[0]
+            errors[held] = Z[held] @ weights + x[held] - reached[held]
+    return errors
+
+
+def _chosen(
+    errors: Mapping[float, Array], groups: Rows, usual: float, clear: float, alike: float
+) -> tuple[float, float, float] | None:
+    """Return the value that two halves of the recordings choose alike, its held-out ratio and the agreeing share.
+
+    Returns None unless the error clearly falls, in most recordings.
+
+    Args:
+        errors: the squared errors of each value, shape ``(N,)``.
+        groups: the part of the recordings in which each error lies.
+        usual: the value without a change.
+        clear: largest ratio of the errors with and without a change.
+        alike: largest difference between the values that two halves of the recordings choose.
+    """
+    known = np.unique(groups)
+    if len(known) < 2:
+        return None
+    values = list(errors)
+    table = np.array([[errors[value][groups == group].mean() for group in known] for value in values])
+    base = table[values.index(usual)]
+    halves = [np.arange(len(known)) % 2 == k for k in (0, 1)]
+    picked = [values[int(np.argmin(table[:, half].sum(axis=1)))] for half in halves]
+    # Smaller errors are rounding.
+    if abs(picked[0] - picked[1]) > alike or usual in picked or base.mean() < 1e-9**2:
+        return None
+    row = int(np.argmin(table.sum(axis=1)))
+    ratio, agreeing = float(np.sqrt(table[row].sum() / base.sum())), float((table[row] < base).mean())
+    if ratio > clear or agreeing < 0.8:  # in most recordings
+        return None
+    return values[row], ratio, agreeing

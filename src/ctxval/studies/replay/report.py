@@ -1,0 +1,279 @@
+"""``replay``: what recordings show of a model, as one value."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from ctxval._util.arrays import single_threaded
+from ctxval._util.columns import unit_advice
+from ctxval._util.representation import ShortRepr, counted
+from ctxval.core.model import Model, require_time_step
+from ctxval.core.trajectory import Transitions
+from ctxval.core.validation import Validation
+from ctxval.data.recordings import Recordings
+from ctxval.data.sampling import Break
+from ctxval.errors import InputError
+from ctxval.studies.replay.accuracy import RecordedSteps, Region, StepError, regions, step_errors
+from ctxval.studies.replay.causes import ResidualShare, Suggestion, residual_shares, suggestions
+from ctxval.studies.replay.untested import PredictedTasks, predicted_tasks
+
+STEPS = (1, 5, 20, 100)
+"""Numbers of steps after which errors are computed, unless others are given."""
+
+
+@dataclass(frozen=True)
+class RecordedData(ShortRepr):
+    """The recordings that were compared with the model.
+
+    Attributes:
+        sources: the files and episodes.
+        recordings, steps: the numbers of recordings and of steps.
+        dt: length of a step, seconds.
+        states, inputs: the names of the states and inputs with their units.
+        breaks: where logs were split, and why.
+        notes: sentences on how the logs were read.
+        seen: number of recordings that are in the data from which the model was learned. They are left out of the
+            errors, unless all recordings are.
+    """
+
+    sources: tuple[str, ...]
+    recordings: int
+    steps: int
+    dt: float
+    states: dict[str, str]
+    inputs: dict[str, str]
+    breaks: tuple[Break, ...]
+    notes: tuple[str, ...]
+    seen: int
+
+
+@dataclass(frozen=True, eq=False)
+class ReplayReport(ShortRepr):
+    """What recordings show of a model.
+
+    Attributes:
+        data: the recordings.
+        errors: the error of each state after each number of steps.
+        regions: the one-step error in ranges of each state and input.
+        residuals: how much of the one-step residual of each state can be explained.
+        suggestions: changes of timing with which the model predicts held-out recordings clearly better.
+        tasks: what the recordings predict of the tasks of an experiment; None without an experiment, or if the
+            recordings teach nothing.
+        insights: what follows, in sentences, the most important one first.
+    """
+
+    data: RecordedData
+    errors: tuple[StepError, ...]
+    regions: tuple[Region, ...]
+    residuals: tuple[ResidualShare, ...]
+    suggestions: tuple[Suggestion, ...]
+    tasks: PredictedTasks | None
+    insights: tuple[str, ...]
+
+    def to_json(self) -> dict[str, Any]:
+        """Return all results as plain values; numbers that are not finite are None."""
+        report: dict[str, Any] = plain_numbers(asdict(self))
+        for row, error in zip(report["errors"], self.errors, strict=True):
+            row["relative"] = plain_numbers(error.relative)
+        return report
+
+
+def replay(
+    model: Model,
+    recordings: Recordings,
+    *,
+    steps: Sequence[int] = STEPS,
+    validation: Validation | None = None,
+    executions: int = 10,
+    seed: int = 0,
+) -> ReplayReport:
+    """Compare a model with recordings of its system. Nothing is executed.
+
+    Args:
+        model: the model M, with the time step of the recordings.
+        recordings: the recordings.
+        steps: numbers of steps after which errors are computed.
+        validation: an experiment with this model, whose tasks are then judged too; its system is never executed.
+        executions: number of executions of the experiment that are proposed.
+        seed: seed of all random numbers.
+    """
+    if not steps or not all(isinstance(k, int) and not isinstance(k, bool) and k >= 1 for k in steps):
+        raise InputError(f"steps must be positive integers, got {list(steps)}.")
+    if validation is not None:
+        _require_same_step(validation, recordings)
+    require_time_step(model, recordings.dt, "the recording")
+    seen = _seen(model, recordings)
+    every = range(len(recordings.runs))
+    used = [number for number in every if number not in seen] or list(every)
+    recorded = RecordedSteps(recordings, used)
+    with single_threaded():
+        errors = step_errors(model, recorded, sorted(set(steps)))
+        where = regions(model, recorded)
+        residuals = residual_shares(model, recorded, seed)
+        changes = suggestions(model, recorded)
+    tasks = None
+    if validation is not None:
+        logged = [run.trajectory for run in recordings.runs]
+        tasks = predicted_tasks(validation, logged, executions=executions, seed=seed)
+    data = RecordedData(
+        tuple(dict.fromkeys(run.source for run in recordings.runs)),
+        len(recordings.runs),
+        recordings.steps,
+        recordings.dt,
+        recordings.states,
+        recordings.inputs,
+        recordings.breaks,
+        recordings.notes,
+        len(seen),
+    )
+    sentences = [
+        *_of_data(data),
+        *(change.sentence for change in changes),
+        *_of_errors(errors, len(used)),
+        *_of_residuals(errors, residuals),
+        *_of_regions(errors, where),
+        *_of_tasks([*data.states, *data.inputs], tasks),
+    ]
+    if validation is not None and tasks is None:
+        sentences.append(
+            "nothing is predicted of the tasks: the model explains the recordings, or no controller can be designed "
+            "for a task"
+        )
+    return ReplayReport(data, errors, where, residuals, changes, tasks, tuple(sentences))
+
+
+def _seen(model: Model, recordings: Recordings) -> set[int]:
+    """Return the recordings most of whose steps are in the data from which the model was learned."""
+    data, sizes = getattr(model, "data", None), (len(recordings.states), len(recordings.inputs))
+    if not isinstance(data, Transitions) or (data.x.shape[1], data.u.shape[1]) != sizes:
+        return set()
+
+    def rows(transitions: Transitions) -> list[bytes]:
+        """Return transitions as texts that agree if the numbers agree to single precision."""
+        whole = np.concatenate([transitions.x, transitions.u, transitions.x_next], axis=1)
+        return [row.tobytes() for row in (whole.astype(np.float32) + np.float32(0.0))]
+
+    known = set(rows(data))
+    recorded = [rows(run.trajectory.transitions()) for run in recordings.runs]
+    return {k for k, steps in enumerate(recorded) if sum(step in known for step in steps) > len(steps) / 2}
+
+
+def _require_same_step(validation: Validation, recordings: Recordings) -> None:
+    space = validation.space
+    task = validation.task(space.parameters(0.5 * (space.low + space.high)))
+    if task.initial_state.shape[-1] != len(recordings.states):
+        raise InputError(
+            f"the tasks have {task.initial_state.shape[-1]} states and the recordings have {len(recordings.states)}: "
+            f"{', '.join(recordings.states)}."
+        )
+    if not np.isclose(task.dt, recordings.dt, rtol=1e-3, atol=0):
+        raise InputError(
+            f"the tasks have steps of {task.dt:g} s and the recordings have steps of {recordings.dt:g} s: "
+            f"{unit_advice(recordings.dt, task.dt) or f'give dt = {task.dt:g} in the mapping of the recordings'}."
+        )
+
+
+def plain_numbers(value: Any) -> Any:
+    """Return plain values for JSON; numbers that are not finite are None."""
+    if isinstance(value, dict):
+        return {key: plain_numbers(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain_numbers(item) for item in value]
+    return None if isinstance(value, float) and not np.isfinite(value) else value
+
+
+# What follows, in sentences
+
+_SHARE = 0.3  # share of a residual from which an explanation is named
+_SMALL = 1e-3  # a one-step error below this share of the change is called small, and its causes are not named
+
+
+def _of_data(data: RecordedData) -> Iterator[str]:
+    if data.breaks:
+        places = {(gap.source, gap.time): gap.seconds for gap in data.breaks}  # several fields may lack one time
+        yield (
+            f"the logs were split at {counted(len(places), 'place')}, and {sum(places.values()):.3g} s are left out; "
+            f"the first is {data.breaks[0]}"
+        )
+    if data.seen == data.recordings:
+        yield "the model was learned from all of these recordings, so its errors on others are larger"
+    elif data.seen:
+        yield f"the model was learned from {data.seen} of these recordings; the errors are those of the others"
+
+
+def _of_errors(errors: Sequence[StepError], held_out: int) -> Iterator[str]:
+    single = [error for error in errors if error.steps == 1]
+    if not single:
+        yield "no recording has a single step, so nothing can be compared"
+        return
+    worst = max(single, key=lambda one: one.relative)
+    if worst.relative >= 1:
+        yield (
+            f"the model predicts {worst.state} no better than no change at all: its one-step error is "
+            f"{100 * worst.relative:.0f} % of the recorded change"
+        )
+    last = max(errors, key=lambda one: one.steps)
+    late = ", ".join(error.state for error in errors if error.steps == last.steps and error.relative >= 1)
+    if late and worst.relative < 1:
+        yield f"after {last.steps} steps the model predicts {late} no better than no change at all"
+    diverged = max(errors, key=lambda one: one.diverged)
+    if diverged.diverged > 0:
+        yield f"{100 * diverged.diverged:.2g} % of the predictions of {diverged.steps} steps diverge"
+    if held_out == 1:
+        yield "there is only one recording, so the spread is that over five parts of it"
+
+
+def _of_residuals(errors: Sequence[StepError], residuals: Sequence[ResidualShare]) -> Iterator[str]:
+    relative = {error.state: error.relative for error in errors if error.steps == 1}
+    for one in residuals:
+        if relative.get(one.state, 0.0) < _SMALL:
+            continue
+        left = f"{one.rest:.3g} {one.unit}".rstrip()
+        if one.explained >= _SHARE:
+            how = "an affine function" if one.linear > 0.9 * one.explained else "a function"
+            yield (
+                f"{100 * one.explained:.0f} % of the residual of {one.state} is {how} of state and input: a better "
+                f"model can be learned from these recordings, with {left} of one-step error left"
+            )
+        elif one.history < _SHARE:
+            yield (
+                f"state and input explain {100 * one.explained:.0f} % of the residual of {one.state}: the rest of "
+                f"{left} is noise, or has a cause that is not recorded"
+            )
+        if one.history >= _SHARE and one.rest > 0.05 * one.rms:
+            yield (
+                f"the step before explains {100 * one.history:.0f} % of what state and input leave of the residual of "
+                f"{one.state}: the system has a state that is not recorded, a delay, or filtered measurements"
+            )
+
+
+def _of_regions(errors: Sequence[StepError], where: Sequence[Region]) -> Iterator[str]:
+    if max((error.relative for error in errors if error.steps == 1), default=0.0) < _SMALL:
+        return
+    for region in sorted(where, key=lambda region: -region.ratio)[:3]:
+        if region.ratio >= 1.5:
+            yield (
+                f"the one-step error is {region.ratio:.2g} times as large as on average where {region.variable} is "
+                f"between {region.low:.3g} and {f'{region.high:.3g} {region.unit}'.rstrip()}"
+            )
+
+
+def _of_tasks(names: Sequence[str], tasks: PredictedTasks | None) -> Iterator[str]:
+    if tasks is None or not tasks.worst:
+        return
+    worst = tasks.worst[0]
+    values = {k: f"{value:.4g}" if isinstance(value, float) else value for k, value in worst.parameters.items()}
+    task = ", ".join(f"{name} = {value}" for name, value in values.items())
+    yield (
+        f"of all tasks, {task} has the largest predicted distance, {worst.median:.3g} (between {worst.low:.3g} and "
+        f"{worst.high:.3g}); no execution has tested it"
+    )
+    if tasks.beyond > 0.05:
+        yield (
+            f"predicted runs of the tasks leave the recorded range of {names[tasks.beyond_of]} by "
+            f"{100 * tasks.beyond:.0f} %: predictions are extrapolated there"
+        )

@@ -1,0 +1,557 @@
+"""Experiment files: the whole in one, written by init, looked at by check."""
+
+from __future__ import annotations
+
+import io
+import json
+import sys
+import tomllib
+import zipfile
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from typer.testing import CliRunner, Result
+
+from conftest import make_validation, make_validation_without_inputs
+from ctxval import Experiment, Store, Task, TaskSpace, Trajectory, Validation, controllers, distances, systems
+from ctxval.cli import app
+from ctxval.cli.config.check import check_experiment
+from ctxval.cli.config.parts import TaskTable, part, recorded
+from ctxval.cli.config.settings import Settings, read_settings
+from ctxval.core.experiment import UnitsWarning
+from ctxval.errors import CtxvalError, InputError
+from ctxval.testing import FaultyRig
+
+
+@pytest.fixture
+def invoke(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):  # type: ignore[no-untyped-def]
+    """Run the command line in a folder with the file that init writes."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    sys.modules.pop("experiment_system", None)
+
+    def run(*arguments: str) -> Result:
+        return CliRunner().invoke(app, list(arguments))
+
+    assert run("init").exit_code == 0
+    yield run
+    sys.modules.pop("experiment_system", None)
+
+
+def changed(*changes: tuple[str, str]) -> str:
+    """Write the file of init with some of its text replaced."""
+    text = Path("experiment.toml").read_text()
+    for old, new in changes:
+        assert old in text
+        text = text.replace(old, new)
+    Path("e.toml").write_text(text)
+    return "e.toml"
+
+
+def sentence(result: Result) -> str:
+    assert result.exit_code == 2, result.stdout + result.stderr
+    assert "Traceback" not in result.stderr
+    return result.stderr.replace("\n", " ")
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("few_loops")
+def test_the_file_of_init_reaches_a_verdict_as_it_is(invoke: Any) -> None:
+    result = invoke("run", "experiment.toml", "--json")
+    assert result.exit_code == 0, result.stderr
+    report = json.loads(result.stdout)
+    assert (report["case"], report["search"], report["units"]) == ("cart", "auto", "m")
+    assert report["verdict"] == "validated"
+    assert 4 <= report["executions"] < 40
+    assert report["worst"]["distance"] > 0.01
+    again = json.loads(invoke("run", "experiment.toml", "--json").stdout)
+    assert again == report
+
+
+def test_the_file_of_init_passes_its_check(invoke: Any) -> None:
+    result = invoke("check", "experiment.toml", "--execute", "--json")
+    assert result.exit_code == 0
+    report = json.loads(result.stdout)
+    assert report["ok"]
+    assert {finding["state"] for finding in report["findings"]} == {"ok"}
+    assert (
+        "ok      execution: two executions of one task are the same"
+        in invoke("check", "experiment.toml", "--execute").stdout
+    )
+    assert not Path("runs").exists()
+
+
+def test_init_overwrites_nothing(invoke: Any) -> None:
+    before = Path("experiment.toml").read_bytes()
+    assert "experiment.toml already exists" in sentence(invoke("init"))
+    assert "must" not in invoke("init", "other.toml").stderr
+    assert "next: ctxval check 'my rig.toml'" in invoke("init", "my rig.toml").stdout
+    assert "ends in .toml" in sentence(invoke("init", "other.ini"))
+    assert "cannot be written" in sentence(invoke("init", "/proc/none/other.toml"))
+    assert Path("experiment.toml").read_bytes() == before
+
+
+def test_a_described_experiment_can_be_asked_by_hand(invoke: Any) -> None:
+    manual = (
+        'type = "Simulated"\nstep = { ref = "experiment_system:step" }',
+        'type = "Manual"\nstates = { position = "m", speed = "m/s" }\ninputs = { force = "N" }\ndt = 0.05',
+    )
+    target = changed(manual, ("dt = 0.05               # time step in seconds\n", "\n"))
+    asked = json.loads(invoke("ask", target, "--store", "a.sqlite", "--json").stdout)
+    assert asked["trial"] == 0
+    assert invoke("tell", "a.sqlite", "0", "--distance", "0.1").exit_code == 0
+    assert Store("a.sqlite").trials()[0].distance == 0.1
+    assert "skipped execution: people execute this system" in invoke("check", target, "--execute").stdout
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "expected"),
+    [
+        ('type = "Simulated"', 'type = "Simulatd"', "no system is called 'Simulatd'; did you mean 'Simulated'"),
+        ('type = "LQR"', 'type = "LQG"', "no synthesizer is called 'LQG'"),
+        ("R = [0.1]", "RR = [0.1]", "did you mean 'R'"),
+        ("R = [0.1]", 'R = "much"', "R must be numbers"),
+        ("R = [0.1]", "R = [-0.1]", "R must have no negative eigenvalue"),
+        ("R = [0.1]", "", "the synthesizer LQR cannot be made: TypeError"),
+        ("A = [[1.0, 0.05], [0.0, 1.0]]", "A = [[1.0]]", "needs A (n, n), B (n, m)"),
+        ('goal = ["goal", 0.0]', 'goal = ["gaol", 0.0]', "did you mean 'goal'"),
+        ('goal = ["goal", 0.0]', "goal = 3", "goal of [task] must be a list"),
+        ('goal = ["goal", 0.0]', "goal = [1.0]", "goal must have 2 components"),
+        ('goal = ["goal", 0.0]', 'goal = ["goal[1]", 0.0]', "[task] cannot be used"),
+        ("horizon = 60            # number of time steps", "", "[task] needs horizon"),
+        ("horizon = 60", "horizonn = 60", "did you mean 'horizon'"),
+        ("horizon = 60", "horizon = -1", "horizon must be a positive integer"),
+        ("goal = [0.5, 3.0", "goal = [3.0, 0.5", "low < high"),
+        ("threshold = 0.5", "threshold = true", "threshold"),
+        ('goal = [0.5, 3.0, "m"]', "goal = 3", "space.goal"),
+        ("experiment_system:step", "nowhere:step", "cannot be loaded"),
+        ("[system] ", "[sistem] ", "no setting is called 'sistem'; did you mean 'system'?"),
+        ("stochastic = false", "stochastik = true", "no setting is called 'stochastik'; did you mean 'stochastic'?"),
+        (
+            'kind = "auto"',
+            'kind = "audit"\nresolution = 0.3',
+            "resolution is for certificates of the kind auto or posterior; the kind here is",
+        ),
+        ("repeats = 1", "repeats = 0", "search.repeats"),
+        ("components = [0]", "componets = [0]", "did you mean 'components'"),
+        ('name = "auto"', 'name = "gp-ucb"\nbeta = "two"', "search 'gp-ucb': beta"),
+        ('name = "auto"', 'name = "gp-ucb"\ninitial = 2.5', "search 'gp-ucb': initial"),
+        ('name = "auto"', 'name = "gp-ucb"\ninitial = true', "search 'gp-ucb': initial"),
+        ('name = "auto"', 'name = "gp-ucb"\nkernel = "matern"', "search 'gp-ucb': kernel"),
+        ('name = "auto"', 'name = "gp-ucb"\nnoise = 3', "search 'gp-ucb': noise"),
+        ('kind = "auto"', 'kind = "posteriour"', "did you mean 'posterior'"),
+        ('name = "cart"', 'name = "cart"\nexperiment = "pendulum"', "has its own"),
+        ('name = "cart"', 'name = "cart"\n[options]\nx = 1\n[other]', "other"),
+    ],
+)
+def test_what_is_wrong_in_a_file_is_named_before_anything_is_executed(
+    invoke: Any, old: str, new: str, expected: str
+) -> None:
+    for command in ("check", "run"):
+        assert expected in sentence(invoke(command, changed((old, new))))
+    assert not Path("runs").exists()
+
+
+@pytest.mark.parametrize("options", ["settings = 3", "pendulum = 3", "settings = { dt = 0.1 }"])
+def test_options_of_a_case_are_plain_values(invoke: Any, options: str) -> None:
+    Path("e.toml").write_text(f'experiment = "pendulum"\n[options]\n{options}')
+    assert "case 'pendulum'" in sentence(invoke("run", "e.toml"))
+    Path("e.toml").write_text('experiment = "linear"\n[options]\ndim = "three"')
+    assert "dim" in sentence(invoke("run", "e.toml"))
+
+
+def test_what_the_certificate_of_the_file_would_ignore_is_refused(invoke: Any) -> None:
+    target = changed(('kind = "auto"', 'kind = "scenario"'))
+    for option in (["--stochastic"], ["--resolution", "1"]):
+        said = sentence(invoke("run", target, *option))
+        assert f"{option[0][2:]} is for certificates of the kind auto or " in said
+    assert not Path("runs").exists()
+
+
+@pytest.mark.parametrize("target", ["experiment = 'pendulum'", "name = 'cart'"])
+def test_the_file_says_the_largest_horizon_that_is_planned(invoke: Any, target: str) -> None:
+    text = target if "pendulum" in target else Path("experiment.toml").read_text()
+    for longest in (3, 10**7):
+        Path("e.toml").write_text(f"longest = {longest}\n{text}")
+        assert read_settings("e.toml", {}).load().validation.longest == longest
+    for wrong in ("0", "2.5", "true", "'3'", str(2**60)):
+        Path("e.toml").write_text(f"longest = {wrong}\n{text}")
+        assert "longest" in sentence(invoke("run", "e.toml"))
+    Path("e.toml").write_text(f"longest = 3\n{text}")
+    assert "at most 3 steps are permitted: longest =" in sentence(invoke("run", "e.toml"))
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("few_loops")
+def test_the_certificate_of_the_file_is_what_run_and_certify_judge_by(invoke: Any) -> None:
+    scenario = ('kind = "auto"', 'kind = "scenario"\nvolume = 0.5')
+    target = changed(scenario, ('name = "auto"', 'name = "random"'))
+    run = json.loads(invoke("run", target, "--json").stdout)
+    assert (run["verdict"], run["certificate"]["kind"]) == ("validated", "scenario")
+    certified = json.loads(invoke("certify", run["store"], "--threshold", "0.5", "--json").stdout)
+    assert (certified["kind"], certified["verdict"]) == ("scenario", "validated")
+    assert "needs one of the certificates" in sentence(invoke("run", target, "--decide"))
+    adaptive = changed(scenario, ('name = "auto"', 'name = "gp-ucb"'))
+    refused = json.loads(invoke("run", adaptive, "--store", "b.sqlite", "--json").stdout)
+    assert refused["verdict"] == "undecided"
+    assert "independent draws alone" in refused["reason"]
+
+
+# Tasks and data without code
+
+
+def test_a_task_table_serves_one_task_and_a_batch() -> None:
+    space = TaskSpace(goal=(0, 2), offsets=([-1, -1], [1, 1]))
+    table = TaskTable((0.5, "-goal"), ("goal", "offsets[1]"), 4, 0.1)
+    points = space.iid(5, np.random.default_rng(0))
+    batch = table(space.parameters(points))
+    np.testing.assert_array_equal(batch.initial_state, np.stack([np.full(5, 0.5), -points[:, 0]], axis=1))
+    np.testing.assert_array_equal(batch.goal, points[:, [0, 2]])
+    np.testing.assert_array_equal(table(space.parameters(points[3])).goal, batch.goal[3])
+
+
+def test_a_model_is_learned_from_recorded_files(invoke: Any) -> None:
+    rng = np.random.default_rng(0)
+    x = np.zeros((31, 2))
+    u = rng.normal(size=(30, 1))
+    for t in range(30):
+        x[t + 1] = [x[t, 0] + 0.05 * x[t, 1], 0.9 * x[t, 1] + 0.05 * u[t, 0] + 0.01 * rng.normal()]
+    trajectory = Trajectory(np.arange(31) * 0.05, x, u)
+    trajectory.to_csv("run1.csv")
+    Path("run2.npz").write_bytes(trajectory.to_npz())
+    steps = trajectory.transitions()
+    np.savez("steps.npz", x=steps.x, u=steps.u, x_next=steps.x_next)
+    assert len(recorded(["run1.csv", "run2.npz", "steps.npz"])) == 90
+    matrices = "A = [[1.0, 0.05], [0.0, 1.0]]\nB = [[0.0], [0.05]]\n"
+    settings = read_settings(changed((matrices, 'data = ["run1.csv", "run2.npz"]\n')), {})
+    model = settings.load().validation.model
+    np.testing.assert_allclose(model.A[0], [1, 0.05], atol=1e-9)  # type: ignore[attr-defined]
+    for data in ("none.csv", "experiment_system.py", ["x.npz"], [], 3):
+        with pytest.raises(InputError):
+            recorded(data)
+
+
+# Any bytes
+
+
+@given(st.text(max_size=60))
+def test_no_text_gives_anything_but_an_error_of_ours(text: str) -> None:
+    try:
+        content = tomllib.loads(text)
+    except tomllib.TOMLDecodeError:
+        return
+    with pytest.raises((CtxvalError, ValueError)):
+        Settings.model_validate({**content, "unknown": 1})
+
+
+PLAIN = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=5), inner, max_size=3),
+    max_leaves=6,
+)
+WHOLE: dict[str, Any] = {
+    "space": {"goal": [0.0, 1.0]},
+    "task": {"initial_state": [0.0], "goal": ["goal"], "horizon": 3, "dt": 0.1},
+    "system": {"type": "Manual", "states": {"x": "m"}, "inputs": {"u": "N"}, "dt": 0.1},
+    "model": {"type": "Linear", "A": [[1.0]], "B": [[1.0]]},
+    "synthesizer": {"type": "LQR", "Q": [1.0], "R": [1.0]},
+    "distance": {"type": "FinalState"},
+    "search": {"name": "gp-ucb", "beta": 1.0},
+    "certificate": {"kind": "posterior"},
+}
+
+
+@given(st.data())
+def test_no_value_anywhere_gives_anything_but_an_error_of_ours(data: st.DataObject) -> None:
+    table = data.draw(st.sampled_from(list(WHOLE)))
+    key = data.draw(st.sampled_from([None, *WHOLE[table]]))
+    value = data.draw(PLAIN)
+    content = {**WHOLE, table: value if key is None else {**WHOLE[table], key: value}}
+    try:
+        settings = Settings.model_validate(content)
+    except ValueError:
+        return
+    try:
+        settings.search.build()
+        settings.load().validation.describe()
+    except CtxvalError:
+        return
+
+
+# What a check finds
+
+
+def findings(validation: Any, execute: bool = False, **names: Any) -> dict[str, tuple[str, str]]:
+    """Return the worst finding of each check."""
+    order = ("ok", "skipped", "noted", "failed")
+    found = check_experiment(Experiment("x", validation, **names), execute=execute)
+    ordered = sorted(found, key=lambda finding: order.index(finding.state))
+    return {finding.check: (finding.state, finding.text) for finding in ordered}
+
+
+@pytest.mark.parametrize(("iterations", "state"), [(1, "noted"), (100, "ok")])
+def test_a_check_counts_the_designs_that_did_not_converge(iterations: int, state: str) -> None:
+    validation = make_validation()
+    hasty = controllers.ILQR([1.0, 0.1], [1e-2], [10.0, 1.0], iterations=iterations, limits=0.5)
+    validation = Validation(**{**vars(validation), "synthesizer": hasty})
+    found = {one.check: one for one in check_experiment(Experiment("x", validation))}["convergence of the designs"]
+    assert found.state == state
+    designs = "of 11 designs did not converge, such as goal = " if state == "noted" else "all 11 designs converged"
+    assert designs in found.text
+    assert "convergence of the designs" not in {
+        one.check for one in check_experiment(Experiment("x", make_validation()))
+    }
+
+
+def test_a_check_executes_nothing_unless_told() -> None:
+    rig = FaultyRig(make_validation().system, dict.fromkeys(range(9), "raise"))
+    validation = make_validation(system=rig)
+    assert findings(validation)["execution"][0] == "skipped"
+    assert rig._executions == 0
+    state, text = findings(validation, execute=True)["execution"]
+    assert (state, "motor cut out" in text) == ("failed", True)
+
+
+def test_noise_is_measured() -> None:
+    rng = np.random.default_rng(0)
+    plain = make_validation()
+
+    class Noisy:
+        def execute(self, controller: Any, task: Task) -> Trajectory:
+            whole = plain.system.execute(controller, task)
+            return Trajectory(whole.times, whole.states + 1e-9 * rng.normal(size=whole.states.shape), whole.inputs)
+
+    state, text = findings(make_validation(system=Noisy()), execute=True)["execution"]
+    assert state == "noted"
+    assert "the system is stochastic" in text
+
+
+def test_a_start_that_is_not_the_tasks_is_found() -> None:
+    plain = make_validation()
+
+    class Elsewhere:
+        def execute(self, controller: Any, task: Task) -> Trajectory:
+            whole = plain.system.execute(controller, task)
+            return Trajectory(whole.times, whole.states + 0.125, whole.inputs)
+
+    assert "starts 0.125 away" in findings(make_validation(system=Elsewhere()), execute=True)["execution"][1]
+
+
+def test_a_model_whose_batches_differ_is_found() -> None:
+    plain = make_validation()
+
+    class Sloppy:
+        def step(self, x: Any, u: Any) -> Any:
+            return plain.model.step(x, u) + (0.1 if np.ndim(x) > 1 and len(x) == 7 else 0.0)
+
+    state, text = findings(make_validation(model=Sloppy()))["model"]
+    assert (state, "differs from the steps one by one" in text) == ("failed", True)
+
+
+@pytest.mark.parametrize("batched", [True, False])
+def test_a_system_without_inputs_has_none_to_name(batched: bool) -> None:
+    found = check_experiment(Experiment("x", make_validation_without_inputs(batched)), execute=True)
+    assert ("names", "ok", "inputs: none") in [(one.check, one.state, one.text) for one in found]
+    assert not [one for one in found if one.state == "failed"]
+
+
+def test_dimensions_names_and_units_are_held_against_each_other() -> None:
+    validation = make_validation(system=systems.Manual(states={"a": "m"}, inputs={"u": "N"}, dt=0.01))
+    found = findings(validation, states=("angle",), inputs=("torque",))
+    assert (
+        "the time step of the system is 0.01 s, that of the task is 0.02 s" in [t for _, t in found.values()][2]
+        or found["system"][0] == "failed"
+    )
+    assert found["system"][0] == "failed"
+    assert found["names"] == ("failed", "there are 2 states, but the number of names is 1: angle")
+    assert findings(make_validation())["names"][0] == "noted"
+
+
+def test_a_check_notes_a_distance_that_adds_different_units_and_how_to_weight_them() -> None:
+    with pytest.warns(UnitsWarning, match=r"adds states in rad and rad/s without weights or scales"):
+        experiment = Experiment("x", make_validation(), states=("angle [rad]", "rate [rad/s]"))
+    found = [finding for finding in check_experiment(experiment) if finding.check == "distance"]
+    assert found[0].state == "noted"
+    assert "scales=[...], the size of an error of each state that counts as 1" in found[0].text
+
+
+def test_a_controller_that_fails_on_the_model_itself_is_noted() -> None:
+    state, text = findings(make_validation(horizon=3))["controller on the model"]
+    assert state == "noted"
+    assert "fails on the model itself" in text
+
+
+def test_a_part_that_breaks_is_a_finding_and_no_traceback() -> None:
+    validation = make_validation(distance=lambda a, b, task: 1 / 0)
+    assert findings(validation)["distance"][0] == "failed"
+    elsewhere = findings(make_validation(distance=distances.FinalState(components=[7])))
+    assert elsewhere["tasks"][0] == "ok"
+    assert elsewhere["distance"] == (
+        "failed",
+        "the distance failed: ShapeError: components must be indices of 2 states, from 0 to 1, got 7.",
+    )
+    broken = make_validation(model=lambda x, u: x * float("nan"))
+    assert findings(broken)["tasks"][0] == "failed"
+
+
+@pytest.mark.parametrize(
+    ("limits", "low", "high"),
+    [
+        ("2.0", [-2, -2], [2, 2]),
+        ("{ low = 0.0, high = 8.0 }", [0, 0], [8, 8]),
+        ("{ low = [0.0, -inf], high = 8.0 }", [0, -np.inf], [8, 8]),
+        ("[[0.0, 8.0], [0.0, 8.0]]", [0, 0], [8, 8]),
+    ],
+)
+def test_limits_are_written_in_a_file_as_in_python(limits: str, low: list[float], high: list[float]) -> None:
+    table = tomllib.loads(f'type = "LQR"\nQ = [1.0]\nR = [1.0, 1.0]\nlimits = {limits}')
+    made = part("synthesizer", table)
+    assert (made.limits.low.tolist(), made.limits.high.tolist()) == (low, high)
+
+
+@pytest.mark.parametrize("kind", ["LQR", "ILQR", "StationaryLQR"])
+def test_a_flat_list_of_limits_in_a_file_is_refused(kind: str) -> None:
+    with pytest.raises(InputError, match=r"flat list, got \[1\.0, 8\.0\]: write one number h"):
+        part("synthesizer", {"type": kind, "Q": [1.0], "R": [1.0, 1.0], "limits": [1.0, 8.0]})
+
+
+def test_recorded_data_is_read_with_bounds(tmp_path: Path) -> None:
+    path = tmp_path / "steps.npz"
+    np.savez(path, x=np.zeros((3, 2)), u=np.zeros((3, 1)), x_next=np.ones((3, 2)))
+    assert recorded(str(path)).x_next.tolist() == [[1, 1]] * 3
+    header = np.lib.format.header_data_from_array_1_0(np.zeros(1)) | {"shape": (2**40, 2)}
+    huge = io.BytesIO()
+    np.lib.format.write_array_header_1_0(huge, header)
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("x_next.npy", huge.getvalue())
+        archive.writestr("x.npy", huge.getvalue())
+    with pytest.raises(InputError, match=r"steps\.npz cannot be read as recorded data: its array x .* is too large"):
+        recorded(str(path))
+
+
+def test_a_model_is_learned_from_logs_with_a_mapping(tmp_path: Path) -> None:
+    pytest.importorskip("mcap")
+    from rig_logs import DT, run, write_mcap_json
+
+    write_mcap_json(tmp_path / "run.mcap", run())
+    mapping = {"states": ["/state.cart.position", "/state.cart.speed"], "inputs": ["/command.force"]}
+    model = part("model", {"type": "Linear", "data": {"logs": "run.mcap", **mapping}}, tmp_path)
+    np.testing.assert_allclose(model.A, [[1, DT], [0, 1 - 0.3 * DT]], atol=1e-9)
+    assert len(model.data) == 60
+    with pytest.raises(InputError, match="data must be a file of recorded trajectories"):
+        part("model", {"type": "Linear", "data": mapping}, tmp_path)
+    with pytest.raises(InputError, match=r"has no states under a usual name"):
+        part("model", {"type": "Linear", "data": "run.mcap"}, tmp_path)
+
+
+COMPARABLE = "components = [0, 1]\nweights = [1.0, 2.0]\nscales = [0.1, 0.5]\nangles = [0]\n"
+DISTANCES = {
+    **{f"{name} {norm}": f'type = "{name}"\nnorm = {norm}\n{COMPARABLE}'
+       for name in ("FinalState", "GoalError", "MaximumDeviation", "MeanDeviation", "WholeTrajectory", "TrackingError")
+       for norm in (1, 2, "inf")},
+    "relative": f'type = "RelativeDeviation"\nnorm = inf\nleast = [0.1, 0.2]\n{COMPARABLE}',
+    "times": f'type = "AtTimes"\ntimes = [0.1, 0.3]\n{COMPARABLE}',
+    "crossing": f'type = "AtCrossing"\nstate = 0\nlevel = 0.2\ndirection = "up"\ncrossings = 2\n{COMPARABLE}',
+    "time": 'type = "CrossingTime"\nstate = 0\nlevel = 0.2\nangle = true\n',
+    "average": f'type = "TrackingError"\nover = "mean"\n{COMPARABLE}',
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", DISTANCES)
+def test_every_distance_is_written_in_a_file_as_in_python(name: str) -> None:
+    table = tomllib.loads(DISTANCES[name])
+    made = part("distance", dict(table))
+    in_python = getattr(distances, table.pop("type"))(**table)
+    found = make_validation(distance=made).outcome([0.5])
+    assert found.distance == make_validation(distance=in_python).outcome([0.5]).distance
+    assert np.isfinite(found.distance)
+    if "weights" in table and name != "relative":
+        assert made.mixed_units(["rad", "rad/s"]) == ()
+        del table["weights"], table["scales"]
+        assert getattr(distances, type(made).__name__)(**table).mixed_units(["rad", "rad/s"]) == ("rad", "rad/s")
+
+
+@pytest.mark.parametrize(
+    ("name", "file"),
+    [
+        ("cart", "cart-auto-seed0.sqlite"),
+        ("Kran 起重机", "Kran 起重机-auto-seed0.sqlite"),
+        ("../../etc/cart", "..-..-etc-cart-auto-seed0.sqlite"),
+        ("a\\b\nc\0", "a-b-c--auto-seed0.sqlite"),
+    ],
+)
+def test_no_name_leaves_the_folder_of_the_stores(name: str, file: str) -> None:
+    assert read_settings("pendulum", {}).store_path(name) == Path("runs") / file
+
+
+@pytest.mark.parametrize(
+    ("table", "entry"),
+    [
+        ("distance", {"type": "FinalState", "components": [5]}),
+        ("distance", {"type": "FinalState", "angles": [7]}),
+        ("distance", {"type": "AtTimes", "times": [99.0]}),
+        ("distance", {"type": "FinalState", "components": ["speed"]}),
+        ("distance", {"type": "AtCrossing", "crossings": 0}),
+        ("certificate", {"kind": "mean", "quantile": 2.0}),
+        ("certificate", {"kind": "mean", "predictions": 0}),
+        ("certificate", {"kind": "region", "discard": -1}),
+        ("certificate", {"kind": "sampling-discarding"}),
+        ("certificate", {"kind": "region", "discard": 9}),
+        ("search", {"name": "gp-ucb", "beta": -1.0}),
+        ("search", {"name": "cma-es", "population": 0}),
+        ("synthesizer", {"type": "ILQR", "Q": [1.0], "R": [1.0], "iterations": 0}),
+        ("space", {"goal": [1.0, 0.0]}),
+        ("task", {"initial_state": [0.0], "goal": ["goal"], "horizon": 0, "dt": 0.1}),
+        ("system", {"type": "Manual", "states": {"time": "s"}, "inputs": {"u": "N"}, "dt": 0.1}),
+    ],
+    ids=repr,
+)
+def test_a_wrong_option_is_refused_before_an_execution_is_spent(table: str, entry: dict[str, Any]) -> None:
+    counted: list[int] = []
+
+    def step(x: np.ndarray, u: np.ndarray) -> np.ndarray:
+        counted.append(1)
+        return x + u
+
+    def run() -> None:
+        settings = Settings.model_validate({**WHOLE, table: entry, "budget": 5, "threshold": 1.0})
+        experiment = settings.load()
+        chosen = settings.certificate_options
+        chosen.kind.require_usable(chosen.confidence, 5)
+        validation = Validation(**{**vars(experiment.validation), "system": systems.Simulated(step)})
+        settings.campaign(replace(experiment, validation=validation), Store()).run(5)
+
+    with pytest.raises((ValueError, CtxvalError)):
+        run()
+    assert not counted
+
+
+def test_a_file_names_the_states_that_are_compared() -> None:
+    entry = {"type": "FinalState", "components": ["x"], "angles": ["x"]}
+    experiment = Settings.model_validate({**WHOLE, "distance": entry}).load()
+    assert experiment.validation.distance == distances.FinalState(components=(0,), angles=(0,))
+
+
+def test_a_wrong_file_that_was_told_is_replaced(invoke: Any) -> None:
+    target = changed(
+        (
+            'type = "Simulated"\nstep = { ref = "experiment_system:step" }',
+            'type = "Manual"\nstates = { position = "m", speed = "m/s" }\ninputs = { force = "N" }\ndt = 0.05',
+        ),
+        ("dt = 0.05               # time step in seconds\n", "\n"),
+    )
+    assert invoke("ask", target, "--store", "a.sqlite").exit_code == 0
+    refused = invoke("tell", "a.sqlite", "0", "--distance", "0.2", "--replace", "typing error")
+    assert refused.exit_code == 2
+    assert "has no result that was told by a person" in refused.stderr.replace("\n", " ")
+    assert invoke("tell", "a.sqlite", "0", "--distance", "0.1").exit_code == 0
+    assert invoke("tell", "a.sqlite", "0", "--distance", "0.2").exit_code == 2
+    assert invoke("tell", "a.sqlite", "0", "--distance", "0.2", "--replace", "typing error").exit_code == 0
+    store = Store("a.sqlite")
+    assert store.trials()[0].distance == 0.2
+    assert [change.why for change in store.history()] == ["typing error"]

@@ -1,0 +1,379 @@
+"""What ``module:attr`` names: where it is sought, and what it must be before it is called."""
+
+from __future__ import annotations
+
+import importlib
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner
+
+from ctxval import Experiment, TaskSpace, distances, models, systems
+from ctxval.cli import app
+from ctxval.cli.config.parts import argument, part, recorded, task_function
+from ctxval.cli.config.references import is_function, reference
+from ctxval.cli.config.settings import Settings, read_settings
+from ctxval.core.trajectory import Trajectory
+from ctxval.errors import InputError
+
+PARTS = """
+import functools
+import numpy
+from ctxval import distances, models, systems
+
+calls = []
+
+class Rig:
+    def __init__(self, speed=1.0):
+        calls.append("Rig")
+        self.speed = speed
+    def execute(self, controller, task):
+        return None
+
+class Model:
+    def step(self, x, u):
+        return x
+
+class Other:
+    def __init__(self, **options):
+        calls.append("Other")
+
+class Distance:
+    def __call__(self, model_trajectory, system_trajectory, task):
+        return 0.0
+
+def distance(model_trajectory, system_trajectory, task):
+    return 0.0
+
+def scaled(scale):
+    calls.append("scaled")
+    return functools.partial(weighted, scale)
+
+def weighted(scale, model_trajectory, system_trajectory, task):
+    return scale
+
+def step(x, u):
+    return x
+
+def steps(x, u, t):
+    return x
+
+def make_rig(speed=2.0):
+    calls.append("make_rig")
+    return Rig(speed)
+
+def make_nothing(speed):
+    calls.append("make_nothing")
+
+def task(p):
+    calls.append("task")
+
+def experiment(seed, size=1):
+    raise ZeroDivisionError("inside")
+
+@functools.lru_cache
+def cached(p):
+    return None
+
+rig, model, other, near = Rig(), Model(), Other(), Distance()
+method = rig.execute
+builtin = numpy.array
+absolute = numpy.absolute
+calls.clear()
+"""
+
+
+@pytest.fixture(autouse=True)
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Work in a folder of its own, on a path and with modules of its own."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    for name in ("parts_here", "helper_here", "step_here"):
+        sys.modules.pop(name, None)
+    (tmp_path / "parts_here.py").write_text(PARTS)
+    return tmp_path
+
+
+def calls() -> list[str]:
+    return list(importlib.import_module("parts_here").calls)
+
+
+# What it must be
+
+
+@pytest.mark.parametrize(
+    ("kind", "given", "expected"),
+    [
+        ("system", "parts_here:rig", "Rig"),
+        ("system", "parts_here:Rig", "Rig"),
+        ("system", {"type": "parts_here:Rig", "speed": 3.0}, "Rig"),
+        ("system", "parts_here:make_rig", "Rig"),
+        ("system", {"type": "parts_here:make_rig", "speed": 3.0}, "Rig"),
+        ("model", "parts_here:model", "Model"),
+        ("model", "parts_here:Model", "Model"),
+        ("model", "parts_here:step", "function"),
+        ("distance", "parts_here:distance", "function"),
+        ("distance", "parts_here:near", "Distance"),
+        ("distance", "parts_here:Distance", "Distance"),
+        ("distance", {"type": "parts_here:scaled", "scale": 2.0}, "partial"),
+    ],
+)
+def test_a_reference_names_a_part_or_what_makes_it(kind: str, given: Any, expected: str) -> None:
+    assert type(part(kind, given)).__name__ == expected
+
+
+@pytest.mark.parametrize(
+    ("kind", "given", "sentence"),
+    [
+        ("system", "parts_here:Other", "must be a system, got the class parts_here.Other, which has no execute"),
+        ("system", {"type": "parts_here:Other", "args": "id > PWNED", "shell": True}, "which has no execute"),
+        ("system", "parts_here:other", "got an object of the class parts_here.Other, which has no execute"),
+        ("system", "parts_here:model", "which has no execute"),
+        ("system", "parts_here:step", "must be a system, got the function step"),
+        ("model", "parts_here:rig", "which has no step"),
+        ("model", "parts_here:steps", "must be a model, got the function steps"),
+        ("synthesizer", "parts_here:Rig", "which has no design"),
+        ("distance", "parts_here:Rig", "must be a function (model_trajectory, system_trajectory, task) -> d"),
+        ("distance", "parts_here:builtin", "got the builtin or method array"),
+        ("distance", "parts_here:absolute", "got an object of the class numpy.ufunc"),
+        ("distance", "parts_here:method", "got the builtin or method execute"),
+        ("distance", "parts_here:step", "must be a function (model_trajectory, system_trajectory, task)"),
+        ("system", {"type": "parts_here:rig", "speed": 1.0}, "is an object already, so it takes no arguments"),
+        ("system", {"type": "parts_here:method", "speed": 1.0}, "takes no arguments"),
+    ],
+)
+def test_what_is_no_part_is_refused_before_it_is_called(kind: str, given: Any, sentence: str) -> None:
+    with pytest.raises(InputError) as refused:
+        part(kind, given)
+    assert sentence in str(refused.value)
+    assert calls() == []
+
+
+def test_what_a_function_makes_must_be_a_part_too() -> None:
+    with pytest.raises(
+        InputError, match=r"must be a system, got an object of the class builtins\.NoneType, which has no execute"
+    ):
+        part("system", {"type": "parts_here:make_nothing", "speed": 1.0})
+
+
+@pytest.mark.parametrize("name", ["subprocess:Popen", "os:getcwd", "builtins:exec", "webbrowser:open", "sys:exit"])
+def test_pythons_own_library_has_no_parts(name: str) -> None:
+    for kind in ("system", "model", "synthesizer", "distance"):
+        for given in (name, {"type": name, "args": "id > PWNED", "shell": True}):
+            with pytest.raises(InputError, match="is in Python's standard library"):
+                part(kind, given)
+    with pytest.raises(InputError, match="is in Python's standard library"):
+        argument({"ref": name})
+
+
+def test_a_task_by_name_is_a_function_of_the_parameters() -> None:
+    space = TaskSpace(goal=(0.0, 1.0))
+    for name in ("task", "cached"):
+        assert callable(task_function(f"parts_here:{name}", space, None))
+    for name, sentence in (
+        ("step", "must be a function p -> Task; it takes (x, u)"),
+        ("Rig", "must be a function p -> Task written in Python, got the class parts_here.Rig"),
+        ("builtin", "written in Python, got the builtin or method array"),
+    ):
+        with pytest.raises(InputError) as refused:
+            task_function(f"parts_here:{name}", space, None)
+        assert sentence in str(refused.value)
+    assert calls() == []
+
+
+def test_functions_that_are_arguments_are_looked_at_too() -> None:
+    for name in ("step", "model"):
+        assert isinstance(
+            part("system", {"type": "Simulated", "step": {"ref": f"parts_here:{name}"}}), systems.Simulated
+        )
+    for name, sentence in (
+        ("steps", "step of the system Simulated must be a function (x, u) -> x_next; it takes (x, u, t)"),
+        ("absolute", "step of the system Simulated must be a function (x, u) -> x_next written in Python"),
+        ("builtin", "must be an object, a class or a function written in Python"),
+        ("method", "must be an object, a class or a function written in Python"),
+        ("numpy", "must be an object, a class or a function written in Python"),
+    ):
+        with pytest.raises(InputError) as refused:
+            part("system", {"type": "Simulated", "step": {"ref": f"parts_here:{name}"}})
+        assert sentence in str(refused.value)
+    with pytest.raises(InputError, match="a function"):
+        part("synthesizer", {"type": "Policy", "policy": {"ref": "parts_here:step"}})
+
+
+def test_an_experiment_by_name_is_one_or_a_function_of_a_seed() -> None:
+    for name, sentence in (
+        ("calls", "must be an Experiment or a Validation, or a function of a seed that makes one, got list"),
+        ("Rig", "must be an Experiment or a Validation"),
+        ("builtin", "must be an Experiment or a Validation"),
+        ("steps", "must be callable with a seed and its options; it takes (x, u, t)"),
+        ("experiment", "parts_here:experiment failed: ZeroDivisionError: inside"),
+    ):
+        with pytest.raises(InputError) as refused:
+            Settings(experiment=f"parts_here:{name}").load()
+        assert sentence in str(refused.value)
+    with pytest.raises(InputError, match=r"with a seed and its options length; it takes \(seed, size=1\)"):
+        Settings(experiment="parts_here:experiment", options={"length": 2}).load()
+    assert calls() == []
+
+
+@pytest.mark.parametrize("text", ["parts_here", ":rig", "parts_here:", "", "a b:c", "..:x", "parts_here:none", "1:\0"])
+def test_a_text_that_names_nothing_is_a_sentence(text: str) -> None:
+    with pytest.raises(InputError, match=r"must be module:attr|cannot be loaded"):
+        reference(text)
+
+
+def test_functions_are_recognised_below_decorators() -> None:
+    assert is_function(distances.FinalState())
+    assert is_function(lambda: None)
+    assert not is_function(distances.FinalState)
+    assert not is_function(print)
+    assert not is_function(models.Linear([[1.0]], [[1.0]]).step)
+
+
+# Where it is sought
+
+
+def described(folder: Path, value: str, module: str = "step_here") -> Path:
+    """Write an experiment file with a module and its data beside it."""
+    folder.mkdir(exist_ok=True)
+    (folder / f"{module}.py").write_text(f"def step(x, u):\n    return {value}\n")
+    Trajectory([0, 0.1, 0.2, 0.3], [[0], [1], [3], [2]], [[1], [0], [1]]).to_csv(folder / "run.csv")
+    (folder / "experiment.toml").write_text(
+        'name = "x"\nspace = { goal = [0.0, 1.0] }\n'
+        'task = { initial_state = [0.0], goal = ["goal"], horizon = 3, dt = 0.1 }\n'
+        f'system = {{ type = "Simulated", step = {{ ref = "{module}:step" }} }}\n'
+        'model = { type = "Linear", data = ["run.csv"] }\n'
+        'synthesizer = { type = "LQR", Q = [1.0], R = [1.0] }\n'
+    )
+    return folder / "experiment.toml"
+
+
+def load(file: Path) -> Experiment:
+    return read_settings(str(file), {}).load()
+
+
+def step_of(experiment: Experiment) -> float:
+    return float(experiment.validation.system.model.function(0.0, 0.0))  # type: ignore[attr-defined]
+
+
+def test_what_a_file_names_is_sought_beside_it(here: Path) -> None:
+    described(here / "one", "1.0")
+    (here / "step_here.py").write_text("raise SystemExit('that of the current folder')")
+    assert step_of(load(Path("one/experiment.toml"))) == 1.0
+    assert sys.path[0] == str(here / "one")
+
+
+def test_the_file_of_init_is_checked_from_another_folder(here: Path) -> None:
+    (here / "folder").mkdir()
+    sys.modules.pop("experiment_system", None)
+    for command in (("init", "folder/experiment.toml"), ("check", "folder/experiment.toml")):
+        result = CliRunner().invoke(app, list(command))
+        assert result.exit_code == 0, result.stdout + result.stderr
+    sys.modules.pop("experiment_system")
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("few_loops")
+def test_a_command_from_another_folder_finds_what_the_file_names(here: Path) -> None:
+    described(here / "one", "x * 0.5")
+    program = [sys.executable, "-m", "ctxval.cli"]
+    for arguments in (("run", "one/experiment.toml", "--budget", "2", "--store", "a.sqlite"), ("ask", "../a.sqlite")):
+        cwd = here if arguments[0] == "run" else here / "one"
+        result = subprocess.run([*program, *arguments], cwd=cwd, capture_output=True, text=True)
+        assert result.returncode == 0, result.stderr
+    assert (here / "a.sqlite").exists()  # a store is where the command says
+
+
+def test_modules_of_one_name_from_two_folders_are_not_mixed_up(here: Path) -> None:
+    one, two = described(here / "one", "1.0"), described(here / "two", "2.0")
+    assert step_of(load(one)) == 1.0
+    with pytest.raises(InputError, match=r"a module named 'step_here' is already in use, .*one.step_here\.py, and"):
+        load(two)
+    assert step_of(load(one)) == 1.0
+    (here / "two" / "step_here.py").unlink()
+    with pytest.raises(InputError, match="none of this name is in"):
+        load(two)
+    # nor is one found in the folder of the other
+    sys.modules.pop("step_here")
+    with pytest.raises(InputError, match="no module named 'step_here' is in"):
+        load(two)
+    three = described(here / "three", "3.0", module="helper_here")
+    assert step_of(load(three)) == 3.0
+
+
+def test_modules_that_modules_import_are_not_mixed_up_either(here: Path) -> None:
+    for folder, name in (("one", "step_here"), ("two", "parts_here")):
+        (here / folder).mkdir()
+        (here / folder / "helper_here.py").write_text(f"value = {folder!r}\n")
+        (here / folder / f"{name}.py").write_text("from helper_here import value\n")
+    assert reference("step_here:value", here / "one") == "one"
+    with pytest.raises(InputError, match="a module named 'helper_here' is already in use"):
+        reference("parts_here:value", here / "two")
+    (here / "three").mkdir()
+    (here / "three" / "parts_here.py").write_text("value = 'three'\n")
+    assert reference("parts_here:value", here / "three") == "three"
+
+
+def test_a_module_may_extend_the_path_of_modules(here: Path) -> None:
+    (here / "lib").mkdir()
+    (here / "lib" / "helper_here.py").write_text("value = 7\n")
+    (here / "step_here.py").write_text(
+        "import sys\nsys.path.insert(0, 'lib')\nfrom helper_here import value\nassert '' not in sys.path\n"
+    )
+    sys.path.insert(0, "")
+    assert reference("step_here:value", here) == 7
+    assert {"lib", "", str(here)} <= set(sys.path)
+
+
+def test_a_module_called_like_one_of_python_is_found_where_it_is_meant(here: Path) -> None:
+    (here / "this.py").write_text("value = 3\n")
+    assert "this" in sys.stdlib_module_names
+    assert reference("this:value", here) == 3
+    sys.modules.pop("this")
+    (here / "json.py").write_text("value = 3\n")
+    with pytest.raises(InputError, match="a module named 'json' is already in use"):
+        reference("json:value", here)
+
+
+def test_installed_modules_and_those_of_pythonpath_are_found(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert reference("numpy:ndarray", here / "nowhere").__name__ == "ndarray"
+    (here / "helper_here.py").write_text("value = 7\n")
+    sys.path.append(str(here))
+    (here / "one").mkdir()
+    with pytest.raises(InputError, match="no module named 'helper_here'"):
+        reference("helper_here:value", here / "one")
+    monkeypatch.setenv("PYTHONPATH", str(here))
+    assert reference("helper_here:value", here / "one") == 7
+
+
+def test_files_are_sought_in_the_folder_unless_their_path_is_whole(here: Path) -> None:
+    described(here / "one", "1.0")
+    assert len(recorded("run.csv", here / "one")) == 3
+    assert len(recorded(str(here / "one" / "run.csv"), here)) == 3
+    with pytest.raises(InputError, match=r"run\.csv"):
+        recorded("run.csv", here)
+    for kind, table in (
+        ("model", {"type": "Onnx", "source": "none.onnx"}),
+        ("synthesizer", {"type": "OnnxPolicy", "source": "none.onnx"}),
+        ("system", {"type": "MuJoCo", "mjcf": "none.xml"}),
+        ("system", {"type": "FMU", "path": "none.fmu", "states": ["x"], "inputs": ["u"]}),
+    ):
+        with pytest.raises(InputError) as refused:
+            part(kind, table, here / "one")
+        assert "one/none." in str(refused.value) or "is not installed" in str(refused.value)
+
+
+def test_where_to_seek_is_no_setting_of_a_file(here: Path) -> None:
+    Path("a.toml").write_text('experiment = "pendulum"\nfolder = "/"\n')
+    with pytest.raises(InputError, match="no setting is called 'folder'"):
+        read_settings("a.toml", {})
+
+
+def test_a_missing_file_says_how_to_begin(here: Path) -> None:
+    with pytest.raises(
+        InputError, match=r"there is no experiment file a b\.toml; `ctxval init 'a b\.toml'` writes an example"
+    ):
+        read_settings("a b.toml", {})

@@ -1,0 +1,688 @@
+"""A store is data: what it names is imported or run only for the user who made it, or who says so."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import sqlite3
+import stat
+import subprocess
+import sys
+import threading
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner, Result
+
+from ctxval import Store
+from ctxval.cli import app
+from ctxval.cli.config import signatures as trust
+from ctxval.cli.config.settings import read_settings
+from ctxval.cli.config.signatures import SIGNATURES, code_named, key_path, signed, verifies
+from ctxval.cli.config.stored_settings import planned_settings, trusted_settings
+from ctxval.errors import InputError
+from rig_packages import install
+
+PLAIN: dict[str, Any] = {
+    "name": "cart",
+    "space": {"goal": [0.5, 2.0, "m"]},
+    "task": {"initial_state": [0.0, 0.0], "goal": ["goal", 0.0], "horizon": 4, "dt": 0.1},
+    "system": {"type": "Manual", "states": {"position": "m", "speed": "m/s"}, "inputs": {"force": "N"}, "dt": 0.1},
+    "model": {"type": "Linear", "A": [[1.0, 0.1], [0.0, 1.0]], "B": [[0.0], [0.1]]},
+    "synthesizer": {"type": "LQR", "Q": [10.0, 1.0], "R": [0.1]},
+    "distance": {"type": "FinalState", "scales": [0.1, 0.5]},
+}
+"""An experiment without code."""
+
+MODULE = """
+from pathlib import Path
+Path({sentinel!r}).write_text("imported")
+from ctxval import Experiment, Task, TaskSpace, Validation, controllers, distances, models, systems
+
+def experiment(seed):
+    validation = Validation(
+        space=TaskSpace(goal=(0.5, 2.0, "m")),
+        task=lambda p: Task([0, 0], goal=[p.goal, 0], horizon=4, dt=0.1),
+        system=systems.Manual(states={{"position": "m", "speed": "m/s"}}, inputs={{"force": "N"}}, dt=0.1),
+        model=models.Linear([[1, 0.1], [0, 1]], [[0], [0.1]]),
+        synthesizer=controllers.LQR([10, 1], [0.1]),
+        distance=distances.FinalState(weights=(1, 1)),
+    )
+    return Experiment("rig", validation)
+"""
+
+COMMANDS = {
+    "tell": ("tell", "a.sqlite", "0", "--distance", "0.1"),
+    "ask": ("ask", "a.sqlite"),
+    "import": ("import", "a.sqlite", "runs.csv"),
+    "audit": ("certify", "a.sqlite", "--audit", "3"),
+    "remeasure": ("remeasure", "a.sqlite"),
+}
+"""All that build the experiment of a store."""
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Work in a folder of its own, on a path of modules of its own."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    monkeypatch.delitem(sys.modules, "my_rig", raising=False)
+    Path("runs.csv").write_text("goal,distance\n1.0,0.1\n")
+    return tmp_path
+
+
+def invoke(*arguments: str) -> Result:
+    return CliRunner().invoke(app, list(arguments))
+
+
+def refusal(*arguments: str) -> str:
+    result = invoke(*arguments)
+    assert result.exit_code == 2, result.stdout + result.stderr
+    assert "Traceback" not in result.stderr
+    return result.stderr.replace("\n", " ")
+
+
+def done(*arguments: str) -> Result:
+    result = invoke(*arguments)
+    assert result.exit_code == 0, result.stdout + result.stderr
+    return result
+
+
+def plain_store(path: str = "a.sqlite") -> Store:
+    """Make a store of an experiment without code, with one open trial."""
+    settings = read_settings_of(PLAIN)
+    campaign = settings.campaign(settings.load(), Path(path))
+    campaign.ask()
+    return campaign.store
+
+
+def read_settings_of(content: dict[str, Any]) -> Any:
+    from ctxval.cli.config.settings import Settings
+
+    return Settings.model_validate(content)
+
+
+def store_with(settings: dict[str, Any], path: str = "a.sqlite") -> Store:
+    """Make a store and write other settings into it, as somebody else would."""
+    store = plain_store(path)
+    store.keep_settings(settings)
+    return store
+
+
+def rig_store(folder: Path, sentinel: str = "imported.txt") -> None:
+    """Make a store of a module, as its user does: with a signature."""
+    Path(folder, "my_rig.py").write_text(MODULE.format(sentinel=str(folder / sentinel)))
+    done("ask", "my_rig:experiment", "--store", "a.sqlite")
+    Path(folder, sentinel).unlink()
+    sys.modules.pop("my_rig")
+
+
+# The store of the attack
+
+
+HOSTILE = {
+    **PLAIN,
+    "system": {"type": "subprocess:Popen", "args": "id > PWNED", "shell": True},
+    "task": "os:getcwd",
+}
+
+EVIL_CALL = {"type": "Subprocess", "command": ["sh", "-c", "id > PWNED"], "timeout": 5.0}
+
+ATTACKS: dict[str, dict[str, Any]] = {
+    "issue": HOSTILE,
+    "class": {**PLAIN, "system": HOSTILE["system"]},
+    "module": {**PLAIN, "task": "evil:task"},
+    "module alone": {**PLAIN, "task": "evil"},
+    "experiment": {"experiment": "evil:experiment"},
+    "function": {**PLAIN, "model": {"type": "subprocess:getoutput", "cmd": "id > PWNED"}},
+    "argument": {**PLAIN, "system": {"type": "Simulated", "step": {"ref": "evil:step"}}},
+    "distance": {**PLAIN, "distance": "evil:distance"},
+    "search": {**PLAIN, "search": {"name": "gp-ucb", "kernel": {"ref": "evil:kernel"}}},
+    "options": {"experiment": "pendulum", "options": {"settings": {"ref": "evil:settings"}}},
+    "command": {**PLAIN, "system": EVIL_CALL},
+    "environment": {**PLAIN, "system": {"type": "Gymnasium", "environment": "evil:Environment-v0"}},
+    "fmu": {**PLAIN, "system": {"type": "FMU", "path": "evil.fmu", "states": ["x"], "inputs": ["u"]}},
+    "installed distance": {**PLAIN, "distance": {"type": "Speed"}},
+    "installed search": {**PLAIN, "search": {"name": "corners", "repeats": 1}},
+    "installed case": {"experiment": "swing"},
+    "folder": {**PLAIN, "task": "evil:task", "folder": "."},
+    "forged": {**PLAIN, "task": "evil:task", SIGNATURES: ["0" * 64]},
+    "deep": {**PLAIN, "system": {"type": "Simulated", "step": [[{"a": [{"ref": "evil:step"}]}]]}},
+}
+
+
+def plant(folder: Path) -> None:
+    """Put a module that leaves a mark when it is imported where a careless program would find it."""
+    (folder / "evil.py").write_text("from pathlib import Path\nPath('PWNED').write_text('')\n")
+
+
+@pytest.mark.parametrize("attack", ATTACKS)
+def test_nothing_that_a_foreign_store_names_is_imported_or_run(attack: str, folder: Path) -> None:
+    plant(folder)
+    store_with(ATTACKS[attack])
+    before = set(sys.modules)
+    for command in COMMANDS.values():
+        said = refusal(*command)
+        assert "would import or run code" in said
+        assert "--trust" in said
+        assert "--experiment FILE.toml" in said
+    assert not Path("PWNED").exists()
+    assert "evil" not in set(sys.modules) - before
+    assert [trial.state for trial in Store("a.sqlite").trials()] == ["open"]
+
+
+@pytest.mark.slow
+def test_the_store_of_the_attack_runs_nothing_through_the_real_command_line(folder: Path) -> None:
+    store_with(HOSTILE)
+    started = [
+        subprocess.Popen([sys.executable, "-m", "ctxval.cli", *command], stderr=subprocess.PIPE, text=True)
+        for command in COMMANDS.values()
+    ]
+    for process in started:
+        said = process.communicate(timeout=60)[1]
+        assert process.returncode == 2
+        assert "task = 'os:getcwd'" in said.replace("\n", " ")
+        assert "id > PWNED" in said
+    assert not list(folder.glob("PWNED*"))
+
+
+WATCHED = """
+import sys
+seen = []
+sys.addaudithook(lambda event, args: seen.append((event, args)))
+from typer.testing import CliRunner
+from ctxval.cli import app
+for command in ("status", "export", "certify"):
+    result = CliRunner().invoke(app, [command, "a.sqlite"])
+    print(command, result.exit_code, result.stderr)
+assert not [args for event, args in seen if event == "import" and args[0] == "evil"]
+assert not [event for event, _ in seen if event in ("subprocess.Popen", "os.system", "os.exec", "os.posix_spawn")]
+"""
+
+
+@pytest.mark.slow
+def test_looking_at_a_store_imports_and_runs_nothing(folder: Path) -> None:
+    plant(folder)
+    store_with({**HOSTILE, "model": "evil:model", "system": EVIL_CALL})
+    done("status", "a.sqlite")
+    result = subprocess.run([sys.executable, "-c", WATCHED], capture_output=True, text=True, timeout=60)
+    assert result.returncode == 0, result.stdout + result.stderr
+    assert "status 0" in result.stdout
+    assert "export 0" in result.stdout
+    assert not Path("PWNED").exists()
+
+
+def test_what_is_shown_of_a_store_steers_no_terminal(folder: Path) -> None:
+    store_with({**PLAIN, "task": "evil:\x1b[2J\u202etask" + "a" * 10_000, "search": {"name": "auto", "\x1b[2J": {}}})
+    said = refusal("ask", "a.sqlite")
+    assert r"\x1b[2J\u202etask" in said
+    assert "\x1b" not in said
+    assert len(said) < 1_500
+
+
+def test_many_things_are_shown_in_part(folder: Path) -> None:
+    store_with({**PLAIN, "search": {"name": "auto", **{f"x{i}": {"ref": "evil:x"} for i in range(1_000)}}})
+    assert "and 992 more" in refusal("ask", "a.sqlite")
+
+
+# Whose store it is
+
+
+def test_the_user_who_made_a_store_is_not_asked(folder: Path) -> None:
+    rig_store(folder)
+    assert Store("a.sqlite").settings()["folder"] == str(folder)
+    done("ask", "a.sqlite")
+    done("tell", "a.sqlite", "0", "--distance", "0.1")
+    done("import", "a.sqlite", "runs.csv")
+    assert Path("imported.txt").exists()
+
+
+def test_a_store_of_another_user_is_asked_about_once(
+    folder: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch, state_folder: Path
+) -> None:
+    rig_store(folder)
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path_factory.mktemp("other")))
+    said = refusal("ask", "a.sqlite")
+    assert f"experiment = 'my_rig:experiment', from the folder '{folder}'" in said
+    assert not Path("imported.txt").exists()
+    assert "a.sqlite now carries your signature" in done("ask", "a.sqlite", "--trust").stderr
+    assert "signature" not in done("ask", "a.sqlite").stderr
+    # and its first user is not asked either
+    monkeypatch.setenv("XDG_STATE_HOME", str(state_folder))
+    done("tell", "a.sqlite", "0", "--distance", "0.1")
+    assert len(Store("a.sqlite").settings()[SIGNATURES]) == 2
+
+
+def test_settings_that_were_edited_are_not_those_that_were_signed(folder: Path) -> None:
+    rig_store(folder)
+    plant(folder)
+    kept = Store("a.sqlite").settings()
+    for change in ({"experiment": "evil:experiment"}, {"folder": "/elsewhere"}, {"seed": 1}, {"options": {"a": 1}}):
+        Store("a.sqlite").keep_settings({**kept, **change})
+        assert "was changed since" in refusal("ask", "a.sqlite")
+    Store("a.sqlite").keep_settings(kept)
+    done("ask", "a.sqlite")
+    assert not Path("PWNED").exists()
+
+
+def test_a_signature_of_another_store_serves_only_the_settings_that_it_is_of(folder: Path) -> None:
+    rig_store(folder)
+    signatures = Store("a.sqlite").settings()[SIGNATURES]
+    store_with({**PLAIN, "task": "my_rig:experiment", SIGNATURES: signatures}, "b.sqlite")
+    refusal("ask", "b.sqlite")
+    assert not Path("imported.txt").exists()
+
+
+@pytest.mark.slow
+def test_a_module_beside_a_copied_store_is_not_found(folder: Path) -> None:
+    rig_store(folder)
+    elsewhere = folder / "downloads"
+    elsewhere.mkdir()
+    shutil.move("a.sqlite", elsewhere / "a.sqlite")
+    (elsewhere / "my_rig.py").write_text("from pathlib import Path\nPath('PWNED').write_text('')\n")
+    os.chdir(elsewhere)  # the fixture goes back
+    done("ask", "a.sqlite")
+    assert (folder / "imported.txt").exists()
+    # and not even where the module that is meant has gone
+    sys.modules.pop("my_rig")
+    (folder / "my_rig.py").unlink()
+    shutil.rmtree(folder / "__pycache__", ignore_errors=True)
+    program = [sys.executable, "-m", "ctxval.cli", "ask", "a.sqlite"]
+    result = subprocess.run(program, capture_output=True, text=True, timeout=60)
+    assert result.returncode == 2
+    assert f"no module named 'my_rig' is in {folder}" in result.stderr
+    assert not list(folder.rglob("PWNED"))
+
+
+def test_where_code_is_sought_is_known_of_settings_from_python_too(folder: Path) -> None:
+    Path("my_rig.py").write_text(MODULE.format(sentinel="imported.txt"))
+    settings = read_settings_of({"experiment": "my_rig:experiment"})
+    settings.campaign(settings.load(), Path("a.sqlite")).ask()
+    assert Store("a.sqlite").settings()["folder"] == str(folder)
+    Store("a.sqlite").keep_settings(signed({"experiment": "my_rig:experiment", "folder": None}, {}))
+    assert "would import or run code" in refusal("ask", "a.sqlite")
+
+
+def test_a_store_without_code_is_anybodys(folder: Path) -> None:
+    store_with({**PLAIN, SIGNATURES: ["0" * 64, 3, None, "é"]})
+    done("tell", "a.sqlite", "0", "--distance", "0.1")
+    assert "--experiment and --trust need a store as the first argument" in refusal("ask", "pendulum", "--trust")
+    settings = read_settings("linear", {"search": "random", "threshold": 99.0})
+    settings.campaign(settings.load(), Path("p.sqlite")).run(budget=2)
+    kept = Store("p.sqlite").settings()
+    Store("p.sqlite").keep_settings(trust.unsigned(kept))
+    done("certify", "p.sqlite", "--audit", "3")
+
+
+def test_a_store_of_an_older_version_asks_where_it_names_code(folder: Path) -> None:
+    rig_store(folder)
+    old = {k: v for k, v in Store("a.sqlite").settings().items() if k not in (SIGNATURES, "folder")}
+    Store("a.sqlite").keep_settings(old)
+    assert "an older version made it" in refusal("ask", "a.sqlite")
+    done("ask", "a.sqlite", "--trust")
+    assert Store("a.sqlite").settings()["folder"] == str(folder)
+    done("ask", "a.sqlite")
+
+
+MODEL_OUTSIDE: dict[str, dict[str, Any]] = {
+    "data": {"type": "Linear", "data": "../secret.csv"},
+    "a list": {"type": "Linear", "data": ["runs.csv", "/etc/passwd"]},
+    "logs": {"type": "Linear", "data": {"logs": "../secret.csv", "states": {}, "inputs": {}}},
+    "a network": {"type": "Onnx", "source": "/home/you/network.onnx"},
+    "a link": {"type": "Onnx", "source": "link/network.onnx"},
+    "a mesh": {"type": "MuJoCo", "mjcf": "<mujoco><asset><mesh file='/home/you/a.stl'/></asset></mujoco>"},
+    "another folder": {"type": "Saved", "source": "model.npz"},
+}
+
+
+@pytest.mark.parametrize("name", MODEL_OUTSIDE)
+def test_a_foreign_store_without_code_names_no_file_outside_its_folder(name: str, folder: Path) -> None:
+    (folder / "link").symlink_to("/")
+    elsewhere = {"folder": "/home/you"} if name == "another folder" else {}
+    store_with({**PLAIN, "model": MODEL_OUTSIDE[name], **elsewhere})
+    for command in (
+        ("ask", "a.sqlite"),
+        ("report", "a.sqlite", "--out", "r.html"),
+        ("certify", "a.sqlite", "--audit", "3"),
+    ):
+        invoked = invoke(*command)
+        assert "names files outside its folder" in f"{invoked.output} {invoked.stderr}" or invoked.exit_code == 0
+        assert invoked.exit_code == 2 or command[0] == "report"
+    with pytest.raises(InputError, match=r"names files outside its folder: .* --experiment FILE.toml"):
+        trusted_settings(Store("a.sqlite"))
+    assert trusted_settings(Store("a.sqlite"), trust=True).model == MODEL_OUTSIDE[name]
+
+
+def test_a_store_names_files_in_its_folder_and_its_user_any_file(folder: Path) -> None:
+    store_with({**PLAIN, "model": {"type": "Linear", "data": "runs/a.csv"}})
+    assert trusted_settings(Store("a.sqlite")).model is not None
+    outside = {**PLAIN, "model": MODEL_OUTSIDE["data"]}
+    store_with(signed(outside, {}), "own.sqlite")
+    assert trusted_settings(Store("own.sqlite")).model == MODEL_OUTSIDE["data"]
+
+
+def test_an_experiment_that_was_moved_is_named_where_it_is_now(folder: Path) -> None:
+    (folder / "old").mkdir()
+    os.chdir(folder / "old")
+    rig_store(folder / "old")
+    os.chdir(folder)
+    (folder / "old").rename("new")
+    os.chdir("new")
+    said = refusal("ask", "a.sqlite")
+    assert f"no module named 'my_rig' is in {folder / 'old'}" in said
+    assert "which does not exist any more: name the experiment at its present place with --experiment FILE.toml" in said
+    Path("my_rig.py").write_text(MODULE.format(sentinel="imported.txt"))
+    done("ask", "a.sqlite", "--experiment", "my_rig:experiment")
+    done("ask", "a.sqlite")
+
+
+# Parts of installed packages: code that the user installed, but that this store's maker chose
+
+
+@pytest.fixture
+def site(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A package with a distance ``Speed``, a search ``corners``, a case ``swing`` and a certificate ``theirs``."""
+    monkeypatch.delitem(sys.modules, "their_parts", raising=False)
+    monkeypatch.syspath_prepend(str(install(folder / "site")))
+    return folder / "site"
+
+
+INSTALLED: dict[str, dict[str, Any]] = {
+    **{name: content for name, content in ATTACKS.items() if name.startswith("installed")},
+    "installed certificate": {**PLAIN, "certificate": {"kind": "theirs"}},
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("attack", INSTALLED)
+def test_a_foreign_store_imports_no_part_of_an_installed_package(attack: str, site: Path) -> None:
+    store_with(INSTALLED[attack])
+    for command in (*COMMANDS.values(), ("status", "a.sqlite"), ("export", "a.sqlite"), ("certify", "a.sqlite")):
+        assert invoke(*command).exit_code in (0, 1, 2)
+    for command in COMMANDS.values():
+        refusal(*command)
+    assert code_named(INSTALLED[attack])
+    assert "their_parts" not in sys.modules
+    assert not (site / "imported.txt").exists()
+
+
+def test_what_the_user_names_may_be_of_an_installed_package(site: Path) -> None:
+    lines = [f"{key} = {_toml(PLAIN[key])}" for key in ("space", "task", "system", "model", "synthesizer")]
+    Path("cart.toml").write_text("\n".join([*lines, 'distance = "Speed"', 'search = { name = "corners" }']))
+    done("ask", "cart.toml", "--store", "a.sqlite")
+    assert (site / "imported.txt").exists()
+    done("ask", "a.sqlite")  # it is the user's own store
+    Store("a.sqlite").keep_settings(trust.unsigned(Store("a.sqlite").settings()))
+    said = refusal("ask", "a.sqlite")  # it is not any more
+    assert "distance = 'Speed'; search = {'name': 'corners', 'repeats': 1}" in said
+    assert "now carries your signature" in done("ask", "a.sqlite", "--trust").stderr
+    done("ask", "a.sqlite")
+
+
+def test_cases_of_installed_packages_are_listed_with_their_options(site: Path) -> None:
+    said = done("cases").stdout
+    assert "swing     A pendulum of a size; options: size=1" in said
+    assert json.loads(done("cases", "swing", "--json").stdout)["options"] == {"size": 1}
+    assert "case 'swing': size" in refusal("run", "swing", "--option", "size=large")
+    (site / "their_parts.py").write_text("1 / 0")
+    sys.modules.pop("their_parts")
+    assert "cannot be loaded from 'their_parts:swing': ZeroDivisionError" in " ".join(done("cases").stdout.split())
+    assert "pendulum" in done("cases").stdout
+    refusal("cases", "swing")
+
+
+@pytest.mark.parametrize(
+    ("code", "said"),
+    [
+        ("swing = dict", "the case 'swing' must be a function of a seed and its options"),
+        ("def swing(seed, size: '1 / 0' = 2): ...", "options: size=2"),
+    ],
+)
+def test_a_case_that_cannot_be_inspected_hides_no_other_one(code: str, said: str, site: Path) -> None:
+    (site / "their_parts.py").write_text(code)
+    listed = " ".join(done("cases").stdout.split())
+    assert said in listed
+    assert "pendulum" in listed
+
+
+# Naming the experiment again
+
+
+def test_naming_the_experiment_replaces_what_the_store_names(folder: Path) -> None:
+    plant(folder)
+    rig_store(folder)
+    Store("a.sqlite").keep_settings({**Store("a.sqlite").settings(), "experiment": "evil:experiment"})
+    named = ("--experiment", "my_rig:experiment")
+    assert "--trust and --experiment cannot be given together" in refusal("ask", "a.sqlite", *named, "--trust")
+    assert "now carries your signature" in done("tell", "a.sqlite", "0", "--distance", "0.1", *named).stderr
+    assert Store("a.sqlite").settings()["experiment"] == "my_rig:experiment"
+    done("ask", "a.sqlite")
+    assert not Path("PWNED").exists()
+
+
+def test_another_experiment_is_refused_and_signs_nothing(folder: Path) -> None:
+    store_with(HOSTILE)
+    assert "was made by another experiment" in refusal("ask", "a.sqlite", "--experiment", "pendulum")
+    assert Store("a.sqlite").settings() == HOSTILE
+
+
+def test_seed_and_search_remain_the_stores(folder: Path) -> None:
+    Path("my_rig.py").write_text(MODULE.format(sentinel="imported.txt"))
+    done("ask", "my_rig:experiment", "--store", "a.sqlite", "--seed", "3", "--search", "random")
+    kept = Store("a.sqlite").settings()
+    Store("a.sqlite").keep_settings(trust.unsigned(kept))
+    done("ask", "a.sqlite", "--experiment", "my_rig:experiment")
+    assert (Store("a.sqlite").settings()["seed"], Store("a.sqlite").settings()["search"]["name"]) == (3, "random")
+    # but code is not taken along
+    search = {"name": "random", "kernel": {"ref": "evil:kernel"}}
+    Store("a.sqlite").keep_settings({**kept, "search": search})
+    assert trusted_settings(Store("a.sqlite"), experiment="pendulum").search.name == "auto"
+
+
+def test_a_store_that_says_nothing_can_be_named(folder: Path) -> None:
+    plain_store()
+    sqlite3.connect("a.sqlite", isolation_level=None).execute("DELETE FROM settings")
+    assert "--experiment FILE.toml" in refusal("ask", "a.sqlite")
+    lines = [
+        'name = "cart"',
+        *(f"{key} = {_toml(PLAIN[key])}" for key in ("space", "task", "system", "model", "synthesizer", "distance")),
+    ]
+    Path("cart.toml").write_text("\n".join(lines))
+    done("ask", "a.sqlite", "--experiment", "cart.toml")
+
+
+def _toml(value: Any) -> str:
+    if isinstance(value, dict):
+        return "{ " + ", ".join(f"{key} = {_toml(item)}" for key, item in value.items()) + " }"
+    return json.dumps(value)
+
+
+def test_only_an_audit_builds_anything(folder: Path) -> None:
+    store_with(HOSTILE)
+    for option in (("--trust",), ("--experiment", "pendulum")):
+        assert "--trust and --experiment need --audit" in refusal("certify", "a.sqlite", *option)
+
+
+def test_what_is_trusted_must_still_be_a_part(folder: Path) -> None:
+    store_with(HOSTILE)
+    assert "is in Python's standard library" in refusal("tell", "a.sqlite", "0", "--distance", "0.1", "--trust")
+    assert not Path("PWNED").exists()
+
+
+# The key
+
+
+def test_the_key_is_the_users_own(state_folder: Path) -> None:
+    assert key_path() == state_folder / "ctxval" / "key"
+    settings = signed({"experiment": "my_rig:experiment"}, {})
+    assert verifies(settings)
+    assert not verifies({**settings, "seed": 1})
+    assert not verifies(trust.unsigned(settings))
+    assert len(key_path().read_bytes()) == 32
+    if os.name != "nt":
+        assert stat.S_IMODE(key_path().stat().st_mode) == 0o600
+        assert stat.S_IMODE(key_path().parent.stat().st_mode) == 0o700
+    assert [path.name for path in key_path().parent.iterdir()] == ["key"]
+
+
+def test_a_state_folder_that_is_not_absolute_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_STATE_HOME", "here")
+    monkeypatch.setenv("HOME", "/home/me")
+    assert key_path() == Path("/home/me/.local/state/ctxval/key")
+
+
+def test_those_who_make_the_key_at_once_make_one() -> None:
+    for _ in range(5):
+        begin = threading.Barrier(8)
+
+        def make(start: threading.Barrier = begin) -> bytes:
+            start.wait()
+            signed({}, {})
+            return key_path().read_bytes()
+
+        with ThreadPoolExecutor(8) as pool:
+            assert len({future.result() for future in [pool.submit(make) for _ in range(8)]}) == 1
+        assert [path.name for path in key_path().parent.iterdir()] == ["key"]
+        key_path().unlink()
+
+
+def test_a_key_that_is_being_made_is_never_seen_in_part(monkeypatch: pytest.MonkeyPatch) -> None:
+    link = os.link
+
+    def late(source: str, target: Path) -> None:
+        assert not Path(target).exists()
+        assert len(Path(source).read_bytes()) == 32
+        link(source, target)
+
+    monkeypatch.setattr(os, "link", late)
+    assert verifies(signed({"seed": 1}, {}))
+
+
+def test_a_disk_without_hard_links_has_a_key_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object) -> None:
+        raise PermissionError(1, "not permitted")
+
+    monkeypatch.setattr(os, "link", refuse)
+    assert verifies(signed({"seed": 1}, {}))
+    assert [path.name for path in key_path().parent.iterdir()] == ["key"]
+
+
+@pytest.mark.skipif(os.name != "posix", reason="files have modes on POSIX")
+@pytest.mark.parametrize("mode", [0o640, 0o604, 0o660])
+def test_a_key_that_others_can_read_is_refused(mode: int, folder: Path) -> None:
+    rig_store(folder)
+    key_path().chmod(mode)
+    assert "can be read or written by other users" in refusal("ask", "a.sqlite")
+    key_path().chmod(0o600)
+    assert verifies(Store("a.sqlite").settings())
+
+
+@pytest.mark.parametrize("content", [b"", b"short", b"x" * 33])
+def test_a_damaged_key_is_named(content: bytes, folder: Path) -> None:
+    rig_store(folder)
+    key_path().write_bytes(content)
+    for command in (("ask", "a.sqlite"), ("run", "pendulum", "--budget", "1")):
+        assert f"the key {key_path()} is damaged: it must have 32 bytes" in refusal(*command)
+    key_path().unlink()
+    refusal("ask", "a.sqlite")
+    done("ask", "a.sqlite", "--trust")
+
+
+def test_without_a_place_for_the_key_stores_are_unsigned(folder: Path, state_folder: Path) -> None:
+    (state_folder / "ctxval").write_text("in the way")
+    Path("my_rig.py").write_text(MODULE.format(sentinel="imported.txt"))
+    done("ask", "my_rig:experiment", "--store", "a.sqlite")
+    assert SIGNATURES not in Store("a.sqlite").settings()
+    refusal("ask", "a.sqlite")
+    said = done("ask", "a.sqlite", "--trust").stderr
+    assert "cannot carry your signature, and the question will be asked again: the key in" in said
+
+
+def test_a_user_without_a_home_has_no_key(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("XDG_STATE_HOME")
+    monkeypatch.setattr(Path, "home", lambda: (_ for _ in ()).throw(RuntimeError("no home")))
+    assert signed({"seed": 1}, {}) == {"seed": 1}
+    assert not verifies({SIGNATURES: ["0"]})
+    assert "home folder" in str(trust.why_no_key())
+
+
+def test_numbers_and_texts_survive_the_store(folder: Path) -> None:
+    settings = {"threshold": 0.1 + 0.2, "name": "\ud800é\x00", "options": {"b": [1, 2.0, None], "a": True}}
+    store = plain_store()
+    store.keep_settings(signed(settings, {}))
+    assert verifies(Store("a.sqlite").settings())
+
+
+def test_signatures_do_not_pile_up() -> None:
+    before = {"seed": 1, SIGNATURES: [f"{i:064d}" for i in range(100)]}
+    kept = signed({"seed": 1}, before)
+    assert len(kept[SIGNATURES]) == 16
+    assert verifies(kept)
+    assert signed({"seed": 1}, kept) == kept
+    assert len(signed({"seed": 2}, before)[SIGNATURES]) == 1
+
+
+# What is code
+
+
+def test_what_is_data_names_no_code() -> None:
+    assert code_named(PLAIN) == []
+    assert code_named({"experiment": "pendulum", "options": {"variant": "basin"}}) == []
+    assert code_named({**PLAIN, "system": "Manual", "distance": {"type": "FinalState", "norm": 2}}) == []
+    assert code_named({**PLAIN, "model": {"type": "Onnx", "source": "a.onnx"}}) == []
+
+
+@pytest.mark.parametrize("attack", ATTACKS)
+def test_whatever_is_not_known_to_be_data_is_code(attack: str) -> None:
+    assert code_named(ATTACKS[attack])
+
+
+def test_unknown_parts_and_odd_values_are_code() -> None:
+    for value in ("Popen", {"type": "Popen"}, {"type": 3}, {"type": ["x"]}, 3, ["Linear"]):
+        assert code_named({**PLAIN, "model": value}), value
+
+
+def test_what_is_nested_too_deeply_is_code() -> None:
+    value: Any = {}
+    for _ in range(100_000):
+        value = [value]
+    assert code_named({"options": {"x": value}})
+
+
+def test_stored_settings_are_read_without_their_signatures(folder: Path) -> None:
+    rig_store(folder)
+    assert planned_settings(Store("a.sqlite")).experiment == "my_rig:experiment"
+
+
+# The Subprocess of a file is trusted as what it is: named by the user
+
+
+def test_a_file_that_the_user_names_runs_what_it_says(folder: Path) -> None:
+    program = folder / "rig.py"
+    program.write_text(
+        "import sys\nfrom pathlib import Path\n"
+        "rows = ''.join(f'{t * 0.1},0,0,{0 if t < 4 else str()}\\n' for t in range(5))\n"
+        "(Path(sys.argv[1]) / 'trajectory.csv').write_text(f't,x0,x1,u0\\n{rows}')\n"
+    )
+    command = f"{sys.executable} rig.py"
+    content = {**PLAIN, "system": {"type": "Subprocess", "command": command, "timeout": 60}, "folder": folder}
+    settings = read_settings_of(content)
+    os.chdir(folder.parent)
+    system = settings.load().validation.system
+    described = system.describe()
+    assert described["program"] == Path(sys.executable).name  # wherever it is
+    assert list(described["files"]) == ["rig.py"]
+    plan = settings.load().validation.plan(np.array([1.0]))
+    assert system.execute(plan.controller, plan.task).states.shape == (5, 2)
+
+
+def test_settings_of_a_damaged_shape_are_a_sentence(folder: Path) -> None:
+    store_with({"experiment": 3})
+    assert "the store's settings: experiment" in refusal("ask", "a.sqlite")
+    with pytest.raises(InputError):
+        trusted_settings(Store("a.sqlite"), trust=True)
+    assert read_settings("pendulum", {}).folder is None

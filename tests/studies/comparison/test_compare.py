@@ -1,0 +1,315 @@
+"""Comparisons of models, controllers and distances on one system."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from conftest import make_validation
+from ctxval import (
+    Campaign,
+    Comparison,
+    Labels,
+    Task,
+    TaskSpace,
+    Validation,
+    compare,
+    controllers,
+    distances,
+    models,
+    searches,
+    systems,
+)
+from ctxval.campaign.storage.store import Store
+from ctxval.errors import InputError
+from ctxval.studies.comparison import CandidateResult, PairResult
+from ctxval.studies.comparison.candidates import TrialNote
+from ctxval.studies.comparison.executions import agrees
+
+pytestmark = pytest.mark.usefixtures("few_loops")
+
+
+def plant(x: np.ndarray, u: np.ndarray) -> np.ndarray:
+    drag = 0.3 * x[..., 1] * np.abs(x[..., 1])
+    return np.stack([x[..., 0] + 0.05 * x[..., 1], x[..., 1] + 0.05 * (u[..., 0] - drag)], axis=-1)
+
+
+class Counted(systems.Simulated):
+    """The cart, which counts its executions."""
+
+    executed = 0
+
+    def execute(self, controller: Any, task: Task) -> Any:
+        type(self).executed += 1
+        return super().execute(controller, task)
+
+
+def cart(weight: float = 1.0, distance: Any = None, mass: float = 1.0, limit: float = 2.0) -> Validation:
+    return Validation(
+        space=TaskSpace(goal=(-limit, limit, "m")),
+        task=lambda p: Task([0.0, 0.0], goal=[p.goal, 0.0], horizon=60, dt=0.05),
+        system=Counted(plant, vectorized=True),
+        model=models.Linear([[1, 0.05], [0, 1]], [[0], [0.05 / mass]]),
+        synthesizer=controllers.LQR([weight, 1], [1 / weight]),
+        distance=distance or distances.WholeTrajectory(norm=np.inf, components=[0]),
+        labels=Labels(units="m"),
+    )
+
+
+def by_hand() -> Validation:
+    rig = systems.Manual(states={"position": "m", "speed": "m/s"}, inputs={"force": "N"}, dt=0.1)
+    return make_validation(system=rig)
+
+
+def campaigns(**validations: Validation) -> dict[str, Campaign]:
+    """Return campaigns with a search whose choices depend on no clock."""
+    return {name: Campaign(one, search=searches.GPUCB()) for name, one in validations.items()}
+
+
+@pytest.mark.slow
+def test_the_controller_with_the_smaller_largest_distance_is_found() -> None:
+    pair = {"gentle": cart(), "stiff": cart(10.0)}
+    found = compare(campaigns(**pair), question="worst", budget=30)
+    truths = {name: one.distances(one.space.grid(401)).max() for name, one in pair.items()}
+    assert found.decided
+    assert found.ranking("worst") == ((min(truths, key=lambda name: truths[name]),), ("gentle",))
+    decided = found.pair("worst", "stiff", "gentle")
+    assert decided.smaller == "stiff"
+    known = {one.name: one for one in found.candidates}
+    assert truths["stiff"] <= (known["stiff"].bound or 0) < (known["gentle"].largest or 0) <= truths["gentle"] + 1e-12
+    assert known["gentle"].bound is None
+    assert known["gentle"].executions < 4  # only the better one needs a bound
+
+
+@pytest.mark.slow
+def test_the_controller_with_the_smaller_expected_distance_is_found_by_the_same_tasks() -> None:
+    pair = {"gentle": cart(), "stiff": cart(10.0)}
+    made = campaigns(**pair)
+    found = compare(made, question="mean", budget=80)
+    means = {name: one.distances(one.space.grid(2001)).mean() for name, one in pair.items()}
+    decided = found.pair("mean", "gentle", "stiff")
+    assert decided.smaller == min(means, key=lambda name: means[name]) == "stiff"
+    assert decided.low is not None
+    assert decided.high is not None
+    assert decided.low < means["gentle"] - means["stiff"] < decided.high
+    points = [[trial.unit_point.tolist() for trial in one.trials] for one in made.values()]
+    assert points[0] == points[1]
+    assert {trial.origin for one in made.values() for trial in one.trials} == {"iid"}
+    assert found.executions == 2 * decided.tasks
+
+
+@pytest.mark.slow
+def test_distances_of_one_controller_share_every_execution() -> None:
+    Counted.executed = 0
+    pair = campaigns(whole=cart(), mean=cart(distance=distances.MeanDeviation(components=[0])))
+    found = compare(pair, question="both", budget=8)
+    whole, mean = found.candidates
+    assert found.executions == Counted.executed == whole.executions + mean.executions
+    assert whole.executions + whole.shared == mean.executions + mean.shared == found.executions
+    trajectories = [
+        {trial.number: one.trajectories(trial)[1] for trial in one.trials if trial.executed} for one in pair.values()
+    ]
+    assert [len(one) for one in trajectories] == [found.executions] * 2
+    shared = [TrialNote.of(trial) for one in pair.values() for trial in one.trials]
+    assert sum(note is not None and note.shared is not None for note in shared) == found.executions
+
+
+@pytest.mark.slow
+def test_models_with_other_numbers_in_the_same_controller_share_and_others_do_not() -> None:
+    same = compare(campaigns(a=cart(), b=cart()), question="mean", budget=12)
+    assert same.executions == 12
+    assert [one.shared + one.executions for one in same.candidates] == [12, 12]
+    assert not same.decided  # all differences are 0
+    other = compare(campaigns(a=cart(), b=cart(mass=1.3)), question="mean", budget=4)
+    assert [one.shared for one in other.candidates] == [0, 0]
+
+
+def test_an_execution_agrees_only_with_the_controller_that_gave_its_inputs() -> None:
+    one, other = cart(), cart(10.0)
+    trajectory = one.outcome([1.0]).system_trajectory
+    assert agrees(one.plan([1.0]), trajectory)
+    assert not agrees(other.plan([1.0]), trajectory)
+    assert not agrees(make_validation().plan([1.0]), trajectory)
+
+    def fails(t: int, x: np.ndarray) -> np.ndarray:
+        raise ValueError("never here")
+
+    assert not agrees(replace(one.plan([1.0]), controller=fails), trajectory)
+
+
+@pytest.mark.slow
+def test_a_comparison_that_is_stopped_continues_with_the_same_choices(tmp_path: Path) -> None:
+    def stores(folder: str) -> dict[str, Campaign]:
+        pair = {"gentle": cart(), "stiff": cart(10.0)}
+        return {
+            name: Campaign(one, search=searches.GPUCB(), store=tmp_path / folder / f"{name}.sqlite", name=name)
+            for name, one in pair.items()
+        }
+
+    (tmp_path / "whole").mkdir()
+    (tmp_path / "parts").mkdir()
+    whole = compare(stores("whole"), budget=10)
+
+    class StoppedError(Exception):
+        pass
+
+    for limit in (1, 6):
+        seen: list[str] = []
+
+        def stop(name: str, trial: object, limit: int = limit, seen: list[str] = seen) -> None:
+            seen.append(name)
+            if len(seen) == limit:
+                raise StoppedError
+
+        with pytest.raises(StoppedError):
+            compare(stores("parts"), budget=10, on_trial=stop)
+    parts = compare(stores("parts"), budget=10)
+    assert parts.to_dict() == whole.to_dict()
+    for name in ("gentle", "stiff"):
+        kept = [Store(tmp_path / folder / f"{name}.sqlite").trials() for folder in ("whole", "parts")]
+        plain = [[(t.unit_point.tolist(), t.distance, json.dumps(t.note)) for t in trials] for trials in kept]
+        assert plain[0] == plain[1]
+    again = compare(stores("parts"), budget=10)
+    assert again.to_dict() == whole.to_dict()
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: {"a": cart()}, "at least two candidates, got 1"),
+        (lambda: {"a": cart(), "b": cart(limit=3.0)}, "the same task spaces, but space"),
+        (lambda: {"a": cart(), "b": make_validation()}, "the same task spaces"),
+        (lambda: {"a": by_hand(), "b": by_hand()}, "on a system that people execute"),
+        (lambda: {"a": cart(), "b": 3}, "each value is a Validation or an Experiment or a Campaign, also 'b'"),
+        (lambda: [cart(), cart()], "must be a table of names"),
+        (
+            lambda: {"a": cart(), "b": cart().with_labels(Labels(units="mm"))},
+            "must have the same unit, got 'm' and 'mm'",
+        ),
+    ],
+)
+def test_what_cannot_be_compared_is_refused(make: Callable[[], Any], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        compare(make())
+
+
+def test_another_system_is_refused() -> None:
+    other = make_validation(system=systems.Simulated(lambda x, u: x, vectorized=True))
+    with pytest.raises(InputError, match="the same systems, but system"):
+        compare({"a": make_validation(), "b": other})
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"question": "median"}, "no question is called 'median'; did you mean 'mean'"),
+        ({"budget": 0}, "budget must be a positive integer"),
+        ({"budget": 2.5}, "budget must be a positive integer"),
+        ({"seed": -1}, "seed must be an integer"),
+        ({"largest_possible": 0.0}, "largest_possible must be a positive number"),
+        ({"largest_possible": float("nan")}, "largest_possible must be a positive number"),
+        ({"confidence": 0.3}, "more often than right"),
+        ({"stochastic": True}, "question must be mean for a stochastic system, got 'both'"),
+        ({"stochastic": True, "question": "worst"}, "executed distances do not tell which d. is larger"),
+    ],
+)
+def test_values_that_cannot_be_used_are_refused(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        compare({"a": cart(), "b": cart(10.0)}, **options)
+
+
+@pytest.mark.parametrize("question", ["mean", "both"])
+def test_a_distance_above_the_largest_possible_one_ends_the_comparison(tmp_path: Path, question: Any) -> None:
+    with pytest.raises(InputError, match=r"largest_possible is 0\.0001, but a distance of"):
+        compare({"a": cart(), "b": cart(10.0)}, question=question, budget=9, largest_possible=1e-4, stores=tmp_path)
+    kept = [trial for name in "ab" for trial in Store(tmp_path / f"{name}.sqlite").trials()]
+    assert max(trial.distance for trial in kept) > 1e-4
+
+
+@pytest.mark.slow
+def test_a_failed_draw_leaves_the_expected_distance_open_unless_a_largest_one_is_stated() -> None:
+    def breaks(x: np.ndarray, u: np.ndarray) -> np.ndarray:
+        if np.abs(x[..., 0]).max() > 1.0:
+            raise RuntimeError("the cart left the rail")
+        return plant(x, u)
+
+    def broken(weight: float) -> Validation:
+        parts = {**vars(cart(weight)), "system": systems.Simulated(breaks)}
+        return Validation(**parts)
+
+    pair = {"gentle": broken(1.0), "stiff": broken(10.0)}
+    open_ = compare(campaigns(**pair), question="mean", budget=24)
+    assert not open_.decided
+    assert "has no distance, so the expected distance is not known" in open_.pairs[0].reason
+    assert sum(one.failed for one in open_.candidates) >= 1
+    stated = compare(campaigns(**pair), question="mean", budget=12, largest_possible=1.0)
+    assert stated.executions == 12
+    assert any("no distance can exceed 1" in assumption for assumption in stated.assumptions)
+
+
+def comparison() -> Comparison:
+    named = ("gp", "fnn", "<b>|linear")
+    candidates = tuple(
+        CandidateResult(name, 5, 1, 0, 0.1 * k + 0.1, {"y": 0.1}, None if k == 2 else 0.15 * k + 0.11, 3, 0.05 * k)
+        for k, name in enumerate(named)
+    )
+    pairs = (
+        PairResult("worst", "gp", "fnn", "gp", "a fact"),
+        PairResult("worst", "gp", "<b>|linear", "gp", "a fact"),
+        PairResult("worst", "fnn", "<b>|linear", None, "no bound separates them"),
+        PairResult("mean", "gp", "fnn", "gp", "the interval", -0.02, -0.03, -0.01, 9, 0.2),
+        PairResult("mean", "gp", "<b>|linear", None, "contains 0", 0.01, -np.inf, np.inf, 3),
+        PairResult("mean", "fnn", "<b>|linear", "<b>|linear", "the interval", 0.02, 0.01, 0.03, 9, 0.2),
+    )
+    return Comparison(candidates, pairs, 0.95, 15, 75, "m", ("the system does not change",))
+
+
+def test_a_ranking_groups_what_is_not_told_apart() -> None:
+    found = comparison()
+    assert found.ranking("worst") == (("gp",), ("fnn", "<b>|linear"))
+    assert found.ranking_text("worst") == "gp < fnn ? <b>|linear"
+    assert found.ranking("mean") == (("gp", "<b>|linear"), ("fnn",))
+    assert not found.decided
+    assert found.pair("mean", "fnn", "gp").smaller == "gp"
+    assert "undecided" in found.pair("mean", "gp", "<b>|linear").answer
+    with pytest.raises(KeyError):
+        found.pair("worst", "gp", "nothing")
+
+
+def test_a_result_is_json_and_markdown_whatever_the_names_are() -> None:
+    found = comparison()
+    plain = json.loads(json.dumps(found.to_dict(), allow_nan=False))
+    assert plain["pairs"][4]["low"] is None
+    assert plain["rankings"]["worst"] == [["gp"], ["fnn", "<b>|linear"]]
+    text = found.to_markdown()
+    assert "<b>" not in text
+    assert r"\<b\>\|linear" in text
+    assert "| expected distance | gp | fnn | -0.02 | -0.03 to -0.01 | 9 |" in text
+    assert "| -0.02 | -0.03 to -0.01 |" in text  # of the smaller one minus the other one
+    assert "&lt;b&gt;" in found._repr_html_()
+
+
+@pytest.mark.slow
+def test_a_picture_has_a_panel_for_each_question(tmp_path: Path) -> None:
+    figure = comparison().plot()
+    assert [ax.get_xlabel() for ax in figure.axes] == ["distance [m]", "difference [m]"]
+    assert figure.axes[1].get_yticklabels()[0].get_text() == "gp - fnn"
+    figure.savefig(tmp_path / "comparison.png")
+
+
+@pytest.mark.slow
+def test_notes_of_others_are_no_notes_of_a_comparison() -> None:
+    trial = Campaign(make_validation()).ask({"goal": 0.5}).trial
+    for note in (None, {"comparison": 3}, {"comparison": {"step": "x"}}, {"other": {}}):
+        assert TrialNote.of(replace(trial, note=note)) is None
+    kept = TrialNote(4, "mean", 2, 0.5, 0.25, ("a", 3))
+    for stored in (kept.to_note(), json.loads(json.dumps(kept.to_note()))):
+        found = TrialNote.of(replace(trial, note=stored))
+        assert found is not None
+        assert vars(found) == vars(kept)

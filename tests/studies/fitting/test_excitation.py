@@ -1,0 +1,69 @@
+"""Signals that excite a system, and executions with them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from conftest import make_validation
+from ctxval import systems
+from ctxval.errors import InputError, ShapeError, UnknownNameError
+from ctxval.studies.fitting import Excitation, excitation
+
+KINDS: list[Any] = ["random", "multisine", "chirp"]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@settings(max_examples=20, deadline=None)
+@given(st.integers(1, 300), st.lists(st.floats(0.1, 10), min_size=1, max_size=3), st.integers(0, 10**6))
+def test_a_signal_stays_within_its_amplitude(kind: Any, horizon: int, amplitude: list[float], seed: int) -> None:
+    signal = excitation(kind, horizon, amplitude, np.random.default_rng(seed))
+    assert signal.shape == (horizon, len(amplitude))
+    assert (np.abs(signal) <= np.array(amplitude) * (1 + 1e-12)).all()
+    np.testing.assert_array_equal(signal, excitation(kind, horizon, amplitude, np.random.default_rng(seed)))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_signal_excites_slow_motion_and_no_fast_one(kind: Any) -> None:
+    signal = excitation(kind, 400, 1.0, np.random.default_rng(0))[:, 0]
+    power = np.abs(np.fft.rfft(signal)) ** 2
+    share = power[np.fft.rfftfreq(400) <= 0.12].sum() / power.sum()
+    assert share > (0.6 if kind == "random" else 0.98)
+    assert (power[1:30] > 1e-6 * power.max()).mean() > 0.25
+
+
+def test_runs_excite_the_system_within_limits_and_depend_on_seed_and_number() -> None:
+    validation = make_validation()
+    made = Excitation(validation, "random", 2.0, 3.0, seed=4)
+    first, second = made.run(0), made.run(1)
+    assert not np.array_equal(first.states, second.states)
+    np.testing.assert_array_equal(Excitation(validation, "random", 2.0, 3.0, seed=4).run(1).states, second.states)
+    plan = made.plan(0)
+    plain = validation.execute(plan)
+    assert np.abs(first.inputs).max() <= 3.0 + 1e-12
+    assert np.abs(first.inputs - plain.inputs).max() > 0.1
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "message"),
+    [
+        ({"kind": "chrip"}, UnknownNameError, "did you mean 'chirp'"),
+        ({"amplitude": -1.0}, InputError, "amplitude must be numbers >= 0"),
+        ({"amplitude": [0.0]}, InputError, "amplitude must be numbers >= 0, not all of them 0"),
+        ({"amplitude": [1.0, 2.0]}, ShapeError, "amplitude must be one number for each of 1 inputs"),
+        ({"limits": None}, InputError, "the controllers have no limits"),
+    ],
+)
+def test_what_cannot_be_used_is_refused(options: dict[str, Any], error: type[Exception], message: str) -> None:
+    with pytest.raises(error, match=message):
+        Excitation(make_validation(), **({"kind": "random", "amplitude": 1.0, "limits": 5.0} | options))
+
+
+def test_people_are_not_asked_to_run_signals() -> None:
+    rig = systems.Manual(states={"angle": "rad", "rate": "rad/s"}, inputs={"torque": "N m"}, dt=0.02)
+    with pytest.raises(InputError, match="people execute the tasks of this system"):
+        Excitation(make_validation(system=rig), "random", 1.0, 5.0)
