@@ -15,7 +15,7 @@ from ctxval.campaign.campaign import Campaign
 from ctxval.certificates import CertificateOptions, Verdict
 from ctxval.report.charts import Axis, Chart
 from ctxval.report.context import ReportContext, context_of_campaign, context_of_store
-from ctxval.report.diagnostics import Finding
+from ctxval.report.findings import Finding
 from ctxval.report.markup import bullets, element, heading, joined, paragraph, table
 from ctxval.report.page import page, write_page
 from ctxval.report.sections import SECTIONS, Section

@@ -18,7 +18,7 @@ from markupsafe import Markup
 from ctxval._util.arrays import Array, ArrayLike
 from ctxval._util.representation import ShortRepr
 from ctxval.certificates.bounds import at_most
-from ctxval.report.markup import element, number
+from ctxval.report.markup import element, joined, number
 
 SMALL = {"width": 340, "height": 220}
 """Size of a chart of which several stand side by side."""
@@ -31,15 +31,17 @@ Kind = Literal[
 ]  # fmt: skip
 """What is drawn, which decides its colour, its line style and its mark."""
 
+_DOT = "M-3.6,0a3.6,3.6 0 1,0 7.2,0a3.6,3.6 0 1,0 -7.2,0z"
+_CROSS = "M-4,-4L4,4M-4,4L4,-4"
 _MARKS: dict[str, str] = {
-    "sample": "M-3.6,0a3.6,3.6 0 1,0 7.2,0a3.6,3.6 0 1,0 -7.2,0z",
+    "sample": _DOT,
+    "mean": _DOT,
+    "failed": _CROSS,
+    "weak": _CROSS,
     "initial": "M-3.4,-3.4h6.8v6.8h-6.8z",
     "covering": "M0,-4.6L4.2,3.2H-4.2z",
-    "failed": "M-4,-4L4,4M-4,4L4,-4",
     "worst": "M0,-8L2.1,-2.6L7.6,-2.4L3.3,1.1L4.7,6.6L0,3.5L-4.7,6.6L-3.3,1.1L-7.6,-2.4L-2.1,-2.6z",
     "corrected": "M0,-4.6L4.6,0L0,4.6L-4.6,0z",
-    "mean": "M-3.6,0a3.6,3.6 0 1,0 7.2,0a3.6,3.6 0 1,0 -7.2,0z",
-    "weak": "M-4,-4L4,4M-4,4L4,-4",
 }
 
 
@@ -88,14 +90,14 @@ class Axis(ShortRepr):
         low, high = self.ends
         raw = (high - low) / count
         power = 10.0 ** np.floor(np.log10(raw))
-        step = power * next(one for one in (1.0, 2.0, 2.5, 5.0, 10.0) if one * power >= raw * (1 - 1e-9))
+        step = power * next(factor for factor in (1.0, 2.0, 2.5, 5.0, 10.0) if factor * power >= raw * (1 - 1e-9))
         step = max(step, 1.0) if self.whole else step
         first, last = np.ceil(low / step - 1e-9), np.floor(high / step + 1e-9)
         return [float(k * step) for k in np.arange(first, last + 1)][: 4 * count]
 
 
 @dataclass(eq=False)
-class Chart:
+class Chart(ShortRepr):
     """A chart with two axes, to which lines, bands and marks are added in the order of drawing.
 
     Attributes:
@@ -109,8 +111,8 @@ class Chart:
     y: Axis
     width: int = 480
     height: int = 280
-    _parts: list[Markup] = field(default_factory=list, init=False)
-    _legend: dict[str, tuple[str, str]] = field(default_factory=dict, init=False)
+    _parts: list[Markup] = field(default_factory=list, init=False, repr=False)
+    _legend: dict[str, Markup] = field(default_factory=dict, init=False, repr=False)
 
     def across(self, values: ArrayLike) -> Array:
         """Return the horizontal positions of values of x; NaN stays NaN."""
@@ -120,10 +122,13 @@ class Chart:
         """Return the vertical positions of values of y; NaN stays NaN."""
         return np.asarray(self.height - _BOTTOM - self.y.shares(values) * (self.height - _TOP - _BOTTOM))
 
+    def _at(self, x: ArrayLike, y: ArrayLike) -> Array:
+        return np.stack([self.across(x), self.up(y)], axis=-1)
+
     def line(self, x: ArrayLike, y: ArrayLike, kind: Kind, label: str = "") -> Chart:
         """Add a line; it is interrupted at values that are not finite."""
-        at = np.stack([self.across(x), self.up(y)], axis=-1)
-        self._named(kind, label, "line")
+        at = self._at(x, y)
+        self._named(label, element("path", d="M1,8H25", class_=f"line {kind}"))
         finite = np.isfinite(at).all(axis=-1)
         for run in np.split(at, np.flatnonzero(np.diff(finite)) + 1):
             if len(run) > 1 and np.isfinite(run[0]).all():
@@ -132,9 +137,8 @@ class Chart:
 
     def band(self, x: ArrayLike, low: ArrayLike, high: ArrayLike, label: str = "") -> Chart:
         """Add a band between two lines."""
-        xs = self.across(x)
-        outline = np.concatenate([np.stack([xs, self.up(low)], -1), np.stack([xs, self.up(high)], -1)[::-1]])
-        self._named("band", label, "area")
+        outline = np.concatenate([self._at(x, low), self._at(x, high)[::-1]])
+        self._named(label, element("path", d="M1,3H25V13H1z", class_="band"))
         if np.isfinite(outline).all():
             self._parts.append(_path(outline, "band", closed=True))
         return self
@@ -143,23 +147,22 @@ class Chart:
         self, x: ArrayLike, y: ArrayLike, kind: Kind, label: str = "", names: Sequence[str] | None = None
     ) -> Chart:
         """Add marks; their names appear if the pointer rests on them."""
-        xs, ys = np.ravel(self.across(x)), np.ravel(self.up(y))
-        self._named(kind, label, "mark")
-        drawn = np.flatnonzero(np.isfinite(xs + ys)).tolist()
-        if len(xs) > 600:  # dots have no names, and are smaller in the file
-            dots = "".join(f"M{xs[k]:.0f},{ys[k]:.0f}h0" for k in drawn)
+        at = self._at(x, y).reshape(-1, 2)
+        self._named(label, element("path", d=_MARKS[kind], transform="translate(13 8)", class_=f"mark {kind}"))
+        drawn = [(k, *place) for k, place in enumerate(at.tolist()) if np.isfinite(place).all()]
+        if len(at) > 600:  # dots have no names, and are smaller in the file
+            dots = "".join(f"M{across:.0f},{up:.0f}h0" for _, across, up in drawn)
             self._parts.append(element("path", d=dots, class_=f"dots {kind}"))
             return self
-        for k in drawn:
+        for k, across, up in drawn:
             name = None if names is None else element("title", names[k])
-            where = f"translate({xs[k]:.1f} {ys[k]:.1f})"
+            where = f"translate({across:.1f} {up:.1f})"
             self._parts.append(element("path", name, d=_MARKS[kind], transform=where, class_=f"mark {kind}"))
         return self
 
     def whiskers(self, x: ArrayLike, low: ArrayLike, high: ArrayLike, kind: Kind) -> Chart:
         """Add vertical intervals."""
-        ends = np.stack([[np.ravel(self.across(x)), np.ravel(self.up(end))] for end in (low, high)])
-        for interval in np.moveaxis(ends, -1, 0):
+        for interval in np.stack([self._at(x, low), self._at(x, high)], axis=-2):
             if np.isfinite(interval).all():
                 self._parts.append(_path(interval, f"whisker {kind}"))
         return self
@@ -170,31 +173,35 @@ class Chart:
             return self
         low, high = self.y.ends
         name = f"{label} {at_most(value) if kind == 'bound' else number(value)}"
-        if not low <= value <= high:
-            self._named(kind, f"{name}, {'above' if value > high else 'below'} this chart", "line")
-            return self
-        return self.line(self.x.ends, [value, value], kind, name)
+        if low <= value <= high:
+            return self.line(self.x.ends, [value, value], kind, name)
+        return self.line([], [], kind, f"{name}, {'above' if value > high else 'below'} this chart")
 
     def image(self, values: Array, low: float, high: float) -> Chart:
         """Add a map of values ``(rows, columns)``, the first row at the bottom, in a colour scale from low to high."""
         left, right = (float(self.across(end)) for end in self.x.ends)
         bottom, top = (float(self.up(end)) for end in self.y.ends)
-        shape = {"x": f"{left:.1f}", "y": f"{top:.1f}", "width": f"{right - left:.1f}", "height": f"{bottom - top:.1f}"}
-        picture = data_uri(values, low, high)
-        self._parts.append(element("image", href=picture, preserveAspectRatio="none", class_="map", **shape))
+        self._parts.append(
+            element(
+                "image", href=data_uri(values, low, high), preserveAspectRatio="none", class_="map",
+                x=f"{left:.1f}", y=f"{top:.1f}", width=f"{right - left:.1f}", height=f"{bottom - top:.1f}",
+            )
+        )  # fmt: skip
         return self
 
     def edges(self, segments: Array, label: str) -> Chart:
         """Add line segments on a map ``(k, 2, 2)``: black under dashed white, which is visible on every colour."""
-        at = np.stack([self.across(segments[..., 0]), self.up(segments[..., 1])], axis=-1)
+        at = self._at(segments[..., 0], segments[..., 1])
         path = "".join(f"M{a:.1f},{b:.1f}L{c:.1f},{d:.1f}" for (a, b), (c, d) in at.tolist())
-        self._named("edge", label, "edge")
-        self._parts += [element("path", d=path, class_=f"line {kind}") for kind in ("edge-under", "edge")]
+        kinds = ("edge-under", "edge")
+        self._named(label, *(element("path", d="M1,8H25", class_=f"line {kind}") for kind in kinds))
+        self._parts += [element("path", d=path, class_=f"line {kind}") for kind in kinds]
         return self
 
-    def _named(self, kind: str, label: str, form: str) -> None:
+    def _named(self, label: str, *shapes: Markup) -> None:
+        """Add a label with the shapes of its swatch to the legend."""
         if label:
-            self._legend[label] = (kind, form)
+            self._legend[label] = joined(shapes)
 
     def __html__(self) -> str:
         """Return the chart with its legend, as templates and elements insert it."""
@@ -204,7 +211,7 @@ class Chart:
         """Return the chart as a figure with a legend and its title; elements ``below`` follow the legend."""
         inside = element("title", self.title), self._frame(), element("g", *self._parts)
         shape = {"viewBox": f"0 0 {self.width} {self.height}", "role": "img", "class_": "chart", "width": self.width}
-        names = legend(self._legend) if with_legend else None
+        names = _legend(self._legend) if with_legend else None
         return element("figure", element("svg", *inside, **shape), names, *below, element("figcaption", self.title))
 
     def _frame(self) -> Markup:
@@ -227,35 +234,20 @@ class Chart:
             element("text", self.y.label, transform=upright, class_="axis-label"),
         )
 
-    def __repr__(self) -> str:
-        return f"Chart({self.title!r}, {self.x!r}, {self.y!r})"
-
 
 def small_charts(charts: Sequence[Chart]) -> Markup:
     """Return charts side by side, with one legend for all of them."""
-    named: dict[str, tuple[str, str]] = {}
-    for chart in charts:
-        named |= chart._legend
+    named = {label: swatch for chart in charts for label, swatch in chart._legend.items()}
     figures = (chart.render(with_legend=False) for chart in charts)
-    return element("div", legend(named), element("div", *figures, class_="charts small"))
+    return element("div", _legend(named), element("div", *figures, class_="charts small"))
 
 
-def legend(named: dict[str, tuple[str, str]]) -> Markup | None:
-    """Return a legend, from labels with the kind and the form (line, area or mark) of each; None if there is none."""
-    if not named:
-        return None
+def _legend(named: dict[str, Markup]) -> Markup | None:
     items = []
-    for label, (kind, form) in named.items():
-        if form == "mark":
-            shapes = [element("path", d=_MARKS[kind], transform="translate(13 8)", class_=f"mark {kind}")]
-        elif form == "area":
-            shapes = [element("path", d="M1,3H25V13H1z", class_="band")]
-        else:
-            kinds = ("edge-under", "edge") if form == "edge" else (kind,)
-            shapes = [element("path", d="M1,8H25", class_=f"line {name}") for name in kinds]
-        swatch = element("svg", *shapes, viewBox="0 0 26 16", aria_hidden="true", class_="swatch")
+    for label, shapes in named.items():
+        swatch = element("svg", shapes, viewBox="0 0 26 16", aria_hidden="true", class_="swatch")
         items.append(element("li", swatch, element("span", label)))
-    return element("ul", *items, class_="legend")
+    return element("ul", *items, class_="legend") if items else None
 
 
 def data_uri(values: Array, low: float, high: float) -> str:

@@ -23,7 +23,10 @@ from ctxval.core.trial import Change, Trial, designs_sentence
 from ctxval.core.validation import Validation
 from ctxval.errors import InputError
 from ctxval.learning.replays import Replay, replay_executed
-from ctxval.report.distance_model import DistanceModel
+from ctxval.report.diagnostics import DIAGNOSTICS, not_tested
+from ctxval.report.distance_model import DistanceModel, distance_of
+from ctxval.report.findings import Finding
+from ctxval.report.insights import INSIGHTS
 
 
 class TrajectoryPair(NamedTuple):
@@ -93,7 +96,7 @@ class ReportContext(ShortRepr):
     @functools.cached_property
     def worst_first(self) -> tuple[Trial, ...]:
         """The trials with a distance, the largest first."""
-        return tuple(sorted(self.completed, key=lambda trial: -distance_of(trial)))
+        return tuple(sorted(self.completed, key=distance_of, reverse=True))
 
     def worst_tasks(self, count: int = 5, *, recorded: bool = False) -> list[Trial]:
         """Return the trials with the largest distances at different tasks, the largest first.
@@ -112,17 +115,19 @@ class ReportContext(ShortRepr):
     @functools.cached_property
     def points(self) -> Array:
         """The points of the unit cube with a distance ``(n, d)``."""
-        return np.array([trial.unit_point for trial in self.completed]).reshape(-1, self.space.dimension)
+        return self._unit_points(self.completed)
 
     @functools.cached_property
     def distances(self) -> Array:
         """The distances ``(n,)`` of these points."""
-        return np.array([distance_of(trial) for trial in self.completed])
+        return np.array(list(map(distance_of, self.completed)))
 
     def coordinates(self, trials: Sequence[Trial]) -> Array:
         """Return the tasks of trials in the units of the parameters, ``(n, d)``."""
-        points = np.array([trial.unit_point for trial in trials]).reshape(-1, self.space.dimension)
-        return self.space.from_unit(points)
+        return self.space.from_unit(self._unit_points(trials))
+
+    def _unit_points(self, trials: Sequence[Trial]) -> Array:
+        return np.array([trial.unit_point for trial in trials]).reshape(-1, self.space.dimension)
 
     @property
     def threshold(self) -> float | None:
@@ -149,17 +154,15 @@ class ReportContext(ShortRepr):
     @functools.cached_property
     def recordings(self) -> dict[int, TrajectoryPair]:
         """The trajectories of the worst trials that have both, by number; those of another size are left out."""
-        pairs, widths = dict[int, TrajectoryPair](), None
+        pairs, first = dict[int, TrajectoryPair](), None
         for trial in self.worst_first[:400]:
             model, system = (self.store.trajectory(trial.number, side) for side in ("model", "system"))
             if model is None or system is None or model.batch_shape or system.batch_shape:
                 continue
-            same = model.states.shape == system.states.shape and model.inputs.shape == system.inputs.shape
-            if not (same and model.horizon and model.finite and system.finite):
-                continue
-            width = system.states.shape[-1], system.inputs.shape[-1]
-            widths = widths or width
-            if width == widths:
+            widths = system.states.shape[-1], system.inputs.shape[-1]
+            alike = model.states.shape == system.states.shape and model.inputs.shape == system.inputs.shape
+            if alike and model.horizon and model.finite and system.finite and widths == (first or widths):
+                first = widths
                 pairs[trial.number] = TrajectoryPair(trial, model, system)
         return pairs
 
@@ -168,9 +171,9 @@ class ReportContext(ShortRepr):
         """The labels of the states and of the inputs, with units."""
         if not self.recordings:
             return (), ()
-        first = next(iter(self.recordings.values())).system
+        run = next(iter(self.recordings.values())).system
         system = None if self.validation is None else self.validation.system
-        states, inputs = self.labels.names(system, first.states.shape[-1], first.inputs.shape[-1])
+        states, inputs = self.labels.names(system, run.states.shape[-1], run.inputs.shape[-1])
         return labels_of(states), labels_of(inputs)
 
     @property
@@ -179,6 +182,21 @@ class ReportContext(ShortRepr):
         return f"distance [{self.labels.units}]" if self.labels.units else "distance"
 
     # What follows from them
+
+    @functools.cached_property
+    def diagnostics(self) -> list[Finding]:
+        """What would speak against the verdict."""
+        return [finding for ask in DIAGNOSTICS if (finding := ask(self)) is not None]
+
+    @functools.cached_property
+    def insights(self) -> list[Finding]:
+        """What the trials show of M, of the controllers and of the tasks."""
+        return [finding for ask in INSIGHTS if (finding := ask(self)) is not None]
+
+    @functools.cached_property
+    def not_tested(self) -> list[str]:
+        """What was not tested, one sentence each."""
+        return not_tested(self)
 
     @functools.cached_property
     def distance_model(self) -> DistanceModel | None:
@@ -220,12 +238,6 @@ class ReportContext(ShortRepr):
         with stage("replaying executed tasks", len(points), "tasks"):
             replays = replay_executed(self.validation, executed, points)
         return {k: replay for k, replay in zip(self.recordings, replays, strict=False) if replay is not None}
-
-
-def distance_of(trial: Trial) -> float:
-    """Return the distance of a completed trial."""
-    assert trial.distance is not None
-    return trial.distance
 
 
 def context_of_campaign(

@@ -15,6 +15,12 @@ from ctxval.gp.regression import GaussianProcess
 from ctxval.gp.surrogate import Learned, learn
 
 
+def distance_of(trial: Trial) -> float:
+    """Return the distance of a completed trial."""
+    assert trial.distance is not None
+    return trial.distance
+
+
 class Band(NamedTuple):
     """The medians of predicted distances ``(m,)``, and the ends of their bands of 95 %; none is below 0."""
 
@@ -40,18 +46,17 @@ class DistanceModel:
     process: GaussianProcess
 
     @classmethod
-    def of(cls, trials: Sequence[Trial]) -> DistanceModel | None:
-        """Return the model of completed trials; None if fewer than two distances are known, or none can be fitted."""
-        known = [trial for trial in trials if trial.distance is not None]
+    def of(cls, completed: Sequence[Trial]) -> DistanceModel | None:
+        """Return the model of trials with a distance; None if they are fewer than two, or none can be fitted."""
+        known = list(completed)
+        if len(known) < 2:
+            return None
         if len(known) > 500:  # those with the largest distances, and others evenly spread over their order
-            order = sorted(range(len(known)), key=lambda k: -(known[k].distance or 0.0))
+            order = sorted(range(len(known)), key=lambda k: -distance_of(known[k]))
             rest = sorted(order[250:])
             evenly = np.linspace(0, len(rest) - 1, 250).astype(int)
             known = [known[k] for k in sorted({*order[:250], *(rest[j] for j in evenly.tolist())})]
-        points = np.array([trial.unit_point for trial in known])
-        values = np.array([trial.distance for trial in known], dtype=np.float64)
-        if len(known) < 2:
-            return None
+        points, values = np.array([trial.unit_point for trial in known]), np.array(list(map(distance_of, known)))
         with single_threaded(), np.errstate(all="ignore"):
             learned = learn(points, values)
             process = learned.condition(points, values)
@@ -99,11 +104,13 @@ class DistanceModel:
             indices = sobol_indices(func=lambda x: self.predict(x.T).median[None], n=256, dists=[uniform()] * d, rng=0)
         return np.asarray(np.clip(np.nan_to_num(np.ravel(indices.total_order)), 0.0, 1.0))
 
-    def _band(self, mean: Array, variance: Array) -> Band:
-        def on_own_scale(standardised: Array) -> Array:
-            with np.errstate(all="ignore"):
-                values = self.learned.warp.backward(self.learned.shift + self.learned.scale * standardised)
-            return np.maximum(values, 0.0)
+    @property
+    def influence(self) -> list[int]:
+        """The parameters, the one to which the distance is most sensitive first."""
+        return [int(j) for j in np.argsort(-self.sensitivity, kind="stable")]
 
+    def _band(self, mean: Array, variance: Array) -> Band:
         half = 1.96 * np.sqrt(np.maximum(variance, 0.0))  # a band of 95 %
-        return Band(on_own_scale(mean), on_own_scale(mean - half), on_own_scale(mean + half))
+        with np.errstate(all="ignore"):
+            ends = (self.learned.shift + self.learned.scale * end for end in (mean, mean - half, mean + half))
+            return Band(*(np.maximum(self.learned.warp.backward(end), 0.0) for end in ends))

@@ -2,25 +2,25 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from ctxval._util.arrays import Array
 from ctxval._util.representation import counted
 from ctxval.core import soundness
 from ctxval.core.distance import ComposedDistance
-from ctxval.report.context import ReportContext, TrajectoryPair
-from ctxval.report.diagnostics import Finding, Question, findings_of
+from ctxval.report.findings import Answer, asks
 from ctxval.report.markup import number, percent, quantity
+
+if TYPE_CHECKING:
+    from ctxval.report.context import ReportContext, TrajectoryPair
 
 _WORST = 5  # number of trials with the largest distances that the insights on closed loops look at
 
 
-def insights(context: ReportContext) -> list[Finding]:
-    """Return what the trials show, one finding for each question that has an answer."""
-    return findings_of(_QUESTIONS, context)
-
-
-def weak_region(context: ReportContext) -> Finding | None:
+@asks("Where M is weak")
+def weak_region(context: ReportContext) -> Answer | None:
     """Where the distance exceeds the threshold, executed and predicted."""
     tau, units = context.threshold, context.labels.units
     if tau is None or not len(context.distances):
@@ -31,14 +31,14 @@ def weak_region(context: ReportContext) -> Finding | None:
     numbers = {"executed_above": int(above.sum()), "executed": len(above), "predicted_share_above": share}
     if not above.any():
         text = f"No executed task exceeds {quantity(tau, units)}, but the trials predict that {percent(share)} do."
-        return Finding("Where M is weak", "attention", text, numbers) if share else None
+        return ("attention", text, numbers) if share else None
     # Below a share of 0.002, too few of the random tasks are weak.
     weak = context.points[above] if model is None or share < 0.002 else model.tasks[model.over_tasks.median > tau]
     text = (
         f"{int(above.sum())} of {len(above)} executed tasks exceed {quantity(tau, units)}, the largest with {largest}: "
         f"{region_text(context, weak)}. The trials predict that {percent(share)} of all tasks exceed it."
     )
-    return Finding("Where M is weak", "bad", text, numbers)
+    return "bad", text, numbers
 
 
 def region_text(context: ReportContext, points: Array) -> str:
@@ -53,7 +53,8 @@ def region_text(context: ReportContext, points: Array) -> str:
     return f"most of them have {' and '.join(parts)}" if parts else "they are spread over the task space"
 
 
-def weak_states(context: ReportContext) -> Finding | None:
+@asks("States visited there")
+def weak_states(context: ReportContext) -> Answer | None:
     """Which states and inputs the system visits where M is weak, and not elsewhere."""
     if len(context.recordings) < 4:
         return None
@@ -76,10 +77,11 @@ def weak_states(context: ReportContext) -> Finding | None:
         f"{counted(int(weak.sum()), 'trial')} {which}: {label} goes from {number(low[weak, j].min())} to "
         f"{number(high[weak, j].max())}; all others stay within {number(inside_low[j])} and {number(inside_high[j])}."
     )
-    return Finding("States visited there", "note", text, numbers)
+    return "note", text, numbers
 
 
-def bias(context: ReportContext) -> Finding | None:
+@asks("Bias across the tasks")
+def bias(context: ReportContext) -> Answer | None:
     """How the distance of a typical task compares with the largest one, and whether S errs to one side of M."""
     model = context.distance_model
     if model is None or not context.distances.max() > 0:
@@ -103,17 +105,18 @@ def bias(context: ReportContext) -> Finding | None:
             "trials" + (", so the error is systematic." if same > 0.9 else ".")
         )
         numbers |= {"one_sided_share": same}
-    return Finding("Bias across the tasks", "note", text, numbers)
+    return "note", text, numbers
 
 
-def explained(context: ReportContext) -> Finding | None:
+@asks("Corrected model")
+def explained(context: ReportContext) -> Answer | None:
     """Whether the corrected model, learned from the other trials, predicts the distance."""
     if context.validation is None:
-        return Finding("Corrected model", "unknown", "Not known: it needs the experiment, which is not loaded.")
+        return "unknown", "Not known: it needs the experiment, which is not loaded.", {}
     replays = {k: replay.distance for k, replay in context.replays.items() if np.isfinite(replay.distance)}
     pairs = [(context.recordings[k].distance, distance) for k, distance in replays.items()]
     if len(pairs) < 2:
-        return Finding("Corrected model", "unknown", "Not known: the trials do not teach a correction of M.")
+        return "unknown", "Not known: the trials do not teach a correction of M.", {}
     executed, predicted = np.array(pairs).T
     size = float(np.sqrt((executed**2).mean()))
     error = float(np.sqrt(((executed - predicted) ** 2).mean()))
@@ -131,10 +134,11 @@ def explained(context: ReportContext) -> Finding | None:
         else " It does not explain the distance: a state that is not recorded, a contact, dry friction or noise is the "
         "likely cause, or too few trials."
     )
-    return Finding("Corrected model", "good" if share >= 0.8 else "attention", text, numbers)
+    return "good" if share >= 0.8 else "attention", text, numbers
 
 
-def components(context: ReportContext) -> Finding | None:
+@asks("What errs, and when")
+def components(context: ReportContext) -> Answer | None:
     """Which states err in the worst trials, and when their errors peak."""
     if not context.recordings:
         return None
@@ -156,7 +160,7 @@ def components(context: ReportContext) -> Finding | None:
         largest = sorted(shares.items(), key=lambda item: -item[1])[:3]
         listed = " and ".join(f"{percent(share)} is in {name}" for name, share in largest)
         text += f" Of the error that the distance measures, {listed}."
-    return Finding("What errs, and when", "note", text, numbers)
+    return "note", text, numbers
 
 
 def _shares(context: ReportContext, worst: list[TrajectoryPair]) -> dict[str, float]:
@@ -166,14 +170,15 @@ def _shares(context: ReportContext, worst: list[TrajectoryPair]) -> dict[str, fl
         return {}
     names = labels if distance.components is None else [labels[i] for i in distance.components]
     tasks = [context.replays[k].task for k in list(context.recordings)[:_WORST] if k in context.replays]
-    errors = np.array([distance.error(one.model, one.system, task) for one, task in zip(worst, tasks, strict=False)])
+    errors = np.array([distance.error(run.model, run.system, task) for run, task in zip(worst, tasks, strict=False)])
     if errors.ndim != 2 or errors.shape[1] != len(names) or not np.abs(errors).sum() > 0:
         return {}
     sizes = np.abs(errors).mean(axis=0)
     return {name: float(size) for name, size in zip(names, sizes / sizes.sum(), strict=True)}
 
 
-def flips(context: ReportContext) -> Finding | None:
+@asks("Controllers of neighbouring tasks")
+def flips(context: ReportContext) -> Answer | None:
     """Whether the controllers of neighbouring tasks differ abruptly."""
     if len(context.recordings) < 2:
         return None
@@ -189,10 +194,11 @@ def flips(context: ReportContext) -> Finding | None:
         f"example trials {numbers[i]} and {numbers[j]}: their inputs on M differ by {percent(pairs.largest)} of the "
         "range of the inputs. A planner that jumps between solutions makes the distance jump, too."
     )
-    return Finding("Controllers of neighbouring tasks", "attention", text, values)
+    return "attention", text, values
 
 
-def unusual_motion(context: ReportContext) -> Finding | None:
+@asks("Motion of M")
+def unusual_motion(context: ReportContext) -> Answer | None:
     """Whether M itself makes an unusual motion in the worst trials, such as turning over."""
     if len(context.recordings) < 4:
         return None
@@ -210,10 +216,11 @@ def unusual_motion(context: ReportContext) -> Finding | None:
         "as in the median trial: the controller asks for an unusual motion, which may explain the distance better "
         "than an error of M."
     )
-    return Finding("Motion of M", "attention", text, values)
+    return "attention", text, values
 
 
-def saturation(context: ReportContext) -> Finding | None:
+@asks("Inputs and their limits")
+def saturation(context: ReportContext) -> Answer | None:
     """Whether inputs stay at their limits."""
     synthesizer = None if context.validation is None else context.validation.synthesizer
     limits = soundness.saturation([run.system.inputs for run in context.recordings.values()], synthesizer)
@@ -225,20 +232,22 @@ def saturation(context: ReportContext) -> Finding | None:
     text = f"{label} is at its limit in {percent(share)} of all steps" + (
         "." if limits.known else " (the limits are taken from the records, in which the extreme value repeats)."
     )
-    return Finding("Inputs and their limits", "attention", text, values)
+    return "attention", text, values
 
 
-def converged(context: ReportContext) -> Finding | None:
+@asks("Design of the controllers")
+def converged(context: ReportContext) -> Answer | None:
     """Whether the designs of the controllers converged, and whether controllers jump."""
     if context.designs is None:
         return None
-    return Finding("Design of the controllers", "attention", f"{context.designs[0].upper()}{context.designs[1:]}.")
+    return "attention", f"{context.designs[0].upper()}{context.designs[1:]}.", {}
 
 
-def goals(context: ReportContext) -> Finding | None:
+@asks("Goals of M")
+def goals(context: ReportContext) -> Answer | None:
     """Whether M itself reaches its goals under the controllers that are designed on it."""
     if context.validation is None:
-        return Finding("Goals of M", "unknown", "Not known: it needs the experiment, which is not loaded.")
+        return "unknown", "Not known: it needs the experiment, which is not loaded.", {}
     if not any(replay.task.has_goal for replay in context.replays.values()):
         return None
     numbers = list(context.replays)
@@ -254,19 +263,9 @@ def goals(context: ReportContext) -> Finding | None:
         f"of a weighted state from its goal; it misses most in {label}, by {number(size)}, in trial {numbers[row]}. A "
         "controller that fails on M cannot be expected to work on S."
     )
-    return Finding("Goals of M", "attention", text, values)
+    return "attention", text, values
 
 
-# What is asked about every campaign, with the name of each question.
-_QUESTIONS: tuple[tuple[str, Question], ...] = (
-    ("Where M is weak", weak_region),
-    ("States visited there", weak_states),
-    ("What errs, and when", components),
-    ("Controllers of neighbouring tasks", flips),
-    ("Inputs and their limits", saturation),
-    ("Design of the controllers", converged),
-    ("Motion of M", unusual_motion),
-    ("Goals of M", goals),
-    ("Bias across the tasks", bias),
-    ("Corrected model", explained),
-)
+INSIGHTS = (
+    weak_region, weak_states, components, flips, saturation, converged, unusual_motion, goals, bias, explained,
+)  # fmt: skip

@@ -16,84 +16,14 @@ from ctxval._util.texts import plain, shortened, visible
 
 UNCUT = 100_000  # characters of one text that must never be shortened, such as an assumption
 
+# Texts
+
 
 def text(value: object, longest: int = 2_000) -> Markup:
     """Return a text that cannot be markup; :class:`Markup` and charts stay as they are."""
     if hasattr(value, "__html__"):
         return Markup(value.__html__())
     return escape(shortened(visible(plain(value)), longest))
-
-
-def element(name: str, *children: object, **attributes: object) -> Markup:
-    """Return one element.
-
-    Args:
-        name: the name of the element.
-        children: elements, or texts that are escaped; None is left out.
-        attributes: its attributes. An underscore is a hyphen, and one at the end is dropped: ``class_``. An attribute
-            that is None is left out, and one that is True has no value.
-    """
-    inside = Markup("").join(text(child) for child in children if child is not None)
-    given = Markup("")
-    for key, value in attributes.items():
-        if value is not None:
-            content = Markup("") if value is True else Markup('="{}"').format(text(value, 4_000_000))
-            given += Markup(" {}{}").format(Markup(key.rstrip("_").replace("_", "-")), content)
-    if name in ("br", "meta", "link", "input"):
-        return Markup("<{}{}>").format(Markup(name), given)
-    return Markup("<{0}{1}>{2}</{0}>").format(Markup(name), given, inside)
-
-
-def joined(parts: Iterable[object]) -> Markup:
-    """Return elements and charts one after the other; other texts are escaped."""
-    return Markup("").join(text(part) for part in parts)
-
-
-def paragraph(*children: object, class_: str | None = None) -> Markup:
-    """Return a paragraph."""
-    return element("p", *children, class_=class_)
-
-
-def heading(words: object, level: int = 3) -> Markup:
-    """Return a heading inside a section, whose own heading has level 2."""
-    return element(f"h{level}", words)
-
-
-def bullets(items: Iterable[object], class_: str | None = None) -> Markup:
-    """Return a list; an item that is an ``li`` element stays as it is."""
-    rows = (item if str(item).startswith("<li") and isinstance(item, Markup) else element("li", item) for item in items)
-    return element("ul", *rows, class_=class_)
-
-
-def table(caption: str, headers: Sequence[str], rows: Iterable[Sequence[object]], class_: str | None = None) -> Markup:
-    """Return a table with a caption; the first cell of each row is its header. Numbers have four digits."""
-    head = element("tr", *(element("th", header, scope="col") for header in headers))
-    body = [
-        element("tr", element("th", cell(first), scope="row"), *(element("td", cell(value)) for value in others))
-        for first, *others in rows
-    ]
-    inside = element("caption", caption), element("thead", head), element("tbody", *body)
-    return scrolling(element("table", *inside, class_=class_), shortened(visible(caption), 120))
-
-
-def scrolling(content: object, label: str, class_: str = "scroll") -> Markup:
-    """Return a wide element that scrolls by itself, so that it can be reached by the keyboard."""
-    return element("div", content, class_=class_, tabindex="0", role="region", aria_label=label)
-
-
-def cell(value: object) -> Markup:
-    """Return the content of a cell: numbers with four digits, a dash for None."""
-    if value is None:
-        return Markup("&ndash;")
-    if hasattr(value, "__html__"):
-        return Markup(value.__html__())
-    return text(value if isinstance(value, str) else number(value), 300)
-
-
-def bar(share: float) -> Markup:
-    """Return a bar as long as a share from 0 to 1, which only repeats a number beside it."""
-    shape = element("rect", width=f"{100 * share:.1f}", height=9, class_="bar")
-    return element("svg", shape, viewBox="0 0 100 9", preserveAspectRatio="none", class_="bars", aria_hidden="true")
 
 
 def number(value: object, digits: int = 4) -> str:
@@ -117,6 +47,100 @@ def percent(share: float, digits: int = 2) -> str:
 def quantity(value: float | None, units: str = "") -> str:
     """Return a number with its unit; a dash if it is None."""
     return "\u2013" if value is None else f"{number(value)} {units}".rstrip()
+
+
+def sentence(words: str) -> str:
+    """Return words that begin with a capital letter."""
+    return f"{words[:1].upper()}{words[1:]}"
+
+
+# Elements
+
+
+def element(name: str, /, *children: object, **attributes: object) -> Markup:
+    """Return one element.
+
+    Args:
+        name: the name of the element.
+        children: elements, or texts that are escaped; None is left out.
+        attributes: its attributes. An underscore is a hyphen, and one at the end is dropped: ``class_``. An attribute
+            that is None is left out, and one that is True has no value.
+    """
+    given = Markup("")
+    for key, value in attributes.items():
+        if value is not None:
+            content = Markup("") if value is True else Markup('="{}"').format(text(value, 4_000_000))
+            given += Markup(" {}{}").format(Markup(key.rstrip("_").replace("_", "-")), content)
+    if name in ("br", "meta", "link", "input"):
+        return Markup("<{}{}>").format(Markup(name), given)
+    return Markup("<{0}{1}>{2}</{0}>").format(
+        Markup(name), given, joined(child for child in children if child is not None)
+    )
+
+
+def joined(parts: Iterable[object]) -> Markup:
+    """Return elements and charts one after the other; other texts are escaped."""
+    return Markup("").join(map(text, parts))
+
+
+def paragraph(*children: object, class_: str | None = None) -> Markup:
+    """Return a paragraph."""
+    return element("p", *children, class_=class_)
+
+
+def heading(words: object, level: int = 3) -> Markup:
+    """Return a heading inside a section, whose own heading has level 2."""
+    return element(f"h{level}", words)
+
+
+def bullets(items: Iterable[object], class_: str | None = None) -> Markup:
+    """Return a list; an item that is an ``li`` element stays as it is."""
+    rows = (item if str(item).startswith("<li") and isinstance(item, Markup) else element("li", item) for item in items)
+    return element("ul", *rows, class_=class_)
+
+
+def table(
+    caption: str,
+    headers: Sequence[str],
+    rows: Iterable[Sequence[object]],
+    class_: str | None = None,
+    *,
+    id_: str | None = None,
+    label: str | None = None,
+    scroll: str = "scroll",
+) -> Markup:
+    """Return a table with a caption, which scrolls by itself; a row is an element, or values with a header first.
+
+    Numbers have four digits. The label is the caption, unless it is given.
+    """
+    head = element("tr", *(element("th", header, scope="col") for header in headers))
+    body = [row if isinstance(row, Markup) else _row(*row) for row in rows]
+    inside = element("caption", caption), element("thead", head), element("tbody", *body)
+    return scrolling(
+        element("table", *inside, class_=class_, id=id_), label or shortened(visible(caption), 120), scroll
+    )
+
+
+def _row(first: object, *others: object) -> Markup:
+    return element("tr", element("th", cell(first), scope="row"), *(element("td", cell(value)) for value in others))
+
+
+def scrolling(content: object, label: str, class_: str = "scroll") -> Markup:
+    """Return a wide element that scrolls by itself, so that it can be reached by the keyboard."""
+    return element("div", content, class_=class_, tabindex="0", role="region", aria_label=label)
+
+
+def cell(value: object) -> Markup:
+    """Return the content of a cell: numbers with four digits, a dash for None."""
+    if value is None:
+        return Markup("&ndash;")
+    return text(value if isinstance(value, str) or hasattr(value, "__html__") else number(value), 300)
+
+
+def bar(share: float) -> Markup:
+    """Return a bar as long as a share from 0 to 1, which only repeats a number beside it."""
+    shape = element("rect", width=f"{100 * share:.1f}", height=9, class_="bar")
+    return element("svg", shape, viewBox="0 0 100 9", preserveAspectRatio="none", class_="bars", aria_hidden="true")
 
 
 def code(words: str, label: str) -> Markup:

@@ -9,7 +9,6 @@ from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
 from importlib.resources import files
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from markupsafe import Markup
@@ -18,25 +17,13 @@ from ctxval._util.files import write_text
 from ctxval._util.texts import reason_of, visible
 from ctxval._util.version import VERSION
 from ctxval.report.context import ReportContext
-from ctxval.report.markup import paragraph, text
+from ctxval.report.markup import element, joined, paragraph, text
 from ctxval.report.sections import Section, all_sections
-
-if TYPE_CHECKING:
-    import jinja2
-
-
-class Rendered(NamedTuple):
-    """A section with its content."""
-
-    title: Markup
-    content: Markup
 
 
 def page(context: ReportContext, sections: Sequence[Section] = ()) -> str:
     """Return a report as one HTML page; ``sections`` follow those that every report has."""
-    with np.errstate(all="ignore"):  # a store may have any numbers
-        whole = all_sections(sections)
-        parts = [rendered(section.title, functools.partial(section.render, context)) for section in whole]
+    parts = [(section.title, functools.partial(section.render, context)) for section in all_sections(sections)]
     name = visible(context.name) or "campaign"
     return framed(f"Validation of {name}", f"Store {context.store.name}; report made {now()}.", parts, folded=True)
 
@@ -46,48 +33,65 @@ def write_page(context: ReportContext, path: str | Path, sections: Sequence[Sect
     return write_text(path, page(context, sections))
 
 
-def rendered(title: str, render: Callable[[], object]) -> Rendered:
-    """Return a section with its content; one that fails says why, and the others are shown."""
+def framed(
+    title: str, subtitle: str, sections: Sequence[tuple[str, Callable[[], object]]], *, folded: bool = False
+) -> str:
+    """Return sections, each a title and a function that renders it, in the frame of every page.
+
+    A section that fails says why, and the others are shown; ``folded`` folds all but the first one.
+    """
+    style, script = (
+        (files("ctxval.report") / "assets" / name).read_text("utf-8") for name in ("report.css", "report.js")
+    )
+    of_script, of_style = (
+        base64.b64encode(hashlib.sha256(asset.encode()).digest()).decode() for asset in (script, style)
+    )
+    # Nothing but the style and the script of this page runs, and only data images are shown.
+    policy = (
+        f"default-src 'none'; script-src 'sha256-{of_script}'; style-src 'sha256-{of_style}'; img-src data:; "
+        "base-uri 'none'; form-action 'none'"
+    )
+    heading, made = text(title, 200), "This file contains everything that it shows and opens no connection."
+    head = element(
+        "head",
+        element("meta", charset="utf-8"),
+        element("meta", http_equiv="Content-Security-Policy", content=policy),
+        element("meta", name="viewport", content="width=device-width, initial-scale=1"),
+        element("meta", name="color-scheme", content="light dark"),
+        element("meta", name="referrer", content="no-referrer"),
+        element("title", heading),
+        element("style", Markup(style)),
+    )
+    with np.errstate(all="ignore"):  # a store may have any numbers
+        shown = [
+            _section(number, name, render, folded=folded) for number, (name, render) in enumerate(sections, start=1)
+        ]
+    body = element(
+        "body",
+        element("header", element("h1", heading), paragraph(text(subtitle, 600), class_="note")),
+        element("main", *shown),
+        element("footer", paragraph(f"Made by ctxval {VERSION}. {made}", class_="note")),
+        element("script", Markup(script)),
+    )
+    return f"<!DOCTYPE html>\n{element('html', head, body, lang='en')}\n"
+
+
+def _section(number: int, title: str, render: Callable[[], object], *, folded: bool) -> Markup:
     try:
         content = render()
     except Exception as error:  # a user's own section, or odd data
         content = paragraph(f"This section cannot be shown: {reason_of(error)}.")
-    return Rendered(text(title, 200), text(content) if hasattr(content, "__html__") else paragraph(str(content)))
-
-
-def framed(title: str, subtitle: str, sections: Sequence[Rendered], *, folded: bool = False) -> str:
-    """Return sections in the frame of every page; ``folded`` folds all but the first one."""
-    style, script = map(_asset, ("report.css", "report.js"))
-    digests = [base64.b64encode(hashlib.sha256(asset.encode()).digest()).decode() for asset in (style, script)]
-    # Nothing but the style and the script of this page runs, and only data images are shown.
-    policy = (
-        f"default-src 'none'; script-src 'sha256-{digests[1]}'; style-src 'sha256-{digests[0]}'; img-src data:; "
-        "base-uri 'none'; form-action 'none'"
+    shown = content if hasattr(content, "__html__") else paragraph(str(content))
+    first, label = folded and number == 1, f"heading-{number}"
+    head = element("h2", text(title, 200), id=label, class_="hidden" if first else None)
+    inside = (
+        joined([head, shown])
+        if first
+        else element("details", element("summary", head), shown, open=None if folded else True)
     )
-    return _template().render(
-        title=text(title, 200),
-        subtitle=text(subtitle, 600),
-        policy=policy,
-        style=Markup(style),
-        script=Markup(script),
-        sections=sections,
-        folded=folded,
-        version=VERSION,
-    )
+    return element("section", inside, id=f"section-{number}", aria_labelledby=label)
 
 
 def now() -> str:
     """Return the present time in UTC, for the subtitle of a page."""
     return datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
-
-
-def _asset(name: str) -> str:
-    return (files("ctxval.report") / "assets" / name).read_text(encoding="utf-8")
-
-
-@functools.cache
-def _template() -> jinja2.Template:
-    import jinja2  # imported here, because no other command needs it
-
-    environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined)
-    return environment.from_string(_asset("page.html"))

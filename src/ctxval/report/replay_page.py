@@ -12,32 +12,29 @@ from ctxval._util.files import write_text
 from ctxval._util.representation import counted
 from ctxval._util.texts import visible
 from ctxval.report.charts import SMALL, Axis, Chart, small_charts
-from ctxval.report.markup import bar, bullets, details, joined, number, paragraph, percent, quantity, table
-from ctxval.report.page import framed, now, rendered
+from ctxval.report.markup import bar, bullets, details, joined, number, paragraph, percent, quantity, sentence, table
+from ctxval.report.page import framed, now
 from ctxval.studies.replay import PredictedTask, PredictedTasks, ReplayReport, StepError
 
 __all__ = ["replay_page", "write_replay_page"]
 
-_LISTED = 20  # largest number of sources and of splits that are listed
 _CHARTED = 12  # largest number of states and inputs with charts of their own
 
 
 def replay_page(report: ReplayReport, *, name: str = "", units: str = "") -> str:
     """Return what recordings show of a model as one HTML page, which opens no connection."""
     tasks = report.tasks
-    sections: dict[str, Callable[[], Markup]] = {
-        "What follows": lambda: _insights(report),
-        "Error of the prediction": lambda: _errors(report),
-        "Where the error is large": lambda: _regions(report),
-        "What a better model could explain": lambda: _residuals(report),
-        **({} if tasks is None else {"Tasks": lambda: _tasks(tasks, units)}),
-        "Recordings": lambda: _recordings(report),
-    }
-    with np.errstate(all="ignore"):  # recordings may have any numbers
-        parts = [rendered(title, render) for title, render in sections.items()]
+    sections: list[tuple[str, Callable[[], object]]] = [
+        ("What follows", lambda: _insights(report)),
+        ("Error of the prediction", lambda: _errors(report)),
+        ("Where the error is large", lambda: _regions(report)),
+        ("What a better model could explain", lambda: _residuals(report)),
+        *([] if tasks is None else [("Tasks", lambda: _tasks(tasks, units))]),
+        ("Recordings", lambda: _recordings(report)),
+    ]
     count = counted(report.data.recordings, "recording")
     title = f"Recordings replayed on {visible(name) or 'a model'}"
-    return framed(title, f"{count} compared with the model; nothing was executed; report made {now()}.", parts)
+    return framed(title, f"{count} compared with the model; nothing was executed; report made {now()}.", sections)
 
 
 def write_replay_page(report: ReplayReport, path: str | Path, *, name: str = "", units: str = "") -> Path:
@@ -48,7 +45,7 @@ def write_replay_page(report: ReplayReport, path: str | Path, *, name: str = "",
 def _insights(report: ReplayReport) -> Markup:
     if not report.insights:
         return paragraph("The model predicts these recordings, and nothing is unusual.")
-    return bullets(map(_sentence, report.insights))
+    return bullets(f"{sentence(words)}." for words in report.insights)
 
 
 def _errors(report: ReplayReport) -> Markup:
@@ -161,16 +158,12 @@ def _recordings(report: ReplayReport) -> Markup:
     folded = [("source", list(data.sources)), ("split", [str(gap) for gap in data.breaks])]
     parts = [table("The recordings", ("Quantity", "Value"), rows, class_="facts")]
     if data.notes:
-        parts += [paragraph("How they were read:"), bullets(map(_sentence, data.notes))]
+        parts += [paragraph("How they were read:"), bullets(f"{sentence(words)}." for words in data.notes)]
     for name, lines in folded:
-        more = [f"and {len(lines) - _LISTED} others; --json lists them"] if len(lines) > _LISTED else []
+        more = [f"and {len(lines) - 20} others; --json lists them"] if len(lines) > 20 else []
         if lines:
-            parts.append(details(counted(len(lines), name), bullets([*lines[:_LISTED], *more])))
+            parts.append(details(counted(len(lines), name), bullets([*lines[:20], *more])))
     return joined(parts)
-
-
-def _sentence(words: str) -> str:
-    return f"{words[:1].upper()}{words[1:]}." if words else ""
 
 
 def _named(name: str, unit: str) -> str:
@@ -190,7 +183,7 @@ def _error_chart(errors: Sequence[StepError]) -> Chart:
     # Far above the error, the change would only make the error invisible.
     if (change <= 3 * np.nanmax(np.append(high, rms))).all():
         chart.line(steps, change, "reference", "change: the error of predicting no change")
-    return chart.marks(steps, rms, "mean", "", [f"{one.steps} steps: {number(one.rms)}" for one in errors])
+    return chart.marks(steps, rms, "mean", "", [f"{error.steps} steps: {number(error.rms)}" for error in errors])
 
 
 def _region_chart(report: ReplayReport, name: str) -> Chart:

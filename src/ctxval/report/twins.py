@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict
 from typing import Any
 from xml.etree import ElementTree
 
@@ -12,9 +11,9 @@ import numpy as np
 from ctxval._util.describe import describe
 from ctxval._util.files import MADE_BY
 from ctxval._util.texts import markdown_text, shortened, visible
-from ctxval.report.context import ReportContext, distance_of
-from ctxval.report.diagnostics import WORDS, Finding, diagnostics, not_tested
-from ctxval.report.insights import insights
+from ctxval.report.context import ReportContext
+from ctxval.report.distance_model import distance_of
+from ctxval.report.findings import WORDS, Finding
 from ctxval.report.markup import UNCUT, number, quantity
 from ctxval.report.sections.appendix import appendix
 from ctxval.report.sections.repeat import command_snippet, identity, python_snippet, repeating_command
@@ -32,9 +31,9 @@ def to_json(context: ReportContext) -> dict[str, Any]:
             "failed": [trial.number for trial in context.failed],
             "certificate": None if certificate is None else certificate.to_json(),
             "missing": context.missing or None,
-            "diagnostics": [finding.to_json() for finding in diagnostics(context)],
-            "insights": [finding.to_json() for finding in insights(context)],
-            "not_tested": not_tested(context),
+            "diagnostics": [finding.to_json() for finding in context.diagnostics],
+            "insights": [finding.to_json() for finding in context.insights],
+            "not_tested": context.not_tested,
             "worst": [
                 {
                     "trial": trial.number,
@@ -47,7 +46,7 @@ def to_json(context: ReportContext) -> dict[str, Any]:
             ],
             "command": repeating_command(context) or None,
             "identity": identity(context),
-            "appendix": [asdict(entry) for entry in appendix(context)],
+            "appendix": [entry._asdict() for entry in appendix(context)],
         }
         plain: dict[str, Any] = json.loads(json.dumps(describe(report, depth=12), allow_nan=False))
     return plain
@@ -59,20 +58,24 @@ def junit(context: ReportContext) -> str:
     The verdict fails if M is falsified, and is skipped if it is undecided. A diagnostic fails if it speaks against the
     verdict, and is skipped if it is not known.
     """
-    suite = ElementTree.Element("testsuite", name=_xml_text(f"ctxval {context.name}"))
+
+    def xml_text(words: str) -> str:  # control characters are written out
+        return shortened(visible(words).replace("\ufffe", "").replace("\uffff", ""))
+
+    suite = ElementTree.Element("testsuite", name=xml_text(f"ctxval {context.name}"))
     kinds = {"falsified": "failure", "bad": "failure", "undecided": "skipped", "unknown": "skipped"}
 
     def add(classname: str, name: str, result: str, text: str) -> None:
-        case = ElementTree.SubElement(suite, "testcase", classname=classname, name=_xml_text(name))
+        case = ElementTree.SubElement(suite, "testcase", classname=classname, name=xml_text(name))
         if result in kinds:
-            ElementTree.SubElement(case, kinds[result], message=_xml_text(text))
+            ElementTree.SubElement(case, kinds[result], message=xml_text(text))
         elif text:
-            ElementTree.SubElement(case, "system-out").text = _xml_text(text)
+            ElementTree.SubElement(case, "system-out").text = xml_text(text)
 
     verdict = context.verdict
     answer, reason = ("undecided", "no threshold was given") if verdict is None else (verdict.answer, str(verdict))
     add("ctxval", "verdict", answer, "" if answer == "validated" else reason)
-    for finding in diagnostics(context):
+    for finding in context.diagnostics:
         add("ctxval.diagnostics", finding.name, finding.light, finding.text)
     failures, skipped = (len(suite.findall(f"testcase/{tag}")) for tag in ("failure", "skipped"))
     seconds = f"{sum(trial.seconds or 0.0 for trial in context.trials):.3f}"
@@ -81,11 +84,6 @@ def junit(context: ReportContext) -> str:
     ElementTree.indent(suite)
     content = ElementTree.tostring(suite, encoding="unicode")
     return f'<?xml version="1.0" encoding="utf-8"?>\n<!-- {MADE_BY} -->\n{content}\n'
-
-
-def _xml_text(words: str) -> str:
-    """Return a text that XML can hold: control characters are written out."""
-    return shortened(visible(words).replace("\ufffe", "").replace("\uffff", ""))
 
 
 def markdown(context: ReportContext) -> str:
@@ -111,9 +109,9 @@ def markdown(context: ReportContext) -> str:
 
     head = f"| trial | distance | {' | '.join(map(markdown_text, context.space.labels))} |"
     parts = {
-        "Diagnostics": items(diagnostics(context)),
-        "Insights": items(insights(context)),
-        "What was not tested": [f"- {markdown_text(sentence)}" for sentence in not_tested(context)],
+        "Diagnostics": items(context.diagnostics),
+        "Insights": items(context.insights),
+        "What was not tested": [f"- {markdown_text(sentence)}" for sentence in context.not_tested],
         "Worst tasks": [head, f"|{'---|' * (2 + context.space.dimension)}", *rows],
         "For the file": entries,
     }

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from ctxval import Validation, distances, systems
-from ctxval._util.arrays import Array, Rows, single_threaded, vector_norm
+from ctxval._util.arrays import Array, Rows, single_threaded
 from ctxval.core.model import Model, linearize
 from ctxval.core.rollout import rollout
 from ctxval.core.task import Task
@@ -78,6 +78,12 @@ def closed_loops(validation: Validation, task: Task) -> tuple[Trajectory, Trajec
 # convex; it is mostly there if both are affine in the input, by Pontryagin's principle. Many restarts and a test of
 # every single switch guard against poor local maxima. The result is a lower bound of the true maximum.
 
+Slope = Callable[[Array, Rows], Array]
+"""A convex function of the gaps ``(..., N, H + 1, n)`` of some restarts, by its subgradient W; it is ``sum(W * gap)``.
+
+It is a linear function of the gap, or a norm: then W has unit dual norm.
+"""
+
 
 def worst_open_loop(
     system: Model,
@@ -106,13 +112,23 @@ def worst_open_loop(
     counts = np.ones((task.horizon + 1, task.initial_state.size))
     if isinstance(distance, FinalState):
         counts[:-1] = 0.0
-    norm = _Norm(distance.norm, counts)
+    first = _directions(distance.norm, counts, restarts)
+
+    def norm(gap: Array, rows: Rows) -> Array:
+        if distance.norm == 1:
+            return np.sign(gap * counts) * counts
+        flat = (gap * counts).reshape(*gap.shape[:-2], -1)
+        largest = np.abs(flat).argmax(axis=-1)[..., None]
+        chosen = np.zeros_like(flat)
+        np.put_along_axis(chosen, largest, np.sign(np.take_along_axis(flat, largest, axis=-1)), axis=-1)
+        return chosen.reshape(gap.shape) * counts
+
     with single_threaded():
         U = _first_inputs(pair, restarts, seed)
-        U = _ascend(pair, U, _Fixed(norm.directions(restarts)), _by_gradient)
+        U = _ascend(pair, U, lambda gap, rows: first[rows], _by_gradient)
         U = _ascend(pair, U, norm, _by_gradient)
         U = _ascend(pair, U, norm, _by_trial)
-        values = norm.value(pair.gap(U), np.arange(restarts))
+        values = pair.values(U, norm, np.arange(restarts))
     return U[np.argmax(values)], np.sort(values)[::-1]
 
 
@@ -137,6 +153,11 @@ class _Pair:
         """Return the states of S minus those of M, shape ``(..., H + 1, n)``."""
         return self.run(self.system, U).states - self.run(self.model, U).states
 
+    def values(self, U: Array, slope: Slope, rows: Rows) -> Array:
+        """Return the values of a function of the gap, shape ``(..., N)``."""
+        gap = self.gap(U)
+        return np.asarray((slope(gap, rows) * gap).sum(axis=(-1, -2)))
+
     def gradient(self, U: Array, weights: Array) -> Array:
         """Gradient of ``sum(weights * gap)`` with respect to the inputs, shape ``(..., H, 1)``."""
         return self._pulled_back(self.system, U, weights) - self._pulled_back(self.model, U, weights)
@@ -154,71 +175,24 @@ class _Pair:
         return gradient
 
 
-# Objectives: convex functions of the gap (..., N, H + 1, n) of the restarts ``rows``, and a subgradient of each
+def _directions(order: float, counts: Array, restarts: int) -> Array:
+    """Return linear functions below a norm that the restarts maximise first, shape ``(R, H + 1, n)``.
 
-
-@dataclass(frozen=True, eq=False)
-class _Fixed:
-    """One linear function of the gap for each restart, ``W`` of shape ``(R, H + 1, n)``."""
-
-    W: Array
-
-    def value(self, gap: Array, rows: Rows) -> Array:
-        return np.asarray((self.W[rows] * gap).sum(axis=(-1, -2)))
-
-    def weights(self, gap: Array, rows: Rows) -> Array:
-        return self.W[rows]
-
-
-@dataclass(frozen=True, eq=False)
-class _Norm:
-    """The norm, of order 1 or infinity, of the gap's entries that count, shape ``(H + 1, n)``."""
-
-    order: float
-    counts: Array
-
-    def value(self, gap: Array, rows: Rows) -> Array:
-        return vector_norm(self._flat(gap), self.order)
-
-    def weights(self, gap: Array, rows: Rows) -> Array:
-        """Return w of unit dual norm with ``sum(w * gap) = ||gap||``."""
-        flat = self._flat(gap)
-        if self.order == 1:
-            return np.sign(flat).reshape(gap.shape) * self.counts
-        largest = np.abs(flat).argmax(axis=-1)[..., None]
-        chosen = np.zeros_like(flat)
-        np.put_along_axis(chosen, largest, np.sign(np.take_along_axis(flat, largest, axis=-1)), axis=-1)
-        return chosen.reshape(gap.shape) * self.counts
-
-    def _flat(self, gap: Array) -> Array:
-        return (gap * self.counts).reshape(*gap.shape[:-2], -1)
-
-    def directions(self, count: int) -> Array:
-        """Return the linear functions below the norm that the restarts maximise first, shape ``(R, H + 1, n)``.
-
-        The norm is the maximum of such functions. For the infinity norm each of them is one state at one time, with a
-        sign; for the other norm it has a sign for each state. The first few cover every state, every sign and the
-        final time.
-        """
-        times, n = np.flatnonzero(self.counts.any(axis=1)), self.counts.shape[1]
-        directions = np.zeros((count, *self.counts.shape))
-        for r in range(count):
-            if self.order == np.inf:
-                index, sign = divmod(r, 2)
-                level, component = divmod(index, n)
-                # 0, 1/2, 1/4, 3/4, 1/8, ... (van der Corput): each entry falls into the largest gap.
-                share = sum((level >> j & 1) * 0.5 ** (j + 1) for j in range(level.bit_length()))
-                directions[r, times[-1 - int(share * len(times))], component] = 1 - 2 * sign
-            else:
-                directions[r] = [1 - 2 * (r >> j & 1) for j in range(n)]
-        return directions * self.counts
-
-
-# Maximisation
-
-_Objective = _Fixed | _Norm
-# A proposal returns a target for each entry of the inputs, and the gain of the objective by that entry alone.
-_Proposal = Callable[[_Pair, Array, _Objective, Rows], tuple[Array, Array]]
+    The norm is the maximum of such functions. For the infinity norm each of them is one state at one time, with a sign;
+    for the other norm it has a sign for each state. The first few cover every state, every sign and the final time.
+    """
+    times, n = np.flatnonzero(counts.any(axis=1)), counts.shape[1]
+    directions = np.zeros((restarts, *counts.shape))
+    for r in range(restarts):
+        if order == np.inf:
+            index, sign = divmod(r, 2)
+            level, component = divmod(index, n)
+            # 0, 1/2, 1/4, 3/4, 1/8, ... (van der Corput): each entry falls into the largest gap.
+            share = sum((level >> j & 1) * 0.5 ** (j + 1) for j in range(level.bit_length()))
+            directions[r, times[-1 - int(share * len(times))], component] = 1 - 2 * sign
+        else:
+            directions[r] = [1 - 2 * (r >> j & 1) for j in range(n)]
+    return directions * counts
 
 
 def _first_inputs(pair: _Pair, restarts: int, seed: int) -> Array:
@@ -232,16 +206,20 @@ def _first_inputs(pair: _Pair, restarts: int, seed: int) -> Array:
     return np.array(sequences) * pair.bound
 
 
-def _ascend(pair: _Pair, U: Array, objective: _Objective, proposal: _Proposal) -> Array:
-    """Improve each restart's inputs ``(R, H, 1)`` until no proposal improves them, at most 200 times."""
-    U = U.copy()
-    rows = np.arange(len(U))
-    values = objective.value(pair.gap(U), rows)
+def _ascend(
+    pair: _Pair, U: Array, slope: Slope, proposal: Callable[[_Pair, Array, Slope, Rows], tuple[Array, Array]]
+) -> Array:
+    """Improve each restart's inputs ``(R, H, 1)`` until no proposal improves them, at most 200 times.
+
+    A proposal returns a target for each entry of the inputs, and the gain of the function by that entry alone.
+    """
+    U, rows = U.copy(), np.arange(len(U))
+    values = pair.values(U, slope, rows)
     for _ in range(200):
         if not len(rows):
             break
-        candidates = _moves(U[rows], *proposal(pair, U[rows], objective, rows))
-        reached = objective.value(pair.gap(candidates), rows)
+        candidates = _moves(U[rows], *proposal(pair, U[rows], slope, rows))
+        reached = pair.values(candidates, slope, rows)
         best, columns = reached.argmax(axis=0), np.arange(len(rows))
         improved = reached[best, columns] > values[rows] + 1e-10 * np.abs(values[rows])
         best, columns, rows = best[improved], columns[improved], rows[improved]
@@ -262,24 +240,20 @@ def _moves(U: Array, targets: Array, gains: Array) -> Array:
     return np.stack([*whole, *(U + share * (targets - U) for share in 0.5 ** np.arange(1, 7))])
 
 
-def _by_gradient(pair: _Pair, U: Array, objective: _Objective, rows: Rows) -> tuple[Array, Array]:
+def _by_gradient(pair: _Pair, U: Array, slope: Slope, rows: Rows) -> tuple[Array, Array]:
     """Propose the bound in the direction of the gradient, as the Frank-Wolfe method does."""
-    gradient = pair.gradient(U, objective.weights(pair.gap(U), rows))
+    gradient = pair.gradient(U, slope(pair.gap(U), rows))
     targets = np.where(gradient == 0, U, np.copysign(pair.bound, gradient))
     return targets, gradient * (targets - U)
 
 
-def _by_trial(pair: _Pair, U: Array, objective: _Objective, rows: Rows) -> tuple[Array, Array]:
+def _by_trial(pair: _Pair, U: Array, slope: Slope, rows: Rows) -> tuple[Array, Array]:
     """Propose the opposite bound, with the true gain of each single switch."""
-    targets = -np.copysign(pair.bound, U)
-    step = max(1, 4096 // U[0].size)  # rollouts in one batch
-    gains = []
+    targets, gains, step = -np.copysign(pair.bound, U), [], max(1, 4096 // U[0].size)  # 4096 rollouts in one batch
     for i in range(0, len(U), step):
         batch, some = U[i : i + step], rows[i : i + step]
-        flat = batch.reshape(len(batch), -1)
-        entries = np.arange(flat.shape[1])
-        trials = np.repeat(flat[None], len(entries), axis=0)
-        trials[entries, :, entries] = targets[i : i + step].reshape(flat.shape).T
-        switched = objective.value(pair.gap(trials.reshape(-1, *batch.shape)), some)
-        gains.append((switched - objective.value(pair.gap(batch), some)).T.reshape(batch.shape))
+        switched = np.repeat(batch[None], U.shape[1], axis=0)
+        entries = np.arange(U.shape[1])
+        switched[entries, :, entries] = targets[i : i + step].swapaxes(0, 1)
+        gains.append((pair.values(switched, slope, some) - pair.values(batch, slope, some)).T[..., None])
     return targets, np.concatenate(gains)

@@ -14,7 +14,7 @@ from ctxval.report.sections.appendix import for_the_file
 from ctxval.report.sections.distances import convergence, distances
 from ctxval.report.sections.repeat import repeat
 from ctxval.report.sections.trials import trials
-from ctxval.report.sections.verdict import basis, shown_insights, verdict
+from ctxval.report.sections.verdict import basis, lights, verdict
 
 GROUP = "ctxval.report_sections"
 """Group of the entry points by which installed packages add sections: each is a class or an object of a section."""
@@ -46,7 +46,7 @@ class _Part:
 SECTIONS: tuple[Section, ...] = (
     _Part("Verdict", verdict),
     _Part("Assumptions and diagnostics", basis),
-    _Part("Insights", shown_insights),
+    _Part("Insights", lambda context: lights(context.insights)),
     _Part("Distance over the tasks", distances),
     _Part("Trials", trials),
     _Part("Convergence", convergence),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from markupsafe import Markup
@@ -12,16 +12,16 @@ from markupsafe import Markup
 from ctxval._util.arrays import Array
 from ctxval._util.version import VERSION
 from ctxval.certificates.bounds import at_most, with_error
-from ctxval.report.context import ReportContext, distance_of
-from ctxval.report.diagnostics import WORDS, diagnostics, not_tested
+from ctxval.report.context import ReportContext
+from ctxval.report.distance_model import distance_of
+from ctxval.report.findings import WORDS
 from ctxval.report.markup import UNCUT, joined, number, paragraph, quantity, table, text
 from ctxval.report.sections.repeat import command_of, digest
 
 _NASA, _V10, _V20 = "NASA-STD-7009B", "ASME V&V 10", "ASME V&V 20"
 
 
-@dataclass(frozen=True)
-class Entry:
+class Entry(NamedTuple):
     """One entry of the appendix."""
 
     term: str
@@ -31,16 +31,13 @@ class Entry:
 
 def for_the_file(context: ReportContext) -> Markup:
     """Return what a file on the credibility of a model holds, as far as this campaign knows it, as a table."""
-    rows = [(entry.term, text(entry.content, UNCUT), entry.standard) for entry in appendix(context)]
-    return joined(
-        [
-            paragraph(
-                "The entries use the vocabulary of the named standards. They state what this campaign knows; they "
-                "are no claim of conformance."
-            ),
-            table("Appendix for the file", ("Term", "Content", "Vocabulary of"), rows, class_="facts"),
-        ]
+    meaning = (
+        "The entries use the vocabulary of the named standards. They state what this campaign knows; they are no claim "
+        "of conformance."
     )
+    rows = [(entry.term, text(entry.content, UNCUT), entry.standard) for entry in appendix(context)]
+    headers = ("Term", "Content", "Vocabulary of")
+    return joined([paragraph(meaning), table("Appendix for the file", headers, rows, class_="facts")])
 
 
 def appendix(context: ReportContext) -> list[Entry]:
@@ -49,7 +46,6 @@ def appendix(context: ReportContext) -> list[Entry]:
 
 
 def _purpose(context: ReportContext) -> Iterator[Entry]:
-    """Yield what the model is for, what is compared, and what is required."""
     space, units = context.space, context.labels.units
     synthesizer = None if context.validation is None else type(context.validation.synthesizer).__name__
     design = "" if synthesizer is None else f", with the synthesizer {synthesizer}"
@@ -77,7 +73,6 @@ def _purpose(context: ReportContext) -> Iterator[Entry]:
 
 
 def _evidence(context: ReportContext) -> Iterator[Entry]:
-    """Yield what was executed, the errors, and where."""
     origins = Counter(trial.origin for trial in context.trials)
     listed = ", ".join(f"{count} {origin}" for origin, count in sorted(origins.items()))
     yield Entry(
@@ -104,7 +99,6 @@ def _evidence(context: ReportContext) -> Iterator[Entry]:
 
 
 def _limits(context: ReportContext) -> Iterator[Entry]:
-    """Yield how certain the result is, what it assumes, what was not tested, and the conclusion."""
     certificate, model = context.certificate, context.distance_model
     uncertainty = "No certificate was computed, so no uncertainty is stated for tasks that were not executed."
     assumptions, robustness = "None beyond the recorded executions", "Not known: fewer than two distances."
@@ -119,15 +113,15 @@ def _limits(context: ReportContext) -> Iterator[Entry]:
         )
         assumptions = "; ".join(certificate.assumptions)
     if model is not None:
-        order = np.argsort(-model.sensitivity, kind="stable")[:5]
-        listed = "; ".join(f"{context.space.labels[j]} {number(float(model.sensitivity[j]), 2)}" for j in order)
+        shares = ((context.space.labels[j], number(float(model.sensitivity[j]), 2)) for j in model.influence[:5])
+        listed = "; ".join(f"{label} {share}" for label, share in shares)
         robustness = f"Total Sobol indices of the predicted distance, the largest first: {listed}."
-    lights = "; ".join(f"{finding.name}: {WORDS[finding.light]}" for finding in diagnostics(context))
+    lights = "; ".join(f"{finding.name}: {WORDS[finding.light]}" for finding in context.diagnostics)
     changes = "; ".join(f"{change.at[:19]} {change.what}: {change.why}" for change in context.changes)
     yield Entry("Uncertainty characterization", f"{_NASA}, {_V10}, {_V20}", uncertainty)
     yield Entry("Results robustness (sensitivity)", _NASA, robustness)
     yield Entry("Assumptions", f"{_NASA}, {_V10}", f"{assumptions}.")
-    yield Entry("Limits of the assessment: what was not tested", f"{_NASA}, {_V10}", " ".join(not_tested(context)))
+    yield Entry("Limits of the assessment: what was not tested", f"{_NASA}, {_V10}", " ".join(context.not_tested))
     yield Entry(
         "Verification",
         f"{_NASA}, {_V10}",
@@ -146,7 +140,6 @@ def _limits(context: ReportContext) -> Iterator[Entry]:
 
 
 def _box(context: ReportContext, low: Array, high: Array) -> str:
-    """Return the ranges of the task parameters."""
     ends = zip(context.space.labels, low.tolist(), high.tolist(), strict=True)
     return "; ".join(f"{label} from {number(first)} to {number(last)}" for label, first, last in ends)
 

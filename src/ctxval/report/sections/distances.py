@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-
 import numpy as np
 from markupsafe import Markup
 
-from ctxval._util.arrays import Array, Mask
+from ctxval._util.arrays import Array
 from ctxval.core.trial import Trial
 from ctxval.report.charts import SMALL, Axis, Chart, Kind, colour_scale, small_charts
-from ctxval.report.context import ReportContext, distance_of
+from ctxval.report.context import ReportContext
 from ctxval.report.diagnostics import stored_predictions
-from ctxval.report.distance_model import Band, DistanceModel
+from ctxval.report.distance_model import Band, DistanceModel, distance_of
 from ctxval.report.markup import bar, element, heading, joined, number, paragraph, percent, scrolling, table
 
 _CURVE, _GRID = 121, 32  # number of points of a curve, and of each side of a map
@@ -23,44 +21,41 @@ _ORIGINS: tuple[tuple[Kind, str, tuple[str, ...]], ...] = (
     ("sample", "chosen by the search", ("acquisition",)),
 )
 
-Place = Callable[[Sequence[Trial]], tuple[Array, Array]]
-"""A function from trials to the positions of their marks in a chart."""
-
 
 def distances(context: ReportContext) -> Markup:
     """Return the distance over the tasks: the charts that suit the number of parameters, and the sensitivity."""
     model = context.distance_model
     if model is None:
         return paragraph("Fewer than two distances are known, so no picture of the distance can be drawn.")
+    predicted = _predicted(context, model)
     if context.space.dimension == 1:  # the distance over the tasks is on the first screen
-        parts = [element("div", _predicted(context, model), class_="charts")]
+        parts = [element("div", predicted, class_="charts")]
     else:
-        second = element("div", _sensitivity(context, model), _predicted(context, model), class_="charts")
-        parts = [_space_charts(context, model), second]
-    mapped = _region(context)
-    if mapped is not None:
-        parts += [heading("Where the threshold is kept"), mapped]
-    return joined(parts)
+        second = element("div", _sensitivity(context, model), predicted, class_="charts")
+        note = "Lines, bands and maps are pictures of what the trials suggest, and no certificate."
+        parts = [paragraph(note), *_over_space(context, model), second]
+    return joined([*parts, *_region(context)])
 
 
-def distance_over_task(context: ReportContext) -> Chart | None:
-    """Return the distance over the only parameter with the executed tasks; None if too few distances are known."""
-    return _slice(context, 0) if context.worst_first else None
-
-
-def _space_charts(context: ReportContext, model: DistanceModel) -> Markup:
+def _over_space(context: ReportContext, model: DistanceModel) -> list[Markup]:
+    """Return a map with two slices if there are two parameters, otherwise a slice for each and all tasks at once."""
     d = context.space.dimension
-    note = paragraph("Lines, bands and maps are pictures of what the trials suggest, and no certificate.")
     if d == 2:
         values = (_estimated(context, _grid_of_tasks()) or model.predict(_grid_of_tasks())).median
-        drawn = _map(context, "Map of the distance over the two parameters, with the executed tasks", values)
-        return joined([note, element("div", drawn, *(_slice(context, axis) for axis in range(2)), class_="charts")])
-    axes = [int(j) for j in np.argsort(-model.sensitivity, kind="stable")[:12]]
-    if d > len(axes):
-        note += paragraph(f"{d - len(axes)} parameters with less influence have no slice here.")
+        values = np.nan_to_num(values, nan=float(context.distances.max()))
+        title = "Map of the distance over the two parameters, with the executed tasks"
+        drawn = _map(context, title, values, context.distance_label)
+        return [element("div", drawn, *(_slice(context, axis) for axis in range(2)), class_="charts")]
+    axes = model.influence[:12]
+    rest = f"{d - len(axes)} parameters with less influence have no slice here."
     slices = filter(None, (_slice(context, axis, small=True) for axis in axes))
-    parts = heading("Slices through the worst task"), small_charts(list(slices))
-    return joined([note, *parts, heading("All tasks at once"), _parallel_coordinates(context)])
+    return [
+        *([paragraph(rest)] if d > len(axes) else []),
+        heading("Slices through the worst task"),
+        small_charts(list(slices)),
+        heading("All tasks at once"),
+        *_parallel_coordinates(context),
+    ]
 
 
 def _estimated(context: ReportContext, unit: Array) -> Band | None:
@@ -69,6 +64,11 @@ def _estimated(context: ReportContext, unit: Array) -> Band | None:
     if values is not None:
         return Band(values, values, values)
     return None if context.distance_model is None else context.distance_model.predict(unit)
+
+
+def distance_over_task(context: ReportContext) -> Chart | None:
+    """Return the distance over the only parameter with the executed tasks; None if too few distances are known."""
+    return _slice(context, 0) if context.worst_first else None
 
 
 def _slice(context: ReportContext, axis: int, *, small: bool = False) -> Chart | None:
@@ -81,25 +81,24 @@ def _slice(context: ReportContext, axis: int, *, small: bool = False) -> Chart |
     x, band = space.from_unit(unit)[:, axis], _estimated(context, unit)
     if band is None:
         return None
-    label = space.labels[axis]
-    title = f"Distance over {label}" + ("" if space.dimension == 1 else ", through the worst executed task")
-    ends = Axis(label, float(space.low[axis]), float(space.high[axis]))
-    chart = Chart(title, ends, _distance_axis(context, band), **(SMALL if small else {}))
+    title = f"Distance over {space.labels[axis]}" + (
+        "" if space.dimension == 1 else ", through the worst executed task"
+    )
+    chart = Chart(title, _parameter_axis(context, axis), _distance_axis(context, band), **(SMALL if small else {}))
     if band.low is band.high:
         chart.line(x, band.median, "mean", "predicted by the learned dynamics")
     else:
         chart.band(x, band.low, band.high, "95 % band").line(x, band.median, "mean", "Gaussian process of the distance")
     chart.limit(context.threshold, "threshold", "threshold").limit(context.bound, "bound", "bound on d*")
-
-    def place(trials: Sequence[Trial]) -> tuple[Array, Array]:
-        distances = [0.03 * chart.y.ends[1] if trial.distance is None else trial.distance for trial in trials]
-        return context.coordinates(trials)[:, axis], np.array(distances)
-
     if space.dimension == 1:
-        _add_samples(chart, context, place)
-        _mark(chart, place, context.failed, "failed", "no distance is known")
-    _mark(chart, place, [worst], "worst", "worst executed task")
+        _add_trials(chart, context, 0)
+    _add_marks(chart, context, [worst], (axis, None), "worst", "worst executed task")
     return chart
+
+
+def _parameter_axis(context: ReportContext, axis: int) -> Axis:
+    space = context.space
+    return Axis(space.labels[axis], float(space.low[axis]), float(space.high[axis]))
 
 
 def _distance_axis(context: ReportContext, band: Band) -> Axis:
@@ -111,59 +110,53 @@ def _distance_axis(context: ReportContext, band: Band) -> Axis:
     return Axis.over(context.distance_label, context.distances, high, shown, zero=True)
 
 
+def _add_trials(chart: Chart, context: ReportContext, x: int, y: int | None = None) -> None:
+    """Add all tasks at their parameters x and y, or at their distances, with a mark for each origin."""
+    for kind, label, origins in _ORIGINS:
+        trials = [trial for trial in context.completed if trial.origin in origins]
+        _add_marks(chart, context, trials, (x, y), kind, label)
+    _add_marks(chart, context, list(context.failed), (x, y), "failed", "no distance is known")
+
+
+def _add_marks(
+    chart: Chart, context: ReportContext, trials: list[Trial], axes: tuple[int, int | None], kind: Kind, label: str
+) -> None:
+    if not trials:
+        return
+    at, (x, y) = context.coordinates(trials), axes
+    distances = [0.03 * chart.y.ends[1] if trial.distance is None else trial.distance for trial in trials]
+    known = ("no distance" if trial.distance is None else number(trial.distance) for trial in trials)
+    names = [f"trial {trial.number}: {distance}" for trial, distance in zip(trials, known, strict=True)]
+    chart.marks(at[:, x], distances if y is None else at[:, y], kind, label, names)
+
+
 def _grid_of_tasks() -> Array:
     """Return the tasks of a map, points of the unit cube ``(_GRID**2, 2)``."""
     side = np.linspace(0, 1, _GRID)
     return np.stack(np.meshgrid(side, side, indexing="xy"), axis=-1).reshape(-1, 2)
 
 
-def _map(context: ReportContext, title: str, values: Array, label: str = "") -> Markup:
+def _map(context: ReportContext, title: str, values: Array, label: str) -> Markup:
     """Return a map of values on the grid of tasks, with the edge of the threshold and the executed tasks."""
-    space, tau, largest = context.space, context.threshold, float(context.distances.max())
-    values = np.nan_to_num(values, nan=np.nanmax(values) if label else largest)
-    low, high = 0.0, max(float(values.max()), largest)
-    x, y = (Axis(space.labels[i], float(space.low[i]), float(space.high[i])) for i in range(2))
-    chart = Chart(title, x, y, height=360).image(values.reshape(_GRID, _GRID), low, high)
+    tau, top = context.threshold, max(float(values.max()), float(context.distances.max()))
+    chart = Chart(title, _parameter_axis(context, 0), _parameter_axis(context, 1), height=360)
+    chart.image(values.reshape(_GRID, _GRID), 0.0, top)
     if tau is not None and (values > tau).any() and (values <= tau).any():
-        _add_contour(chart, space.from_unit(_grid_of_tasks()), values > tau)
-
-    def place(trials: Sequence[Trial]) -> tuple[Array, Array]:
-        at = context.coordinates(trials)
-        return at[:, 0], at[:, 1]
-
-    _add_samples(chart, context, place)
-    _mark(chart, place, context.failed, "failed", "no distance is known")
-    _mark(chart, place, context.worst_first[:1], "worst", "worst executed task")
-    return chart.render(colour_scale(low, high, label or context.distance_label))
-
-
-def _add_contour(chart: Chart, points: Array, above: Mask) -> None:
-    """Draw the edge of the region above the threshold, between the cells of the map."""
-    inside, grid = above.reshape(_GRID, _GRID), points.reshape(_GRID, _GRID, 2)
-    half = 0.5 * (grid[1, 1] - grid[0, 0])
-    across = grid[:, :-1][inside[:, 1:] != inside[:, :-1]]
-    along = grid[:-1][inside[1:] != inside[:-1]]
-    upright = np.stack([across + half * [1, -1], across + half], axis=1)
-    level = np.stack([along + half * [-1, 1], along + half], axis=1)
-    chart.edges(np.concatenate([upright, level]), "edge of the region above the threshold")
+        # The edge of the region above the threshold lies between the cells of the map.
+        above = (values > tau).reshape(_GRID, _GRID)
+        grid = context.space.from_unit(_grid_of_tasks()).reshape(_GRID, _GRID, 2)
+        half = 0.5 * (grid[1, 1] - grid[0, 0])
+        across = grid[:, :-1][above[:, 1:] != above[:, :-1]]
+        along = grid[:-1][above[1:] != above[:-1]]
+        upright = np.stack([across + half * [1, -1], across + half], axis=1)
+        level = np.stack([along + half * [-1, 1], along + half], axis=1)
+        chart.edges(np.concatenate([upright, level]), "edge of the region above the threshold")
+    _add_trials(chart, context, 0, 1)
+    _add_marks(chart, context, [context.worst_first[0]], (0, 1), "worst", "worst executed task")
+    return chart.render(colour_scale(0.0, top, label))
 
 
-def _mark(chart: Chart, place: Place, trials: Sequence[Trial], kind: Kind, label: str) -> None:
-    if trials:
-        chart.marks(*place(trials), kind, label, list(map(_named, trials)))
-
-
-def _add_samples(chart: Chart, context: ReportContext, place: Place) -> None:
-    """Add the executed tasks, with a mark for each origin."""
-    for kind, label, origins in _ORIGINS:
-        _mark(chart, place, [trial for trial in context.completed if trial.origin in origins], kind, label)
-
-
-def _named(trial: Trial) -> str:
-    return f"trial {trial.number}: {'no distance' if trial.distance is None else number(trial.distance)}"
-
-
-def _parallel_coordinates(context: ReportContext) -> Markup:
+def _parallel_coordinates(context: ReportContext) -> list[Markup]:
     """Return one line for each executed task, the worst fifth in another style and on top."""
     trials, d = context.worst_first, context.space.dimension
     rows = np.arange(len(trials))
@@ -178,35 +171,32 @@ def _parallel_coordinates(context: ReportContext) -> Markup:
         chart.line([axis, axis], [0, 1], "axis")
     for rank, row in reversed(list(enumerate(rows))):
         shares = [*trials[row].unit_point, distance_of(trials[row]) / top]
-        of_worst = rank < worst
-        label = f"the {worst} worst tasks" if of_worst else "the other tasks"
-        chart.line(np.arange(d + 1), shares, "weak" if of_worst else "rest", label)
-    ends = zip([*context.space.labels, context.distance_label], [*context.space.low, 0.0], [*context.space.high, top],
-               strict=True)  # fmt: skip
-    names = [f"{j}: {label} from {number(low, 3)} to {number(high, 3)}" for j, (label, low, high) in enumerate(ends)]
-    return joined([scrolling(chart, "Parallel coordinates"), paragraph("; ".join(names), class_="note")])
+        kind, label = ("weak", f"the {worst} worst tasks") if rank < worst else ("rest", "the other tasks")
+        chart.line(np.arange(d + 1), shares, kind, label)
+    low, high = [*context.space.low, 0.0], [*context.space.high, top]
+    labels = [*context.space.labels, context.distance_label]
+    names = [f"{j}: {labels[j]} from {number(low[j], 3)} to {number(high[j], 3)}" for j in range(d + 1)]
+    return [scrolling(chart, "Parallel coordinates"), paragraph("; ".join(names), class_="note")]
 
 
 def _sensitivity(context: ReportContext, model: DistanceModel) -> Markup:
     """Return the shares of the parameters in the variance of the predicted distance, the largest first."""
-    labels, shares = context.space.labels, model.sensitivity
-    order = np.argsort(-shares, kind="stable").tolist()
-    rows = [(labels[j], percent(float(shares[j])), bar(float(shares[j]))) for j in order]
+    shares = {context.space.labels[j]: float(model.sensitivity[j]) for j in model.influence}
     caption = (
         "Sensitivity of the distance: the share of each parameter in the variance of the predicted distance, alone and "
         "together with others (total Sobol index)"
     )
+    rows = ((label, percent(share), bar(share)) for label, share in shares.items())
     return table(caption, ("Parameter", "Share", "Bar"), rows)
 
 
 def _predicted(context: ReportContext, model: DistanceModel) -> Chart:
     """Return predicted against executed distances, each predicted without its own execution."""
-    band = model.left_out
+    band, label = model.left_out, context.distance_label
     replayed = {k: replay.distance for k, replay in context.replays.items() if np.isfinite(replay.distance)}
     # A wide interval would hide everything else.
-    top = 2 * float(context.distances.max())
-    label = context.distance_label
-    axis = Axis.over(label, context.distances, np.minimum(band.median, top), list(replayed.values()), zero=True)
+    shown = np.minimum(band.median, 2 * float(context.distances.max()))
+    axis = Axis.over(label, context.distances, shown, list(replayed.values()), zero=True)
     x, y = (Axis(f"{which} {label}", axis.low, axis.high) for which in ("executed", "predicted"))
     chart = Chart("Predicted against executed distance, each predicted without its own execution", x, y)
     chart.line(axis.ends, axis.ends, "identity", "predicted = executed")
@@ -215,29 +205,27 @@ def _predicted(context: ReportContext, model: DistanceModel) -> Chart:
     if replayed:
         executed = [context.recordings[k].distance for k in replayed]
         chart.marks(executed, list(replayed.values()), "corrected", "by the corrected model")
-    beforehand = stored_predictions(context)
+    beforehand = [(distance_of(trial), prediction.median) for trial, prediction in stored_predictions(context)]
     if beforehand:
-        executed = [distance_of(trial) for trial, _ in beforehand]
-        chart.marks(
-            executed, [prediction.median for _, prediction in beforehand], "covering", "stored before the execution"
-        )
+        chart.marks(*np.transpose(beforehand), "covering", "stored before the execution")
     return chart
 
 
-def _region(context: ReportContext) -> Markup | None:
-    """Return where the threshold is kept; None if the certificate is of another kind or the experiment is not loaded.
+def _region(context: ReportContext) -> list[Markup]:
+    """Return where the threshold is kept; nothing if the certificate is of another kind or S is not known.
 
     A task keeps it if its prediction from the trials before the independent draws, plus the margin of the certificate
     ``region``, is at most the threshold.
     """
     certificate, learned, tau = context.certificate, context.provenance.learned, context.threshold
     if certificate is None or certificate.kind != "region" or learned is None or tau is None:
-        return None
+        return []
     margin, before = float(certificate.details["margin"]), int(certificate.details["learned_before"])
-    space, d = context.space, context.space.dimension
-    unit = _grid_of_tasks() if d == 2 else np.random.default_rng(0).random((400, d))
+    space, d, model = context.space, context.space.dimension, context.distance_model
     if d == 1:
         unit = np.linspace(0, 1, _CURVE)[:, None]
+    else:
+        unit = _grid_of_tasks() if d == 2 else np.random.default_rng(0).random((400, d))
     bounds = learned.expected(unit, before) + margin
     inside, points, label = bounds <= tau, space.from_unit(unit), f"predicted {context.distance_label} + margin"
     text = paragraph(
@@ -248,32 +236,35 @@ def _region(context: ReportContext) -> Markup | None:
     title = "Tasks that keep the threshold by the prediction plus its margin"
     drawn: object
     if d == 2:
-        drawn = _map(context, title, bounds, label)
+        drawn = _map(context, title, np.nan_to_num(bounds, nan=np.nanmax(bounds)), label)
     elif d == 1:
-        x = Axis(space.labels[0], float(space.low[0]), float(space.high[0]))
-        chart = Chart("Predicted distance plus margin, and the threshold", x, Axis.over(label, bounds, tau, zero=True))
+        axes = _parameter_axis(context, 0), Axis.over(label, bounds, tau, zero=True)
+        chart = Chart("Predicted distance plus margin, and the threshold", *axes)
         drawn = chart.line(points[:, 0], bounds, "mean", label).limit(tau, "threshold", "threshold")
-    else:  # the map shows the two parameters to which the distance is most sensitive
-        model = context.distance_model
-        order = np.argsort(-model.sensitivity, kind="stable") if model is not None else np.arange(d)
-        i, j = int(order[0]), int(order[1])
-        x, y = (Axis(space.labels[k], float(space.low[k]), float(space.high[k])) for k in (i, j))
-        chart = Chart(title, x, y, height=360)
-        outside = points[~inside]
-        if len(outside):
-            chart.marks(outside[:, i], outside[:, j], "weak", "above the threshold or not predicted")
+    else:  # the chart shows the two parameters to which the distance is most sensitive
+        i, j = (0, 1) if model is None else model.influence[:2]
+        drawn = chart = Chart(title, _parameter_axis(context, i), _parameter_axis(context, j), height=360)
+        if not inside.all():
+            chart.marks(points[~inside, i], points[~inside, j], "weak", "above the threshold or not predicted")
         if inside.any():
             chart.marks(points[inside, i], points[inside, j], "sample", "keeps the threshold")
-        drawn = chart
-    return joined([text, element("div", drawn, class_="charts wide")])
+    return [heading("Where the threshold is kept"), text, element("div", drawn, class_="charts wide")]
 
 
 def convergence(context: ReportContext) -> Markup:
-    """Return the distances in the order of the executions with the bound, and the time of each execution."""
+    """Return the distances in the order of the executions with the bound, and how long the executions took."""
     chart = distances_in_order(context)
     if chart is None:
         return paragraph("No distance is known yet.")
-    return joined([element("div", chart, _times(context), class_="charts"), _spent(context)])
+    timed = [trial.seconds for trial in context.trials if trial.seconds is not None]
+    attempts, sentences = sum(trial.attempts for trial in context.trials), list[str]()
+    if attempts > len(context.trials):
+        sentences.append(f"{attempts} attempts were made in {len(context.trials)} trials.")
+    if timed:
+        total, median = number(float(np.sum(timed))), number(float(np.median(timed)))
+        sentences.append(f"The executions took {total} s, {median} s in the median.")
+    spent = paragraph(" ".join(sentences)) if sentences else Markup("")
+    return joined([element("div", chart, class_="charts"), spent])
 
 
 def distances_in_order(context: ReportContext) -> Chart | None:
@@ -284,43 +275,19 @@ def distances_in_order(context: ReportContext) -> Chart | None:
     so_far = np.maximum.accumulate(context.distances)
     last = float(max(trial.number for trial in context.trials))
     limits = [limit for limit in (context.threshold, context.bound) if limit is not None]
-    beforehand = [(trial.number, prediction.median) for trial, prediction in stored_predictions(context)]
-    axes = _trial_axis(last), Axis.over(context.distance_label, context.distances, limits, zero=True)
-    chart = Chart("Distance of each trial, and the largest one so far", *axes)
+    x = Axis("trial", -0.02 * max(last, 1.0), 1.02 * max(last, 1.0), whole=True)
+    y = Axis.over(context.distance_label, context.distances, limits, zero=True)
+    chart = Chart("Distance of each trial, and the largest one so far", x, y)
     risen = np.flatnonzero(np.diff(so_far, prepend=-1.0) > 0)  # the line is the same without all other points
     steps = np.repeat(numbers[risen], 2)[1:], np.repeat(so_far[risen], 2)[:-1]
     chart.line(np.append(steps[0], last), np.append(steps[1], so_far[-1]), "best", "largest so far")
     chart.limit(context.threshold, "threshold", "threshold").limit(context.bound, "bound", "bound on d*")
-    names = [f"trial {trial.number}: {number(trial.distance)}" for trial in context.completed]
+    beforehand = [(trial.number, prediction.median) for trial, prediction in stored_predictions(context)]
     if beforehand:
-        at, expected = zip(*beforehand, strict=True)
-        chart.marks(at, expected, "covering", "predicted before the execution")
+        chart.marks(*np.transpose(beforehand), "covering", "predicted before the execution")
+    names = [f"trial {trial.number}: {number(trial.distance)}" for trial in context.completed]
     chart.marks(numbers, context.distances, "sample", "executed", names)
     if context.failed:
-        where = np.full(len(context.failed), 0.03 * chart.y.ends[1])
-        chart.marks([trial.number for trial in context.failed], where, "failed", "no distance is known")
+        bottom = np.full(len(context.failed), 0.03 * chart.y.ends[1])
+        chart.marks([trial.number for trial in context.failed], bottom, "failed", "no distance is known")
     return chart
-
-
-def _times(context: ReportContext) -> Chart | None:
-    timed = [(trial.number, trial.seconds) for trial in context.trials if trial.seconds is not None]
-    if not timed:
-        return None
-    numbers, seconds = np.array(timed, dtype=np.float64).T
-    axes = _trial_axis(float(numbers.max())), Axis.over("time [s]", seconds, zero=True)
-    return Chart("Time of each execution", *axes).marks(numbers, seconds, "sample", "time of the execution")
-
-
-def _trial_axis(last: float) -> Axis:
-    return Axis("trial", -0.02 * max(last, 1.0), 1.02 * max(last, 1.0), whole=True)
-
-
-def _spent(context: ReportContext) -> Markup | None:
-    timed = [trial.seconds for trial in context.trials if trial.seconds is not None]
-    attempts, sentences = sum(trial.attempts for trial in context.trials), list[str]()
-    if attempts > len(context.trials):
-        sentences.append(f"{attempts} attempts were made in {len(context.trials)} trials.")
-    if timed:
-        total, median = number(float(np.sum(timed))), number(float(np.median(timed)))
-        sentences.append(f"The executions took {total} s, {median} s in the median.")
-    return paragraph(" ".join(sentences)) if sentences else None

@@ -19,7 +19,8 @@ from ctxval.certificates import RESOLUTION
 from ctxval.certificates.options import CONFIDENCE, WITHIN
 from ctxval.certificates.prediction_tests import TESTS
 from ctxval.core.trial import Trial
-from ctxval.report.context import ReportContext, distance_of
+from ctxval.report.context import ReportContext
+from ctxval.report.distance_model import distance_of
 from ctxval.report.markup import code, heading, joined, paragraph, quantity, table
 from ctxval.searches import DEFAULT as DEFAULT_SEARCH
 

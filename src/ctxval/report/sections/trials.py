@@ -17,16 +17,11 @@ from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import Trial
 from ctxval.report.charts import SMALL, Axis, Chart, Kind, small_charts
 from ctxval.report.context import ReportContext
-from ctxval.report.markup import cell, details, element, heading, joined, paragraph, quantity, scrolling
+from ctxval.report.markup import cell, details, element, heading, joined, paragraph, quantity, table
 
-_ROWS = 1000  # largest number of trials in the table: those with the largest distances, and those without a distance
+_ROWS = 1000  # largest number of trials in the table
 
-_LINES: dict[Kind, str] = {
-    "reference": "reference",
-    "corrected": "corrected model",
-    "system": "system S",
-    "model": "model M",
-}
+_LINES = {"reference": "reference", "corrected": "corrected model", "system": "system S", "model": "model M"}
 
 
 def trials(context: ReportContext) -> Markup:
@@ -39,16 +34,16 @@ def trials(context: ReportContext) -> Markup:
     escaped = Markup(plain.translate({ord(character): f"\\u{ord(character):04x}" for character in "<>&"}))
     return joined(
         [
-            _left_out(context, lines),
+            *_left_out(context, lines),
             _table(context, lines),
             element("div", id="trial", aria_live="polite", class_="needs-script"),
             element("script", escaped, type="application/json", id="trial-data"),
-            _worst(context),
+            *_worst(context),
         ]
     )
 
 
-def _left_out(context: ReportContext, lines: RecordedLines) -> Markup:
+def _left_out(context: ReportContext, lines: RecordedLines) -> list[Markup]:
     notes = []
     if lines.left_out:
         notes.append(
@@ -61,19 +56,17 @@ def _left_out(context: ReportContext, lines: RecordedLines) -> Markup:
         notes.append("The corrected model is not drawn, because the experiment is not loaded.")
     elif context.replays:
         notes.append("The corrected model in each trial is learned from the other trials.")
-    return paragraph(" ".join(notes)) if notes else Markup("")
+    return [paragraph(" ".join(notes))] if notes else []
 
 
 def _table(context: ReportContext, lines: RecordedLines) -> Markup:
+    # Those with the largest distances, and those without a distance.
     shown = [*context.worst_first, *(trial for trial in context.trials if trial.distance is None)][:_ROWS]
     headers = ("trial", "distance", "state", "origin", *context.space.labels, "time [s]", "attempts", "remarks")
-    heads = element("tr", *(element("th", label, scope="col") for label in headers))
     points = context.coordinates(shown)
     rows = [_row(trial, point, trial.number in lines.kept) for trial, point in zip(shown, points, strict=True)]
     caption = f"Trials, the largest distance first{'' if len(shown) == len(context.trials) else f' ({_ROWS} of them)'}"
-    inside = element("caption", caption), element("thead", heads), element("tbody", *rows)
-    whole = element("table", *inside, class_="sortable", id="trials")
-    return scrolling(whole, "Table of trials", "scroll tall")
+    return table(caption, headers, rows, "sortable", id_="trials", label="Table of trials", scroll="scroll tall")
 
 
 def _row(trial: Trial, point: Array, recorded: bool) -> Markup:
@@ -84,21 +77,20 @@ def _row(trial: Trial, point: Array, recorded: bool) -> Markup:
     cells = [element("th", cell(button), scope="row", data_value=number)]
     for value in values:
         exact = repr(float(value)) if isinstance(value, int | float) else None
-        cells.append(element("td", cell(value) if value != "" else "", data_value=exact))
+        cells.append(element("td", cell(value), data_value=exact))
     return element("tr", *cells)
 
 
-def _worst(context: ReportContext) -> Markup:
+def _worst(context: ReportContext) -> list[Markup]:
     """Return the trajectories of the worst trials, drawn without a script."""
     worst = context.worst_tasks(recorded=True)
     if not worst:
-        return paragraph("No trajectories are recorded, so the worst tasks cannot be drawn.")
+        return [paragraph("No trajectories are recorded, so the worst tasks cannot be drawn.")]
     parts = [heading(f"The {counted(len(worst), 'worst task')}")]
     for trial in worst:
         head = f"Trial {trial.number}: {quantity(trial.distance, context.labels.units)} at {task_of(context, trial)}"
-        charts = small_charts(_signals(context, trial.number))
-        parts.append(details(head, charts, opened=trial is worst[0]))
-    return joined(parts)
+        parts.append(details(head, small_charts(_signals(context, trial.number)), opened=trial is worst[0]))
+    return parts
 
 
 def task_of(context: ReportContext, trial: Trial) -> str:

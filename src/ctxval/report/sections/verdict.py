@@ -10,23 +10,11 @@ from ctxval._util.representation import counted
 from ctxval.campaign.storage.other_stores import other_stores
 from ctxval.certificates import Certificate
 from ctxval.certificates.bounds import as_text, at_most, with_error
-from ctxval.report.context import ReportContext, distance_of
-from ctxval.report.diagnostics import WORDS, Finding, diagnostics, not_tested
-from ctxval.report.insights import insights
-from ctxval.report.markup import (
-    UNCUT,
-    bullets,
-    code,
-    details,
-    element,
-    heading,
-    joined,
-    paragraph,
-    percent,
-    quantity,
-    table,
-    text,
-)
+from ctxval.report import markup
+from ctxval.report.context import ReportContext
+from ctxval.report.distance_model import distance_of
+from ctxval.report.findings import WORDS, Finding
+from ctxval.report.markup import UNCUT, bullets, element, heading, joined, paragraph, percent, quantity, table, text
 from ctxval.report.sections.distances import distance_over_task, distances_in_order
 from ctxval.report.sections.repeat import command_of, path_of
 from ctxval.report.sections.trials import task_of
@@ -37,27 +25,24 @@ _SHAPES = {
     **{"good": "\u25cf", "note": "\u25c6", "attention": "\u25b2", "bad": "\u25a0", "unknown": "\u25cb"},
 }
 
-_TESTS = 22
-"""Number of tests that is advised if an error would be costly."""
-_MORE = 10  # number of further executions that are advised if none can be forecast
+_TESTS = 22  # number of tests that is advised if an error would be costly
 
 
 def verdict(context: ReportContext) -> Markup:
     """Return the first screen: the verdict, its sentence, the picture, the next step and the numbers."""
     answer = "no verdict" if context.verdict is None else context.verdict.answer
-    shape = element("span", _SHAPES[answer], class_="shape", aria_hidden="true")
-    word = element("p", shape, " ", answer.capitalize(), class_="word")
+    word = element("p", _shape(answer), " ", answer.capitalize(), class_="word")
     chart = (distance_over_task(context) if context.space.dimension == 1 else None) or distances_in_order(context)
-    drawn = paragraph("No distance is known yet.") if chart is None else chart
+    picture = element("div", chart or paragraph("No distance is known yet."), class_="picture")
     advice, command = _next(context)
-    block = code(command, "Next command") if command else None
+    block = markup.code(command, "Next command") if command else None
     beside = element("div", heading("What next"), paragraph(advice), block, _facts(context), *_remarks(context))
-    return joined(
-        [
-            element("div", word, paragraph(_sentence(context), class_="sentence"), class_=f"answer {answer}"),
-            element("div", element("div", drawn, class_="picture"), beside, class_="first"),
-        ]
-    )
+    stated = element("div", word, paragraph(_sentence(context), class_="sentence"), class_=f"answer {answer}")
+    return joined([stated, element("div", picture, beside, class_="first")])
+
+
+def _shape(answer: str) -> Markup:
+    return element("span", _SHAPES[answer], class_="shape", aria_hidden="true")
 
 
 def _sentence(context: ReportContext) -> str:
@@ -66,11 +51,11 @@ def _sentence(context: ReportContext) -> str:
     if verdict is None:
         return "No threshold was given."
     if verdict.answer != "validated" or certificate is None or certificate.kind != "dynamics":
-        return f"{verdict.reason[:1].upper()}{verdict.reason[1:]}"
+        return markup.sentence(verdict.reason)
     drawn = certificate.details["tests"]["drawn"]
-    tested = "No prediction was tested where nobody chose to look."
-    if drawn:
-        tested = f"{drawn} tasks that were drawn over the whole task space tested the predictions."
+    tested = f"{drawn} tasks that were drawn over the whole task space tested the predictions."
+    if not drawn:
+        tested = "No prediction was tested where nobody chose to look."
     designs = "" if context.designs is None else f" Note: {context.designs}."
     return (
         f"Every task keeps the threshold of {quantity(verdict.threshold, units)}: the largest distance is at most "
@@ -118,7 +103,7 @@ def _next(context: ReportContext) -> tuple[str, str]:
     advice = f"about {expected} are expected to decide" if expected else "how many will decide cannot be forecast"
     # A search that explores may never execute what the certificate lacks.
     decide = ["--decide"] if getattr(verdict.certificate, "kind", "") in ("dynamics", "posterior") else []
-    command = command_of(context, context.executions + (expected or _MORE), *decide, "--store", path)
+    command = command_of(context, context.executions + (expected or 10), *decide, "--store", path)
     return f"Execute more tasks: {advice}.", shlex.join(["ctxval", "ask", path]) if by_hand else command
 
 
@@ -150,7 +135,7 @@ def _remarks(context: ReportContext) -> list[Markup]:
     """Return what must not be overlooked in what is folded below, and around the store."""
     remarks = []
     # The sentence of the verdict says why a certificate is refused or withdrawn.
-    findings = [finding for finding in [*diagnostics(context), *insights(context)] if finding.name != "Certificate"]
+    findings = [finding for finding in [*context.diagnostics, *context.insights] if finding.name != "Certificate"]
     for light in ("bad", "attention"):
         names = [finding.name for finding in findings if finding.light == light]
         if names:
@@ -177,16 +162,11 @@ def basis(context: ReportContext) -> Markup:
             *([] if context.certificate is None else _assumptions(context.certificate)),
             *([] if rests_on is None else [paragraph(text(rests_on, UNCUT))]),
             heading("Diagnostics"),
-            lights(diagnostics(context)),
+            lights(context.diagnostics),
             heading("What was not tested"),
-            bullets(not_tested(context)),
+            bullets(context.not_tested),
         ]
     )
-
-
-def shown_insights(context: ReportContext) -> Markup:
-    """Return what the trials show of M, of the controllers and of the tasks."""
-    return lights(insights(context))
 
 
 def _assumptions(certificate: Certificate) -> list[Markup]:
@@ -194,8 +174,8 @@ def _assumptions(certificate: Certificate) -> list[Markup]:
     return [
         heading(f"What the certificate {certificate.kind} assumes"),
         paragraph(certificate.statement if certificate.doubt is None else f"It is withdrawn: {certificate.doubt}."),
-        bullets(text(f"{words[:1].upper()}{words[1:]}.", UNCUT) for words in certificate.assumptions),
-        details("Numbers of the certificate", table("Numbers of the certificate", ("Name", "Value"), rows)),
+        bullets(text(f"{markup.sentence(words)}.", UNCUT) for words in certificate.assumptions),
+        markup.details("Numbers of the certificate", table("Numbers of the certificate", ("Name", "Value"), rows)),
     ]
 
 
@@ -205,7 +185,6 @@ def lights(findings: list[Finding]) -> Markup:
         return paragraph("Nothing is unusual.")
     items = []
     for finding in findings:
-        shape = element("span", _SHAPES[finding.light], class_="shape", aria_hidden="true")
-        word = element("span", shape, " ", WORDS[finding.light], class_=f"light {finding.light}")
+        word = element("span", _shape(finding.light), " ", WORDS[finding.light], class_=f"light {finding.light}")
         items.append(element("li", word, " ", element("strong", f"{finding.name}."), " ", finding.text))
     return element("ul", *items, class_="lights")
