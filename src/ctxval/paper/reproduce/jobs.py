@@ -133,7 +133,6 @@ def _truth(job: Job) -> Result:
 
 
 def _profile(job: Job) -> Result:
-    """Return the distance on a grid of a one-dimensional task space."""
     validation = job.experiment().validation
     points = validation.space.grid(job.budget)
     return {"points": points[:, 0].tolist(), "distances": validation.distances(points).tolist()}

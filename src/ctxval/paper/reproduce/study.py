@@ -35,6 +35,11 @@ class Scale:
     trials: int
     share: float
 
+    @property
+    def seeds(self) -> range:
+        """The seeds of the trials."""
+        return range(self.trials)
+
     def of(self, full: int) -> int:
         """Return this scale's share of a grid or a budget."""
         return max(2, round(self.share * full))
@@ -142,7 +147,7 @@ class ExecutionsWithin(Study):
     def jobs(self, scale: Scale) -> list[Job]:
         """Return one campaign for each technique, set of options and trial, and the truths."""
         different = dict.fromkeys(place.options for place in self.places)
-        runs = [(options, seed) for options in different for seed in range(scale.trials)]
+        runs = [(options, seed) for options in different for seed in scale.seeds]
         searches = [self._job(search, *run, scale) for search in ("gp-ucb", "random") for run in runs]
         return searches + [Job("truth", self.case, seed, options) for options, seed in runs]
 

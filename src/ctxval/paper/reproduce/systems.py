@@ -90,7 +90,7 @@ class ArmModels(Study):
         return Job(kind, "arm", seed, (("model", model),), search, budget)
 
     def jobs(self, scale: Scale) -> list[Job]:
-        pairs = [(model, seed) for model in MODELS for seed in range(scale.trials)]
+        pairs = [(model, seed) for model in MODELS for seed in scale.seeds]
         return [self._job(kind, *pair) for kind in ("search", "truth", "aspects") for pair in pairs]
 
     def fill(self, axes: Axes, results: Results, scale: Scale) -> None:
@@ -106,19 +106,17 @@ class ArmModels(Study):
 
     def data(self, results: Results, scale: Scale) -> Columns:
         """Return, for each model and trial, d* and the final distances of model and system from their targets."""
-        rows: list[tuple[str | float, ...]] = []
-        for model in MODELS:
-            for seed in range(scale.trials):
-                aspects = results[self._job("aspects", model, seed)]
-                errors = [aspects[side] for side in ("model_error", "system_error")]
-                ends = [float(statistic(error)) for error in errors for statistic in (np.median, np.max)]
-                rows.append((model, float(seed), results[self._job("truth", model, seed)]["distance"], *ends))
-        names = ["model", "seed", "d_star_m"]
-        names += [f"{side}_to_target_{part}_m" for side in ("model", "system") for part in ("median", "max")]
-        return dict(zip(names, zip(*rows, strict=True), strict=True))
+        pairs = [(model, seed) for model in MODELS for seed in scale.seeds]
+        columns: Columns = {"model": [model for model, _ in pairs], "seed": [float(seed) for _, seed in pairs]}
+        columns["d_star_m"] = [results[self._job("truth", *pair)]["distance"] for pair in pairs]
+        for side in ("model", "system"):
+            errors = [results[self._job("aspects", *pair)][f"{side}_error"] for pair in pairs]
+            columns[f"{side}_to_target_median_m"] = [float(np.median(error)) for error in errors]
+            columns[f"{side}_to_target_max_m"] = [float(np.max(error)) for error in errors]
+        return columns
 
     def claims(self, results: Results, scale: Scale) -> list[Claim]:
-        seeds = range(scale.trials)
+        seeds = scale.seeds
         worst = {m: [results[self._job("truth", m, s)]["distance"] for s in seeds] for m in MODELS}
         aspects: dict[str, list[Result]] = {m: [results[self._job("aspects", m, s)] for s in seeds] for m in MODELS}
         reached = {m: [float(np.median(a["system_error"])) for a in aspects[m]] for m in MODELS}
@@ -180,7 +178,7 @@ class DubinsMedians(Study):
         return Job("search", "dubins", seed, search=search, budget=_CAR if search == "gp-ucb" else _RANDOM)
 
     def jobs(self, scale: Scale) -> list[Job]:
-        seeds = range(scale.trials)
+        seeds = scale.seeds
         searches = [self._job(search, seed) for search in TECHNIQUES for seed in seeds]
         return searches + [job for seed in seeds for job in (Job("truth", "dubins", seed), self._aspects(seed))]
 
@@ -189,12 +187,12 @@ class DubinsMedians(Study):
 
     def estimates(self, results: Results, scale: Scale, search: str) -> Array:
         """Return the estimates of d*, shape ``(trials, budget)``."""
-        jobs = [self._job(search, seed) for seed in range(scale.trials)]
+        jobs = [self._job(search, seed) for seed in scale.seeds]
         return np.array([running_estimate(distances_of(results[job]), search) for job in jobs])
 
     def fill(self, axes: Axes, results: Results, scale: Scale) -> None:
         draw_quartiles(axes, {search: self.estimates(results, scale, search) for search in TECHNIQUES})
-        best = np.median([results[Job("truth", "dubins", seed)]["distance"] for seed in range(scale.trials)])
+        best = np.median([results[Job("truth", "dubins", seed)]["distance"] for seed in scale.seeds])
         axes.axhline(float(best), color=BLACK, linewidth=1, linestyle="-.", label="best-known value (median)")
 
     def data(self, results: Results, scale: Scale) -> Columns:
@@ -205,12 +203,16 @@ class DubinsMedians(Study):
         return columns
 
     def claims(self, results: Results, scale: Scale) -> list[Claim]:
-        seeds = range(scale.trials)
+        seeds = scale.seeds
         final = {search: self.estimates(results, scale, search)[:, -1] for search in TECHNIQUES}
         truths = np.array([results[Job("truth", "dubins", seed)]["distance"] for seed in seeds])
         ucb, sc, sd = final.values()
         share = 100 * ucb / truths
         high, low = float(np.median(ucb)), float(max(np.median(sc), np.median(sd)))
+        aspects = [results[self._aspects(seed)] for seed in seeds]
+        names = ("model_error", "system_error", "size")
+        model, system, size = ([float(np.median(trial[name])) for trial in aspects] for name in names)
+        missed = np.array(model) / np.array(size)
         wins = int((ucb > np.maximum(sc, sd)).sum())
         return [
             Claim(
@@ -237,21 +239,14 @@ class DubinsMedians(Study):
                 agreement(_as_in_the_paper(high, low), _as_in_the_paper(_SQUARE * high, _SQUARE * low)),
                 "the numbers of the paper are root mean squares; its formula divides by H instead of the root of H",
             ),
-            self._aspect1([results[self._aspects(seed)] for seed in seeds]),
+            Claim(
+                "the model itself performs its tasks (Remark 1, Aspect 1)",
+                f"the mean distance from the reference is {ranged(model, 2)} m on the model and {ranged(system, 2)} m "
+                f"on the system (median over {_TASKS} random tasks), against {spread(size)[0]:.2f} m straight ahead",
+                agreement(float(missed.max()) < MISSED, float(missed.min()) < MISSED),
+                "the reference has the heading 0, which is not that of its waves, so that LQR trades one for the other",
+            ),
         ]
-
-    def _aspect1(self, trials: list[Result]) -> Claim:
-        model, system, size = (
-            [float(np.median(trial[name])) for trial in trials] for name in ("model_error", "system_error", "size")
-        )
-        missed = np.array(model) / np.array(size)
-        return Claim(
-            "the model itself performs its tasks (Remark 1, Aspect 1)",
-            f"the mean distance from the reference is {ranged(model, 2)} m on the model and {ranged(system, 2)} m on "
-            f"the system (median over {_TASKS} random tasks), against {spread(size)[0]:.2f} m straight ahead",
-            agreement(float(missed.max()) < MISSED, float(missed.min()) < MISSED),
-            "the reference has the heading 0, which is not that of its waves, so that LQR trades one for the other",
-        )
 
 
 def _as_in_the_paper(custom: float, random: float) -> bool:
