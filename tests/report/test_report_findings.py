@@ -12,8 +12,9 @@ from ctxval import Campaign, Task, TaskSpace, Trajectory, Validation, controller
 from ctxval._util.arrays import Array
 from ctxval.certificates import CertificateOptions
 from ctxval.report import ReportContext, context_of_campaign
-from ctxval.report.diagnostics import Finding, diagnostics, findings_of, not_tested, share_far_from_trials
+from ctxval.report.diagnostics import share_far_from_trials, smooth
 from ctxval.report.distance_model import DistanceModel
+from ctxval.report.findings import Answer, Finding, asks
 from ctxval.report.insights import (
     bias,
     components,
@@ -21,7 +22,6 @@ from ctxval.report.insights import (
     explained,
     flips,
     goals,
-    insights,
     saturation,
     unusual_motion,
     weak_region,
@@ -53,24 +53,24 @@ def named(findings: list[Finding]) -> dict[str, Finding]:
 
 
 def test_the_lights_of_a_campaign_with_a_failure(flat: ReportContext) -> None:
-    found = named(diagnostics(flat))
+    found = named(flat.diagnostics)
     assert found["Executions"].light == "bad"
     assert found["Executions"].numbers["failed"] == [1]
     assert set(found) <= {"Executions", "Predictions made beforehand"}  # a counterexample rests on nothing else
-    assert any("trial 1" in sentence for sentence in not_tested(flat))
+    assert any("trial 1" in sentence for sentence in flat.not_tested)
 
 
 def test_a_campaign_without_a_threshold_has_no_verdict() -> None:
     context = context_of_campaign(pendulum(executions=3))
-    assert "Certificate" not in named(diagnostics(context))
+    assert "Certificate" not in named(context.diagnostics)
     assert weak_region(context) is None
 
 
 def test_an_empty_campaign_has_findings_too() -> None:
     campaign = Campaign(pendulum(executions=1).validation)
     context = context_of_campaign(campaign, threshold=0.5)
-    assert named(diagnostics(context))["Executions"].light == "unknown"
-    assert {one.light for one in insights(context)} <= {"unknown", "good"}
+    assert named(context.diagnostics)["Executions"].light == "unknown"
+    assert {one.light for one in context.insights} <= {"unknown", "good"}
 
 
 def test_the_share_far_from_trials_is_that_of_a_line() -> None:
@@ -233,32 +233,36 @@ def test_the_bias_has_numbers_and_nothing_is_said_of_what_is_usual(swing: Report
 
 def test_every_finding_is_one_text_with_a_light_and_json(swing: ReportContext, flat: ReportContext) -> None:
     for context in (swing, flat):
-        for found in diagnostics(context) + insights(context):
+        for found in context.diagnostics + context.insights:
             assert found.light in ("good", "note", "attention", "bad", "unknown")
             assert found.to_json()["name"] == found.name
             assert "could not be computed" not in found.text
             assert "nan" not in found.text.lower().split()
 
 
-def test_a_question_that_fails_does_not_hide_the_others(swing: ReportContext) -> None:
-    def failing(context: ReportContext) -> Finding:
+def test_a_question_that_fails_is_a_finding_that_is_not_known(swing: ReportContext) -> None:
+    @asks("odd")
+    def failing(context: ReportContext) -> Answer:
         raise ValueError("odd data")
 
-    found = findings_of([("odd", failing), ("bias", bias)], swing)
-    assert found[0].light == "unknown"
-    assert "odd data" in found[0].text
-    assert len(found) == 2
+    found = failing(swing)
+    assert found is not None
+    assert (found.name, found.light) == ("odd", "unknown")
+    assert "odd data" in found.text
 
 
-def test_neither_smooth_nor_alike_is_good_if_designs_did_not_converge(weak_motor: ReportContext) -> None:
+def test_neither_smooth_nor_alike_is_good_if_designs_did_not_converge(
+    weak_motor: ReportContext, monkeypatch: pytest.MonkeyPatch
+) -> None:
     assert weak_motor.designs is not None
     assert "did not converge at 4 of 4 executed tasks, among them the worst one" in weak_motor.designs
-    good = Finding("Controllers of neighbouring tasks", "good", "They are alike.")
-    doubted = good.unless(weak_motor.designs)
-    assert doubted.light == "attention"
-    assert doubted.text.startswith("They are alike. But the design of the controller did not converge at 4 of 4")
-    assert good.unless(None) is good
-    assert replace(good, light="bad").unless("it jumps").light == "bad"
-    for finding in [*diagnostics(weak_motor), *insights(weak_motor)]:
+    monkeypatch.setattr(DistanceModel, "calibration", 1.0)
+    sure = smooth(replace(weak_motor, trials=tuple(replace(trial, note=None) for trial in weak_motor.trials)))
+    doubted = smooth(weak_motor)
+    assert sure is not None
+    assert doubted is not None
+    assert (sure.light, doubted.light) == ("good", "attention")
+    assert "But the design of the controller did not converge at 4 of 4" in doubted.text
+    for finding in [*weak_motor.diagnostics, *weak_motor.insights]:
         if finding.name in ("Distance is smooth over the tasks", "Controllers of neighbouring tasks"):
             assert finding.light != "good"

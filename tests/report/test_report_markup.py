@@ -106,7 +106,7 @@ def test_a_chart_draws_what_it_is_given_where_it_belongs() -> None:
     x, y = float(chart.across(1.0)), float(chart.up(0.5))
     assert f"translate({x:.1f} {y:.1f})" in found
     assert chart.up(1.0) < chart.up(0.0)
-    assert repr(chart).startswith("Chart('Distance over goal'")
+    assert repr(chart).startswith("Chart(title='Distance over goal'")
 
 
 def test_a_limit_outside_a_chart_is_named_and_not_drawn() -> None:

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -21,7 +21,6 @@ from ctxval._util.representation import ShortRepr
 from ctxval.core.labels import labels_of
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import Trial
-from ctxval.core.validation import Validation
 from ctxval.errors import InputError
 from ctxval.gp.surrogate import Surrogate
 
@@ -29,34 +28,10 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+    from ctxval.campaign.campaign import Campaign
+
 # Okabe and Ito's colours survive colour blindness; the line styles and the markers survive grey print.
 _BLUE, _ORANGE, _BLACK, _GREY = "#0072B2", "#D55E00", "#000000", "#B0B0B0"
-
-
-class Results(Protocol):
-    """The results that a figure reads: a :class:`ctxval.Campaign`, or another object with the same results."""
-
-    @property
-    def validation(self) -> Validation:
-        """The map p -> d(p); only its tasks are read."""
-
-    @property
-    def trials(self) -> Sequence[Trial]:
-        """All trials in the order of asking."""
-
-    @property
-    def completed(self) -> Sequence[Trial]:
-        """The trials with a distance."""
-
-    @property
-    def worst(self) -> Trial | None:
-        """The completed trial with the largest distance."""
-
-    def surrogate(self) -> Surrogate:
-        """Return the Gaussian process of the distance."""
-
-    def trajectories(self, trial: Trial) -> tuple[Trajectory | None, Trajectory | None]:
-        """Return the trajectories of the model and of the system in a trial."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +43,7 @@ class Curve(ShortRepr):
 
 
 def overview(
-    campaign: Results,
+    campaign: Campaign,
     *,
     units: str = "",
     threshold: float | None = None,
@@ -85,7 +60,7 @@ def overview(
 
 
 def convergence(
-    campaign: Results,
+    campaign: Campaign,
     *,
     units: str = "",
     threshold: float | None = None,
@@ -113,7 +88,7 @@ def convergence(
 
 
 def surrogate_slice(
-    campaign: Results,
+    campaign: Campaign,
     axis: int = 0,
     *,
     truth: Curve | None = None,
@@ -131,14 +106,13 @@ def surrogate_slice(
     space = campaign.validation.space
     if not 0 <= axis < space.dimension:
         raise InputError(f"axis must be from 0 to {space.dimension - 1}, one of {', '.join(space.names)}, got {axis}.")
-    fitted, worst = campaign.surrogate(), _worst(campaign)
     axes = _axes(ax)
-    _draw_slice(axes, campaign, fitted, worst, axis, truth)
+    _draw_slice(axes, campaign, campaign.surrogate(), axis, truth)
     return _finished(axes, campaign, units, threshold, bound)
 
 
 def surrogate(
-    campaign: Results,
+    campaign: Campaign,
     *,
     truth: Curve | None = None,
     units: str = "",
@@ -151,15 +125,13 @@ def surrogate(
     it shows a slice along each axis through the worst task. This is the converged Gaussian process in the paper's
     figures.
     """
-    fitted = campaign.surrogate()
-    worst = _worst(campaign)
-    space = campaign.validation.space
+    fitted, space = campaign.surrogate(), campaign.validation.space
     columns = min(space.dimension, 4)
     rows = int(np.ceil(space.dimension / columns))
     figure = _figure(max(6.4, 3.2 * columns), max(4.0, 2.6 * rows))
     for axis in range(space.dimension):
         axes = figure.add_subplot(rows, columns, axis + 1)
-        _draw_slice(axes, campaign, fitted, worst, axis, truth)
+        _draw_slice(axes, campaign, fitted, axis, truth)
         _draw_limits(axes, threshold, bound)
         if axis % columns == 0:
             axes.set_ylabel(_distance_label(campaign, units))
@@ -167,15 +139,15 @@ def surrogate(
     return figure
 
 
-def _finished(axes: Axes, campaign: Results, units: str, threshold: float | None, bound: float | None) -> Axes:
+def _finished(axes: Axes, campaign: Campaign, units: str, threshold: float | None, bound: float | None) -> Axes:
     _draw_limits(axes, threshold, bound)
     axes.set_ylabel(_distance_label(campaign, units))
     axes.legend(loc="best", fontsize=8, framealpha=0.9)
     return axes
 
 
-def _draw_slice(axes: Axes, campaign: Results, fitted: Surrogate, worst: Trial, axis: int, truth: Curve | None) -> None:
-    space = campaign.validation.space
+def _draw_slice(axes: Axes, campaign: Campaign, fitted: Surrogate, axis: int, truth: Curve | None) -> None:
+    worst, space = _worst(campaign), campaign.validation.space
     unit = np.tile(worst.unit_point, (401, 1))
     unit[:, axis] = np.linspace(0, 1, len(unit))
     x = space.from_unit(unit)[:, axis]
@@ -203,7 +175,7 @@ def _draw_limits(axes: Axes, threshold: float | None, bound: float | None) -> No
         axes.axhline(bound, color=_BLACK, linestyle=":", linewidth=1.6, label="bound on d*")
 
 
-def _draw_samples(axes: Axes, campaign: Results, place: Callable[[Trial], float]) -> None:
+def _draw_samples(axes: Axes, campaign: Campaign, place: Callable[[Trial], float]) -> None:
     """Draw the known distances of the trials, with a different marker for each origin."""
     styles = (
         ("initial samples", ("iid", "spread", "initial", "manual"), "white"),
@@ -217,24 +189,22 @@ def _draw_samples(axes: Axes, campaign: Results, place: Callable[[Trial], float]
             axes.plot(x, y, "o", markersize=5, markerfacecolor=face, markeredgecolor=_BLACK, label=label)
 
 
-def worst_trajectories(campaign: Results, *, states: Sequence[str] = (), inputs: Sequence[str] = ()) -> Figure:
+def worst_trajectories(campaign: Campaign, *, states: Sequence[str] = (), inputs: Sequence[str] = ()) -> Figure:
     """Draw the trajectories of M and of S for the worst executed task, with these axis labels."""
     worst = _worst(campaign)
     model, system = campaign.trajectories(worst)
     if model is None or system is None:
         raise InputError(f"the trajectories of trial {worst.number} are not in the store.")
-    space = campaign.validation.space
-    reference = campaign.validation.task(space.parameters(space.from_unit(worst.unit_point))).reference
-    named = campaign.validation.names(model.states.shape[-1], model.inputs.shape[-1])
-    own_states, own_inputs = map(labels_of, named)
-    figure = trajectories(model, system, reference=reference, states=states or own_states, inputs=inputs or own_inputs)
-    distance = f"{_known(worst):.4g} {campaign.validation.labels.units}".rstrip()
-    task = ", ".join(
-        f"{name} = [{', '.join(f'{item:.3g}' for item in value)}]"
-        if isinstance(value, list)
-        else f"{name} = {value:.4g}"
-        for name, value in worst.parameters.items()
-    )
+    validation = campaign.validation
+    space = validation.space
+    reference = validation.task(space.parameters(space.from_unit(worst.unit_point))).reference
+    names = map(labels_of, validation.names(model.states.shape[-1], model.inputs.shape[-1]))
+    states, inputs = (given or known for given, known in zip((states, inputs), names, strict=True))
+    figure = trajectories(model, system, reference=reference, states=states, inputs=inputs)
+    distance = f"{_known(worst):.4g} {validation.labels.units}".rstrip()
+    items = worst.parameters.items()
+    texts = {k: f"[{', '.join(f'{x:.3g}' for x in v)}]" if isinstance(v, list) else f"{v:.4g}" for k, v in items}
+    task = ", ".join(f"{name} = {value}" for name, value in texts.items())
     figure.suptitle(f"worst task executed: {task} (distance {distance})", fontsize=10)
     return figure
 
@@ -257,10 +227,8 @@ def trajectories(
         *(inputs[i] if i < len(inputs) else f"input {i}" for i in range(m)),
     ]
     figure = _figure(6.4, 1.0 + 1.7 * len(names))
-    first: Axes | None = None
     for row, name in enumerate(names):
-        axes = figure.add_subplot(len(names), 1, row + 1, sharex=first)
-        first = axes if first is None else first
+        axes = figure.add_subplot(len(names), 1, row + 1, sharex=figure.axes[0] if row else None)
         signal(model, system, row, label=name, reference=reference, ax=axes)
         axes.set_xlabel("")
     figure.axes[-1].set_xlabel("time [s]")
@@ -328,12 +296,12 @@ def _axes(ax: Axes | None) -> Axes:
     return pyplot.subplots(layout="constrained")[1]
 
 
-def _distance_label(campaign: Results, units: str) -> str:
+def _distance_label(campaign: Campaign, units: str) -> str:
     known = units or campaign.validation.labels.units
     return f"distance [{known}]" if known else "distance"
 
 
-def _worst(campaign: Results) -> Trial:
+def _worst(campaign: Campaign) -> Trial:
     if campaign.worst is None:
         raise InputError("there is nothing to draw: no distance is known yet.")
     return campaign.worst
