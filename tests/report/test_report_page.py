@@ -74,7 +74,7 @@ def test_names_units_threshold_and_verdict_are_on_the_page(html: str) -> None:
 
 @pytest.mark.parametrize(
     ("dimension", "holds"),
-    [(2, "Map of the distance"), (3, "Parallel coordinates"), (5, "Slices through the worst task")],
+    [(2, "Map of the distance"), (5, "Slices through the worst task")],
 )
 def test_the_charts_suit_the_number_of_parameters(dimension: int, holds: str) -> None:
     found = report.page(context_of_campaign(plane(dimension)))

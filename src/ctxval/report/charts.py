@@ -27,7 +27,7 @@ _LEFT, _RIGHT, _TOP, _BOTTOM = 62, 14, 12, 46
 
 Kind = Literal[
     "mean", "model", "system", "corrected", "reference", "best", "threshold", "bound", "sample", "initial", "covering",
-    "failed", "worst", "band", "weak", "rest", "identity", "axis",
+    "failed", "worst", "weak", "identity",
 ]  # fmt: skip
 """What is drawn, which decides its colour, its line style and its mark."""
 

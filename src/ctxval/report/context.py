@@ -48,16 +48,12 @@ class ReportContext(ShortRepr):
 
     Attributes:
         name: the name of the experiment.
-        space: the task space.
         trials: all trials, in the order of asking.
-        store: the store of the trials.
         verdict: the verdict; None if there is no threshold.
         validation: the map p -> d(p), which is never executed; None if the experiment is not loaded.
         missing: why the experiment is not loaded, as a sentence; empty if it is.
-        labels: names and units of states, inputs and the distance.
         budget: the budget of the campaign; None if it is not known.
-        settings: the settings in the store, which make the experiment again; empty if it has none.
-        description: the description of the experiment in the store.
+        settings, description: what the store knows of the experiment; the settings make it again.
         changes: the later changes of the store.
         provenance: what a certificate knows besides the trials.
     """
@@ -207,25 +203,6 @@ class ReportContext(ShortRepr):
     def batched(self) -> bool:
         """Whether the experiment is loaded, and its synthesizer designs many controllers at once."""
         return self.validation is not None and bool(getattr(self.validation.synthesizer, "batched", False))
-
-    def predicted(self, points: Array) -> Array | None:
-        """Return the distances ``(m,)`` that the learned dynamics predict at points of the unit cube ``(m, d)``.
-
-        They are None if nothing can be predicted, or if :attr:`distance_model` predicts the executed distances better,
-        each from the other trials.
-        """
-        learned, model = self.provenance.learned, self.distance_model
-        if learned is None:
-            return None
-        errors = np.array([replay.distance - self.recordings[k].distance for k, replay in self.replays.items()])
-        if model is not None and not (errors**2).mean() <= ((model.left_out.median - model.values) ** 2).mean():
-            return None
-        try:
-            with stage("predicting distances", len(points), "tasks"):
-                expected = learned.expected(points, len(self.trials))
-        except Exception:  # the user's parts, at states that no execution has reached, must not end a report
-            return None
-        return expected if np.isfinite(expected).any() else None
 
     @functools.cached_property
     def replays(self) -> dict[int, Replay]:

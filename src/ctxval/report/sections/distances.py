@@ -1,4 +1,4 @@
-"""The distance over the tasks, as a curve, a map, slices or parallel coordinates, and in the order of execution."""
+"""The distance over the tasks, as a curve, a map or slices, and in the order of execution."""
 
 from __future__ import annotations
 
@@ -6,12 +6,13 @@ import numpy as np
 from markupsafe import Markup
 
 from ctxval._util.arrays import Array
+from ctxval._util.progress import stage
 from ctxval.core.trial import Trial
 from ctxval.report.charts import SMALL, Axis, Chart, Kind, colour_scale, small_charts
 from ctxval.report.context import ReportContext
 from ctxval.report.diagnostics import stored_predictions
 from ctxval.report.distance_model import Band, DistanceModel, distance_of
-from ctxval.report.markup import bar, element, heading, joined, number, paragraph, percent, scrolling, table
+from ctxval.report.markup import bar, element, heading, joined, number, paragraph, percent, table
 
 _CURVE, _GRID = 121, 32  # number of points of a curve, and of each side of a map
 
@@ -38,7 +39,7 @@ def distances(context: ReportContext) -> Markup:
 
 
 def _over_space(context: ReportContext, model: DistanceModel) -> list[Markup]:
-    """Return a map with two slices if there are two parameters, otherwise a slice for each and all tasks at once."""
+    """Return a map with two slices if there are two parameters, otherwise a slice for each."""
     d = context.space.dimension
     if d == 2:
         values = (_estimated(context, _grid_of_tasks()) or model.predict(_grid_of_tasks())).median
@@ -49,21 +50,28 @@ def _over_space(context: ReportContext, model: DistanceModel) -> list[Markup]:
     axes = model.influence[:12]
     rest = f"{d - len(axes)} parameters with less influence have no slice here."
     slices = filter(None, (_slice(context, axis, small=True) for axis in axes))
-    return [
-        *([paragraph(rest)] if d > len(axes) else []),
-        heading("Slices through the worst task"),
-        small_charts(list(slices)),
-        heading("All tasks at once"),
-        *_parallel_coordinates(context),
-    ]
+    parts = [heading("Slices through the worst task"), small_charts(list(slices))]
+    return parts if d == len(axes) else [paragraph(rest), *parts]
 
 
 def _estimated(context: ReportContext, unit: Array) -> Band | None:
-    """Return the distances at points of the unit cube by the learned dynamics, or by a Gaussian process with a band."""
-    values = context.predicted(unit) if context.batched or context.space.dimension == 1 else None
-    if values is not None:
-        return Band(values, values, values)
-    return None if context.distance_model is None else context.distance_model.predict(unit)
+    """Return the distances at points of the unit cube by the learned dynamics, or by a Gaussian process with a band.
+
+    That is the one which predicts the executed distances better, each from the other trials.
+    """
+    model, learned = context.distance_model, context.provenance.learned
+    if learned is None or not (context.batched or context.space.dimension == 1):
+        return None if model is None else model.predict(unit)
+    errors = np.array([replay.distance - context.recordings[k].distance for k, replay in context.replays.items()])
+    if model is None or (errors**2).mean() <= ((model.left_out.median - model.values) ** 2).mean():
+        try:
+            with stage("predicting distances", len(unit), "tasks"):
+                values = learned.expected(unit, len(context.trials))
+            if np.isfinite(values).any():
+                return Band(values, values, values)
+        except Exception:  # the user's parts, at states that no execution has reached, must not end a report
+            pass
+    return None if model is None else model.predict(unit)
 
 
 def distance_over_task(context: ReportContext) -> Chart | None:
@@ -154,29 +162,6 @@ def _map(context: ReportContext, title: str, values: Array, label: str) -> Marku
     _add_trials(chart, context, 0, 1)
     _add_marks(chart, context, [context.worst_first[0]], (0, 1), "worst", "worst executed task")
     return chart.render(colour_scale(0.0, top, label))
-
-
-def _parallel_coordinates(context: ReportContext) -> list[Markup]:
-    """Return one line for each executed task, the worst fifth in another style and on top."""
-    trials, d = context.worst_first, context.space.dimension
-    rows = np.arange(len(trials))
-    if len(trials) > 300:  # those with the largest distances, and others evenly from the rest
-        rows = np.unique(np.concatenate([rows[:150], np.linspace(0, len(trials) - 1, 150).astype(int)]))
-    top = max(float(context.distances.max()), 1e-300)
-    worst = max(1, round(0.2 * len(rows)))
-    title = "Parallel coordinates: one line for each executed task, through its parameters and its distance"
-    x, y = Axis("number of the parameter", -0.1, d + 0.1, whole=True), Axis("share of the range", 0.0, 1.0)
-    chart = Chart(title, x, y, width=max(480, 70 * d + 76))
-    for axis in range(d + 1):
-        chart.line([axis, axis], [0, 1], "axis")
-    for rank, row in reversed(list(enumerate(rows))):
-        shares = [*trials[row].unit_point, distance_of(trials[row]) / top]
-        kind, label = ("weak", f"the {worst} worst tasks") if rank < worst else ("rest", "the other tasks")
-        chart.line(np.arange(d + 1), shares, kind, label)
-    low, high = [*context.space.low, 0.0], [*context.space.high, top]
-    labels = [*context.space.labels, context.distance_label]
-    names = [f"{j}: {labels[j]} from {number(low[j], 3)} to {number(high[j], 3)}" for j in range(d + 1)]
-    return [scrolling(chart, "Parallel coordinates"), paragraph("; ".join(names), class_="note")]
 
 
 def _sensitivity(context: ReportContext, model: DistanceModel) -> Markup:
