@@ -3,7 +3,7 @@
 A function that draws one plot has the argument ``ax`` and returns the matplotlib axes. By default, these are new axes
 of ``matplotlib.pyplot``, so that notebooks and ``pyplot.show()`` show them. A function that draws several panels
 returns a figure. Names and units are those of the validation, unless the arguments state others. A campaign must have
-at least one distance, and two for a surrogate. If a threshold tau or a bound on d* is given, it is drawn as a line.
+at least one distance, and two for a surrogate.
 """
 
 from __future__ import annotations
@@ -33,6 +33,9 @@ if TYPE_CHECKING:
 # Okabe and Ito's colours survive colour blindness; the line styles and the markers survive grey print.
 _BLUE, _ORANGE, _BLACK, _GREY = "#0072B2", "#D55E00", "#000000", "#B0B0B0"
 
+Limit = float | None
+"""A threshold tau, or a bound on d*, which is drawn as a line; None if there is none."""
+
 
 @dataclass(frozen=True, eq=False)
 class Curve(ShortRepr):
@@ -43,12 +46,7 @@ class Curve(ShortRepr):
 
 
 def overview(
-    campaign: Campaign,
-    *,
-    units: str = "",
-    threshold: float | None = None,
-    bound: float | None = None,
-    ax: Axes | None = None,
+    campaign: Campaign, *, units: str = "", threshold: Limit = None, bound: Limit = None, ax: Axes | None = None
 ) -> Axes:
     """Draw the most informative single plot of a campaign.
 
@@ -60,12 +58,7 @@ def overview(
 
 
 def convergence(
-    campaign: Campaign,
-    *,
-    units: str = "",
-    threshold: float | None = None,
-    bound: float | None = None,
-    ax: Axes | None = None,
+    campaign: Campaign, *, units: str = "", threshold: Limit = None, bound: Limit = None, ax: Axes | None = None
 ) -> Axes:
     """Draw the distance of each trial and the largest distance so far, and mark the trials without a distance."""
     from matplotlib.ticker import MaxNLocator
@@ -93,8 +86,8 @@ def surrogate_slice(
     *,
     truth: Curve | None = None,
     units: str = "",
-    threshold: float | None = None,
-    bound: float | None = None,
+    threshold: Limit = None,
+    bound: Limit = None,
     ax: Axes | None = None,
 ) -> Axes:
     """Draw the Gaussian process along one task parameter, through the worst executed task, with its 95 % band.
@@ -112,12 +105,7 @@ def surrogate_slice(
 
 
 def surrogate(
-    campaign: Campaign,
-    *,
-    truth: Curve | None = None,
-    units: str = "",
-    threshold: float | None = None,
-    bound: float | None = None,
+    campaign: Campaign, *, truth: Curve | None = None, units: str = "", threshold: Limit = None, bound: Limit = None
 ) -> Figure:
     """Draw the Gaussian process over the task space with its 95 % band, the samples and the maximum.
 
@@ -139,7 +127,7 @@ def surrogate(
     return figure
 
 
-def _finished(axes: Axes, campaign: Campaign, units: str, threshold: float | None, bound: float | None) -> Axes:
+def _finished(axes: Axes, campaign: Campaign, units: str, threshold: Limit, bound: Limit) -> Axes:
     _draw_limits(axes, threshold, bound)
     axes.set_ylabel(_distance_label(campaign, units))
     axes.legend(loc="best", fontsize=8, framealpha=0.9)
@@ -167,7 +155,7 @@ def _draw_slice(axes: Axes, campaign: Campaign, fitted: Surrogate, axis: int, tr
     axes.set_xlabel(space.labels[axis])
 
 
-def _draw_limits(axes: Axes, threshold: float | None, bound: float | None) -> None:
+def _draw_limits(axes: Axes, threshold: Limit, bound: Limit) -> None:
     """Draw the threshold and the bound as horizontal lines, which differ in style and not only in colour."""
     if threshold is not None:
         axes.axhline(threshold, color=_ORANGE, linestyle="-.", linewidth=1.4, label=f"threshold {threshold:.4g}")

@@ -149,14 +149,14 @@ class Chart(ShortRepr):
         """Add marks; their names appear if the pointer rests on them."""
         at = self._at(x, y).reshape(-1, 2)
         self._named(label, element("path", d=_MARKS[kind], transform="translate(13 8)", class_=f"mark {kind}"))
-        drawn = [(k, *place) for k, place in enumerate(at.tolist()) if np.isfinite(place).all()]
+        drawn = np.flatnonzero(np.isfinite(at).all(axis=-1)).tolist()
         if len(at) > 600:  # dots have no names, and are smaller in the file
-            dots = "".join(f"M{across:.0f},{up:.0f}h0" for _, across, up in drawn)
+            dots = "".join(f"M{at[k, 0]:.0f},{at[k, 1]:.0f}h0" for k in drawn)
             self._parts.append(element("path", d=dots, class_=f"dots {kind}"))
             return self
-        for k, across, up in drawn:
+        for k in drawn:
             name = None if names is None else element("title", names[k])
-            where = f"translate({across:.1f} {up:.1f})"
+            where = f"translate({at[k, 0]:.1f} {at[k, 1]:.1f})"
             self._parts.append(element("path", name, d=_MARKS[kind], transform=where, class_=f"mark {kind}"))
         return self
 

@@ -145,6 +145,12 @@ class ReportContext(ShortRepr):
         """Which controllers did not converge or jump, as a clause; None if that is not known of any."""
         return designs_sentence(self.trials)
 
+    @property
+    def parts(self) -> Mapping[str, Any]:
+        """The descriptions of the parts of the validation by name; a store may hold anything instead."""
+        parts = self.description.get("validation")
+        return parts if isinstance(parts, Mapping) else {}
+
     # Trajectories
 
     @functools.cached_property

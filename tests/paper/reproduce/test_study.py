@@ -69,27 +69,24 @@ def test_there_are_the_papers_eight_figures() -> None:
 def test_a_study_runs_is_drawn_and_enters_the_table_and_a_second_call_reuses_it(tmp_path: Path) -> None:
     started: list[int] = []
     done: list[object] = []
-    out = tmp_path / "paper"
+    out, stored = tmp_path / "paper", tmp_path / "runs"
     for _ in range(2):
-        table = reproduce("converged-gp", out, scale=QUICK, workers=1, on_start=started.append, on_done=done.append)
+        table = reproduce(
+            "converged-gp", out, stored=stored, scale=QUICK, workers=1, on_start=started.append, on_done=done.append
+        )
     assert started == [2, 0]
     assert len(done) == 2
+    assert sorted(path.name for path in out.iterdir()) == ["converged-gp.csv", "converged-gp.png"]
+    assert sorted(path.name for path in stored.iterdir()) == ["profile.jsonl", "search.jsonl"]
     assert (out / "converged-gp.png").stat().st_size > 10_000
     with (out / "converged-gp.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == 801
     text = table.read_text()
-    assert f"stored results in `{out.as_posix()}/results/`" in text
+    assert f"stored results in `{stored.as_posix()}/`" in text
     assert "95 % band" in text
     assert "`torque_weight` = 0.0001" in text
     assert "Dubins" not in text
-
-
-@pytest.mark.slow
-def test_the_runs_may_be_stored_elsewhere(tmp_path: Path) -> None:
-    reproduce("converged-gp", tmp_path / "paper", stored=tmp_path / "runs", scale=QUICK, workers=1)
-    assert sorted(path.name for path in (tmp_path / "paper").iterdir()) == ["converged-gp.csv", "converged-gp.png"]
-    assert sorted(path.name for path in (tmp_path / "runs").iterdir()) == ["profile.jsonl", "search.jsonl"]
 
 
 def test_no_workers_are_refused(tmp_path: Path) -> None:

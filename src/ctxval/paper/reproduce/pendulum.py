@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ctxval import cases, plot
-from ctxval._util.arrays import Array, Mask
+from ctxval._util.arrays import Array
 from ctxval.core.trajectory import Trajectory
 from ctxval.gp.surrogate import fit_surrogate
 from ctxval.paper.reproduce.frameworks import PAPERS_GOAL, closed_loops
@@ -26,6 +26,7 @@ from ctxval.paper.reproduce.study import (
     Study,
     agreement,
     draw_quartiles,
+    first,
     ranged,
     running_estimate,
     spread,
@@ -229,10 +230,10 @@ class Techniques(Study):
         names = (*TECHNIQUES, *INFORMED)
         errors = {name: self.errors(results, scale, name) for name in names}
         ucb, sc, sd = (np.median(errors[name], axis=0) for name in TECHNIQUES)
-        within = {name: [_first(row <= 1.0) - _COMMON for row in errors[name]] for name in ("gp-ucb", *INFORMED)}
+        within = {name: [first(row <= 1.0) - _COMMON for row in errors[name]] for name in ("gp-ucb", *INFORMED)}
         median = {name: spread(counts)[0] for name, counts in within.items()}
         beyond = {name: ranged(counts, 1).replace(".0", "") for name, counts in within.items()}
-        near = _first(sc <= _NEAR)
+        near = first(sc <= _NEAR)
         as_near = int((errors["random"][:, -1] <= ucb[19]).sum())
         profiles = [results[job]["custom"] for job in FourFrameworks().jobs(scale)[: scale.trials]]
         broad = 100 * np.median([np.mean(np.array(d) >= (1 - _NEAR / 100) * max(d)) for d in profiles])
@@ -278,11 +279,6 @@ class Techniques(Study):
                 "a few values teach the length-scale, and that of another trial differs",
             ),
         ]
-
-
-def _first(reached: Mask) -> float:
-    """Return the number of the first execution at which something is reached; infinity for never."""
-    return float(np.argmax(reached) + 1) if reached.any() else np.inf
 
 
 class ConvergedGP(Study):

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 
-from ctxval._util.arrays import Array
+from ctxval._util.arrays import Array, Mask
 from ctxval.paper.reproduce.jobs import DISCARDED, Job, Results, distances_of
 
 if TYPE_CHECKING:
@@ -214,7 +214,11 @@ def running_estimate(distances: Sequence[float] | Array, search: str) -> Array:
 
 def executions_within(distances: Sequence[float] | Array, search: str, truth: float, percent: float) -> float:
     """Return the number of executions until the estimate is within ``percent`` per cent of d*; infinity if never."""
-    reached = running_estimate(distances, search) >= truth * (1 - percent / 100)
+    return first(running_estimate(distances, search) >= truth * (1 - percent / 100))
+
+
+def first(reached: Mask) -> float:
+    """Return the number of the first execution at which something is reached; infinity for never."""
     return float(np.argmax(reached) + 1) if reached.any() else np.inf
 
 

@@ -56,8 +56,7 @@ def _purpose(context: ReportContext) -> Iterator[Entry]:
         f"{context.name or 'this experiment'}: {_box(context, space.low, space.high)}. Distribution of tasks: "
         f"{context.provenance.distribution or 'uniform'}.",
     )
-    parts = context.description.get("validation")
-    described = parts.get("distance") if isinstance(parts, dict) else None
+    described = context.parts.get("distance")
     kind = described.get("type", "a function") if isinstance(described, dict) else described or "not known"
     yield Entry(
         "Response quantity of interest and validation metric",
@@ -145,5 +144,4 @@ def _box(context: ReportContext, low: Array, high: Array) -> str:
 
 
 def _part_digest(context: ReportContext, part: str) -> str:
-    parts = context.description.get("validation")
-    return digest(parts[part]) if isinstance(parts, dict) and part in parts else "not known"
+    return digest(context.parts[part]) if part in context.parts else "not known"

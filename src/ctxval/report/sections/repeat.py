@@ -27,9 +27,8 @@ from ctxval.searches import DEFAULT as DEFAULT_SEARCH
 
 def repeat(context: ReportContext) -> Markup:
     """Return the command, the seed, the versions, the digests and a snippet for each of the worst tasks."""
-    command = repeating_command(context)
     parts = [paragraph("No command made this store, so there is none that repeats it.")]
-    if command:
+    if command := repeating_command(context):
         same = (
             "The command makes the same choices again, into a new store, with the same versions of the libraries on "
             "the same kind of processor. The option thinking of the search auto must then be a number, fast or "
@@ -58,12 +57,9 @@ def repeat(context: ReportContext) -> Markup:
 
 def identity(context: ReportContext) -> dict[str, str]:
     """Return the seed, the versions and the digests by name."""
-    search, parts = context.description.get("search"), context.description.get("validation")
-    digests = {
-        f"digest of the {name}": digest(part)
-        for name, part in (parts.items() if isinstance(parts, Mapping) else ())
-        if name in ("space", "task", "system", "model", "synthesizer", "distance")
-    }
+    search = context.description.get("search")
+    known = ("space", "task", "system", "model", "synthesizer", "distance")
+    digests = {f"digest of the {name}": digest(part) for name, part in context.parts.items() if name in known}
     return {
         "store": str(context.store.name),
         "search": str(search.get("type")) if isinstance(search, Mapping) else "not known",
