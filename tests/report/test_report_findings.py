@@ -12,9 +12,8 @@ from ctxval import Campaign, Task, TaskSpace, Trajectory, Validation, controller
 from ctxval._util.arrays import Array
 from ctxval.certificates import CertificateOptions
 from ctxval.report import ReportContext, context_of_campaign
-from ctxval.report.diagnostics import share_far_from_trials, smooth
 from ctxval.report.distance_model import DistanceModel
-from ctxval.report.findings import Answer, Finding, asks
+from ctxval.report.findings import Answer, Finding, asks, share_far_from_trials, smooth
 from ctxval.report.insights import (
     bias,
     components,

@@ -23,9 +23,8 @@ from ctxval.core.trial import Change, Trial, designs_sentence
 from ctxval.core.validation import Validation
 from ctxval.errors import InputError
 from ctxval.learning.replays import Replay, replay_executed
-from ctxval.report.diagnostics import DIAGNOSTICS, not_tested
 from ctxval.report.distance_model import DistanceModel, distance_of
-from ctxval.report.findings import Finding
+from ctxval.report.findings import DIAGNOSTICS, Finding, not_tested
 from ctxval.report.insights import INSIGHTS
 
 

@@ -1,4 +1,7 @@
-"""Findings: what the trials show, each a sentence with its numbers and a light, which all outputs of a report share."""
+"""Findings: what the trials show, each a sentence with its numbers and a light, which all outputs of a report share.
+
+The diagnostics are those that would speak against the verdict; ``report/insights.py`` has the others.
+"""
 
 from __future__ import annotations
 
@@ -7,8 +10,21 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
 
-from ctxval._util.representation import ShortRepr
+import numpy as np
+from scipy.spatial import KDTree
+
+from ctxval._util.arrays import Array
+from ctxval._util.representation import ShortRepr, counted
 from ctxval._util.texts import reason_of
+from ctxval.campaign.dynamics import PREDICTION
+from ctxval.certificates import RESOLUTION
+from ctxval.certificates.bounds import at_most, of_tasks
+from ctxval.certificates.covering import bare_corners, farthest_task
+from ctxval.certificates.dynamics_diagnostics import ACCURATE, agrees
+from ctxval.core.trial import Trial
+from ctxval.learning import ExecutionPrediction
+from ctxval.report.distance_model import distance_of
+from ctxval.report.markup import number, percent, quantity
 
 if TYPE_CHECKING:
     from ctxval.report.context import ReportContext
@@ -68,3 +84,174 @@ def asks(name: str) -> Callable[[Callable[[ReportContext], Answer | None]], Ques
         return question
 
     return decorate
+
+
+# Diagnostics
+
+
+@asks("Executions")
+def executions(context: ReportContext) -> Answer | None:
+    """Whether executions have no distance, or are open."""
+    states = ("failed", "unmeasured", "open")
+    listed = {state: [trial.number for trial in context.trials if trial.state == state] for state in states}
+    numbers = {"executions": context.executions, **listed}
+    without = len(listed["failed"]) + len(listed["unmeasured"])
+    if without:
+        text = f"{without} of {len(context.trials)} trials have no distance: nothing is known of d at their tasks."
+        return "bad", text, numbers
+    if listed["open"]:
+        waiting = ", ".join(map(str, listed["open"]))
+        return "attention", f"Trials are open and wait for their results: {waiting}.", numbers
+    return None if context.executions else ("unknown", "Nothing was executed.", numbers)
+
+
+@asks("Certificate")
+def certificate_stands(context: ReportContext) -> Answer | None:
+    """Whether the certificate is refused or withdrawn."""
+    verdict, certificate = context.verdict, context.certificate
+    if verdict is None or verdict.answer == "falsified":
+        return None
+    if certificate is None:
+        return "bad", f"Refused: {verdict.reason}", {}
+    if certificate.doubt is None:
+        return None
+    bound = certificate.upper_bound if np.isfinite(certificate.upper_bound) else None
+    numbers = {"kind": certificate.kind, "upper_bound": bound, "confidence": certificate.confidence}
+    return "bad", f"Withdrawn: {certificate.doubt}.", numbers
+
+
+def _rests_on_distances(context: ReportContext) -> bool:
+    """Return whether the answer depends on where the tasks lie: not a counterexample, not a bound from dynamics."""
+    verdict, certificate = context.verdict, context.certificate
+    if verdict is None or verdict.answer == "falsified" or certificate is None:
+        return verdict is None
+    return certificate.kind != "dynamics" or certificate.doubt is not None
+
+
+@asks("Tasks covered")
+def tasks_covered(context: ReportContext) -> Answer | None:
+    """How far tasks are from every trial."""
+    if not len(context.points) or not _rests_on_distances(context):
+        return None
+    farthest, share = farthest_task(context.points), share_far_from_trials(context.points)
+    near = farthest <= RESOLUTION
+    text = (
+        f"The task farthest from every trial is {number(farthest, 2)} diagonals of the task space away, "
+        f"{'within' if near else 'more than'} the resolution of {RESOLUTION:g}; "
+        f"{percent(share)} of the tasks are farther than that from every trial."
+    )
+    return "good" if near else "attention", text, {"farthest": farthest, "share_beyond_resolution": share}
+
+
+def share_far_from_trials(points: Array) -> float:
+    """Return the share of the tasks that are farther than the resolution from every trial."""
+    d = points.shape[1]
+    gaps, _ = KDTree(points).query(np.random.default_rng(0).random((4096, d)))
+    return float(np.mean(gaps / np.sqrt(d) > RESOLUTION))
+
+
+@asks("Search converged")
+def search_converged(context: ReportContext) -> Answer | None:
+    """Whether many executions followed without a larger distance."""
+    distances = context.distances
+    if len(distances) < 2 or not _rests_on_distances(context):
+        return None
+    last = int(np.argmax(distances >= 0.99 * distances.max()))
+    quiet = len(distances) - 1 - last
+    text = (
+        f"The largest distance was within 1 % of its final value after {last + 1} of {len(distances)} measured "
+        f"executions; {quiet} followed without an improvement."
+    )
+    good = quiet >= max(3.0, len(distances) / 3)
+    return "good" if good else "attention", text, {"last": last + 1, "after": quiet}
+
+
+@asks("Distance is smooth over the tasks")
+def smooth(context: ReportContext) -> Answer | None:
+    """Whether a Gaussian process predicts each distance from the others."""
+    model = context.distance_model
+    if model is None or not _rests_on_distances(context):
+        return None
+    size = model.calibration
+    light: Light = "good" if 0.5 <= size <= 1.5 else "attention" if size <= 2.5 else "bad"
+    text = (
+        "A Gaussian process of the distance predicts each trial from the others with errors of "
+        f"{number(size, 2)} of its own standard deviations (root mean square; about 1 is expected)."
+    )
+    if light == "good" and context.designs is not None:
+        light, text = "attention", f"{text} But {context.designs}: tasks between the executed ones may be unlike them."
+    return light, text, {"standardised_error": size}
+
+
+def stored_predictions(context: ReportContext) -> list[tuple[Trial, ExecutionPrediction]]:
+    """Return the trials whose execution was predicted beforehand, with the predictions."""
+    notes = [(trial, (trial.note or {}).get(PREDICTION)) for trial in context.completed]
+    read = [(trial, ExecutionPrediction.from_json(note)) for trial, note in notes if isinstance(note, dict)]
+    return [(trial, prediction) for trial, prediction in read if prediction is not None]
+
+
+@asks("Predictions made beforehand")
+def predictions_held(context: ReportContext) -> Answer | None:
+    """Whether executions came out as they had been predicted."""
+    predicted = stored_predictions(context)
+    if not predicted:
+        return None
+    size = max(float(context.distances.max()), context.bound or 0.0)
+    held = sum(agrees(distance_of(trial), prediction.median, size) for trial, prediction in predicted)
+    text = (
+        f"{held} of {counted(len(predicted), 'execution')} that were predicted beforehand came out within "
+        f"{quantity(ACCURATE * size, context.labels.units)} of the prediction, which is {percent(ACCURATE)} of the "
+        "largest distance or of the bound."
+    )
+    return "good" if held == len(predicted) else "attention", text, {"made": len(predicted), "held": held}
+
+
+@asks("States and inputs covered")
+def states_covered(context: ReportContext) -> Answer | None:
+    """How far the closed loops leave the recorded states and inputs."""
+    certificate = context.certificate
+    if certificate is None or "beyond_the_records" not in certificate.details:
+        return None
+    gap, beyond = certificate.details["coverage_gap"], certificate.details["beyond_the_records"]
+    text = (
+        f"The closed loops of the tasks leave the recorded range of a state or an input by {percent(beyond)} of it or "
+        f"less, and are never farther than {percent(gap)} of it from every record."
+    )
+    return "good" if certificate.doubt is None else "attention", text, {"beyond": beyond, "gap": gap}
+
+
+DIAGNOSTICS = (
+    executions, certificate_stands, tasks_covered, search_converged, smooth, predictions_held, states_covered,
+)  # fmt: skip
+
+
+def not_tested(context: ReportContext) -> list[str]:
+    """Return what was not tested, one sentence each."""
+    sentences = []
+    certificate = context.certificate
+    if certificate is not None and certificate.volume:
+        left_out = at_most(100 * certificate.volume, 3)
+        sentences.append(f"The certificate leaves out {left_out} % {of_tasks(certificate.distribution)}.")
+    if len(context.points):
+        share, d = share_far_from_trials(context.points), context.space.dimension
+        if share:
+            sentences.append(
+                f"{percent(share)} of the task space is farther than {RESOLUTION:g} diagonals from every trial; there "
+                "the distance is inferred and not executed."
+            )
+        bare = len(bare_corners(context.points, RESOLUTION))
+        where = "ends of the range" if d == 1 else "corners of the task space"
+        if bare:
+            sentences.append(f"{bare} of the {2**d} {where} have no trial next to them.")
+    for trial in context.failed[:10]:
+        values = zip(context.space.labels, context.coordinates([trial])[0], strict=True)
+        where = ", ".join(f"{label} = {number(value)}" for label, value in values)
+        ended = "failed" if trial.state == "failed" else "could not be measured"
+        sentences.append(f"The distance at the task of trial {trial.number} ({where}), because it {ended}.")
+    if len(context.failed) > 10:
+        sentences.append(f"The distances of {len(context.failed) - 10} more trials that failed or were not measured.")
+    sentences.append(
+        "Tasks outside the task space, other controllers, and conditions that the recorded state does not hold, such "
+        "as wear, temperature or payload."
+    )
+    return sentences

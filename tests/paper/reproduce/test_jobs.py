@@ -10,7 +10,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ctxval import cases, searches
-from ctxval.errors import InputError
 from ctxval.paper.reproduce.jobs import DISCARDED, Job, Results, case_digest, distances_of, records, run_job
 from ctxval.paper.reproduce.study import running_estimate
 
@@ -94,11 +93,6 @@ def test_every_job_has_its_own_key() -> None:
         for search in ("gp-ucb", "random")
     ]
     assert len({job.key for job in jobs}) == len(jobs)
-
-
-def test_an_unknown_kind_is_refused() -> None:
-    with pytest.raises(InputError, match="no kind of job 'dance'"):
-        run_job(Job("dance", "pendulum", 0))
 
 
 def test_sd_discards_the_papers_five() -> None:

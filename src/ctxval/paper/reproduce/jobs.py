@@ -22,7 +22,6 @@ from ctxval._util.json_lines import JsonLines
 from ctxval.campaign.campaign import Campaign
 from ctxval.core.experiment import Experiment
 from ctxval.distances import TrackingError
-from ctxval.errors import InputError
 from ctxval.gp.kernels import Matern
 from ctxval.gp.surrogate import fit_surrogate
 from ctxval.paper.cases import arm
@@ -184,8 +183,6 @@ KINDS: dict[str, Callable[[Job], Result]] = {
 
 def run_job(job: Job) -> Result:
     """Run one job on one thread."""
-    if job.kind not in KINDS:
-        raise InputError(f"there is no kind of job {job.kind!r}.")
     with single_threaded():
         return KINDS[job.kind](job)
 

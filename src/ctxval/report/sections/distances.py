@@ -10,8 +10,8 @@ from ctxval._util.progress import stage
 from ctxval.core.trial import Trial
 from ctxval.report.charts import SMALL, Axis, Chart, Kind, colour_scale, small_charts
 from ctxval.report.context import ReportContext
-from ctxval.report.diagnostics import stored_predictions
 from ctxval.report.distance_model import Band, DistanceModel, distance_of
+from ctxval.report.findings import stored_predictions
 from ctxval.report.markup import bar, element, heading, joined, number, paragraph, percent, table
 
 _CURVE, _GRID = 121, 32  # number of points of a curve, and of each side of a map
@@ -188,11 +188,12 @@ def _predicted(context: ReportContext, model: DistanceModel) -> Chart:
     chart.whiskers(model.values, band.low, band.high, "mean")
     chart.marks(model.values, band.median, "mean", "by a Gaussian process of the distance, with its 95 % band")
     if replayed:
-        executed = [context.recordings[k].distance for k in replayed]
-        chart.marks(executed, list(replayed.values()), "corrected", "by the corrected model")
-    beforehand = [(distance_of(trial), prediction.median) for trial, prediction in stored_predictions(context)]
+        distances = [context.recordings[k].distance for k in replayed]
+        chart.marks(distances, list(replayed.values()), "corrected", "by the corrected model")
+    beforehand = stored_predictions(context)
     if beforehand:
-        chart.marks(*np.transpose(beforehand), "covering", "stored before the execution")
+        executed, expected = zip(*((distance_of(trial), stored.median) for trial, stored in beforehand), strict=True)
+        chart.marks(executed, expected, "covering", "stored before the execution")
     return chart
 
 
@@ -267,9 +268,10 @@ def distances_in_order(context: ReportContext) -> Chart | None:
     steps = np.repeat(numbers[risen], 2)[1:], np.repeat(so_far[risen], 2)[:-1]
     chart.line(np.append(steps[0], last), np.append(steps[1], so_far[-1]), "best", "largest so far")
     chart.limit(context.threshold, "threshold", "threshold").limit(context.bound, "bound", "bound on d*")
-    beforehand = [(trial.number, prediction.median) for trial, prediction in stored_predictions(context)]
+    beforehand = stored_predictions(context)
     if beforehand:
-        chart.marks(*np.transpose(beforehand), "covering", "predicted before the execution")
+        at, expected = zip(*((trial.number, stored.median) for trial, stored in beforehand), strict=True)
+        chart.marks(at, expected, "covering", "predicted before the execution")
     names = [f"trial {trial.number}: {number(trial.distance)}" for trial in context.completed]
     chart.marks(numbers, context.distances, "sample", "executed", names)
     if context.failed:
