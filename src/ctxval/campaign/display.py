@@ -75,8 +75,8 @@ def to_dataframe(trials: Sequence[Trial], space: TaskSpace) -> DataFrame:
     columns: dict[str, list[Any]] = {name: [getattr(trial, name) for trial in trials] for name in _BEFORE}
     points = [space.point(trial.parameters).tolist() for trial in trials]
     for axis, name in enumerate(space.names):
-        own = f"parameters.{name}" if name in (*_BEFORE, *_AFTER) else name
-        columns[own] = [point[axis] for point in points]
+        column = f"parameters.{name}" if name in (*_BEFORE, *_AFTER) else name
+        columns[column] = [point[axis] for point in points]
     columns |= {name: [getattr(trial, name) for trial in trials] for name in _AFTER}
     frame = DataFrame(columns)
     numbers = dict.fromkeys(("distance", "seconds", *list(columns)[len(_BEFORE) : -len(_AFTER)]), "float64")

@@ -42,9 +42,9 @@ def options_of(name: str) -> dict[str, Any]:
 
     The first parameter of a case is its seed, which is not an option.
     """
-    found = REGISTRY.find(name)
+    case = REGISTRY.find(name)
     try:
-        parameters = list(inspect.signature(found).parameters.values())[1:]
+        parameters = list(inspect.signature(case).parameters.values())[1:]
     except (TypeError, ValueError) as error:
         raise InputError(f"the case {name!r} must be a function of a seed and its options: {error}.") from error
     variadic = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
