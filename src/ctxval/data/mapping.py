@@ -96,7 +96,8 @@ class LogMapping(ShortRepr):
 
     def __post_init__(self) -> None:
         for name in ("states", "inputs"):
-            object.__setattr__(self, name, {key: _field(key, one) for key, one in dict(getattr(self, name)).items()})
+            fields = {key: _field(key, item) for key, item in dict(getattr(self, name)).items()}
+            object.__setattr__(self, name, fields)
         if not self.states:
             raise InputError("a mapping of a log needs at least one state.")
         if both := [name for name in self.states if name in self.inputs]:
@@ -145,10 +146,10 @@ class LogMapping(ShortRepr):
             named = table.get(kind, {})
             named = [named] if isinstance(named, str) else named
             if isinstance(named, list):
-                named = {str(one.get("path") if isinstance(one, Mapping) else one): one for one in named}
+                named = {str(item.get("path") if isinstance(item, Mapping) else item): item for item in named}
             if not isinstance(named, Mapping):
                 raise InputError(f"{kind} must be a table of fields or a list of paths, got {named!r}.")
-            parts[kind] = {name: _field(name, one) for name, one in named.items()}
+            parts[kind] = {name: _field(name, item) for name, item in named.items()}
         if "states" not in table:
             raise InputError("the mapping of recordings needs states.")
         return LogMapping(**{**table, **parts})
@@ -181,9 +182,8 @@ class LogMapping(ShortRepr):
         columns, states, inputs = log.fields(), states or {}, inputs or {}
         wanted = {**states, **inputs}
         if wanted and all(column_of(log.source, columns, name) for name in wanted):
-            named = {name: Field(name, unit) for name, unit in wanted.items()}
-            outputs = {name: one for name, one in named.items() if name not in inputs}
-            return LogMapping(outputs, {name: named[name] for name in inputs}, dt=log.period)
+            outputs = {name: Field(name, unit) for name, unit in states.items() if name not in inputs}
+            return LogMapping(outputs, {name: Field(name, unit) for name, unit in inputs.items()}, dt=log.period)
         vectors = ("states", "x", "observation.state")
         usual = _usual(columns, vectors, "x"), _usual(columns, ("inputs", "u", "action"), "u")
         if not usual[0]:
