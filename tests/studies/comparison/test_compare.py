@@ -30,7 +30,7 @@ from ctxval.campaign.storage.store import Store
 from ctxval.errors import InputError
 from ctxval.studies.comparison import CandidateResult, PairResult
 from ctxval.studies.comparison.candidates import TrialNote
-from ctxval.studies.comparison.executions import agrees
+from ctxval.core.plan import gives_inputs
 
 pytestmark = pytest.mark.usefixtures("few_loops")
 
@@ -133,14 +133,14 @@ def test_models_with_other_numbers_in_the_same_controller_share_and_others_do_no
 def test_an_execution_agrees_only_with_the_controller_that_gave_its_inputs() -> None:
     one, other = cart(), cart(10.0)
     trajectory = one.outcome([1.0]).system_trajectory
-    assert agrees(one.plan([1.0]), trajectory)
-    assert not agrees(other.plan([1.0]), trajectory)
-    assert not agrees(make_validation().plan([1.0]), trajectory)
+    assert gives_inputs(one.plan([1.0]), trajectory, 1e-9)
+    assert not gives_inputs(other.plan([1.0]), trajectory, 1e-9)
+    assert not gives_inputs(make_validation().plan([1.0]), trajectory, 1e-9)
 
     def fails(t: int, x: np.ndarray) -> np.ndarray:
         raise ValueError("never here")
 
-    assert not agrees(replace(one.plan([1.0]), controller=fails), trajectory)
+    assert not gives_inputs(replace(one.plan([1.0]), controller=fails), trajectory, 1e-9)
 
 
 @pytest.mark.slow

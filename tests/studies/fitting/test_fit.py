@@ -95,11 +95,11 @@ def test_what_recordings_do_not_determine_is_said() -> None:
     rng = np.random.default_rng(0)
     x = rng.normal(size=(300, 2))
     feedback = -x[:, :1] + 1e-3 * rng.normal(size=(300, 1))
-    (sentence,) = identifiability(Transitions(x, feedback, x), ["angle", "rate", "torque"])
+    sentence = identifiability(Transitions(x, feedback, x), ["angle", "rate", "torque"])
     assert sentence.startswith("angle and torque nearly depend on each other in these recordings")
-    (sentence,) = identifiability(Transitions(x, 0 * feedback, x), ["angle", "rate", "torque"])
+    sentence = identifiability(Transitions(x, 0 * feedback, x), ["angle", "rate", "torque"])
     assert sentence == "torque never changes, so its coefficients are not determined"
-    (sentence,) = identifiability(Transitions(x, rng.normal(size=(300, 1)), x), ["angle", "rate", "torque"])
+    sentence = identifiability(Transitions(x, rng.normal(size=(300, 1)), x), ["angle", "rate", "torque"])
     assert "vary independently enough" in sentence
 
 

@@ -12,7 +12,7 @@ from ctxval._util.arrays import Array, single_threaded
 from ctxval._util.representation import ShortRepr, counted
 from ctxval.core.model import Model, require_time_step
 from ctxval.core.trajectory import Trajectory, Transitions
-from ctxval.data.recordings import Recording, Recordings
+from ctxval.data.recordings import Recordings
 from ctxval.errors import InputError, ModelError, UnknownNameError
 from ctxval.models import FeedforwardReLU, GaussianProcessModel, Linear
 from ctxval.models.parametric import ParametricStep
@@ -52,14 +52,18 @@ class FittedModel(ShortRepr):
         return max((error.relative for error in self.errors if error.steps == 1), default=float("inf"))
 
     @property
+    def steps(self) -> int:
+        """The largest number of steps after which there are errors; 0 if there are none."""
+        return max((error.steps for error in self.errors), default=0)
+
+    @property
     def useless(self) -> str | None:
         """Why the model is no better than no model, in one sentence; None if it is.
 
         After one step, or after the largest number of steps, its error in a state is at least the recorded change.
         """
-        last = max((error.steps for error in self.errors), default=0)
-        counted_here = [error for error in self.errors if error.steps in (1, last)]
-        worst = max(counted_here, key=lambda error: error.relative, default=None)
+        ends = [error for error in self.errors if error.steps in (1, self.steps)]
+        worst = max(ends, key=lambda error: error.relative, default=None)
         if worst is None or worst.relative < 1:
             return None
         return (
@@ -150,7 +154,7 @@ def fit(
     failed: list[FailedFit] = []
 
     def add(kind: Kind, model: Model, parameters: tuple[FittedParameter, ...] = ()) -> None:
-        notes = identifiability(data, [*recordings.states, *recordings.inputs]) if kind == "linear" else []
+        notes = [identifiability(data, [*recordings.states, *recordings.inputs])] if kind == "linear" else []
         errors = step_errors(model, recorded, sorted(set(steps)))
         fitted.append(FittedModel(kind, model, errors, parameters, tuple(notes)))
 
@@ -171,8 +175,7 @@ def fit(
                 failed.append(FailedFit(kind, str(error)))
 
     def rank(model: FittedModel) -> tuple[float, bool]:
-        last = max((error.steps for error in model.errors), default=0)
-        relative = max((error.relative for error in model.errors if error.steps == last), default=np.inf)
+        relative = max((error.relative for error in model.errors if error.steps == model.steps), default=np.inf)
         return relative if np.isfinite(relative) else np.inf, model.kind == "given"
 
     return FitReport(tuple(sorted(fitted, key=rank)), tuple(failed), learned_from, held_out)
@@ -196,41 +199,41 @@ def split(recordings: Recordings, share: float, seed: int) -> tuple[Recordings, 
         raise InputError(f"the share that is held out must be between 0 and 1, got {share!r}.")
     runs = recordings.runs
     if len(runs) == 1:
-        horizon = runs[0].trajectory.horizon
+        run, horizon = runs[0], runs[0].trajectory.horizon
         cut = round((1 - share) * horizon)
         if not 1 <= cut < horizon:
             raise InputError(f"the only recording has {counted(horizon, 'step')}: too few to hold a part out.")
-        first, last = _part(runs[0], 0, cut), _part(runs[0], cut, horizon)
+        first = replace(run, trajectory=part_of(run.trajectory, 0, cut))
+        start = run.start + float(run.trajectory.times[cut])
+        last = replace(run, start=start, trajectory=part_of(run.trajectory, cut, horizon))
         return replace(recordings, runs=(first,)), replace(recordings, runs=(last,))
     count = min(max(1, round(share * len(runs))), len(runs) - 1)
-    chosen = set(np.random.default_rng(seed).permutation(len(runs))[:count].tolist())
+    chosen = np.sort(np.random.default_rng(seed).permutation(len(runs))[:count]).tolist()
     kept = tuple(run for number, run in enumerate(runs) if number not in chosen)
-    return replace(recordings, runs=kept), replace(recordings, runs=tuple(runs[number] for number in sorted(chosen)))
+    return replace(recordings, runs=kept), replace(recordings, runs=tuple(runs[number] for number in chosen))
 
 
-def _part(run: Recording, first: int, last: int) -> Recording:
-    whole = run.trajectory
-    times: Array = whole.times[first : last + 1] - whole.times[first]
-    part = Trajectory(times, whole.states[first : last + 1], whole.inputs[first:last])
-    return Recording(run.source, run.start + float(whole.times[first]), part)
+def part_of(run: Trajectory, first: int, last: int) -> Trajectory:
+    """Return the steps of a trajectory from one to another one; its times begin at 0."""
+    times: Array = run.times[first : last + 1] - run.times[first]
+    return Trajectory(times, run.states[first : last + 1], run.inputs[first:last])
 
 
-def identifiability(data: Transitions, names: Sequence[str]) -> list[str]:
-    """Return sentences on how well transitions determine a linear model: the variance inflation of each regressor."""
+def identifiability(data: Transitions, names: Sequence[str]) -> str:
+    """Return how well transitions determine a linear model: the variance inflation of each regressor."""
     Z = np.concatenate([data.x, data.u], axis=1)
-    deviations = Z.std(axis=0)
-    still = [name for name, size in zip(names, deviations, strict=True) if size <= 0]
+    still = [name for name, size in zip(names, Z.std(axis=0), strict=True) if size <= 0]
     if still:
-        return [f"{', '.join(still)} never changes, so its coefficients are not determined"]
+        return f"{', '.join(still)} never changes, so its coefficients are not determined"
     inflation = np.sqrt(np.diag(np.linalg.pinv(np.corrcoef(Z, rowvar=False).reshape(len(names), -1))))
     weak = [name for name, ratio in zip(names, inflation, strict=True) if ratio > 30.0]
     worst = float(inflation.max())
     if weak:
-        return [
+        return (
             f"{' and '.join(weak)} nearly depend on each other in these recordings: the standard errors of their "
             f"coefficients are up to {worst:.2g} times those of independent excitation"
-        ]
-    return [
+        )
+    return (
         f"all states and inputs vary independently enough: standard errors of coefficients are at most {worst:.2g} "
         "times those of independent excitation"
-    ]
+    )

@@ -24,7 +24,6 @@ class FittedParameter(ShortRepr):
     """One parameter of a model.
 
     Attributes:
-        name: its name.
         value: the estimate.
         low, high: the confidence interval; infinite if the recordings do not determine the parameter.
         note: what is unusual: the value is at a bound, or depends on others; empty otherwise.
