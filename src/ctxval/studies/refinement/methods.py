@@ -19,8 +19,7 @@ from ctxval.learning import DynamicsPosterior, PosteriorSettings, learn_posterio
 from ctxval.models import Corrected, Correction, FeedforwardReLU, GaussianProcessModel, Linear, Parametric
 from ctxval.models.parametric import ParametricStep
 from ctxval.studies.fitting import FittedParameter, fit_parameters
-from ctxval.studies.fitting.fit import learned_model
-from ctxval.studies.fitting.least_squares import as_bounds
+from ctxval.studies.fitting.fit import as_bounds, learned_model
 from ctxval.studies.refinement.held_out import HeldOut, Records, held_out
 from ctxval.studies.replay.accuracy import stepped
 

@@ -52,28 +52,28 @@ class ResidualShare(ShortRepr):
 def residual_shares(model: Model, recorded: RecordedSteps, seed: int) -> tuple[ResidualShare, ...]:
     """Return how much of the residual of each state can be explained; none if there are too few recorded steps."""
     where = recorded.windows(1, 1, 12_000)
-    pairs, earlier = (np.concatenate([where.states(k), where.inputs(k)], axis=1) for k in (0, -1))
-    residuals, earlier_residuals = (
-        where.states(k + 1) - stepped(model, where.states(k), where.inputs(k)) for k in (0, -1)
-    )
-    past = np.concatenate([pairs, earlier, earlier_residuals], axis=1)
-    finite: Mask = np.asarray((np.isfinite(residuals) & np.isfinite(earlier_residuals)).all(axis=1))
-    where, pairs, past, residuals = where[finite], pairs[finite], past[finite], residuals[finite]
+    residuals, earlier = (where.states(k + 1) - stepped(model, where.states(k), where.inputs(k)) for k in (0, -1))
+    finite: Mask = np.asarray((np.isfinite(residuals) & np.isfinite(earlier)).all(axis=1))
+    where, residuals, earlier = where[finite], residuals[finite], earlier[finite]
+    pairs, past = where.pairs(), np.concatenate([where.pairs(), where.pairs(-1), earlier], axis=1)
     groups = np.unique(where.groups)
     folds = np.searchsorted(groups, where.groups) * min(4, len(groups)) // max(len(groups), 1)
     if len(residuals) < 20 or len(np.unique(folds)) < 2:
         return ()
-    rest, linear, history = (np.zeros_like(residuals) for _ in range(3))
-    for fold in np.unique(folds):
-        held = folds == fold
-        linear[held] = _affine(pairs, residuals, held)
-        rest[held] = residuals[held] - _learned(model, where, folds, held, seed)
-    affine = residuals - linear
+
+    def left_by(predict: Callable[[Mask], Array], targets: Array) -> Array:
+        """Return what is left of targets if those of each fold are predicted from the other folds."""
+        left = np.zeros_like(targets)
+        for fold in np.unique(folds):
+            held = folds == fold
+            left[held] = targets[held] - predict(held)
+        return left
+
+    affine = left_by(lambda held: _affine(pairs, residuals, held), residuals)
+    rest = left_by(lambda held: _learned(model, where, folds, held, seed), residuals)
     better = (affine**2).mean(axis=0) < (rest**2).mean(axis=0)
     rest[:, better] = affine[:, better]
-    for fold in np.unique(folds):
-        held = folds == fold
-        history[held] = _affine(past, rest, held)
+    history = left_by(lambda held: _affine(past, rest, held), rest)
     follows: Mask = (np.diff(where.runs) == 0) & (np.diff(where.places) == 1)
 
     def share(errors: Array, size: float) -> float:
@@ -87,11 +87,11 @@ def residual_shares(model: Model, recorded: RecordedSteps, seed: int) -> tuple[R
             return 0.0
         return float(np.corrcoef(first, second)[0, 1])
 
-    size, left = (residuals**2).mean(axis=0).tolist(), (rest**2).mean(axis=0).tolist()
+    sizes, left = (residuals**2).mean(axis=0).tolist(), (rest**2).mean(axis=0).tolist()
     return tuple(
         ResidualShare(
-            *(name, unit, math.sqrt(size[i]), share(affine[:, i], size[i]), share(rest[:, i], size[i])),
-            *(share(rest[:, i] - history[:, i], left[i]), correlation(rest[:, i]), math.sqrt(left[i])),
+            *(name, unit, math.sqrt(sizes[i]), share(affine[:, i], sizes[i]), share(rest[:, i], sizes[i])),
+            *(share(history[:, i], left[i]), correlation(rest[:, i]), math.sqrt(left[i])),
         )
         for i, (name, unit) in enumerate(recorded.recordings.states.items())
     )
