@@ -43,7 +43,7 @@ class Signal(ShortRepr):
 
     Attributes:
         times: seconds, in the order of the log, shape ``(N,)``.
-        values: the values, NaN where the log has none, shape ``(N, k)``; k is 1 unless the field is a vector.
+        values: NaN where the log has none, shape ``(N, k)``; k is 1 unless the field is a vector.
         first: the number of the first sample in messages: the line of a CSV file, the index of a message.
         word: what such a number counts: ``line``, ``row`` or ``message``.
         unit: the unit that the name of the column states; empty if it states none.
@@ -94,12 +94,7 @@ class Log(ShortRepr, ABC):
 
     @abstractmethod
     def signals(self, fields: Sequence[str], clock: Clock) -> dict[str, Signal]:
-        """Return fields over time.
-
-        Args:
-            fields: names of fields; ``name[2]`` is one component of a vector.
-            clock: where the times come from.
-        """
+        """Return fields over time by their names; ``name[2]`` is one component of a vector."""
 
     def episodes(self, used: Sequence[str]) -> list[Log]:
         """Return the recordings in this log, one for each number in a column such as ``episode``."""

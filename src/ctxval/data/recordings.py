@@ -24,13 +24,7 @@ from ctxval.errors import InputError
 
 @dataclass(frozen=True, eq=False)
 class Recording(ShortRepr):
-    """A part of a log without gaps, at equal steps.
-
-    Attributes:
-        source: the file, and the episode in it.
-        start: the time at which it begins in the log, seconds.
-        trajectory: the states and inputs; its times begin at 0.
-    """
+    """A part of a log without gaps, at equal steps; it begins in the log at ``start``, and its own times begin at 0."""
 
     source: str
     start: float

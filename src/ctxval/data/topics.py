@@ -22,12 +22,9 @@ _MOST_MEMORY = 2**30  # largest size of the numbers of a log in bytes; each mess
 
 @dataclass(frozen=True, eq=False)
 class Message(ShortRepr):
-    """One message of a topic.
+    """One message of a topic, and when it was recorded and sent, in nanoseconds.
 
-    Attributes:
-        topic: its topic.
-        logged, published: when it was recorded and sent, nanoseconds.
-        content: its decoded fields: a mapping, or an object with an attribute for each field.
+    The content is a mapping, or an object with an attribute for each field.
     """
 
     topic: str
