@@ -155,7 +155,7 @@ def _hdf5_size(h5py: Any, path: str, identifier: Any) -> int:
     if not usual.issuperset(plan.get_filter(i)[0] for i in range(plan.get_nfilters())):
         raise InputError(f"{quoted(path)} is compressed in a way that MATLAB does not use")
     chunk = math.prod(plan.get_chunk()) if plan.get_layout() == h5d.CHUNKED else 0
-    return 8 * max(math.prod(shape), chunk)
+    return int(8 * max(math.prod(shape), chunk))
 
 
 def _is_text(h5py: Any, identifier: Any) -> bool:

@@ -116,12 +116,10 @@ def replay(
     if validation is not None:
         logged = [run.trajectory for run in recordings.runs]
         tasks = predicted_tasks(validation, logged, executions=executions, seed=seed)
-    data = RecordedData(
-        tuple(dict.fromkeys(run.source for run in recordings.runs)),
-        len(recordings.runs),
-        *(getattr(recordings, name) for name in ("steps", "dt", "states", "inputs", "breaks", "notes")),
-        seen=len(seen),
-    )
+    sources = tuple(dict.fromkeys(run.source for run in recordings.runs))
+    names = recordings.states, recordings.inputs
+    counts = len(recordings.runs), recordings.steps, recordings.dt
+    data = RecordedData(sources, *counts, *names, recordings.breaks, recordings.notes, len(seen))
     report = ReplayReport(data, errors, where, residuals, changes, tasks, ())
     sentences = [*_insights(report, len(used)), *_insights_of_tasks([*data.states, *data.inputs], tasks)]
     if validation is not None and tasks is None:
