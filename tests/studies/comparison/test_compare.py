@@ -27,10 +27,10 @@ from ctxval import (
     systems,
 )
 from ctxval.campaign.storage.store import Store
+from ctxval.core.plan import gives_inputs
 from ctxval.errors import InputError
 from ctxval.studies.comparison import CandidateResult, PairResult
 from ctxval.studies.comparison.candidates import TrialNote
-from ctxval.core.plan import gives_inputs
 
 pytestmark = pytest.mark.usefixtures("few_loops")
 
