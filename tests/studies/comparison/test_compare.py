@@ -122,9 +122,9 @@ def test_distances_of_one_controller_share_every_execution() -> None:
 
 @pytest.mark.slow
 def test_models_with_other_numbers_in_the_same_controller_share_and_others_do_not() -> None:
-    same = compare(campaigns(a=cart(), b=cart()), question="mean", budget=12)
-    assert same.executions == 12
-    assert [one.shared + one.executions for one in same.candidates] == [12, 12]
+    same = compare(campaigns(a=cart(), b=cart()), question="mean", budget=6)
+    assert same.executions == 6
+    assert [one.shared + one.executions for one in same.candidates] == [6, 6]
     assert not same.decided  # all differences are 0
     other = compare(campaigns(a=cart(), b=cart(mass=1.3)), question="mean", budget=4)
     assert [one.shared for one in other.candidates] == [0, 0]

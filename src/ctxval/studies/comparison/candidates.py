@@ -40,7 +40,6 @@ class Decision:
     """A decision that one candidate has the smaller d*.
 
     Attributes:
-        smaller, larger: the names of the candidates.
         bound: what d* of the smaller one is at most.
         distance: the executed distance of the larger one that this bound does not exceed.
         certificate: the kind of the certificate of the bound.
