@@ -248,7 +248,7 @@ CORRECTION = models.Correction(
     *(np.zeros(3), np.ones(3), np.zeros((4, 3)), np.ones(3), np.ones((4, 2)), np.zeros((4, 2))),
     *(-np.ones(3), np.ones(3), np.ones(3), np.ones(2)),
 )
-HELD_OUT = refinement.HeldOut(*(np.ones((60, 3)), *[np.full((60, 2), 0.1)] * 3, np.zeros(60)))
+HELD_OUT = refinement.HeldOut(*(np.ones((60, 3)), *[np.full((60, 2), 0.1)] * 3))
 RESIDUAL = refinement.measure_residual(HELD_OUT, {"x": "m", "v": "m/s"}, {"u": "N"})
 
 
@@ -395,6 +395,7 @@ EXAMPLES: dict[str, Callable[[], object]] = {
     "data.Recording": lambda: recordings().runs[0],
     "data.Recordings": recordings,
     "data.Signal": lambda: data.Signal(np.arange(9.0), np.zeros((9, 2))),
+    "data.Table": lambda: data.Table("run.csv", ("t", "x"), lambda names: dict.fromkeys(names, np.arange(9.0))),
     "studies.fitting.Excitation": lambda: fitting.Excitation(make_validation(), "chirp", 0.5, 5.0),
     "studies.fitting.Excited": lambda: fitting.Excited(policy, np.ones((9, 1)), controllers.Limits([-1.0], [1.0])),
     "studies.fitting.FailedFit": lambda: fitting.FailedFit("linear", "too few steps"),

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from ctxval.data import LogMapping, read_logs, read_recordings
-from ctxval.data.messages import ros2_decoder
 from ctxval.errors import InputError
 from rig_logs import run, write_bag1
 
@@ -163,7 +162,15 @@ def test_a_compressed_bag_that_is_much_larger_than_it_looks_is_refused(
         read_recordings([tmp_path / "a.bag"], mapping)
 
 
-def test_the_definition_of_a_message_is_not_printed(capfd: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(InputError):
-        ros2_decoder("a.mcap", "/a", "rig/msg/State", "nonsense\x1b]0;owned\x07")
+def test_the_definition_of_a_message_is_not_printed(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    from mcap.writer import Writer
+
+    with (tmp_path / "a.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        schema = writer.register_schema("rig/msg/State", "ros2msg", b"nonsense\x1b]0;owned\x07")
+        writer.add_message(writer.register_channel("/a", "cdr", schema), log_time=0, publish_time=0, data=b"")
+        writer.finish()
+    with pytest.raises(InputError, match="the definition of the messages of /a, rig/msg/State, cannot be read"):
+        read_recordings([tmp_path / "a.mcap"], LogMapping.from_table({"states": ["/a.x"]}))
     assert capfd.readouterr() == ("", "")

@@ -401,7 +401,7 @@ float64[] y
         *(np.array([1.0, 2.0, 3.0]), ["a", ""], parts, np.array([1, 2], dtype=np.uint8)),
     )
     data = bytes(store.serialize_ros1(message, "rig/msg/All"))
-    found = ros1_decoder("a.bag", "/t", "rig/msg/All", definition)(data)
+    found = ros1_decoder("rig/msg/All", definition.encode())(data)
     plain = {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in found.items()}
     parts_found = [{"x": one["x"], "y": one["y"].tolist()} for one in plain.pop("l")]
     assert parts_found == [{"x": -1, "y": [0.5]}, {"x": 2, "y": []}]
@@ -410,9 +410,15 @@ float64[] y
     assert plain == {**numbers, **times, "j": [1, 2, 3], "k": ["a", ""], "m": [1, 2]}
     for size in range(len(data)):
         with pytest.raises(ValueError, match=r"shorter than its definition|longer than its message"):
-            ros1_decoder("a.bag", "/t", "rig/msg/All", definition)(data[:size])
-    with pytest.raises(InputError, match="the definition of the messages of /t, rig/msg/All, cannot be read"):
-        ros1_decoder("a.bag", "/t", "rig/msg/All", "float64[ broken")
+            ros1_decoder("rig/msg/All", definition.encode())(data[:size])
+
+
+def test_a_definition_that_cannot_be_read_is_named(tmp_path: Path) -> None:
+    write_bag1(tmp_path / "a.bag", run(4))
+    content = (tmp_path / "a.bag").read_bytes()
+    (tmp_path / "a.bag").write_bytes(content.replace(b"float64[] position", b"float64[  position"))
+    with pytest.raises(InputError, match=r"a\.bag: the definition of the messages of /joints, .*, cannot be read"):
+        read_recordings([tmp_path / "a.bag"], JOINTS)
 
 
 def test_header_stamps_are_the_times_if_they_are_plausible(tmp_path: Path) -> None:

@@ -1,7 +1,5 @@
 """Recordings of a system: readers of logs, and their mapping to states and inputs at equal steps."""
 
-from __future__ import annotations
-
 from ctxval.data.log import Clock, Log, MemoryTable, Signal, Table
 from ctxval.data.mapping import Field, LogMapping
 from ctxval.data.readers import READERS, is_log, read_logs

@@ -7,9 +7,10 @@ from __future__ import annotations
 
 import re
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
@@ -23,17 +24,15 @@ from ctxval.errors import InputError
 LISTED = 24
 """Largest number of fields that a message names."""
 
-_INDEX = re.compile(r"(.+?)\[(\d{1,6})\]")
-
 
 @contextmanager
 def reading(source: object, kind: str = "") -> Iterator[None]:
-    """Turn the many exceptions for damaged files into one sentence: that a source cannot be read as its kind."""
+    """Turn the many exceptions for damaged files into one sentence."""
     what = f"{source} cannot be read as {kind}" if kind else f"{source} cannot be read"
     try:
         yield
     except InputError as error:
-        raise InputError(f"{what}: {error}.") from error
+        raise InputError(f"{what}: {str(error).removesuffix('.')}.") from error
     except Exception as error:
         raise InputError(f"{what} ({quoted(reason_of(error))}).") from error
 
@@ -44,7 +43,7 @@ class Signal(ShortRepr):
 
     Attributes:
         times: seconds, in the order of the log, shape ``(N,)``.
-        values: the values, NaN where the log has none, shape ``(N, k)``; k is 1 unless the field is a vector.
+        values: NaN where the log has none, shape ``(N, k)``; k is 1 unless the field is a vector.
         first: the number of the first sample in messages: the line of a CSV file, the index of a message.
         word: what such a number counts: ``line``, ``row`` or ``message``.
         unit: the unit that the name of the column states; empty if it states none.
@@ -95,12 +94,7 @@ class Log(ShortRepr, ABC):
 
     @abstractmethod
     def signals(self, fields: Sequence[str], clock: Clock) -> dict[str, Signal]:
-        """Return fields over time.
-
-        Args:
-            fields: names of fields; ``name[2]`` is one component of a vector.
-            clock: where the times come from.
-        """
+        """Return fields over time by their names; ``name[2]`` is one component of a vector."""
 
     def episodes(self, used: Sequence[str]) -> list[Log]:
         """Return the recordings in this log, one for each number in a column such as ``episode``."""
@@ -112,30 +106,44 @@ class Log(ShortRepr, ABC):
 
 
 class Table(Log):
-    """A log whose fields share one column of times."""
+    """A log whose fields share one column of times.
 
-    word = "row"
-    first = 0
+    Args:
+        source: the file, and the episode in it, for messages.
+        names: the names of the columns.
+        columns: a function that returns columns by name, each of shape ``(N,)``, or ``(N, k)`` for vectors.
+        word: what counts the rows in messages: ``line`` or ``row``.
+        first: the number of the first row in messages.
+        period: seconds between two rows, if the log states it.
+        marks: a function that returns a column whose values are only compared with each other; ``columns`` by default.
+    """
 
-    @abstractmethod
-    def names(self) -> tuple[str, ...]:
-        """Return the names of the columns."""
-
-    @abstractmethod
-    def columns(self, names: Sequence[str]) -> dict[str, Array]:
-        """Return columns, each with shape ``(N,)``, or ``(N, k)`` for vectors."""
+    def __init__(
+        self,
+        source: str,
+        names: Sequence[str],
+        columns: Callable[[Sequence[str]], Mapping[str, Array]],
+        *,
+        word: str = "row",
+        first: int = 0,
+        period: float | None = None,
+        marks: Callable[[str], Array] | None = None,
+    ) -> None:
+        self.source, self.word, self.first, self.period = source, word, first, period
+        self._names, self._columns = tuple(names), columns
+        self._marks = marks or (lambda name: columns([name])[name])
 
     def fields(self) -> tuple[str, ...]:
         """Return the names of the columns."""
-        return self.names()
+        return self._names
 
     def signals(self, fields: Sequence[str], clock: Clock) -> dict[str, Signal]:
         """Return fields over time; see :meth:`Log.signals`."""
-        names = self.names()
-        require_distinct(self.source, names)
-        split = {field: self._split(field, names) for field in fields}
-        time, time_unit = self._time(clock, names)
-        arrays = self.columns(list(dict.fromkeys([*(name for name, _, _ in split.values()), *filter(None, [time])])))
+        require_distinct(self.source, self._names)
+        split = {field: self._split(field) for field in fields}
+        time, time_unit = self._time(clock)
+        wanted = [*(name for name, _, _ in split.values()), *filter(None, [time])]
+        arrays = self._columns(list(dict.fromkeys(wanted)))
         if time is None:
             rows = max(len(arrays[name]) for name, _, _ in split.values())
             times = np.asarray(np.arange(rows) * float(clock.period or 0), dtype=np.float64)
@@ -156,48 +164,58 @@ class Table(Log):
 
     def episodes(self, used: Sequence[str]) -> list[Log]:
         """Return one table for each run of rows with one number in a column such as ``episode``."""
-        counters = [name for name in self.names() if name.lower() in EPISODES and name not in used]
-        marks = [values for values in map(self.marks, counters) if values.ndim == 1 and len(values) > 1]
+        counters = [name for name in self._names if name.lower() in EPISODES and name not in used]
+        marks = [values for values in map(self._marks, counters) if values.ndim == 1 and len(values) > 1]
         if not marks or len({len(values) for values in marks}) > 1:
             return [self]
         changed = np.any([mark[1:] != mark[:-1] for mark in marks], axis=0)
-        ends = [0, *(np.flatnonzero(changed) + 1).tolist(), len(marks[0])]
-        kind, read = counters[0].partition("_")[0], dict[str, Array]()
-        return [
-            Rows(self, f"{kind} {str(marks[0][start]).removesuffix('.0')}", slice(start, stop), ends[-1], read)
-            for start, stop in pairwise(ends)
-        ]
+        count, read = len(marks[0]), dict[str, Array]()
 
-    def marks(self, name: str) -> Array:
-        """Return a column whose values are only compared with each other."""
-        return self.columns([name])[name]
+        def rows(start: int, stop: int, names: Sequence[str]) -> dict[str, Array]:
+            if missing := [name for name in names if name not in read]:  # each column is read once for all episodes
+                read.update(self._columns(missing))
+            for name in names:
+                if len(read[name]) not in (count, count - 1):
+                    raise InputError(
+                        f"{self.source}: {name} must have {count} rows, as the numbers of recordings have, got "
+                        f"{read[name].shape}."
+                    )
+            return {name: read[name][start:stop] for name in names}
 
-    def _split(self, field: str, names: Sequence[str]) -> tuple[str, str, int | None]:
+        def episode(start: int, stop: int) -> Table:
+            number = str(marks[0][start]).removesuffix(".0")
+            source, columns = f"{self.source}, {counters[0].partition('_')[0]} {number}", partial(rows, start, stop)
+            return Table(source, self._names, columns, word=self.word, first=self.first + start, period=self.period)
+
+        return [episode(*ends) for ends in pairwise([0, *(np.flatnonzero(changed) + 1).tolist(), count])]
+
+    def _split(self, field: str) -> tuple[str, str, int | None]:
         """Return the column of a field, its unit, and the number of the component, if only one is meant."""
-        if (column := column_of(self.source, names, field)) is not None:
+        if (column := column_of(self.source, self._names, field)) is not None:
             return *column, None
-        matched = _INDEX.fullmatch(field)
-        column = None if matched is None else column_of(self.source, names, matched[1])
+        matched = re.fullmatch(r"(.+?)\[(\d{1,6})\]", field)
+        column = None if matched is None else column_of(self.source, self._names, matched[1])
         if matched is None or column is None:
             raise self.missing(field)
         return *column, int(matched[2])
 
-    def _time(self, clock: Clock, names: Sequence[str]) -> tuple[str | None, str]:
+    def _time(self, clock: Clock) -> tuple[str | None, str]:
         """Return the column of the times and its unit; None if rows have equal steps."""
-        if clock.field is None and clock.period is not None:
+        if clock.field is not None:
+            column = column_of(self.source, self._names, clock.field)
+            if column is None:
+                raise self.missing(clock.field)
+        elif clock.period is not None:
             return None, ""
-        found = time_column(self.source, names) if clock.field is None else column_of(self.source, names, clock.field)
-        if found is None and clock.field is not None:
-            raise self.missing(clock.field)
-        if found is None:
+        elif (column := time_column(self.source, self._names)) is None:
             raise InputError(
                 f"{self.source} has no column of times ({', '.join(TIMES)}): name it with time, or give the time "
                 "between two rows."
             )
-        column, unit = found
+        name, unit = column
         if unit and clock.unit and unit != clock.unit:
             raise InputError(f"{self.source} has its times in {unit}, and time_unit states {clock.unit}.")
-        return column, unit or clock.unit
+        return name, unit or clock.unit
 
     def _oriented(self, name: str, values: Array, count: int) -> Array:
         """Return an array as ``(N, k)``; MATLAB users also keep one time in each column."""
@@ -215,42 +233,7 @@ class MemoryTable(Table):
     """A table whose columns are in memory; ``first`` is the number of the first row in messages."""
 
     def __init__(self, source: str, columns: Mapping[str, Array], first: int = 0, period: float | None = None) -> None:
-        self.source, self.first, self.period = source, first, period
-        self._columns = dict(columns)
-
-    def names(self) -> tuple[str, ...]:
-        """Return the names of the columns."""
-        return tuple(self._columns)
-
-    def columns(self, names: Sequence[str]) -> dict[str, Array]:
-        """Return columns by name."""
-        return {name: self._columns[name] for name in names}
-
-
-class Rows(Table):
-    """Some rows of a table, such as one episode; ``read`` has the columns that other parts of the table have read."""
-
-    def __init__(self, table: Table, name: str, rows: slice, count: int, read: dict[str, Array]) -> None:
-        self.source, self.word, self.first = f"{table.source}, {name}", table.word, table.first + rows.start
-        self.period = table.period
-        self._table, self._rows, self._count, self._read = table, rows, count, read
-
-    def names(self) -> tuple[str, ...]:
-        """Return the names of the columns."""
-        return self._table.names()
-
-    def columns(self, names: Sequence[str]) -> dict[str, Array]:
-        """Return the rows of columns."""
-        if missing := [name for name in names if name not in self._read]:
-            self._read |= self._table.columns(missing)
-        for name in names:
-            if len(self._read[name]) not in (self._count, self._count - 1):
-                raise InputError(
-                    f"{self._table.source}: {name} must have {self._count} rows, as the numbers of recordings have, "
-                    f"got {self._read[name].shape}."
-                )
-        return {name: self._read[name][self._rows] for name in names}
-
-    def episodes(self, used: Sequence[str]) -> list[Log]:
-        """Return these rows."""
-        return [self]
+        stored = dict(columns)
+        super().__init__(
+            source, tuple(stored), lambda names: {name: stored[name] for name in names}, first=first, period=period
+        )

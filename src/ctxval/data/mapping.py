@@ -73,9 +73,7 @@ class LogMapping(ShortRepr):
 
     Attributes:
         states, inputs: the fields of the states and inputs by name, in the order of the model.
-        time: the column of the times of a table; None to look for ``t``, ``time``, ``times`` or ``timestamp``.
-        time_unit: the unit of this column, s, ms, us, ns, min or h, if its name does not state it; seconds by default.
-        stamp: the time of a message, as in :class:`Clock`.
+        time, time_unit, stamp: where the times come from, as in :class:`Clock`.
         dt: length of a step in seconds; None for the median period of the first state. A table without times has one
             row for each step.
         delay: seconds between the time at which an input is logged and the time from which it acts on the states.
@@ -96,7 +94,8 @@ class LogMapping(ShortRepr):
 
     def __post_init__(self) -> None:
         for name in ("states", "inputs"):
-            object.__setattr__(self, name, {key: _field(key, one) for key, one in dict(getattr(self, name)).items()})
+            fields = {key: _field(key, item) for key, item in dict(getattr(self, name)).items()}
+            object.__setattr__(self, name, fields)
         if not self.states:
             raise InputError("a mapping of a log needs at least one state.")
         if both := [name for name in self.states if name in self.inputs]:
@@ -136,19 +135,16 @@ class LogMapping(ShortRepr):
         A field is a path, or a table with the attributes of :class:`Field`. ``states`` and ``inputs`` may also be lists
         of paths.
         """
-        names = [field.name for field in fields(LogMapping)]
-        for key in table:
-            if key not in names:
-                raise UnknownNameError.among("entry of the mapping of recordings", key, names)
+        _require_known("entry of the mapping of recordings", table, LogMapping)
         parts = dict[str, dict[str, Field]]()
         for kind in ("states", "inputs"):
             named = table.get(kind, {})
             named = [named] if isinstance(named, str) else named
             if isinstance(named, list):
-                named = {str(one.get("path") if isinstance(one, Mapping) else one): one for one in named}
+                named = {str(item.get("path") if isinstance(item, Mapping) else item): item for item in named}
             if not isinstance(named, Mapping):
                 raise InputError(f"{kind} must be a table of fields or a list of paths, got {named!r}.")
-            parts[kind] = {name: _field(name, one) for name, one in named.items()}
+            parts[kind] = {name: _field(name, item) for name, item in named.items()}
         if "states" not in table:
             raise InputError("the mapping of recordings needs states.")
         return LogMapping(**{**table, **parts})
@@ -160,30 +156,25 @@ class LogMapping(ShortRepr):
             content = read_bytes(path)
         try:
             table = tomllib.loads(content.decode("utf-8"))
-        except (ValueError, RecursionError) as error:
-            raise InputError(f"{path} is not valid TOML: {error}.") from error
-        try:
             return LogMapping.from_table(table.get("recordings", table))
         except InputError as error:
             raise InputError(f"{path}: {error}") from error
+        except (ValueError, RecursionError) as error:
+            raise InputError(f"{path} is not valid TOML: {error}.") from error
 
     @staticmethod
     def usual(log: Log, states: Mapping[str, str] | None = None, inputs: Mapping[str, str] | None = None) -> LogMapping:
         """Return the mapping of a log whose fields have usual names.
 
         The states are ``states``, ``x`` or ``observation.state``, or the columns ``x0``, ``x1``, ...; the inputs are
-        ``inputs``, ``u`` or ``action``, or the columns ``u0``, ``u1``, ...
-
-        Args:
-            log: the log.
-            states, inputs: names with their units that are looked for before these.
+        ``inputs``, ``u`` or ``action``, or the columns ``u0``, ``u1``, ... The names in ``states`` and ``inputs``, with
+        their units, are looked for before these.
         """
         columns, states, inputs = log.fields(), states or {}, inputs or {}
         wanted = {**states, **inputs}
         if wanted and all(column_of(log.source, columns, name) for name in wanted):
-            named = {name: Field(name, unit) for name, unit in wanted.items()}
-            outputs = {name: one for name, one in named.items() if name not in inputs}
-            return LogMapping(outputs, {name: named[name] for name in inputs}, dt=log.period)
+            outputs = {name: Field(name, unit) for name, unit in states.items() if name not in inputs}
+            return LogMapping(outputs, {name: Field(name, unit) for name, unit in inputs.items()}, dt=log.period)
         vectors = ("states", "x", "observation.state")
         usual = _usual(columns, vectors, "x"), _usual(columns, ("inputs", "u", "action"), "u")
         if not usual[0]:
@@ -213,6 +204,13 @@ def _usual(known: Sequence[str], vectors: Sequence[str], letter: str) -> dict[st
     return columns
 
 
+def _require_known(what: str, table: Mapping[str, Any], of: type[Field | LogMapping]) -> None:
+    names = [field.name for field in fields(of)]
+    for key in table:
+        if key not in names:
+            raise UnknownNameError.among(what, key, names)
+
+
 def _field(name: str, described: Any) -> Field:
     if isinstance(described, Field):
         return described
@@ -220,11 +218,8 @@ def _field(name: str, described: Any) -> Field:
         return Field(described)
     if not isinstance(described, Mapping):
         raise InputError(f"the field {name} must be a path or a table, got {described!r}.")
-    names = [field.name for field in fields(Field)]
     table = {("path" if key == "field" else key): value for key, value in described.items()}
-    for key in table:
-        if key not in names:
-            raise UnknownNameError.among(f"entry of the field {name}", key, names)
+    _require_known(f"entry of the field {name}", table, Field)
     try:
         return Field(**{"path": name, **table})
     except InputError as error:

@@ -12,7 +12,6 @@ import bz2
 import io
 import itertools
 import json
-import struct
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, redirect_stderr, suppress
@@ -22,6 +21,7 @@ from typing import IO, Any
 
 import numpy as np
 
+from ctxval._util.arrays import Array
 from ctxval._util.extras import require_extra
 from ctxval._util.files import open_regular
 from ctxval._util.texts import quoted, reason_of
@@ -34,7 +34,7 @@ Decoder = Callable[[bytes], Any]
 
 _MOST_CHUNK = 128 * 2**20  # largest size of a record, and of a chunk of records after it is decompressed, in bytes
 
-_PURPOSE = "logs of messages"
+_library = partial(require_extra, extra="logs", purpose="logs of messages")
 
 
 class _FileOfMessages(TopicLog):
@@ -58,13 +58,23 @@ class _FileOfMessages(TopicLog):
             why = quoted(reason_of(error))
             raise InputError(f"{self.source}, message {message}: it cannot be decoded ({why}).") from error
 
+    def _decoder(self, topic: str, make: Callable[[str, bytes], Decoder], name: str, definition: bytes) -> Decoder:
+        try:
+            return make(name, definition)
+        except InputError:
+            raise
+        except Exception as error:  # the definition in a file may be anything
+            raise InputError(
+                f"{self.source}: the definition of the messages of {topic}, {name}, cannot be read."
+            ) from error
+
 
 class McapLog(_FileOfMessages):
     """An MCAP file with messages in JSON, in protobuf or of ROS 1 and 2."""
 
     def __init__(self, path: Path) -> None:
         super().__init__(path)
-        with self._opened() as file, _damage(path, "an MCAP file"):
+        with self._opened() as file, reading(path, "an MCAP file"):
             file.seek(-(8 + 29), io.SEEK_END)  # the footer and the magic bytes, https://mcap.dev/spec
             summary = next(self._records(file)).summary_start  # 0 if there is none
             file.seek(summary)
@@ -72,7 +82,7 @@ class McapLog(_FileOfMessages):
                 if type(record).__name__ == "Channel":
                     self._topics[record.topic] = None
                 if len(self._topics) > 10_000:
-                    raise InputError(f"{path} has more than 10000 topics.")
+                    raise InputError("it has more than 10000 topics")
 
     def _opened(self) -> IO[bytes]:
         with reading(self._path):
@@ -80,8 +90,7 @@ class McapLog(_FileOfMessages):
 
     def _records(self, file: Any) -> Iterator[Any]:
         """Yield the records from a place in the file on, and those within chunks, whose sizes are limited."""
-        library = require_extra("mcap.stream_reader", "logs", _PURPOSE)
-        ended = require_extra("mcap.exceptions", "logs", _PURPOSE).EndOfFile
+        library, ended = _library("mcap.stream_reader"), _library("mcap.exceptions").EndOfFile
         inside = {"skip_magic": file.tell() > 0, "emit_chunks": True, "record_size_limit": _MOST_CHUNK}
         for record in library.StreamReader(file, **inside).records:
             if type(record).__name__ != "Chunk":
@@ -100,7 +109,7 @@ class McapLog(_FileOfMessages):
         with self._opened() as file:
             records = self._records(file)
             while True:
-                with _damage(self._path, "an MCAP file"):
+                with reading(self._path, "an MCAP file"):
                     record: Any = next(records, None)
                 match type(record).__name__:
                     case "Schema":
@@ -108,24 +117,20 @@ class McapLog(_FileOfMessages):
                     case "Channel":
                         channels[record.id] = record
                     case "Message" if (channel := channels.get(record.channel_id)) and channel.topic in wanted:
-                        decoder = partial(self._decoder, schemas.get(channel.schema_id), channel)
+                        decoder = partial(self._decoder_of, schemas.get(channel.schema_id), channel)
                         message = f"{record.sequence} of {channel.topic}"
                         content = self._decoded(channel.id, decoder, record.data, message)
                         yield Message(channel.topic, record.log_time, record.publish_time, content)
                     case "NoneType":
                         return
 
-    def _decoder(self, schema: Any, channel: Any) -> Decoder:
-        match channel.message_encoding, getattr(schema, "encoding", None):
-            case "json", _:
-                return lambda data: json.loads(data, object_pairs_hook=_distinct)
-            case "cdr", "ros2msg":
-                return ros2_decoder(self.source, channel.topic, schema.name, schema.data.decode("utf-8", "replace"))
-            case "ros1", "ros1msg":
-                return ros1_decoder(self.source, channel.topic, schema.name, schema.data.decode("utf-8", "replace"))
-            case "protobuf", "protobuf":
-                return protobuf_decoder(self.source, channel.topic, schema)
-        of = f" with a schema in {schema.encoding}" if schema is not None else ""
+    def _decoder_of(self, schema: Any, channel: Any) -> Decoder:
+        if channel.message_encoding == "json":
+            return lambda data: json.loads(data, object_pairs_hook=_distinct)
+        encoding = getattr(schema, "encoding", None)
+        if (make := _DECODERS.get((channel.message_encoding, encoding))) is not None:
+            return self._decoder(channel.topic, make, schema.name, schema.data)
+        of = f" with a schema in {encoding}" if schema is not None else ""
         raise InputError(
             f"{self.source}: the messages of {channel.topic} are in {channel.message_encoding}{of}; messages in json, "
             "in protobuf, in cdr with ros2msg and in ros1 with ros1msg can be read."
@@ -137,16 +142,15 @@ class BagLog(_FileOfMessages):
 
     def __init__(self, path: Path) -> None:
         super().__init__(path)
+        self._version = 1 if path.suffix.lower() == ".bag" and path.is_file() else 2
+        self._kind = f"a bag of ROS {self._version}"
         with self._reader() as reader:
             self._topics = {connection.topic: connection for connection in reader.connections}
 
     @contextmanager
     def _reader(self) -> Iterator[Any]:
-        version = 1 if self._path.suffix.lower() == ".bag" and self._path.is_file() else 2
-        self._kind = f"a bag of ROS {version}"
-        library = require_extra(f"rosbags.rosbag{version}", "logs", _PURPOSE)
-        with _damage(self._path, self._kind):
-            reader = library.Reader(self._path)
+        with reading(self._path, self._kind):
+            reader = _library(f"rosbags.rosbag{self._version}").Reader(self._path)
             reader.open()
             for place, chunk in getattr(reader, "chunks", {}).items():  # of a bag of ROS 1
                 kind = next((name for name in ("bz2", "lz4") if name in chunk.decompressor.__module__), "")
@@ -162,31 +166,29 @@ class BagLog(_FileOfMessages):
         with self._reader() as reader:
             records = reader.messages([connection for connection in reader.connections if connection.topic in wanted])
             for number in itertools.count():
-                with _damage(self._path, self._kind):
+                with reading(self._path, self._kind):
                     record = next(records, None)
                 if record is None:
                     return
                 connection, time, raw = record
-                message, decoder = f"{number}, of {connection.topic}", partial(self._decoder, connection)
+                message, decoder = f"{number}, of {connection.topic}", partial(self._decoder_of, connection)
                 yield Message(connection.topic, time, time, self._decoded(connection.topic, decoder, raw, message))
 
-    def _decoder(self, connection: Any) -> Decoder:
-        definition = connection.msgdef
-        if self._kind.endswith("1"):
-            return ros1_decoder(self.source, connection.topic, connection.msgtype, definition.data)
-        if definition.format.name == "MSG":
-            return ros2_decoder(self.source, connection.topic, connection.msgtype, definition.data)
-        # Bags before ROS 2 Iron do not hold the definitions of their messages.
-        typesys = require_extra("rosbags.typesys", "logs", _PURPOSE)
-        try:
-            known = typesys.get_typestore(typesys.Stores.LATEST)
-            text, _ = known.generate_msgdef(connection.msgtype, ros_version=2)
-        except Exception as error:
-            raise InputError(
-                f"{self.source}: the definition of the messages of {connection.topic}, {connection.msgtype}, is not in "
-                "the bag, and is not one of ROS 2 itself."
-            ) from error
-        return ros2_decoder(self.source, connection.topic, connection.msgtype, text)
+    def _decoder_of(self, connection: Any) -> Decoder:
+        definition, text = connection.msgdef, connection.msgdef.data
+        if self._version == 2 and definition.format.name != "MSG":
+            # Bags before ROS 2 Iron do not hold the definitions of their messages.
+            typesys = _library("rosbags.typesys")
+            try:
+                known = typesys.get_typestore(typesys.Stores.LATEST)
+                text, _ = known.generate_msgdef(connection.msgtype, ros_version=2)
+            except Exception as error:
+                raise InputError(
+                    f"{self.source}: the definition of the messages of {connection.topic}, {connection.msgtype}, is "
+                    "not in the bag, and is not one of ROS 2 itself."
+                ) from error
+        make = ros1_decoder if self._version == 1 else ros2_decoder
+        return self._decoder(connection.topic, make, connection.msgtype, text.encode())
 
 
 def _distinct(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
@@ -203,11 +205,9 @@ def _decompressed(kind: str, data: bytes) -> bytes:
     """
     match kind:
         case "zstd":
-            zstandard = require_extra("zstandard", "logs", _PURPOSE)
-            content = zstandard.ZstdDecompressor().stream_reader(data).read(_MOST_CHUNK + 1)
+            content = _library("zstandard").ZstdDecompressor().stream_reader(data).read(_MOST_CHUNK + 1)
         case "lz4":
-            frame = require_extra("lz4.frame", "logs", _PURPOSE)
-            content = frame.LZ4FrameDecompressor().decompress(data, max_length=_MOST_CHUNK + 1)
+            content = _library("lz4.frame").LZ4FrameDecompressor().decompress(data, max_length=_MOST_CHUNK + 1)
         case "bz2":
             content = bz2.BZ2Decompressor().decompress(data, max_length=_MOST_CHUNK + 1)
         case "":
@@ -219,55 +219,30 @@ def _decompressed(kind: str, data: bytes) -> bytes:
     return bytes(content)
 
 
-@contextmanager
-def _damage(path: Path, kind: str) -> Iterator[None]:
-    """Turn the many exceptions for damaged files into one."""
-    try:
-        yield
-    except InputError:
-        raise
-    except Exception as error:
-        raise InputError(f"{path} cannot be read as {kind} ({quoted(reason_of(error))}).") from error
+# Decoders
 
 
-def ros2_decoder(source: str, topic: str, name: str, definition: str) -> Decoder:
-    """Return the decoder of ROS 2 messages with a definition."""
-    decoding = require_extra("mcap_ros2.decoder", "logs", _PURPOSE)
-    records = require_extra("mcap.records", "logs", _PURPOSE)
-    schema = records.Schema(id=1, name=name, encoding="ros2msg", data=definition.encode())
-    try:
-        with redirect_stderr(io.StringIO()):  # the parser prints the text of the file
-            decoder: Decoder | None = decoding.DecoderFactory().decoder_for("cdr", schema)
-        if decoder is None:
-            raise ValueError(name)
-        return decoder
-    except Exception as error:
-        raise InputError(f"{source}: the definition of the messages of {topic}, {name}, cannot be read.") from error
+def ros2_decoder(name: str, definition: bytes) -> Decoder:
+    """Return the decoder of ROS 2 messages."""
+    text = definition.decode("utf-8", "replace").encode()
+    schema = _library("mcap.records").Schema(id=1, name=name, encoding="ros2msg", data=text)
+    with redirect_stderr(io.StringIO()):  # the parser prints the text of the file
+        decoder: Decoder = _library("mcap_ros2.decoder").DecoderFactory().decoder_for("cdr", schema)
+    return decoder
 
 
-def protobuf_decoder(source: str, topic: str, schema: Any) -> Decoder:
-    """Return the decoder of messages in protobuf with the schema of an MCAP file, as plain dictionaries."""
-    decoding = require_extra("mcap_protobuf.decoder", "logs", "logs of messages in protobuf")
-    try:
-        decode = decoding.DecoderFactory().decoder_for("protobuf", schema)
-    except Exception as error:  # the schema of a file may be anything
-        raise InputError(
-            f"{source}: the definition of the messages of {topic}, {schema.name}, cannot be read."
-        ) from error
-    return lambda data: _fields(decode(data))
-
-
-def _fields(message: Any) -> dict[str, Any]:
-    return {
-        field.name: _plain(getattr(message, field.name))
-        for field in message.DESCRIPTOR.fields
-        if not field.has_presence or message.HasField(field.name)
-    }
+def protobuf_decoder(name: str, definition: bytes) -> Decoder:
+    """Return the decoder of messages in protobuf, as plain dictionaries."""
+    schema = _library("mcap.records").Schema(id=1, name=name, encoding="protobuf", data=definition)
+    decode = _library("mcap_protobuf.decoder").DecoderFactory().decoder_for("protobuf", schema)
+    return lambda data: _plain(decode(data))
 
 
 def _plain(value: Any) -> Any:
     if hasattr(value, "DESCRIPTOR"):
-        return _fields(value)
+        fields = value.DESCRIPTOR.fields
+        known = [field.name for field in fields if not field.has_presence or value.HasField(field.name)]
+        return {name: _plain(getattr(value, name)) for name in known}
     if isinstance(value, Mapping):
         return {str(key): _plain(item) for key, item in value.items()}
     if isinstance(value, bool | int | float | str | bytes):
@@ -275,73 +250,65 @@ def _plain(value: Any) -> Any:
     return [_plain(item) for item in value]
 
 
-# The format of each type of numbers.
-_NUMBERS = {
-    **{"bool": "?", "byte": "b", "char": "B", "int8": "b", "uint8": "B", "int16": "<h", "uint16": "<H"},
-    **{"int32": "<i", "uint32": "<I", "int64": "<q", "uint64": "<Q", "float32": "<f", "float64": "<d", "octet": "B"},
-}
-
-# The types that ROS 1 calls time and duration, by the names that rosbags gives them.
-_TIMES = {
-    "builtin_interfaces/msg/Time": [("sec", "uint32"), ("nanosec", "uint32")],
-    "builtin_interfaces/msg/Duration": [("sec", "int32"), ("nanosec", "int32")],
-}
-
-
-def ros1_decoder(source: str, topic: str, name: str, definition: str) -> Decoder:
-    """Return the decoder of ROS 1 messages with a definition."""
-    typesys = require_extra("rosbags.typesys", "logs", _PURPOSE)
-    try:
-        parsed = typesys.get_types_from_msg(definition, name)
-        types = {of: [(field, _plain_type(kind)) for field, kind in fields] for of, (_, fields) in parsed.items()}
-    except Exception as error:  # the parser raises many kinds
-        raise InputError(f"{source}: the definition of the messages of {topic}, {name}, cannot be read.") from error
-    for of, fields in _TIMES.items():
-        types.setdefault(of, [(field, ("number", _NUMBERS[kind])) for field, kind in fields])
+def ros1_decoder(name: str, definition: bytes) -> Decoder:
+    """Return the decoder of ROS 1 messages."""
+    parsed = _library("rosbags.typesys").get_types_from_msg(definition.decode("utf-8", "replace"), name)
+    types = {of: {field: _known(kind) for field, kind in fields} for of, (_, fields) in parsed.items()}
+    # The types that ROS 1 calls time and duration, by the names that rosbags gives them.
+    types.setdefault("builtin_interfaces/msg/Time", {"sec": "<u4", "nanosec": "<u4"})
+    types.setdefault("builtin_interfaces/msg/Duration", {"sec": "<i4", "nanosec": "<i4"})
     root = name if name in types else name.replace("/", "/msg/", 1)
     return lambda data: _Message(types, data).record(root, 0)
 
 
-def _plain_type(kind: Any) -> tuple[str, Any]:
-    """Return a parsed type as ``number``, ``string``, ``record``, or ``list`` with its elements and their count."""
+# The format of each type of numbers.
+_NUMBERS = {
+    **{"bool": "?", "byte": "i1", "char": "u1", "octet": "u1", "int8": "i1", "uint8": "u1", "int16": "<i2"},
+    **{"uint16": "<u2", "int32": "<i4", "uint32": "<u4", "int64": "<i8", "uint64": "<u8"},
+    **{"float32": "<f4", "float64": "<f8"},
+}
+
+
+def _known(kind: Any) -> Any:
+    """Return a parsed type as the format of a number, ``string``, ``(name,)``, or ``(elements, their count)``."""
     form, inner = kind[0].name, kind[1]
     if form == "BASE":
-        return ("string", None) if inner[0] == "string" else ("number", _NUMBERS[inner[0]])
-    if form == "NAME":
-        return "record", inner
-    return "list", (_plain_type(inner[0]), inner[1] if form == "ARRAY" else None)
+        return "string" if inner[0] == "string" else _NUMBERS[inner[0]]
+    return (inner,) if form == "NAME" else (_known(inner[0]), inner[1] if form == "ARRAY" else None)
 
 
 class _Message:
     """The bytes of one message, read from the front, with the fields of each type."""
 
-    def __init__(self, types: Mapping[str, list[tuple[str, tuple[str, Any]]]], data: bytes) -> None:
+    def __init__(self, types: Mapping[str, Mapping[str, Any]], data: bytes) -> None:
         self.types, self.data, self.place = types, data, 0
 
     def record(self, name: str, depth: int) -> dict[str, Any]:
         if depth > 32:
             raise ValueError(f"{name} is nested too deeply")
-        return {field: self.value(kind, depth + 1) for field, kind in self.types[name]}
+        return {field: self.value(kind, depth + 1) for field, kind in self.types[name].items()}
 
-    def value(self, kind: tuple[str, Any], depth: int) -> Any:
-        form, inner = kind
-        if form == "number":
-            return struct.unpack(inner, self.taken(struct.calcsize(inner)))[0]
-        if form == "string":
-            return self.taken(self.length()).decode("utf-8", "replace")
-        if form == "record":
-            return self.record(inner, depth)
-        element, count = inner
+    def value(self, kind: Any, depth: int) -> Any:
+        match kind:
+            case "string":
+                return self.taken(self.length()).decode("utf-8", "replace")
+            case str():
+                return self.numbers(kind, 1)[0].item()
+            case (name,):
+                return self.record(name, depth)
+        element, count = kind
         count = self.length() if count is None else count
-        if element[0] == "number":
-            whole = self.taken(count * struct.calcsize(element[1]))
-            return np.frombuffer(whole, dtype=np.dtype(element[1]))
+        if isinstance(element, str) and element != "string":
+            return self.numbers(element, count)
         if count > len(self.data):
             raise ValueError(f"a list of {count} elements is longer than its message")
         return [self.value(element, depth) for _ in range(count)]
 
     def length(self) -> int:
-        return int(struct.unpack("<I", self.taken(4))[0])
+        return int(self.numbers("<u4", 1)[0])
+
+    def numbers(self, kind: str, count: int) -> Array:
+        return np.frombuffer(self.taken(count * np.dtype(kind).itemsize), dtype=kind)
 
     def taken(self, count: int) -> bytes:
         part = self.data[self.place : self.place + count]
@@ -349,3 +316,10 @@ class _Message:
             raise ValueError("the message is shorter than its definition")
         self.place += count
         return part
+
+
+_DECODERS: dict[tuple[str, str | None], Callable[[str, bytes], Decoder]] = {
+    ("cdr", "ros2msg"): ros2_decoder,
+    ("ros1", "ros1msg"): ros1_decoder,
+    ("protobuf", "protobuf"): protobuf_decoder,
+}

@@ -10,12 +10,12 @@ from typing import Any
 
 import numpy as np
 
-from ctxval._util.arrays import Rows
+from ctxval._util.arrays import Array, Rows
 from ctxval._util.columns import FAR, sentinels, time_column, unit_advice
 from ctxval._util.representation import ShortRepr, counted
 from ctxval._util.units import conversion
 from ctxval.core.trajectory import Trajectory, Transitions
-from ctxval.data.log import Log, Table
+from ctxval.data.log import Log, Signal, Table
 from ctxval.data.mapping import LogMapping
 from ctxval.data.readers import is_lerobot, lerobot_names, read_logs
 from ctxval.data.sampling import Break, Channel, sampled
@@ -24,13 +24,7 @@ from ctxval.errors import InputError
 
 @dataclass(frozen=True, eq=False)
 class Recording(ShortRepr):
-    """A part of a log without gaps, at equal steps.
-
-    Attributes:
-        source: the file, and the episode in it.
-        start: the time at which it begins in the log, seconds.
-        trajectory: the states and inputs; its times begin at 0.
-    """
+    """A part of a log without gaps, at equal steps; it begins in the log at ``start``, and its own times begin at 0."""
 
     source: str
     start: float
@@ -87,15 +81,15 @@ def read_recordings(
     """
     logs = read_logs(paths)
     chosen = LogMapping.usual(logs[0], states, inputs) if mapping is None else mapping
-    names: dict[str, list[str]] = {}
+    names: Mapping[str, list[str]] = {}
     if mapping is None and len(paths) == 1 and is_lerobot(Path(paths[0])):
         with suppress(InputError, AttributeError, TypeError):  # names are only labels
-            names = dict(lerobot_names(Path(paths[0])))
+            names = lerobot_names(Path(paths[0]))
     return recordings_of(logs, replace(chosen.in_units(states or {}, inputs or {}), **changes), names)
 
 
 def recordings_of(
-    logs: Sequence[Log], mapping: LogMapping | None = None, names: dict[str, list[str]] | None = None
+    logs: Sequence[Log], mapping: LogMapping | None = None, names: Mapping[str, list[str]] | None = None
 ) -> Recordings:
     """Return the recordings in logs; ``names`` are those of the components of vector fields, if they are known."""
     chosen = LogMapping.usual(logs[0]) if mapping is None else mapping
@@ -124,21 +118,31 @@ def recordings_of(
         runs += [Recording(log.source, start, trajectory) for start, trajectory in parts]
         breaks += gaps
     if dt is None or not runs:
-        why = "; ".join(str(one) for one in breaks[:3])
+        why = "; ".join(map(str, breaks[:3]))
         raise InputError(f"no log has two samples of all states and inputs in a row: {why or 'they are empty'}.")
-    states, inputs = ({one.name: one.unit for one in first if one.of_input == of_input} for of_input in (False, True))
-    whole = (*_notes(chosen, dt, first), *dict.fromkeys(notes))
-    return Recordings(tuple(runs), tuple(breaks), dt, states, inputs, whole)
+    how = [] if chosen.dt is not None else [f"the time step {dt:g} s is the mean period of {first[0].path}"]
+    how += [
+        f"{channel.name} is recorded every {channel.period:.3g} s, less often than every step of {dt:g} s: its values "
+        "between two samples are interpolated"
+        for channel in first
+        if not channel.of_input and channel.period > 1.2 * dt
+    ]
+    if chosen.delay:
+        how.append(f"inputs act {chosen.delay:g} s after they are logged")
+    states, inputs = (
+        {channel.name: channel.unit for channel in first if channel.of_input == of_input} for of_input in (False, True)
+    )
+    return Recordings(tuple(runs), tuple(breaks), dt, states, inputs, (*how, *dict.fromkeys(notes)))
 
 
-def _channels(log: Log, mapping: LogMapping, names: dict[str, list[str]], notes: list[str]) -> list[Channel]:
+def _channels(log: Log, mapping: LogMapping, names: Mapping[str, list[str]], notes: list[str]) -> list[Channel]:
     """Return the components of all states and inputs over time; sentences on how they were read are added to notes."""
     clock, condition = mapping.clock, mapping.condition
-    if clock.field is None and isinstance(log, Table) and time_column(log.source, log.names()) is None:
+    if clock.field is None and isinstance(log, Table) and time_column(log.source, log.fields()) is None:
         clock = replace(clock, period=mapping.dt)
     paths = [field.path for field in mapping.fields.values()]
     signals = log.signals([*paths, *([condition[0]] if condition else [])], clock)
-    channels = []
+    channels: list[Channel] = []
     for name, field in mapping.fields.items():
         signal = signals[field.path]
         values = signal.values.copy()
@@ -152,27 +156,16 @@ def _channels(log: Log, mapping: LogMapping, names: dict[str, list[str]], notes:
             notes.append(f"the times of messages are {moment.get(signal.clock, 'their header stamps')}")
         components = names.get(field.path, [])
         width, scale = values.shape[1], field.scale(signal.unit)
-        for k in range(width):
+        for k, column in enumerate(values.T):
             label = components[k] if len(components) == width else (name if width == 1 else f"{name}{k}")
-            for value in sentinels(values[:, k], scale):
-                rows_of_value = values[:, k] == value
-                notes.append(
-                    f"{log.source}: {label} is {value:g} in {counted(int(rows_of_value.sum()), signal.word)}, far from "
-                    "all other values: it is taken as missing"
-                )
-                values[rows_of_value, k] = np.nan
-            known = np.abs(values[:, k][np.isfinite(values[:, k])])
-            if (largest := float(known.max(initial=0.0))) > 1e100:  # squares of errors must be finite
-                raise InputError(
-                    f"{log.source}: {label} must be at most 1e+100, got {largest:g}; leave out missing values."
-                )
+            _without_marks(f"{log.source}: {label}", column, scale, signal, notes)
             channels.append(
                 Channel(
                     label,
                     field.unit or (signal.unit if field.factor is None else ""),
                     name in mapping.inputs,
                     signal.times,
-                    scale * values[:, k] + field.offset,
+                    scale * column + field.offset,
                     angle=field.angle,
                     held=field.held,
                     path=field.path,
@@ -185,6 +178,20 @@ def _channels(log: Log, mapping: LogMapping, names: dict[str, list[str]], notes:
         replace(channel, name=f"{channel.name} command") if channel.of_input and channel.name in states else channel
         for channel in channels
     ]
+
+
+def _without_marks(name: str, column: Array, scale: float, signal: Signal, notes: list[str]) -> None:
+    """Replace marks of missing values by NaN; note them."""
+    for value in sentinels(column, scale):
+        marked = column == value
+        notes.append(
+            f"{name} is {value:g} in {counted(int(marked.sum()), signal.word)}, far from all other values: it is taken "
+            "as missing"
+        )
+        column[marked] = np.nan
+    largest = float(np.abs(column[np.isfinite(column)]).max(initial=0.0))
+    if largest > 1e100:  # squares of errors must be finite
+        raise InputError(f"{name} must be at most 1e+100, got {largest:g}; leave out missing values.")
 
 
 def _in_unit_of(log: Log, channel: Channel, first: Channel) -> Channel:
@@ -211,17 +218,3 @@ def _period(log: Log, channel: Channel) -> float:
     rounded = float(f"{period:.6g}")
     # A rounded step must not drift away from the samples over the whole recording.
     return rounded if abs(rounded - period) * counts.sum() < 1e-3 * period else period
-
-
-def _notes(mapping: LogMapping, dt: float, channels: Sequence[Channel]) -> Iterable[str]:
-    if mapping.dt is None:
-        yield f"the time step {dt:g} s is the mean period of {channels[0].path}"
-    for channel in channels:
-        period = channel.period
-        if not channel.of_input and period > 1.2 * dt:
-            yield (
-                f"{channel.name} is recorded every {period:.3g} s, less often than every step of {dt:g} s: its values "
-                "between two samples are interpolated"
-            )
-    if mapping.delay:
-        yield f"inputs act {mapping.delay:g} s after they are logged"

@@ -23,7 +23,6 @@ class Break:
     """A place at which a log was split.
 
     Attributes:
-        source: the file, and the episode in it.
         time: the time of the last sample before it in the log, seconds.
         seconds: the time that is left out; 0 if the times go back.
         field: the name of the state or input.
@@ -45,7 +44,6 @@ class Channel(ShortRepr):
     """One state or input over time, in the unit of the model.
 
     Attributes:
-        name, unit: its name and its unit.
         of_input: whether it is an input, which holds until the next sample; a state is interpolated.
         times, values: its samples, shape ``(N,)``; NaN where there is no value.
         angle: whether it is an angle that is continued over turns.

@@ -22,12 +22,9 @@ _MOST_MEMORY = 2**30  # largest size of the numbers of a log in bytes; each mess
 
 @dataclass(frozen=True, eq=False)
 class Message(ShortRepr):
-    """One message of a topic.
+    """One message of a topic, and when it was recorded and sent, in nanoseconds.
 
-    Attributes:
-        topic: its topic.
-        logged, published: when it was recorded and sent, nanoseconds.
-        content: its decoded fields: a mapping, or an object with an attribute for each field.
+    The content is a mapping, or an object with an attribute for each field.
     """
 
     topic: str
@@ -72,36 +69,35 @@ class TopicLog(Log):
                     size += 256 + values[field][-1].nbytes
             if size > _MOST_MEMORY:
                 raise InputError(f"{self.source} has too many numbers: {_MOST_MEMORY} bytes of memory may be used.")
-        for topic, unsorted in stamps.items():
-            order = sorted(range(len(unsorted)), key=[stamp["log"] or 0 for stamp in unsorted].__getitem__)
-            stamps[topic] = [unsorted[k] for k in order]
-            values |= {field: [values[field][k] for k in order] for field, (of, _) in split.items() if of == topic}
+        orders = {
+            topic: sorted(range(len(unsorted)), key=[stamp["log"] or 0 for stamp in unsorted].__getitem__)
+            for topic, unsorted in stamps.items()
+        }
+        stamps = {topic: [stamps[topic][k] for k in order] for topic, order in orders.items()}
         chosen = ("header" if _plausible(stamps) else "log") if clock.stamp == "auto" else clock.stamp
-        times = {topic: [stamp[chosen] for stamp in of_topic] for topic, of_topic in stamps.items()}
+        times: dict[str, list[Any]] = {topic: [stamp[chosen] for stamp in of] for topic, of in stamps.items()}
         for topic, of_topic in times.items():
             if None in of_topic:
                 raise InputError(
                     f"{self.source}, message {of_topic.index(None)} of {topic}: it has no header.stamp or timestamp."
                 )
-        origin = min((min(of_topic) for of_topic in times.values() if of_topic), default=0)  # type: ignore[type-var]
-        return {
-            field: self._signal(field, times[topic], values[field], origin, chosen)  # type: ignore[arg-type]
-            for field, (topic, _) in split.items()
-        }
-
-    def _signal(self, field: str, times: list[int], values: list[Array], origin: int, clock: str) -> Signal:
-        if not times:
-            raise InputError(f"{self.source} has no message with the field {field!r}.")
-        widths = [len(value) for value in values]
-        if len(set(widths)) > 1:
-            row = next(i for i, width in enumerate(widths) if width != widths[0])
-            raise InputError(
-                f"{self.source}, message {row} of {field}: it must have {widths[0]} numbers, got {widths[row]}."
-            )
-        seconds = np.array([1e-9 * (time - origin) for time in times])
-        _, unit, weak = named_unit(field)
-        stated = "" if weak else unit
-        return Signal(seconds, np.array(values).reshape(len(times), -1), 0, "message", stated, clock)
+        origin = min((min(of_topic) for of_topic in times.values() if of_topic), default=0)
+        signals = {}
+        for field, (topic, _) in split.items():
+            if not times[topic]:
+                raise InputError(f"{self.source} has no message with the field {field!r}.")
+            ordered = [values[field][k] for k in orders[topic]]
+            widths = [len(value) for value in ordered]
+            if len(set(widths)) > 1:
+                row = next(i for i, width in enumerate(widths) if width != widths[0])
+                raise InputError(
+                    f"{self.source}, message {row} of {field}: it must have {widths[0]} numbers, got {widths[row]}."
+                )
+            seconds = np.array([1e-9 * (time - origin) for time in times[topic]])
+            _, unit, weak = named_unit(field)
+            array = np.array(ordered).reshape(len(seconds), -1)
+            signals[field] = Signal(seconds, array, 0, "message", "" if weak else unit, chosen)
+        return signals
 
     def _split(self, field: str) -> tuple[str, tuple[str | int, ...]]:
         for topic in sorted(self.topics(), key=len, reverse=True):
@@ -135,7 +131,7 @@ def _header(content: Any) -> int | None:
     return None if whole is None or part is None else int(whole) * 10**9 + int(part)
 
 
-def _plausible(stamps: Mapping[str, Sequence[Mapping[str, int | None]]]) -> bool:
+def _plausible(stamps: Mapping[str, Sequence[Mapping[str, Any]]]) -> bool:
     """Return whether all messages have stamps that increase on each topic and agree with the log times up to 1 s.
 
     The stamps may be those of another clock, such as that of a simulator, if it is the same one for all topics.
@@ -143,9 +139,9 @@ def _plausible(stamps: Mapping[str, Sequence[Mapping[str, int | None]]]) -> bool
     late = list[int]()
     for of_topic in stamps.values():
         headers = [stamp["header"] for stamp in of_topic]
-        if None in headers or any(b <= a for a, b in pairwise(headers)):  # type: ignore[operator]
+        if None in headers or any(b <= a for a, b in pairwise(headers)):
             return False
-        late += [stamp["log"] - stamp["header"] for stamp in of_topic]  # type: ignore[operator]
+        late += [stamp["log"] - stamp["header"] for stamp in of_topic]
     return bool(late) and max(late) - min(late) <= 10**9
 
 

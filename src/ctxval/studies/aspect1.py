@@ -36,20 +36,13 @@ from ctxval.searches import Search, by_name
 __all__ = ["Aspect1Report", "SimulatedTask", "check", "completion"]
 
 TASKS = 100  # number of simulated tasks, unless another one is given
-SEARCH = "bayesian-optimisation"
-"""The search, unless another one is given. Learned dynamics could not teach it anything, because M is known."""
-
-_NEIGHBOURS = 20  # number of tasks beside which another one is planned: the worst ones and spread ones, half of each
 
 
 @dataclass(frozen=True, eq=False)
 class SimulatedTask:
-    """A task on M.
+    """A task on M, and how far M is from completing it.
 
-    Attributes:
-        parameters: the task parameters.
-        error: how far M is from completing it; None if no controller could be designed, or if M diverges.
-        reason: why there is no error; empty if there is one.
+    There is no error, but a reason, if no controller could be designed, or if M diverges.
     """
 
     parameters: dict[str, Any]
@@ -116,24 +109,21 @@ class Aspect1Report:
 
     def to_json(self) -> dict[str, Any]:
         """Return all results as plain values."""
-        shares = None if self.saturation is None else self.saturation.shares.tolist()
+        flips, saturation, verdict = self.flips, self.saturation, self.verdict
+        shares = saturation and dict(zip(self.inputs, saturation.shares.tolist(), strict=False))
         return {
             "distance": repr(self.distance),
-            "units": self.units,
-            "threshold": self.threshold,
+            **{name: getattr(self, name) for name in ("units", "threshold", "completes", "distribution", "designs")},
             "tasks": len(self.simulated),
             "worst": asdict(self.worst),
-            "exceeding": self.exceeding if self.threshold is not None or self.failed else None,
-            "completes": self.completes,
+            "exceeding": None if self.completes is None else self.exceeding,
             "failed": [asdict(task) for task in self.failed],
-            "verdict": None if self.verdict is None else self.verdict.answer,
-            "bound": None if self.verdict is None else self.verdict.bound,
+            "verdict": verdict and verdict.answer,
+            "bound": verdict and verdict.bound,
             "share_at_most": self.share,
-            "distribution": self.distribution,
-            "flips": None if self.flips is None else {**asdict(self.flips), "example": self.flipped},
-            "saturation": None if shares is None else dict(zip(self.inputs, shares, strict=False)),
+            "flips": flips and {**asdict(flips), "example": self.flipped},
+            "saturation": shares,
             "not_converged": list(self.not_converged),
-            "designs": self.designs,
         }
 
 
@@ -161,7 +151,8 @@ def check(
     """
     measured = completion(validation) if distance is None else distance
     on_model = validation.on_model(measured, units=None if distance is None else "")
-    campaign = Campaign(on_model, search=by_name(SEARCH) if search is None else search, seed=seed)
+    # Learned dynamics could not teach the search anything, because M is known.
+    campaign = Campaign(on_model, search=by_name("bayesian-optimisation") if search is None else search, seed=seed)
     with stage("simulating tasks on the model", tasks, "tasks"):
         while (done := len(campaign.trials)) < tasks:  # a task without a closed loop counts, too
             with warnings.catch_warnings(), contextlib.suppress(DesignError, ModelError):  # stored with the reason
@@ -204,11 +195,12 @@ def completion(validation: Validation) -> Distance:
 
 def _report(campaign: Campaign, distance: Distance, threshold: float | None, seed: int) -> Aspect1Report:
     validation, share, verdict = campaign.validation, None, None
-    if threshold is not None and campaign.completed:
-        verdict = campaign.verdict(threshold, certificate=CertificateOptions(Posterior()))
-    if threshold is not None:  # the upper bound of Clopper and Pearson (1934)
+    if threshold is not None:
+        if campaign.completed:
+            verdict = campaign.verdict(threshold, certificate=CertificateOptions(Posterior()))
         drawn = [trial for trial in campaign.trials if trial.origin == "iid"]
         missed = sum(trial.distance is None or trial.distance > threshold for trial in drawn)
+        # The upper bound of Clopper and Pearson (1934).
         share = volume_bound(len(drawn), missed, 1 - CONFIDENCE) if missed < len(drawn) else 1.0
     ordered = sorted(campaign.trials, key=lambda trial: -np.inf if trial.distance is None else -trial.distance)
     done = np.array([trial.unit_point for trial in ordered if trial.distance is not None])
@@ -239,8 +231,7 @@ def _with_neighbours(points: Array, rng: np.random.Generator) -> Array:
     """Return points of the unit cube ``(N, d)``, the worst first, after neighbours of the worst and of spread ones."""
     if not len(points):
         return points
-    half = _NEIGHBOURS // 2
-    chosen = np.concatenate([points[:half], points[:: max(1, len(points) // half)][:half]])
+    chosen = np.concatenate([points[:10], points[:: max(1, len(points) // 10)][:10]])
     directions = rng.normal(size=chosen.shape)
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     # 0.03 diagonals of the task space; a step that would leave the cube goes the other way.
@@ -250,15 +241,12 @@ def _with_neighbours(points: Array, rng: np.random.Generator) -> Array:
 
 
 def _planned(validation: Validation, points: Array) -> dict[int, Plan]:
-    """Return the plans of points by row, without those that fail; only the chosen ones if designs are slow."""
+    """Return the plans of points by row, without those that fail; if designs are slow, only of neighbours."""
     batched = bool(getattr(validation.synthesizer, "batched", False))
-    rows = list(range(len(points) if batched else min(len(points), 2 * _NEIGHBOURS)))
-    space = validation.space
-    try:
+    rows = range(len(points) if batched else min(len(points), 40))
+    space, plans = validation.space, dict[int, Plan]()
+    with contextlib.suppress(CtxvalError):
         return dict(zip(rows, validation.plans(space.from_unit(points[rows])), strict=True)) if rows else {}
-    except CtxvalError:
-        pass
-    plans = dict[int, Plan]()
     for row in rows:
         with contextlib.suppress(DesignError, ModelError):
             plans[row] = validation.plan(space.from_unit(points[row]))

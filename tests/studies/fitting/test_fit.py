@@ -95,11 +95,11 @@ def test_what_recordings_do_not_determine_is_said() -> None:
     rng = np.random.default_rng(0)
     x = rng.normal(size=(300, 2))
     feedback = -x[:, :1] + 1e-3 * rng.normal(size=(300, 1))
-    (sentence,) = identifiability(Transitions(x, feedback, x), ["angle", "rate", "torque"])
+    sentence = identifiability(Transitions(x, feedback, x), ["angle", "rate", "torque"])
     assert sentence.startswith("angle and torque nearly depend on each other in these recordings")
-    (sentence,) = identifiability(Transitions(x, 0 * feedback, x), ["angle", "rate", "torque"])
+    sentence = identifiability(Transitions(x, 0 * feedback, x), ["angle", "rate", "torque"])
     assert sentence == "torque never changes, so its coefficients are not determined"
-    (sentence,) = identifiability(Transitions(x, rng.normal(size=(300, 1)), x), ["angle", "rate", "torque"])
+    sentence = identifiability(Transitions(x, rng.normal(size=(300, 1)), x), ["angle", "rate", "torque"])
     assert "vary independently enough" in sentence
 
 
@@ -216,6 +216,21 @@ def test_a_written_onnx_file_computes_the_same(kind: Any, tmp_path: Path) -> Non
     np.testing.assert_allclose(read.step(x, u[:, :1]), learned.step(x, u[:, :1]), rtol=1e-12, atol=1e-12)
     with pytest.raises(InputError, match="only linear models, networks, Gaussian processes and corrections of these"):
         write_onnx(tmp_path / "other.onnx", models.Function(lambda x, u: x))
+
+
+def test_a_correction_of_a_corrected_model_can_be_written_as_onnx(tmp_path: Path) -> None:
+    pytest.importorskip("onnxruntime")
+    rng = np.random.default_rng(0)
+    correction = models.Correction(
+        *(np.zeros(3), np.ones(3), rng.normal(size=(4, 3)), np.ones(3), rng.normal(size=(4, 2))),
+        *(rng.normal(size=(4, 2)), -np.ones(3), np.ones(3), np.ones(3), np.ones(2)),
+    )
+    first = models.Linear([[1, DT], [0, 1]], [[0], [DT]])
+    twice = models.Corrected(models.Corrected(first, correction), correction)
+    write_onnx(tmp_path / "twice.onnx", twice)
+    x, u = 2 * rng.normal(size=(2, 9, 2))
+    read = models.Onnx(str(tmp_path / "twice.onnx")).step(x, u[:, :1])
+    np.testing.assert_allclose(read, twice.step(x, u[:, :1]), rtol=1e-12, atol=1e-12)
 
 
 @pytest.mark.parametrize(

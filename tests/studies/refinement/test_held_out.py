@@ -83,7 +83,7 @@ def errors_by_speed(count: int = 2000) -> HeldOut:
     rng = np.random.default_rng(0)
     pairs = rng.uniform(-2, 2, (count, 3))
     errors = 0.01 * rng.normal(size=(count, 2)) * np.where(pairs[:, 1:2] > 1, 10, 1)
-    return HeldOut(pairs, errors, errors, rng.normal(size=(count, 2)), np.zeros(count))
+    return HeldOut(pairs, errors, errors, rng.normal(size=(count, 2)))
 
 
 def test_regions_separate_large_residuals_from_small_ones() -> None:
@@ -108,7 +108,7 @@ def test_the_largest_residual_of_a_region_is_measured_in_it() -> None:
 
 def test_residuals_of_zero_have_one_region() -> None:
     given = errors_by_speed()
-    zero = HeldOut(given.pairs, 0 * given.errors, given.before, given.changes, given.groups)
+    zero = HeldOut(given.pairs, 0 * given.errors, given.before, given.changes)
     found = measure_residual(zero, {"a": "", "b": ""}, {"c": ""})
     assert len(found.regions) == 1
     assert "everywhere" in found.text

@@ -1,9 +1,11 @@
-"""The candidates of a comparison: campaigns on one system, what their stores keep of it, and their predictions."""
+"""The candidates of a comparison, which are campaigns on one system, their predictions, and their executions."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
@@ -13,12 +15,14 @@ from ctxval._util.arrays import Array
 from ctxval._util.describe import describe, differences
 from ctxval._util.progress import stage
 from ctxval.campaign.campaign import Campaign
-from ctxval.campaign.history import executed_trials
-from ctxval.campaign.trials import TrialRecorder
+from ctxval.campaign.choices import Choice
+from ctxval.campaign.execution import RetryPolicy, Schedule, execute_schedule
+from ctxval.campaign.history import executed_trials, largest_distance
+from ctxval.core.plan import gives_inputs
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import Trial
 from ctxval.core.validation import Validation
-from ctxval.errors import InputError
+from ctxval.errors import CtxvalError, DistanceError, InputError
 from ctxval.learning import DynamicsStudy
 from ctxval.searches import Prediction
 
@@ -27,13 +31,15 @@ Question = Literal["worst", "mean"]
 Executed = Sequence[tuple[Array, Trajectory]]
 """Executed tasks, points of the unit cube ``(d,)``, with the system's trajectories."""
 
+OnTrial = Callable[[str, Trial], None]
+"""Called with the name of a candidate and each of its trials that has ended."""
+
 
 @dataclass(frozen=True)
 class Decision:
     """A decision that one candidate has the smaller d*.
 
     Attributes:
-        smaller, larger: the names of the candidates.
         bound: what d* of the smaller one is at most.
         distance: the executed distance of the larger one that this bound does not exceed.
         certificate: the kind of the certificate of the bound.
@@ -102,13 +108,9 @@ class Candidate:
 
     def __post_init__(self) -> None:
         validation = self.campaign.validation
+        self.recorder = self.campaign.recorder
         self._space, self._study = validation.space, DynamicsStudy(validation, self.seed)
         self._batched = bool(getattr(validation.synthesizer, "batched", False))
-
-    @property
-    def recorder(self) -> TrialRecorder:
-        """The recorder of the trials."""
-        return self.campaign.recorder
 
     @property
     def trials(self) -> tuple[Trial, ...]:
@@ -123,22 +125,20 @@ class Candidate:
     @property
     def largest(self) -> float:
         """The largest executed distance; 0 if there is none."""
-        return max((trial.distance for trial in self.trials if trial.distance is not None), default=0.0)
+        return largest_distance(self.trials)
 
     def executed(self, *, shared: bool = False) -> list[Trial]:
         """Return the trials whose execution has ended, with or without success: its own, or those of others."""
         return [trial for trial in self.trials if trial.executed and is_shared(trial) == shared]
 
-    def trajectories(self) -> Iterator[tuple[Trial, Trajectory]]:
-        """Yield the completed trials with a recorded trajectory; each trajectory is read once."""
+    def trajectories(self) -> list[tuple[Trial, Trajectory]]:
+        """Return the completed trials with a recorded trajectory; each trajectory is read once."""
         completed = [trial for trial in self.trials if trial.state == "completed"]
-        unread = [trial for trial in completed if trial.number not in self._trajectories]
-        if unread:
+        if unread := [trial for trial in completed if trial.number not in self._trajectories]:
             read = executed_trials(self.campaign.store, unread)
             self._trajectories.update((trial.number, trajectory) for trial, trajectory in read)
-        for trial in completed:
-            if trial.number in self._trajectories:
-                yield trial, self._trajectories[trial.number]
+        known = self._trajectories
+        return [(trial, known[trial.number]) for trial in completed if trial.number in known]
 
     def highest(self, executed: Executed) -> tuple[float, Array] | None:
         """Return the largest predicted distance and its task ``(d,)``; None if nothing can be predicted."""
@@ -190,6 +190,145 @@ def is_shared(trial: Trial) -> bool:
     """Return whether the execution of a trial is that of another candidate."""
     note = TrialNote.of(trial)
     return note is not None and note.shared is not None
+
+
+@dataclass(eq=False)
+class Executions:
+    """Executes tasks one at a time, and records each execution for all candidates whose controllers agree.
+
+    Attributes:
+        candidates: the candidates.
+        most: a number that no distance can exceed; None if none is stated.
+        on_trial: called with each trial that has ended.
+        decided: the decisions on d* so far, by the names of the candidates; each new trial keeps them in its note.
+    """
+
+    candidates: Sequence[Candidate]
+    most: float | None = None
+    on_trial: OnTrial | None = None
+    decided: dict[tuple[str, str], Decision] = field(default_factory=dict, init=False)
+    _examined: set[tuple[str, int, str]] = field(default_factory=set, init=False)
+    _hidden: Array | None = field(default=None, init=False)
+
+    def __post_init__(self) -> None:
+        for candidate in self.candidates:
+            candidate.recorder.dynamics.elsewhere = partial(self._elsewhere, candidate)
+            for _, note in candidate.noted:
+                self.decided |= {(decision.smaller, decision.larger): decision for decision in note.decided}
+
+    @property
+    def count(self) -> int:
+        """The number of executions of S that have ended; a shared execution counts once."""
+        return sum(len(candidate.executed()) for candidate in self.candidates)
+
+    @property
+    def steps(self) -> int:
+        """The number of executions that this comparison has started."""
+        return max((note.step + 1 for candidate in self.candidates for _, note in candidate.noted), default=0)
+
+    def history(self, without: Array | None = None) -> list[tuple[Array, Trajectory]]:
+        """Return all executed tasks but one in the order in which they were executed, each execution once."""
+        executed = []
+        for row, candidate in enumerate(self.candidates):
+            for trial, trajectory in candidate.trajectories():
+                if (without is None or not np.array_equal(trial.unit_point, without)) and not is_shared(trial):
+                    note = TrialNote.of(trial)
+                    order = (-1 if note is None else note.step, row, trial.number)
+                    executed.append((order, trial.unit_point, trajectory))
+        return [(point, trajectory) for _, point, trajectory in sorted(executed, key=lambda item: item[0])]
+
+    def predicted(self, candidate: Candidate, note: TrialNote, point: Array) -> TrialNote:
+        """Return the note of a draw with what the executions of all other tasks predict for a candidate."""
+        prediction = candidate.of_draw(self.history(without=point), point, note.draw or 0, self.most)
+        value, centre = prediction or (None, None)
+        return TrialNote(note.step, "mean", note.draw, value, centre)
+
+    def execute(self, candidate: Candidate, choice: Choice, note: TrialNote, *, predicts: bool) -> None:
+        """Execute one task, and record the execution for the others."""
+        stored = {**(choice.note or {}), **self._stored(note)}
+        self._run(candidate, replace(choice, note=stored, planned_draws=0), predicts)
+        self._share_all()
+
+    def resume(self) -> None:
+        """End what was interrupted: repeat interrupted executions, and record those that are shared."""
+        for candidate in self.candidates:
+            candidate.campaign.refresh()
+            if candidate.recorder.interrupted is not None:
+                self._run(candidate, None, False)
+        self._share_all()
+
+    def _stored(self, note: TrialNote) -> dict[str, Any]:
+        return replace(note, decided=tuple(self.decided.values())).to_note()
+
+    def _run(self, candidate: Candidate, choice: Choice | None, predicts: bool) -> None:
+        waiting = [] if choice is None else [choice]
+        schedule = Schedule(candidate.recorder, lambda: waiting.pop() if waiting else None, expected=None)
+        with candidate.recorder.predicting(predicts), self._hiding(None if choice is None else choice.unit_point):
+            execute_schedule(schedule, None, lambda trial: self._ended(candidate, trial), RetryPolicy())
+
+    def _ended(self, candidate: Candidate, trial: Trial) -> None:
+        if self.on_trial is not None:
+            self.on_trial(candidate.name, trial)
+
+    def _share_all(self) -> None:
+        """Record executions for the candidates that would have given the system the same inputs."""
+        for candidate in self.candidates:
+            for trial, trajectory in candidate.trajectories():
+                note = TrialNote.of(trial)
+                if note is None or note.shared is not None:
+                    continue
+                for other in self.candidates:
+                    key = (candidate.name, trial.number, other.name)
+                    if other is not candidate and key not in self._examined:
+                        self._examined.add(key)
+                        self._share(trial, trajectory, replace(note, shared=key[:2]), other)
+
+    def _share(self, trial: Trial, trajectory: Trajectory, note: TrialNote, other: Candidate) -> None:
+        same = [known for known in other.trials if np.array_equal(known.unit_point, trial.unit_point)]
+        copy = same[-1] if same else None
+        if copy is not None and (copy.state != "open" or copy.attempts):
+            return
+        try:
+            plan = other.recorder.plan(trial)
+        except CtxvalError:  # this candidate has no controller for the task
+            return
+        if not gives_inputs(plan, trajectory, 1e-9):
+            return
+        with other.campaign.store.sole_writer(), self._hiding(trial.unit_point):
+            if copy is None:
+                of_draw = note.question == "mean"
+                made = self.predicted(other, note, trial.unit_point) if of_draw else replace(note, predicted=None)
+                stored, parameters = self._stored(replace(made, shared=note.shared)), trial.parameters
+                choice = Choice(trial.unit_point, trial.origin, planned_draws=0, note=stored, parameters=parameters)
+                with other.recorder.predicting(not of_draw):
+                    copy = other.recorder.open(choice).trial
+            try:
+                ended = other.recorder.complete(copy, other.recorder.validation.accept(plan, trajectory), trajectory)
+            except DistanceError:  # it is stored as unmeasured
+                return
+        self._ended(other, ended)
+
+    @contextmanager
+    def _hiding(self, point: Array | None) -> Iterator[None]:
+        """Leave out the executions of a task from what predictions of its execution are learned from."""
+        before, self._hidden = self._hidden, point
+        try:
+            yield
+        finally:
+            self._hidden = before
+
+    def _elsewhere(self, candidate: Candidate) -> list[Trajectory]:
+        """Return the executions that are in no trial of a candidate."""
+        copied = {note.shared for _, note in candidate.noted}
+        return [
+            trajectory
+            for other in self.candidates
+            if other is not candidate
+            for trial, trajectory in other.trajectories()
+            if not is_shared(trial)
+            and (other.name, trial.number) not in copied
+            and (self._hidden is None or not np.array_equal(trial.unit_point, self._hidden))
+        ]
 
 
 def require_comparable(candidates: Mapping[str, Validation]) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
 from itertools import combinations
@@ -21,8 +21,7 @@ from ctxval.core.task_distribution import distribution_text
 from ctxval.core.validation import Validation
 from ctxval.errors import InputError
 from ctxval.searches import Auto
-from ctxval.studies.comparison.candidates import Candidate, Question, require_comparable
-from ctxval.studies.comparison.executions import Executions, OnTrial
+from ctxval.studies.comparison.candidates import Candidate, Executions, OnTrial, Question, require_comparable
 from ctxval.studies.comparison.questions import MeanQuestion, WorstQuestion
 from ctxval.studies.comparison.result import CandidateResult, Comparison
 
@@ -84,7 +83,7 @@ def compare(
         path = None if stores is None else Path(stores) / f"{store_name(name)}.sqlite"
         return Campaign(validation, search=Auto(thinking="fast"), store=path, seed=seed, name=name)
 
-    made = [Candidate(str(name), campaign(str(name), one), seed) for name, one in candidates.items()]
+    made = [Candidate(str(name), campaign(str(name), compared), seed) for name, compared in candidates.items()]
     require_comparable({candidate.name: candidate.campaign.validation for candidate in made})
     questions: tuple[Question, ...] = ("worst", "mean") if question == "both" else (question,)
     each = 1 - (1 - confidence) / len(questions)
@@ -113,20 +112,21 @@ class _Race:
 
     def run(self) -> Comparison:
         """Execute the task that is expected to decide most, until all pairs are decided or the budget is spent."""
+        executions, candidates = self.executions, self.executions.candidates
         self._require_possible()
         with ExitStack() as stack:
-            for candidate in self.executions.candidates:
+            for candidate in candidates:
                 stack.enter_context(candidate.campaign.store.sole_writer())
-            with stage("comparing", self.budget, "executions", done=self.executions.count):
-                self.executions.resume()
+            with stage("comparing", self.budget, "executions", done=executions.count):
+                executions.resume()
                 while self._step():
                     advance()
-        candidates = self.executions.candidates
         asked: dict[Question, WorstQuestion | MeanQuestion] = {"worst": self.worst, "mean": self.mean}
         pairs = tuple(asked[name].pair(*pair) for name in self.questions for pair in combinations(candidates, 2))
         results, units = tuple(map(self._result, candidates)), candidates[0].campaign.validation.labels.units
-        count = self.executions.count
-        return Comparison(results, pairs, self.confidence, count, self.budget, units, self._assumptions())
+        return Comparison(
+            results, pairs, self.confidence, executions.count, self.budget, units, tuple(self._assumptions())
+        )
 
     def _step(self) -> bool:
         """Execute one task; return False if nothing is left to do."""
@@ -134,16 +134,13 @@ class _Race:
         left = self.budget - self.executions.count
         if left <= 0:
             return False
-        worst = "worst" in self.questions and bool(self.worst.undecided)
+        worst, mean = "worst" in self.questions and bool(self.worst.undecided), "mean" in self.questions
         noted = [pair for candidate in self.executions.candidates for pair in candidate.noted]
         spent = sum(trial.executed and note.shared is None and note.question == "worst" for trial, note in noted)
-        last = "mean" not in self.questions
-        # Share of the budget before the other question is answered.
-        if worst and (last or spent < 0.5 * self.budget) and self.worst.step():
+        # The question about d* has half of the budget before the other one is answered.
+        if worst and (not mean or spent < 0.5 * self.budget) and self.worst.step():
             return True
-        if not last and self.mean.step(left):
-            return True
-        return worst and not last and self.worst.step()
+        return mean and (self.mean.step(left) or (worst and self.worst.step()))
 
     def _require_possible(self) -> None:
         """Check that no executed distance refutes the stated largest one, with which decisions would be false."""
@@ -167,10 +164,10 @@ class _Race:
             float(np.mean(drawn)) if drawn else None,
         )
 
-    def _assumptions(self) -> tuple[str, ...]:
-        assumed = ["the candidates were fixed before the comparison, and the system does not change during it"]
+    def _assumptions(self) -> Iterator[str]:
+        yield "the candidates were fixed before the comparison, and the system does not change during it"
         if "worst" in self.questions:
-            assumed.append(
+            yield (
                 f"each bound on d* holds with confidence {self.worst.options.confidence:.6g} under the prior that its "
                 "certificate states (dynamics or posterior); it is a probability given the executions, so neither the "
                 "changing threshold nor the time of stopping costs confidence"
@@ -178,8 +175,8 @@ class _Race:
         if "mean" in self.questions:
             described = self.executions.candidates[0].campaign.validation.space.distribution
             over = "uniform over the task space" if described is None else distribution_text(described.describe())
-            assumed.append(f"tasks are independent draws ({over})")
-            assumed.append(
+            yield f"tasks are independent draws ({over})"
+            yield (
                 f"no distance can exceed {self.executions.most:g}; the decisions on expected distances are then valid "
                 "for any number of tasks"
                 if self.executions.most is not None
@@ -188,5 +185,4 @@ class _Race:
                 "that were not drawn can make them wrong"
             )
         if self.worst.stochastic:
-            assumed.append("executions of one task may differ, and the questions are about expected distances of tasks")
-        return tuple(assumed)
+            yield "executions of one task may differ, and the questions are about expected distances of tasks"

@@ -26,8 +26,7 @@ from ctxval.certificates.bounds import ERRORS
 from ctxval.certificates.difference import MeanDifference, PairedDifferences, mean_difference
 from ctxval.certificates.dynamics_diagnostics import TESTED
 from ctxval.core.trial import Trial
-from ctxval.studies.comparison.candidates import Candidate, Decision, TrialNote
-from ctxval.studies.comparison.executions import Executions
+from ctxval.studies.comparison.candidates import Candidate, Decision, Executions, TrialNote
 from ctxval.studies.comparison.result import PairResult
 
 # So many more executions than the better candidate the worse one may have to come near its predicted largest one.
@@ -95,13 +94,13 @@ class WorstQuestion:
                 f"the largest executed distances are {a.largest:.4g} ({a.name}) and {b.largest:.4g} ({b.name}), and no "
                 "bound separates them"
             )
-            return PairResult("worst", a.name, b.name, None, reason)
-        reason = (
-            f"d* of {decision.smaller} is at most {decision.bound:.4g} by the {decision.certificate} bound, and an "
-            f"executed distance of {decision.larger} is {decision.distance:.4g}; decided after {decision.executions} "
-            "executions"
-        )
-        return PairResult("worst", a.name, b.name, decision.smaller, reason)
+        else:
+            reason = (
+                f"d* of {decision.smaller} is at most {decision.bound:.4g} by the {decision.certificate} bound, and an "
+                f"executed distance of {decision.larger} is {decision.distance:.4g}; decided after "
+                f"{decision.executions} executions"
+            )
+        return PairResult("worst", a.name, b.name, None if decision is None else decision.smaller, reason)
 
     def _expected(self) -> dict[str, tuple[float, Array | None]]:
         """Return, by name, the largest executed or predicted distance, and its task if it is predicted."""
@@ -109,7 +108,14 @@ class WorstQuestion:
         expected: dict[str, tuple[float, Array | None]] = {}
         for candidate in self.candidates:
             highest = candidate.highest(history)
-            value, task = (0.0, None) if highest is None or not _trusted(candidate) else highest
+            raised = [
+                (trial.distance or 0.0) / note.predicted
+                for trial, note in candidate.noted
+                if note.question == "worst" and note.predicted
+            ]
+            # A prediction is used if one of the last executions that were to raise the largest distance came near it.
+            trusted = len(raised) < _INSIST or max(raised[-_INSIST:]) >= TESTED
+            value, task = highest if highest is not None and trusted else (0.0, None)
             expected[candidate.name] = (max(value, candidate.largest), task if value > candidate.largest else None)
         return expected
 
@@ -117,7 +123,10 @@ class WorstQuestion:
         self, better: Candidate, worse: Candidate, expected: Mapping[str, tuple[float, Array | None]]
     ) -> bool:
         """Return whether the candidate that seems worse is executed, to raise its largest executed distance."""
-        count, others = _executed(worse), _executed(better)
+        count, others = (
+            sum(note.question == "worst" and note.shared is None for _, note in candidate.noted)
+            for candidate in (worse, better)
+        )
         # So far above that its bound is worth executions.
         if worse.largest <= 1.02 * max(better.largest, expected[better.name][0]):
             return count <= others  # neither is clearly worse: they are executed in turn
@@ -125,9 +134,11 @@ class WorstQuestion:
 
     def _certified(self, better: Candidate) -> bool:
         """Keep all decisions by the certificate of a candidate; return whether there is a new one."""
-        above = [other for one, other in self.undecided if one is better and other.largest > max(better.largest, 0.0)]
         new = False
+        above = [worse for first, worse in self.undecided if first is better]
         for other in above:
+            if other.largest <= max(better.largest, 0.0):
+                continue
             verdict = better.campaign.verdict(other.largest, certificate=self.options, progress=False)
             if verdict.answer == "validated" and verdict.certificate is not None:
                 names, certificate = (better.name, other.name), verdict.certificate
@@ -140,21 +151,6 @@ class WorstQuestion:
         note = TrialNote(self.executions.steps, "worst", predicted=predicted)
         rule = IntervalSearch(candidate.recorder, self.options, self.budget)
         self.executions.execute(candidate, choice, note, predicts=rule.predicts)
-
-
-def _trusted(candidate: Candidate) -> bool:
-    """Return whether one of the last executions that were to raise the largest distance came near its prediction."""
-    raised = [
-        (trial.distance or 0.0) / note.predicted
-        for trial, note in candidate.noted
-        if note.question == "worst" and note.predicted
-    ]
-    return len(raised) < _INSIST or max(raised[-_INSIST:]) >= TESTED
-
-
-def _executed(candidate: Candidate) -> int:
-    """Return the number of trials of its own that were to decide this question."""
-    return sum(note.question == "worst" and note.shared is None for _, note in candidate.noted)
 
 
 @dataclass(eq=False)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -23,27 +23,24 @@ if TYPE_CHECKING:
 WORDS: dict[Question, str] = {"worst": "largest distance d*", "mean": "expected distance"}
 """What each question is about."""
 
+# The columns of the tables of candidates and of pairs.
 CANDIDATES = ("candidate", "executions", "shared", "largest distance", "bound on d*", "draws", "mean distance")
-"""The columns of the table of candidates."""
-
 PAIRS = ("question", "smaller", "than", "difference", "interval", "tasks")
-"""The columns of the table of pairs."""
 
 
 @dataclass(frozen=True)
 class CandidateResult(ShortRepr):
-    """What is known of one candidate.
+    """What is known of one candidate; a value that is not known is None.
 
     Attributes:
-        name: its name.
         executions: the number of executions with its controllers that were made for it.
         shared: the number of executions of other candidates that count for it too, because its controllers agree.
         failed: the number of executions that failed.
-        largest: the largest executed distance; None if there is none.
+        largest: the largest executed distance.
         task: the parameters of this task, by name.
         bound: what d* is at most, if a decision needed it.
         draws: the number of its independent draws.
-        mean: the mean of the distances of these draws; None if there is none.
+        mean: the mean of the distances of these draws.
     """
 
     name: str
@@ -105,9 +102,8 @@ class PairResult:
     @property
     def cells(self) -> tuple[str, ...]:
         """The row of the table of pairs; the difference is that of the smaller one minus the other one."""
-        names = (f"{self.first} ? {self.second}", "undecided")
-        if self.smaller is not None:
-            names = (self.smaller, self.larger)
+        undecided = (f"{self.first} ? {self.second}", "undecided")
+        names = undecided if self.smaller is None else (self.smaller, self.larger)
         if self.question != "mean":
             return WORDS[self.question], *names, "-", "-", "-"
         sign = -1 if self.smaller == self.second else 1
@@ -125,7 +121,6 @@ class Comparison:
     """The result of a comparison.
 
     Attributes:
-        candidates: what is known of each candidate.
         pairs: the decision on each pair, for each question.
         confidence: the probability with which all decisions and intervals hold together.
         executions: the number of executions of the system; a shared execution counts once.
@@ -188,25 +183,22 @@ class Comparison:
 
     def to_markdown(self) -> str:
         """Return the tables, the reasons and the assumptions as Markdown."""
-        units = f" The distances are in {markdown_text(self.units)}." if self.units else ""
-        questions = [f"- {WORDS[one].capitalize()}: {markdown_text(self.ranking_text(one))}" for one in self.questions]
-        reasons = [
-            f"- {', '.join(map(markdown_text, (pair.first, pair.second)))}: {markdown_text(pair.reason)}."
-            for pair in self.pairs
-        ]
 
-        def table(headers: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-            whole = [headers, ["---"] * len(headers), *rows]
+        def table(*rows: Sequence[str]) -> str:
+            whole = [rows[0], ["---"] * len(rows[0]), *rows[1:]]
             return "\n".join(f"| {' | '.join(map(markdown_text, cells))} |" for cells in whole)
 
+        units = f" The distances are in {markdown_text(self.units)}." if self.units else ""
+        rankings = ((WORDS[question].capitalize(), self.ranking_text(question)) for question in self.questions)
+        reasons = ((", ".join(map(markdown_text, (pair.first, pair.second))), pair.reason) for pair in self.pairs)
         parts = [
             "## Comparison",
-            "\n".join(questions),
+            "\n".join(f"- {what}: {markdown_text(ranking)}" for what, ranking in rankings),
             f"{self.executions} executions of at most {self.budget}. All decisions hold together with confidence "
             f"{self.confidence:.6g}.{units}",
-            table(CANDIDATES, [candidate.cells for candidate in self.candidates]),
-            table(PAIRS, [pair.cells for pair in self.pairs]),
-            "\n".join(reasons),
+            table(CANDIDATES, *(candidate.cells for candidate in self.candidates)),
+            table(PAIRS, *(pair.cells for pair in self.pairs)),
+            "\n".join(f"- {names}: {markdown_text(reason)}." for names, reason in reasons),
             "It assumes that",
             "\n".join(f"- {markdown_text(assumption)};" for assumption in self.assumptions),
             f"<!-- {MADE_BY} -->",
@@ -217,11 +209,10 @@ class Comparison:
         """Return a figure with a panel for each question: executed distances, bounds and intervals."""
         from matplotlib.figure import Figure  # imported here: loading it takes longer than a short comparison
 
-        rows = max(len(self.candidates), len(self.pairs) // max(1, len(self.questions)))
         panels = len(self.questions)
+        rows = max(len(self.candidates), len(self.pairs) // max(1, panels))
         figure = Figure(figsize=(5.2 * panels, 1.9 + 0.42 * rows), layout="constrained")
-        axes = figure.subplots(1, panels, squeeze=False)[0]
-        for ax, question in zip(axes, self.questions, strict=True):
+        for ax, question in zip(figure.subplots(1, panels, squeeze=False)[0], self.questions, strict=True):
             names, label = (_draw_worst if question == "worst" else _draw_mean)(ax, self)
             ax.set_yticks(range(len(names)), [shortened(name, 24) for name in names])
             ax.set_ylim(len(names) - 0.5, -0.5)
@@ -231,22 +222,19 @@ class Comparison:
         return figure
 
     def __repr__(self) -> str:
-        head = call(
-            self, confidence=self.confidence, executions=self.executions, budget=self.budget, decided=self.decided
-        )
+        counts = {"executions": self.executions, "budget": self.budget, "decided": self.decided}
+        head = call(self, confidence=self.confidence, **counts)
         return lines(head, *(f"{WORDS[question]}: {line(self.ranking_text(question))}" for question in self.questions))
 
     def _repr_html_(self) -> str:
-        return html_table(
-            "Comparison",
-            [
-                *((WORDS[question], self.ranking_text(question)) for question in self.questions),
-                *((f"{pair.first}, {pair.second}", pair.reason) for pair in self.pairs),
-                ("executions", f"{self.executions} of at most {self.budget}"),
-                ("confidence of all decisions together", self.confidence),
-                *(("assumes", assumption) for assumption in self.assumptions),
-            ],
-        )
+        rows = [
+            *((WORDS[question], self.ranking_text(question)) for question in self.questions),
+            *((f"{pair.first}, {pair.second}", pair.reason) for pair in self.pairs),
+            ("executions", f"{self.executions} of at most {self.budget}"),
+            ("confidence of all decisions together", self.confidence),
+            *(("assumes", assumption) for assumption in self.assumptions),
+        ]
+        return html_table("Comparison", rows)
 
 
 def _number(value: float | None) -> str:
@@ -262,15 +250,16 @@ _BLUE, _ORANGE, _GREY = "#0072B2", "#D55E00", "#707070"
 def _draw_worst(ax: Axes, comparison: Comparison) -> tuple[list[str], str]:
     """Draw the largest executed distance and the bound on d* of each candidate; return its rows and its label."""
     ax.set_title("largest distance d*")
-    for row, one in enumerate(comparison.candidates):
-        if one.largest is not None:
-            ax.plot(one.largest, row, "o", color=_BLUE, label="largest executed distance" if not row else None)
-        if one.largest is not None and one.bound is not None:
-            ax.plot([one.largest, one.bound], [row, row], "-", color=_GREY, linewidth=1.5)
-        if one.bound is not None:
-            ax.plot(one.bound, row, "|", color=_ORANGE, markersize=14, markeredgewidth=2.5)
+    for row, candidate in enumerate(comparison.candidates):
+        largest, bound = candidate.largest, candidate.bound
+        if largest is not None:
+            ax.plot(largest, row, "o", color=_BLUE, label="largest executed distance" if not row else None)
+        if largest is not None and bound is not None:
+            ax.plot([largest, bound], [row, row], "-", color=_GREY, linewidth=1.5)
+        if bound is not None:
+            ax.plot(bound, row, "|", color=_ORANGE, markersize=14, markeredgewidth=2.5)
     ax.plot([], [], "|", color=_ORANGE, markersize=12, markeredgewidth=2.5, label="bound on d*")
-    ends = [end for one in comparison.candidates for end in (one.largest, one.bound) if end is not None]
+    ends = [end for item in comparison.candidates for end in (item.largest, item.bound) if end is not None]
     ax.set_xlim(0, 1.08 * max(ends, default=1.0) or 1.0)
     return [candidate.name for candidate in comparison.candidates], "distance"
 

@@ -1,10 +1,7 @@
 """Models that are learned from recordings."""
 
-from __future__ import annotations
-
 from ctxval.studies.fitting.excitation import Excitation, Excited, excitation
-from ctxval.studies.fitting.fit import FailedFit, FitReport, FittedModel, fit
-from ctxval.studies.fitting.least_squares import FittedParameter, fit_parameters
+from ctxval.studies.fitting.fit import FailedFit, FitReport, FittedModel, FittedParameter, fit, fit_parameters
 
 __all__ = [
     "Excitation",

@@ -38,8 +38,7 @@ def _signal(kind: SignalKind, horizon: int, rng: np.random.Generator) -> Array:
     if kind == "random":
         return np.asarray(np.repeat(rng.uniform(-1, 1, -(-horizon // 4)), 4)[:horizon])
     if kind == "chirp":
-        steps = np.arange(horizon)
-        first = min(1 / horizon, fastest)
+        steps, first = np.arange(horizon), min(1 / horizon, fastest)
         turns = first * steps + 0.5 * (fastest - first) * steps**2 / horizon
         return np.asarray(np.sin(2 * np.pi * (turns + rng.uniform())))
     cycles = np.unique(np.linspace(1, max(1, fastest * horizon), 12).round())
@@ -71,7 +70,7 @@ class Excitation(ShortRepr):
 
     Args:
         validation: the map p -> d(p), whose system is executed.
-        kind: the kind of signal.
+        kind: ``random``, ``multisine`` or ``chirp``; see :func:`excitation`.
         amplitude: the largest magnitude of the signal for each input, shape ``(m,)``, or a number.
         limits: the limits of the inputs; by default those of the controllers.
         seed: the seed.

@@ -7,17 +7,18 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal, get_args
 
 import numpy as np
+from scipy.optimize import least_squares
+from scipy.special import stdtrit
 
 from ctxval._util.arrays import Array, single_threaded
 from ctxval._util.representation import ShortRepr, counted
 from ctxval.core.model import Model, require_time_step
 from ctxval.core.trajectory import Trajectory, Transitions
-from ctxval.data.recordings import Recording, Recordings
+from ctxval.data.recordings import Recordings
 from ctxval.errors import InputError, ModelError, UnknownNameError
-from ctxval.models import FeedforwardReLU, GaussianProcessModel, Linear
+from ctxval.models import FeedforwardReLU, GaussianProcessModel, Linear, Parametric
 from ctxval.models.parametric import ParametricStep
-from ctxval.studies.fitting.least_squares import FittedParameter, as_bounds, fit_parameters
-from ctxval.studies.replay.accuracy import RecordedSteps, StepError, step_errors
+from ctxval.studies.replay.accuracy import RecordedSteps, StepError, step_errors, stepped
 from ctxval.studies.replay.report import plain_numbers
 
 Kind = Literal["linear", "network", "gaussian-process", "parameters", "given"]
@@ -26,6 +27,23 @@ STEPS = (1, 20)
 """Numbers of steps after which the held-out errors are computed, unless others are given."""
 HOLD_OUT = 0.25
 """Share of the recordings that is held out, unless another one is given."""
+
+
+@dataclass(frozen=True)
+class FittedParameter(ShortRepr):
+    """One parameter of a model.
+
+    Attributes:
+        value: the estimate.
+        low, high: the confidence interval; infinite if the recordings do not determine the parameter.
+        note: what is unusual: the value is at a bound, or depends on others; empty otherwise.
+    """
+
+    name: str
+    value: float
+    low: float
+    high: float
+    note: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,14 +70,18 @@ class FittedModel(ShortRepr):
         return max((error.relative for error in self.errors if error.steps == 1), default=float("inf"))
 
     @property
+    def steps(self) -> int:
+        """The largest number of steps after which there are errors; 0 if there are none."""
+        return max((error.steps for error in self.errors), default=0)
+
+    @property
     def useless(self) -> str | None:
         """Why the model is no better than no model, in one sentence; None if it is.
 
         After one step, or after the largest number of steps, its error in a state is at least the recorded change.
         """
-        last = max((error.steps for error in self.errors), default=0)
-        counted_here = [error for error in self.errors if error.steps in (1, last)]
-        worst = max(counted_here, key=lambda error: error.relative, default=None)
+        ends = [error for error in self.errors if error.steps in (1, self.steps)]
+        worst = max(ends, key=lambda error: error.relative, default=None)
         if worst is None or worst.relative < 1:
             return None
         return (
@@ -124,8 +146,6 @@ def fit(
     """Learn models from recordings; a part of the recordings is held out and never learned from.
 
     Args:
-        recordings: the recordings.
-        kinds: the kinds of models.
         step: the user's function ``(x, u, theta) -> x_next``, for the kind ``parameters``.
         bounds: the bounds of its parameters by name.
         vectorized: whether this function takes whole batches.
@@ -133,7 +153,6 @@ def fit(
             of the others. It may have been learned from the recordings that are held out here.
         hold_out: the share of the recordings that is held out; of a single recording, its last part.
         steps: numbers of steps after which errors are computed.
-        seed: seed of all random numbers.
     """
     if unknown := [str(kind) for kind in kinds if kind not in KINDS]:
         raise UnknownNameError.among("kind of model", unknown[0], KINDS)
@@ -150,7 +169,7 @@ def fit(
     failed: list[FailedFit] = []
 
     def add(kind: Kind, model: Model, parameters: tuple[FittedParameter, ...] = ()) -> None:
-        notes = identifiability(data, [*recordings.states, *recordings.inputs]) if kind == "linear" else []
+        notes = [identifiability(data, [*recordings.states, *recordings.inputs])] if kind == "linear" else []
         errors = step_errors(model, recorded, sorted(set(steps)))
         fitted.append(FittedModel(kind, model, errors, parameters, tuple(notes)))
 
@@ -171,8 +190,7 @@ def fit(
                 failed.append(FailedFit(kind, str(error)))
 
     def rank(model: FittedModel) -> tuple[float, bool]:
-        last = max((error.steps for error in model.errors), default=0)
-        relative = max((error.relative for error in model.errors if error.steps == last), default=np.inf)
+        relative = max((error.relative for error in model.errors if error.steps == model.steps), default=np.inf)
         return relative if np.isfinite(relative) else np.inf, model.kind == "given"
 
     return FitReport(tuple(sorted(fitted, key=rank)), tuple(failed), learned_from, held_out)
@@ -196,41 +214,131 @@ def split(recordings: Recordings, share: float, seed: int) -> tuple[Recordings, 
         raise InputError(f"the share that is held out must be between 0 and 1, got {share!r}.")
     runs = recordings.runs
     if len(runs) == 1:
-        horizon = runs[0].trajectory.horizon
+        run, horizon = runs[0], runs[0].trajectory.horizon
         cut = round((1 - share) * horizon)
         if not 1 <= cut < horizon:
             raise InputError(f"the only recording has {counted(horizon, 'step')}: too few to hold a part out.")
-        first, last = _part(runs[0], 0, cut), _part(runs[0], cut, horizon)
+        first = replace(run, trajectory=part_of(run.trajectory, 0, cut))
+        start = run.start + float(run.trajectory.times[cut])
+        last = replace(run, start=start, trajectory=part_of(run.trajectory, cut, horizon))
         return replace(recordings, runs=(first,)), replace(recordings, runs=(last,))
     count = min(max(1, round(share * len(runs))), len(runs) - 1)
-    chosen = set(np.random.default_rng(seed).permutation(len(runs))[:count].tolist())
+    chosen = np.sort(np.random.default_rng(seed).permutation(len(runs))[:count]).tolist()
     kept = tuple(run for number, run in enumerate(runs) if number not in chosen)
-    return replace(recordings, runs=kept), replace(recordings, runs=tuple(runs[number] for number in sorted(chosen)))
+    return replace(recordings, runs=kept), replace(recordings, runs=tuple(runs[number] for number in chosen))
 
 
-def _part(run: Recording, first: int, last: int) -> Recording:
-    whole = run.trajectory
-    times: Array = whole.times[first : last + 1] - whole.times[first]
-    part = Trajectory(times, whole.states[first : last + 1], whole.inputs[first:last])
-    return Recording(run.source, run.start + float(whole.times[first]), part)
+def part_of(run: Trajectory, first: int, last: int) -> Trajectory:
+    """Return the steps of a trajectory from one to another one; its times begin at 0."""
+    times: Array = run.times[first : last + 1] - run.times[first]
+    return Trajectory(times, run.states[first : last + 1], run.inputs[first:last])
 
 
-def identifiability(data: Transitions, names: Sequence[str]) -> list[str]:
-    """Return sentences on how well transitions determine a linear model: the variance inflation of each regressor."""
+def identifiability(data: Transitions, names: Sequence[str]) -> str:
+    """Return how well transitions determine a linear model: the variance inflation of each regressor."""
     Z = np.concatenate([data.x, data.u], axis=1)
-    deviations = Z.std(axis=0)
-    still = [name for name, size in zip(names, deviations, strict=True) if size <= 0]
+    still = [name for name, size in zip(names, Z.std(axis=0), strict=True) if size <= 0]
     if still:
-        return [f"{', '.join(still)} never changes, so its coefficients are not determined"]
+        return f"{', '.join(still)} never changes, so its coefficients are not determined"
     inflation = np.sqrt(np.diag(np.linalg.pinv(np.corrcoef(Z, rowvar=False).reshape(len(names), -1))))
     weak = [name for name, ratio in zip(names, inflation, strict=True) if ratio > 30.0]
     worst = float(inflation.max())
     if weak:
-        return [
+        return (
             f"{' and '.join(weak)} nearly depend on each other in these recordings: the standard errors of their "
             f"coefficients are up to {worst:.2g} times those of independent excitation"
-        ]
-    return [
+        )
+    return (
         f"all states and inputs vary independently enough: standard errors of coefficients are at most {worst:.2g} "
         "times those of independent excitation"
-    ]
+    )
+
+
+def fit_parameters(
+    step: ParametricStep,
+    bounds: Mapping[str, tuple[float, float]],
+    data: Transitions,
+    *,
+    vectorized: bool = False,
+    confidence: float = 0.95,
+    seed: int = 0,
+) -> tuple[Parametric, tuple[FittedParameter, ...]]:
+    """Return a model with the parameters of least squared one-step errors, and their confidence intervals.
+
+    The errors of each state are divided by their size at the estimate, so that states of different units count alike
+    (two rounds). The intervals assume that the model is right and that the errors of the steps are independent. Noise
+    of the measured states biases the estimate.
+
+    Args:
+        step: the user's function ``(x, u, theta) -> x_next``.
+        bounds: the lower and upper bound of each parameter by name, in the order of theta.
+        data: the recorded transitions.
+        vectorized: whether ``step`` takes whole batches.
+        confidence: the confidence of each interval.
+        seed: seed of the starting points.
+    """
+    low, high = as_bounds(bounds)
+    some = data[:: max(1, -(-len(data) // 4000))]
+    if some.x.size <= len(low):
+        raise InputError(f"{len(low)} parameters need more than {some.x.size} recorded numbers.")
+    sizes = np.maximum((some.x_next - some.x).std(axis=0), 1e-12)
+
+    def errors(theta: Array, recorded: Transitions) -> Array:
+        model = Parametric(step, dict(zip(bounds, theta, strict=True)), vectorized=vectorized)
+        # Parameters for which the model diverges are far from the estimate; the search needs finite numbers.
+        left = stepped(model, recorded.x, recorded.u) - recorded.x_next
+        return np.nan_to_num(left, nan=1e6, posinf=1e6, neginf=-1e6).clip(-1e6, 1e6)
+
+    def best(start: Array, recorded: Transitions) -> Any:
+        return least_squares(
+            lambda theta: (errors(theta, recorded) / sizes).ravel(), start, bounds=(low, high), x_scale=high - low
+        )
+
+    with single_threaded():
+        rng = np.random.default_rng(seed)
+        starts = np.concatenate([[0.5 * (low + high)], rng.uniform(low, high, (7, len(low)))])
+        few = some[:: max(1, len(some) // 400)]
+        theta = min((best(start, few) for start in starts), key=lambda result: result.cost).x
+        sizes = np.maximum(np.sqrt((errors(theta, some) ** 2).mean(axis=0)), 1e-9 * sizes)
+        result = best(theta, some)
+    intervals = _intervals(list(bounds), result.x, result.jac, result.fun, (low, high), confidence)
+    return Parametric(step, dict(zip(bounds, result.x, strict=True)), vectorized=vectorized, data=data), intervals
+
+
+def as_bounds(bounds: Mapping[str, tuple[float, float]]) -> tuple[Array, Array]:
+    """Return the lower and the upper bounds of parameters, shapes ``(p,)``."""
+    if not bounds:
+        raise InputError("at least one parameter with its bounds is needed, such as mass = [0.5, 2.0].")
+    for name, pair in bounds.items():
+        valid = isinstance(pair, Sequence) and not isinstance(pair, str) and len(pair) == 2
+        if not valid or not all(isinstance(b, int | float) and np.isfinite(b) for b in pair) or pair[0] >= pair[1]:
+            raise InputError(f"the bounds of {name} must be two numbers, the lower one first, got {pair!r}.")
+    ends = np.array([[float(b) for b in pair] for pair in bounds.values()])
+    return ends[:, 0], ends[:, 1]
+
+
+def _intervals(
+    names: Sequence[str], theta: Array, J: Array, errors: Array, bounds: tuple[Array, Array], confidence: float
+) -> tuple[FittedParameter, ...]:
+    """Return the confidence intervals of least squares (Seber and Wild 1989, section 5.1)."""
+    width = bounds[1] - bounds[0]
+    _, singular, V = np.linalg.svd(J * width, full_matrices=False)
+    degrees = max(len(errors) - len(theta), 1)
+    variance = float((errors**2).sum()) / degrees
+    # Beyond this condition number the data do not determine all parameters.
+    weak = V[singular <= singular.max(initial=0.0) / 1e8] if singular.max(initial=0.0) > 0 else V
+    undetermined = (np.abs(weak) > 0.1).any(axis=0) if len(weak) else np.zeros(len(theta), dtype=bool)
+    with np.errstate(all="ignore"):
+        deviations = width * np.sqrt(variance * ((V / singular[:, None]) ** 2).sum(axis=0))
+    reach = np.where(undetermined, np.inf, deviations * stdtrit(degrees, 0.5 + confidence / 2))
+    parameters = []
+    for i, name in enumerate(names):
+        ends = zip(("lower", "upper"), bounds, strict=True)
+        near = [end for end, bound in ends if abs(theta[i] - bound[i]) <= 1e-4 * width[i]]
+        others = [names[j] for j in np.flatnonzero(undetermined).tolist() if j != i]
+        note = f"at its {near[0]} bound" if near else ""
+        if undetermined[i]:
+            note = f"not determined together with {', '.join(others)}" if others else "not determined"
+        interval = float(theta[i] - reach[i]), float(theta[i] + reach[i])
+        parameters.append(FittedParameter(name, float(theta[i]), *interval, note))
+    return tuple(parameters)

@@ -96,12 +96,11 @@ def write_onnx(path: str | Path, model: Model) -> None:
     """Write a model as an ONNX file with one input ``(x, u)`` and the output ``x_next``."""
     onnx = _require_onnx(model)
     graph = _Graph(onnx)
-    n, m = _model(graph, model, "x_next")
-    value = onnx.helper.make_tensor_value_info
-    kind = onnx.TensorProto.DOUBLE
-    made = onnx.helper.make_graph(
-        graph.nodes, "step", [value("z", kind, ["N", n + m])], [value("x_next", kind, ["N", n])], graph.tensors
-    )
+    _, n, m = _next_state(_Value(graph, "z"), model)
+    graph.nodes[-1].output[0] = "x_next"
+    value, kind = onnx.helper.make_tensor_value_info, onnx.TensorProto.DOUBLE
+    ends = [value("z", kind, ["N", n + m])], [value("x_next", kind, ["N", n])]
+    made = onnx.helper.make_graph(graph.nodes, "step", *ends, graph.tensors)
     # Versions that onnxruntime has read since 2022.
     opset = [onnx.helper.make_opsetid("", 17)]
     content = onnx.helper.make_model(made, opset_imports=opset, ir_version=8, producer_name=MADE_BY)
@@ -122,96 +121,85 @@ def _require_onnx(model: Model | None) -> Any:
     return onnx
 
 
-def _model(graph: _Graph, model: Model, output: str) -> tuple[int, int]:
-    """Add the nodes of a model from ``z`` to an output; return the numbers of states and inputs."""
+def _next_state(z: _Value, model: Model) -> tuple[_Value, int, int]:
+    """Return the next state of a model at ``z = (x, u)``, and the numbers of states and inputs."""
     if isinstance(model, Linear):
         n, m = model.B.shape
-        graph.affine("z", np.concatenate([model.A, model.B], axis=1).T, model.c, output)
-        return n, m
+        return z.affine(np.concatenate([model.A, model.B], axis=1).T, model.c), n, m
     if isinstance(model, Corrected):
-        n, m = _model(graph, model.model, "before")
-        _correction(graph, model.correction, "correction")
-        graph.node("Add", ["before", "correction"], output)
-        return n, m
-    assert isinstance(model, FeedforwardReLU | GaussianProcessModel)  # require_onnx has checked it
+        before, n, m = _next_state(z, model.model)
+        return before + _correction(z, model.correction), n, m
+    assert isinstance(model, FeedforwardReLU | GaussianProcessModel)  # _require_onnx has checked it
     scaling = model.scaling
     n, width = len(scaling.shift_out), len(scaling.shift_in)
-    graph.affine("z", np.diag(1 / scaling.scale_in), -scaling.shift_in / scaling.scale_in, "h0")
+    h = z.affine(np.diag(1 / scaling.scale_in), -scaling.shift_in / scaling.scale_in)
     if isinstance(model, FeedforwardReLU):
-        last = len(model.weights) - 1
-        for i, (weight, bias) in enumerate(zip(model.weights, model.biases, strict=True)):
-            graph.affine(f"h{i}", weight, bias, f"a{i}")
-            if i < last:
-                graph.node("Relu", [f"a{i}"], f"h{i + 1}")
-        graph.affine(f"a{last}", np.diag(scaling.scale_out), scaling.shift_out, "change")
+        layers = list(zip(model.weights, model.biases, strict=True))
+        for weight, bias in layers[:-1]:
+            h = h.affine(weight, bias).node("Relu")
+        change = h.affine(*layers[-1]).affine(np.diag(scaling.scale_out), scaling.shift_out)
     else:
-        _squared_distance(graph, "h0", model.centres, model.covariance.length_scales, 0.5, "half")
-        graph.node("Neg", ["half"], "exponent")
-        graph.node("Exp", ["exponent"], "covariances")
+        half = _squared_distance(h, model.centres, model.covariance.length_scales, 0.5)
         weights = model.covariance.variance * model.weights * scaling.scale_out
-        graph.affine("covariances", weights, scaling.shift_out, "change")
-    graph.affine("z", np.eye(width)[:, :n], np.zeros(n), "x")
-    graph.node("Add", ["x", "change"], output)
-    return n, width - n
+        change = half.node("Neg").node("Exp").affine(weights, scaling.shift_out)
+    return z.affine(np.eye(width)[:, :n], np.zeros(n)) + change, n, width - n
 
 
-def _correction(graph: _Graph, one: Correction, output: str) -> None:
-    """Add ``clip(k(z) W + linear) * exp(-1/2 |beyond / fade|^2)``, as :class:`ctxval.models.Correction` computes it."""
-    graph.affine("z", np.diag(1 / one.scale), -one.shift / one.scale, "pair")
-    _squared_distance(graph, "pair", one.centres, one.length_scales, 5.0, "r2")
-    graph.node("Sqrt", ["r2"], "r")
-    graph.node("Neg", ["r"], "minus_r")
-    graph.node("Exp", ["minus_r"], "decay")
-    graph.with_constant("Mul", "r2", np.array([1 / 3]), "third")
-    graph.node("Add", ["r", "third"], "polynomial")
-    graph.with_constant("Add", "polynomial", np.array([1.0]), "polynomial_1")
-    graph.node("Mul", ["polynomial_1", "decay"], "covariances")
-    graph.affine("covariances", one.weights, np.zeros(one.states), "matern")
-    graph.affine("pair", one.linear[:-1], one.linear[-1], "linear")
-    graph.node("Add", ["matern", "linear"], "unlimited")
-    graph.with_constant("Min", "unlimited", one.limit, "below")
-    graph.with_constant("Max", "below", -one.limit, "limited")
-    graph.with_constant("Min", "pair", one.high, "pair_below")
-    graph.with_constant("Max", "pair_below", one.low, "inside")
-    graph.node("Sub", ["pair", "inside"], "beyond")
-    _squared_distance(graph, "beyond", np.zeros((1, len(one.fade))), one.fade, 0.5, "far")
-    graph.node("Neg", ["far"], "minus_far")
-    graph.node("Exp", ["minus_far"], "faded")
-    graph.node("Mul", ["limited", "faded"], output)
+def _correction(z: _Value, given: Correction) -> _Value:
+    """Return ``clip(k(z) W + linear) * exp(-1/2 |beyond / fade|^2)``, as :class:`ctxval.models.Correction` does."""
+    pair = z.affine(np.diag(1 / given.scale), -given.shift / given.scale)
+    r2 = _squared_distance(pair, given.centres, given.length_scales, 5.0)
+    r = r2.node("Sqrt")
+    covariances = (r + r2 * np.array([1 / 3]) + np.array([1.0])) * r.node("Neg").node("Exp")
+    unlimited = covariances.affine(given.weights, np.zeros(given.states)) + pair.affine(
+        given.linear[:-1], given.linear[-1]
+    )
+    limited = unlimited.node("Min", given.limit).node("Max", -given.limit)
+    beyond = pair.node("Sub", pair.node("Min", given.high).node("Max", given.low))
+    far = _squared_distance(beyond, np.zeros((1, len(given.fade))), given.fade, 0.5)
+    return limited * far.node("Neg").node("Exp")
 
 
-def _squared_distance(graph: _Graph, source: str, centres: Array, scales: Array, factor: float, output: str) -> None:
-    """Add ``factor |(z - c) / l|^2`` for each centre c, which rounding must not make negative."""
+def _squared_distance(z: _Value, centres: Array, scales: Array, factor: float) -> _Value:
+    """Return ``factor |(z - c) / l|^2`` for each centre c, which rounding must not make negative."""
     inverse = factor / scales**2
-    graph.node("Mul", [source, source], f"{output}_squares")
-    graph.affine(source, (-2 * inverse * centres).T, (inverse * centres**2).sum(axis=1), f"{output}_mixed")
-    squares = np.repeat(inverse[:, None], len(centres), axis=1)
-    graph.affine(f"{output}_squares", squares, np.zeros(len(centres)), f"{output}_own")
-    graph.node("Add", [f"{output}_mixed", f"{output}_own"], f"{output}_sum")
-    graph.node("Relu", [f"{output}_sum"], output)
+    mixed = z.affine((-2 * inverse * centres).T, (inverse * centres**2).sum(axis=1))
+    squares = (z * z).affine(np.repeat(inverse[:, None], len(centres), axis=1), np.zeros(len(centres)))
+    return (mixed + squares).node("Relu")
 
 
 class _Graph:
     """The nodes and constants of a graph."""
 
     def __init__(self, onnx: Any) -> None:
-        self._onnx = onnx
+        self.onnx = onnx
         self.nodes: list[Any] = []
         self.tensors: list[Any] = []
 
-    def node(self, kind: str, inputs: list[str], output: str) -> None:
-        self.nodes.append(self._onnx.helper.make_node(kind, inputs, [output]))
 
-    def constant(self, name: str, array: Array) -> str:
-        """Add a constant; return its name."""
-        self.tensors.append(self._onnx.numpy_helper.from_array(np.asarray(array, dtype=np.float64), name))
-        return name
+class _Value:
+    """A value in a graph, with the operations that add a node to it."""
 
-    def with_constant(self, kind: str, source: str, array: Array, output: str) -> None:
-        """Add a node of a value and a constant that is broadcast."""
-        self.node(kind, [source, self.constant(f"{output}_constant", array)], output)
+    def __init__(self, graph: _Graph, name: str) -> None:
+        self.graph, self.name = graph, name
 
-    def affine(self, source: str, weight: Array, bias: Array, output: str) -> None:
-        """Add ``output = source @ weight + bias``."""
-        names = [self.constant(f"{output}_weight", weight), self.constant(f"{output}_bias", bias)]
-        self.node("Gemm", [source, *names], output)
+    def node(self, kind: str, *others: _Value | Array) -> _Value:
+        """Return the result of an operation on this value and others; constants are broadcast."""
+        nodes, tensors, onnx = self.graph.nodes, self.graph.tensors, self.graph.onnx
+        names = [self.name]
+        for other in others:
+            if not isinstance(other, _Value):
+                constant = onnx.numpy_helper.from_array(np.asarray(other, dtype=np.float64), f"constant_{len(tensors)}")
+                tensors.append(constant)
+            names.append(other.name if isinstance(other, _Value) else tensors[-1].name)
+        nodes.append(onnx.helper.make_node(kind, names, [f"value_{len(nodes)}"]))
+        return _Value(self.graph, f"value_{len(nodes) - 1}")
+
+    def affine(self, weight: Array, bias: Array) -> _Value:
+        return self.node("Gemm", weight, bias)
+
+    def __add__(self, other: _Value | Array) -> _Value:
+        return self.node("Add", other)
+
+    def __mul__(self, other: _Value | Array) -> _Value:
+        return self.node("Mul", other)

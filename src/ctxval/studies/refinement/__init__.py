@@ -1,7 +1,5 @@
 """Better models from executions: a model is learned again from what falsified it, and validated again."""
 
-from __future__ import annotations
-
 from ctxval.studies.refinement.held_out import (
     HeldOut,
     MeasuredResidual,

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
 
 from ctxval._util.arrays import Array, single_threaded
-from ctxval.core.model import Model, linearize
+from ctxval.core.model import linearize
 from ctxval.core.plan import gives_inputs
 from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory
@@ -45,7 +46,9 @@ def with_best_jacobian(validation: Validation, refined: Refined) -> tuple[Refine
     tasks have a clearly smaller cost on M' with it. Nothing is executed.
     """
     model = refined.model
-    if not isinstance(model, Corrected) or not _linearises_a_linear_model_once(validation, model.model):
+    if not isinstance(model, Corrected) or not isinstance(model.model, Linear):
+        return refined, None
+    if not _linearises_once(validation, model.model):
         return refined, None
     other = Corrected(model.model, model.correction, linearised="model", data=model.data)
     kept = Refined(other, refined.data, refined.before)
@@ -59,10 +62,8 @@ def with_best_jacobian(validation: Validation, refined: Refined) -> tuple[Refine
     )
 
 
-def _linearises_a_linear_model_once(validation: Validation, model: Model) -> bool:
-    """Return whether M is linear, and the design of one controller asks for its Jacobian at one or two points."""
-    if not isinstance(model, Linear):
-        return False
+def _linearises_once(validation: Validation, model: Linear) -> bool:
+    """Return whether the design of one controller asks for the Jacobian of M at one or two points."""
 
     class Counted:
         points = 0
@@ -71,8 +72,8 @@ def _linearises_a_linear_model_once(validation: Validation, model: Model) -> boo
             return model.step(x, u)
 
         def jacobian(self, x: Array, u: Array) -> tuple[Array, Array]:
-            self.points += int(np.prod(x.shape[:-1]))
             batch = x.shape[:-1]
+            self.points += int(np.prod(batch))
             A, B = linearize(model, x, u)
             return np.broadcast_to(A, (*batch, *A.shape[-2:])), np.broadcast_to(B, (*batch, *B.shape[-2:]))
 
@@ -112,13 +113,11 @@ def _cost(validation: Validation, task: Task, loops: Trajectory) -> Array:
 
 def same_controllers(validation: Validation, executed: Sequence[tuple[Trial, Trajectory]]) -> SameControllers:
     """Return on how many executed tasks the controllers of a refined model are those that were executed."""
-    distances = []
-    for trial, recorded in executed[-32:]:
-        try:
+    distances, recent = list[float](), executed[-32:]
+    for trial, recorded in recent:
+        with suppress(Exception):  # users' parts may raise anything: what cannot be compared differs
             plan = validation.plan(validation.space.from_unit(trial.unit_point))
             if gives_inputs(plan, recorded, 1e-6):  # a share of the largest magnitude of each input
-                distances.append(validation.accept(plan, recorded).distance)
-        except Exception:  # users' parts may raise anything: what cannot be compared differs
-            continue
-    measured = [distance for distance in distances if distance is not None]
-    return SameControllers(len(executed[-32:]), len(measured), max(measured, default=None))
+                distance = validation.accept(plan, recorded).distance
+                distances += [] if distance is None else [distance]
+    return SameControllers(len(recent), len(distances), max(distances, default=None))

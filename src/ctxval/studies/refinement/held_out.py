@@ -17,6 +17,7 @@ from ctxval._util.texts import aligned
 from ctxval.core.model import Model
 from ctxval.core.trajectory import Trajectory, Transitions
 from ctxval.errors import CtxvalError, InputError
+from ctxval.studies.fitting.fit import part_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,8 +72,7 @@ class Records(ShortRepr):
             run, middle = self.executed[0], self.executed[0].horizon // 2
             if middle < 1:
                 raise InputError("the only execution has one step: too few to hold a part out.")
-            first = Records((Trajectory(run.times[: middle + 1], run.states[: middle + 1], run.inputs[:middle]),))
-            second = Records((Trajectory(run.times[middle:], run.states[middle:], run.inputs[middle:]),))
+            first, second = (Records((part_of(run, *ends),)) for ends in ((0, middle), (middle, run.horizon)))
             return [(first, second), (second, first)]
         parts = min(count, 10)  # of more executions, some are held out together
         return [
@@ -93,14 +93,12 @@ class HeldOut(ShortRepr):
         errors: those of the learned model, shape ``(N, n)``.
         before: those of the first model, shape ``(N, n)``.
         changes: the recorded changes of the states in one step, shape ``(N, n)``.
-        groups: the part that was held out together with each transition, shape ``(N,)``.
     """
 
     pairs: Array
     errors: Array
     before: Array
     changes: Array
-    groups: Array
 
     @property
     def better(self) -> Mask:
@@ -125,13 +123,9 @@ class HeldOut(ShortRepr):
         """Return the errors if only the chosen states ``(n,)`` are corrected."""
         return replace(self, errors=np.where(chosen, self.errors, self.before))
 
-    def with_executions(self, model: Model, before: Model, executed: tuple[Trajectory, ...]) -> HeldOut:
+    def with_executions(self, model: Model, before: Model, executed: Sequence[Trajectory]) -> HeldOut:
         """Return these errors and those on executions that the model itself was not learned from."""
-        if not executed:
-            return self
-        first = int(self.groups.max(initial=-1)) + 1
-        parts = [_compared(run.transitions(), model, before, k) for k, run in enumerate(executed, first)]
-        return _joined([self, *parts])
+        return _joined([self, *(_compared(run.transitions(), model, before) for run in executed)])
 
 
 def held_out(learn: Callable[[Records], Model], before: Model, records: Records) -> HeldOut:
@@ -141,23 +135,22 @@ def held_out(learn: Callable[[Records], Model], before: Model, records: Records)
     few records to learn from.
     """
     parts = []
-    for group, (known, held) in enumerate(records.folds()):
+    for known, held in records.folds():
         try:
             model = learn(known)
         except CtxvalError:
             model = before
-        parts.append(_compared(held.transitions, model, before, group))
+        parts.append(_compared(held.transitions, model, before))
     return _joined(parts)
 
 
-def _compared(data: Transitions, model: Model, before: Model, group: int) -> HeldOut:
+def _compared(data: Transitions, model: Model, before: Model) -> HeldOut:
     with np.errstate(all="ignore"):
-        errors, first = (data.x_next - one.step(data.x, data.u) for one in (model, before))
+        errors, first = (data.x_next - compared.step(data.x, data.u) for compared in (model, before))
     usable = np.isfinite(first).all(axis=1)
     errors = np.where(np.isfinite(errors), errors, first)
     pairs, changes = np.concatenate([data.x, data.u], axis=1), data.x_next - data.x
-    groups = np.full(len(data), group)
-    return HeldOut(*(array[usable] for array in (pairs, errors, first, changes, groups)))
+    return HeldOut(*(array[usable] for array in (pairs, errors, first, changes)))
 
 
 def _joined(parts: list[HeldOut]) -> HeldOut:
@@ -212,13 +205,15 @@ class MeasuredResidual(ShortRepr):
     @property
     def range_text(self) -> str:
         """The range of the records in one line; nothing was measured outside."""
-        named = zip({**self.states, **self.inputs}.items(), self.whole.low, self.whole.high, strict=True)
-        return ", ".join(f"{name} {low:.3g} to {high:.3g} {unit}".rstrip() for (name, unit), low, high in named)
+        units, ends = {**self.states, **self.inputs}, self._ends(self.whole)
+        return ", ".join(f"{name} {low:.3g} to {high:.3g} {units[name]}".rstrip() for name, low, high in ends)
+
+    def _ends(self, region: ResidualRegion) -> list[tuple[str, float, float]]:
+        return list(zip((*self.states, *self.inputs), region.low.tolist(), region.high.tolist(), strict=True))
 
     def _where(self, region: ResidualRegion) -> str:
         parts = []
-        ends = zip((*self.states, *self.inputs), region.low.tolist(), region.high.tolist(), strict=True)
-        for name, low, high in ends:
+        for name, low, high in self._ends(region):
             if np.isfinite(low) and np.isfinite(high):
                 parts.append(f"{low:.3g} < {name} <= {high:.3g}")
             elif np.isfinite(low):
@@ -231,7 +226,7 @@ class MeasuredResidual(ShortRepr):
         """Return all numbers as plain values; an end that is infinite is None."""
 
         def plain(region: ResidualRegion) -> dict[str, Any]:
-            ends = zip((*self.states, *self.inputs), region.low.tolist(), region.high.tolist(), strict=True)
+            ends = self._ends(region)
             return {
                 "range": {name: [end if np.isfinite(end) else None for end in pair] for name, *pair in ends},
                 "steps": region.steps,
@@ -252,11 +247,7 @@ def measure_residual(held: HeldOut, states: dict[str, str], inputs: dict[str, st
     """Return the residual by regions, from errors on transitions that were held out.
 
     The regions are those of a small regression tree: each split explains most of the spread of the logarithm of the
-    error, in units of the typical change of each state.
-
-    Args:
-        held: the errors.
-        states, inputs: the names of states and inputs with their units.
+    error, in units of the typical change of each state. ``states`` and ``inputs`` are names with their units.
     """
 
     def region(inside: Mask, low: Array, high: Array) -> ResidualRegion:
@@ -268,7 +259,7 @@ def measure_residual(held: HeldOut, states: dict[str, str], inputs: dict[str, st
     logs = np.log(np.maximum(error, 1e-12 * max(float(error.max(initial=0.0)), 1e-300)))
     regions = [region(*box) for box in _split(held.pairs, logs)]
     whole = region(np.ones(len(logs), dtype=bool), held.pairs.min(axis=0), held.pairs.max(axis=0))
-    ordered = sorted(regions, key=lambda one: float((one.quantile / sizes).max()))
+    ordered = sorted(regions, key=lambda item: float((item.quantile / sizes).max()))
     return MeasuredResidual(states, inputs, whole, tuple(ordered))
 
 
@@ -277,7 +268,7 @@ def _split(pairs: Array, logs: Array) -> list[tuple[Mask, Array, Array]]:
     k = pairs.shape[1]
     boxes = [(np.ones(len(pairs), dtype=bool), np.full(k, -np.inf), np.full(k, np.inf))]
     # A split must explain a share of the spread, and more than rounding.
-    least = max(0.1 * float(((logs - logs.mean()) ** 2).sum()), 1e-6 * len(logs))
+    least = max(0.1 * _spread(logs), 1e-6 * len(logs))
     while len(boxes) < 6:
         splits = [_best_split(pairs, logs, box[0]) for box in boxes]
         best = max(range(len(boxes)), key=lambda i: splits[i][0])
@@ -294,17 +285,17 @@ def _split(pairs: Array, logs: Array) -> list[tuple[Mask, Array, Array]]:
 
 def _best_split(pairs: Array, logs: Array, inside: Mask) -> tuple[float, int, float]:
     """Return the spread that the best split of a box explains, with its column and its place."""
-    best = (0.0, 0, 0.0)
-    chosen = logs[inside]
-    total = float(((chosen - chosen.mean()) ** 2).sum())
-    for column in range(pairs.shape[1]):
-        values = pairs[inside, column]
+    best, chosen = (0.0, 0, 0.0), logs[inside]
+    for column, values in enumerate(pairs[inside].T):
         # Rounded, so that they can be written down.
         for place in (float(f"{cut:.3g}") for cut in np.quantile(values, (0.25, 0.5, 0.75))):
             below = values <= place
             # The 0.95 quantile of fewer would be their largest value.
-            if min(int(below.sum()), int((~below).sum())) < 40:
-                continue
-            left = sum(float(((part - part.mean()) ** 2).sum()) for part in (chosen[below], chosen[~below]))
-            best = max(best, (total - left, column, place))
+            if min(int(below.sum()), int((~below).sum())) >= 40:
+                left = _spread(chosen[below]) + _spread(chosen[~below])
+                best = max(best, (_spread(chosen) - left, column, place))
     return best
+
+
+def _spread(values: Array) -> float:
+    return float(((values - values.mean()) ** 2).sum())

@@ -19,8 +19,7 @@ from ctxval.learning import DynamicsPosterior, PosteriorSettings, learn_posterio
 from ctxval.models import Corrected, Correction, FeedforwardReLU, GaussianProcessModel, Linear, Parametric
 from ctxval.models.parametric import ParametricStep
 from ctxval.studies.fitting import FittedParameter, fit_parameters
-from ctxval.studies.fitting.fit import learned_model
-from ctxval.studies.fitting.least_squares import as_bounds
+from ctxval.studies.fitting.fit import as_bounds, learned_model
 from ctxval.studies.refinement.held_out import HeldOut, Records, held_out
 from ctxval.studies.replay.accuracy import stepped
 
@@ -33,13 +32,9 @@ NAMES = ("residual", *get_args(RefitKind), "parameters", "fit")
 
 @dataclass(frozen=True, eq=False)
 class Learned(ShortRepr):
-    """A model that was learned from records.
+    """A model that was learned from records, with its errors on records that were held out.
 
-    Attributes:
-        model: the model.
-        errors: its errors on records that were held out.
-        notes: sentences on what was learned.
-        parameters: the parameters of the user's function; none for other methods.
+    ``parameters`` are those of the user's function; there are none for other methods.
     """
 
     model: Model
@@ -51,9 +46,7 @@ class Learned(ShortRepr):
 class Method(ABC):
     """A method that learns a model from records. It is a function of the model and the records.
 
-    Attributes:
-        name: its name.
-        makes: the type of the models that it learns; None if it may be any.
+    ``makes`` is the type of the models that it learns; None if it may be any.
     """
 
     name: str
@@ -74,10 +67,7 @@ class ResidualCorrection(ShortRepr, Method):
     """The first model with a correction: the mean of Gaussian processes of its residual.
 
     A state is corrected only if this lowers the error on executions that are held out. Outside the range of the
-    records the correction fades, so that the model is as before.
-
-    Attributes:
-        centres: largest number of transitions that the correction is conditioned on.
+    records the correction fades, so that the model is as before. It is conditioned on at most ``centres`` transitions.
     """
 
     centres: int = _CENTRES
@@ -86,12 +76,10 @@ class ResidualCorrection(ShortRepr, Method):
 
     def learn(self, model: Model, records: Records) -> Learned:
         """Return the corrected model."""
+        # Matern 5/2 that does not grow with the inputs.
+        settings = PosteriorSettings(hyperparameters=1, centres=self.centres, families=((2.5, 0.0),), of_steps=False)
 
         def correction(some: Records) -> Correction | None:
-            # Matern 5/2 that does not grow with the inputs.
-            settings = PosteriorSettings(
-                hyperparameters=1, centres=self.centres, families=((2.5, 0.0),), of_steps=False
-            )
             posterior = learn_posterior(model, some.transitions, some.sources, settings=settings)
             return None if posterior is None else correction_of(posterior)
 
@@ -110,10 +98,9 @@ class ResidualCorrection(ShortRepr, Method):
             )
         worth: Mask = np.asarray(errors.rms_before > 1e-7 * errors.changes.std(axis=0))
         rows = ", ".join(str(i) for i in np.flatnonzero(worth & ~better).tolist())
-        notes = (
-            (f"not corrected, because the error on held-out executions would not fall: state {rows}",) if rows else ()
-        )
-        return Learned(Corrected(model, whole.of_states(better), data=records.transitions), errors.kept(better), notes)
+        note = f"not corrected, because the error on held-out executions would not fall: state {rows}"
+        learned = Corrected(model, whole.of_states(better), data=records.transitions)
+        return Learned(learned, errors.kept(better), (note,) if rows else ())
 
 
 def correction_of(posterior: DynamicsPosterior) -> Correction:
@@ -153,12 +140,7 @@ class _Replacement(Method):
 
 @dataclass(frozen=True)
 class Refit(ShortRepr, _Replacement):
-    """A new model of a kind of :func:`ctxval.studies.fitting.fit`, in place of the first model.
-
-    Attributes:
-        kind: ``linear``, ``network`` or ``gaussian-process``.
-        seed: seed of all random numbers.
-    """
+    """A new model of a kind of :func:`ctxval.studies.fitting.fit`, in place of the first model."""
 
     kind: RefitKind
     seed: int = 0
@@ -204,22 +186,19 @@ class ParameterFit(ShortRepr, _Replacement):
         as_bounds(self.bounds)
 
     def _fit(self, model: Model, data: Transitions) -> tuple[Model, tuple[FittedParameter, ...]]:
-        if self.step is not None:
-            return fit_parameters(self.step, self.bounds, data, vectorized=self.vectorized, seed=self.seed)
-        if not isinstance(model, Parametric):
-            raise InputError(
-                "the method 'parameters' needs the function step (--step), because the model is not a Parametric."
-            )
-        return fit_parameters(model.function, self.bounds, data, vectorized=model.vectorized, seed=self.seed)
+        step, vectorized = self.step, self.vectorized
+        if step is None:
+            if not isinstance(model, Parametric):
+                raise InputError(
+                    "the method 'parameters' needs the function step (--step), because the model is not a Parametric."
+                )
+            step, vectorized = model.function, model.vectorized
+        return fit_parameters(step, self.bounds, data, vectorized=vectorized, seed=self.seed)
 
 
 @dataclass(frozen=True, eq=False)
 class UserFit(ShortRepr, _Replacement):
-    """The user's own function ``fit(data) -> model``.
-
-    Attributes:
-        fit: the function of the transitions; it must always return the same for the same data.
-    """
+    """The user's own function ``fit(data) -> model``, which must always return the same for the same data."""
 
     fit: Callable[[Transitions], Model | Step]
     name: str = field(default="fit", init=False)

@@ -24,7 +24,7 @@ from ctxval.models import Refined, read_refined, write_model
 from ctxval.models.corrected import before_refinement
 from ctxval.models.saved import is_savable, read_note
 from ctxval.studies.refinement.design import SameControllers, same_controllers, with_best_jacobian
-from ctxval.studies.refinement.held_out import MeasuredResidual, Records, measure_residual
+from ctxval.studies.refinement.held_out import Records, measure_residual
 from ctxval.studies.refinement.methods import Learned, Method, method_of
 from ctxval.studies.refinement.rounds import Refinement, Round
 
@@ -74,16 +74,13 @@ def refine(
         )
     chosen, options = method_of(method, seed=campaign.seed), certificate or CertificateOptions()
 
-    def same_settings(
-        validation: Validation, store: Path | None, model_file: Path | None, certificate: CertificateOptions
-    ) -> Campaign:
+    def same_settings(validation: Validation, store: Path | None, *_: object) -> Campaign:
         search = copy.deepcopy(campaign.search)
         return Campaign(validation, search=search, store=store, seed=campaign.seed, name=campaign.name)
 
     execution |= {"on_trial": on_trial, "progress": progress}
-    loop = _Loop(campaign, float(threshold), int(budget), chosen, options, open_round or same_settings, execution)
     with progress_shown(progress):
-        return loop.run()
+        return _Loop(campaign, float(threshold), budget, chosen, options, open_round or same_settings, execution).run()
 
 
 @dataclass(eq=False)
@@ -104,6 +101,11 @@ class _Loop:
         # The model that is corrected or replaced; of a model that was refined before, the one before.
         self._base = before_refinement(self.first.validation.model)
 
+    @property
+    def spent(self) -> int:
+        """The number of executions of all rounds."""
+        return sum(item.executions for item in self.rounds)
+
     def run(self) -> Refinement:
         """Run the rounds until one is validated, or nothing more can be done."""
         verdict = self._judged(self.first, self.options)
@@ -111,35 +113,30 @@ class _Loop:
         ended = self._why_ended()
         while ended is None:
             ended = self._next_round() or self._why_ended()
-        number = self.rounds[-1].number
-        learned, residual = self._measured(number) if number else (None, None)
-        accuracy = {}
-        if learned is not None and residual is not None:
-            rms = zip(learned.errors.rms_before.tolist(), learned.errors.rms.tolist(), strict=True)
-            accuracy = dict(zip(residual.states, rms, strict=False))
-        return Refinement(
-            tuple(self.rounds),
-            self.threshold,
-            self.options.confidence,
-            self.budget,
-            ended,
-            residual,
-            accuracy,
-            () if learned is None else learned.parameters,
-            self.first.validation.labels.units,
-        )
+        last = self.rounds[-1]
+        learned = self._measured(last) if last.number else None
+        labels, confidence = self.first.validation.labels, self.options.confidence
+        refinement = Refinement(tuple(self.rounds), self.threshold, confidence, self.budget, ended, units=labels.units)
+        if learned is None:
+            return refinement
+        errors, n = learned.errors, learned.errors.errors.shape[1]
+        states, inputs = self.first.validation.names(n, errors.pairs.shape[1] - n)
+        rms = zip(errors.rms_before.tolist(), errors.rms.tolist(), strict=True)
+        accuracy = dict(zip(states, rms, strict=False))
+        residual = measure_residual(errors, states, inputs)
+        return replace(refinement, residual=residual, accuracy=accuracy, parameters=learned.parameters)
 
     def _judged(self, campaign: Campaign, options: CertificateOptions) -> Verdict:
         """Execute tasks of a campaign until it is decided or the budget ends; people execute theirs themselves."""
         falsified = counterexample(campaign.trials, self.threshold) is not None
-        left = self.budget - sum(item.executions for item in self.rounds)
+        left = self.budget - self.spent
         if not falsified and not getattr(campaign.validation.system, "manual", False) and left >= 1:
             campaign.run(left, self.threshold, certificate=options, **self.execution)
         return campaign.verdict(self.threshold, certificate=options)
 
     def _why_ended(self) -> str | None:
         """Return why there is no further round; None if there is one."""
-        last, spent = self.rounds[-1], sum(item.executions for item in self.rounds)
+        last = self.rounds[-1]
         if last.verdict.answer == "validated":
             which = "the given model" if not last.number else f"the model of round {last.number}"
             return f"{which} is validated"
@@ -149,8 +146,8 @@ class _Loop:
                     f"people execute the tasks of this system: get them with `ctxval ask {last.store}`, tell their "
                     "results, and refine again"
                 )
-            return f"the verdict on the model of round {last.number} is undecided after {spent} executions"
-        return f"the budget of {self.budget} executions is spent" if spent >= self.budget else None
+            return f"the verdict on the model of round {last.number} is undecided after {self.spent} executions"
+        return f"the budget of {self.budget} executions is spent" if self.spent >= self.budget else None
 
     def _next_round(self) -> str | None:
         """Run one more round; return why there is none."""
@@ -226,17 +223,15 @@ class _Loop:
         store = self.first.store.path
         return None if store is None else store.with_name(f"{store.stem}.round-{number}{suffix}")
 
-    def _measured(self, number: int) -> tuple[Learned | None, MeasuredResidual | None]:
-        """Return the errors of the last model on executions that it was not learned from."""
+    def _measured(self, last: Round) -> Learned | None:
+        """Return what the last model was learned with, and its errors also on executions that it did not learn from."""
         with stage("measuring the residual"):
             try:
-                learned = self._learned(number)
+                learned = self._learned(last.number)
             except CtxvalError:  # the file of the model is there, but its executions are not
-                return None, None
-            last = tuple(trajectory for _, trajectory in self._executed(self.rounds[number:]))
-            whole = learned.errors.with_executions(self.rounds[number].model, self._base, last)
-            names = self.first.validation.names(whole.errors.shape[1], whole.pairs.shape[1] - whole.errors.shape[1])
-            return replace(learned, errors=whole), measure_residual(whole, *names)
+                return None
+            executed = [trajectory for _, trajectory in self._executed([last])]
+            return replace(learned, errors=learned.errors.with_executions(last.model, self._base, executed))
 
 
 def confidence_of_round(confidence: float, number: int) -> float:

@@ -32,7 +32,6 @@ class Round(ShortRepr):
         method: the method by which the model was learned; ``given`` for the first one.
         campaign: the campaign of the model, whose store belongs to it alone.
         verdict: the verdict on the model, with the confidence of this round.
-        confidence: the confidence of this round.
         learned_from: number of transitions that the model was learned from.
         model_file: the file of the model; None if there is none.
         notes: sentences on the model.
@@ -65,11 +64,6 @@ class Round(ShortRepr):
         return None if self.campaign.worst is None else self.campaign.worst.distance
 
     @property
-    def task(self) -> Mapping[str, Any] | None:
-        """The task of the largest distance; None if there is none."""
-        return None if self.campaign.worst is None else self.campaign.worst.parameters
-
-    @property
     def store(self) -> Path | None:
         """The store of the round; None if it is in memory."""
         return self.campaign.store.path
@@ -82,7 +76,7 @@ class Round(ShortRepr):
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values."""
-        certificate = self.verdict.certificate
+        worst, certificate = self.campaign.worst, self.verdict.certificate
         return {
             "round": self.number,
             "method": self.method,
@@ -91,12 +85,12 @@ class Round(ShortRepr):
             "store": self.store and str(self.store),
             "learned_from": self.learned_from,
             "executions": self.executions,
-            "worst": None if self.worst is None else {"task": self.task, "distance": self.worst},
+            "worst": worst and {"task": worst.parameters, "distance": worst.distance},
             "verdict": self.verdict.answer,
             "reason": self.verdict.reason,
             "confidence": self.confidence,
             "bound": self.verdict.bound,
-            "certificate": None if certificate is None else certificate.to_json(),
+            "certificate": certificate and certificate.to_json(),
             "notes": list(self.notes),
             "unchanged_controllers": asdict(self.unchanged),
         }
@@ -154,8 +148,10 @@ class Refinement:
     def statement(self) -> str:
         """What the last verdict means: the executions that it counts, and its confidence after several rounds."""
         others = self.executions - self.last.executions
-        counted_here = counted(self.last.executions, "execution")
-        counts = f"The verdict on the model of round {self.last.number} counts {counted_here} under its own controllers"
+        counts = (
+            f"The verdict on the model of round {self.last.number} counts "
+            f"{counted(self.last.executions, 'execution')} under its own controllers"
+        )
         if others:
             counts += (
                 f"; {counted(others, 'execution')} under controllers of other models taught the model, and "
@@ -183,23 +179,17 @@ class Refinement:
 
     def to_dict(self) -> dict[str, Any]:
         """Return everything but the models as plain values."""
+        names = ("threshold", "confidence", "units", "budget", "executions", "ended", "statement")
+        errors = {name: {"before": before, "after": after} for name, (before, after) in self.accuracy.items()}
         return {
             "verdict": self.answer,
-            "threshold": self.threshold,
-            "confidence": self.confidence,
-            "units": self.units,
-            "budget": self.budget,
-            "executions": self.executions,
-            "ended": self.ended,
-            "statement": self.statement,
+            **{name: getattr(self, name) for name in names},
             "distance_before": self.rounds[0].worst,
             "distance_after": self.last.worst,
             "rounds": [item.to_dict() for item in self.rounds],
-            "one_step_error": {
-                name: {"before": before, "after": after} for name, (before, after) in self.accuracy.items()
-            },
+            "one_step_error": errors,
             "parameters": [vars(parameter) for parameter in self.parameters],
-            "residual": None if self.residual is None else self.residual.to_dict(),
+            "residual": self.residual and self.residual.to_dict(),
         }
 
     def to_json(self) -> str:
@@ -211,7 +201,7 @@ class Refinement:
         return lines(head, f"ended: {line(self.ended)}", *(line(row) for row in self.text.splitlines()[1:4]))
 
     def _repr_html_(self) -> str:
-        rows = [(f"round {one.number}: {one.method}", ", ".join(one.cells[2:])) for one in self.rounds]
+        rows = [(f"round {item.number}: {item.method}", ", ".join(item.cells[2:])) for item in self.rounds]
         return table(f"Refinement: {self.answer}", [*rows, ("ended", self.ended), ("statement", self.statement)])
 
 

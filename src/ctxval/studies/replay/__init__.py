@@ -1,7 +1,5 @@
 """Replay of recordings on a model: errors, their causes, and what the recordings predict of the tasks."""
 
-from __future__ import annotations
-
 from ctxval.studies.replay.accuracy import Region, StepError
 from ctxval.studies.replay.causes import ResidualShare, Suggestion
 from ctxval.studies.replay.report import RecordedData, ReplayReport, replay

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -19,8 +20,6 @@ class StepError(ShortRepr):
     """The error of one state after a number of steps.
 
     Attributes:
-        state, unit: the state and its unit.
-        steps: the number of steps.
         rms: root mean square of the error.
         lowest, highest: the smallest and the largest root mean square over the recordings.
         median, upper, largest: median, 0.95 quantile and maximum of the magnitude of the error.
@@ -55,7 +54,6 @@ class Region(ShortRepr):
 
     Attributes:
         variable, unit: the state or input and its unit.
-        low, high: the range.
         count: number of recorded steps in it.
         error: root mean square over the states of the one-step error, as a share of the typical change of each state.
         ratio: this error, divided by that over all steps.
@@ -87,15 +85,14 @@ class RecordedSteps:
 
     def windows(self, before: int, after: int, most: int = 40_000) -> Windows:
         """Return places with so many recorded steps before and after them; of too many, every second, third, ..."""
-        runs, places, groups = [], [], []
+        parts = []
         for number, horizon in enumerate(self._horizons):
             at = np.arange(before, horizon - after + 1)
-            runs.append(np.full(len(at), number))
-            places.append(at)
-            groups.append(np.full(len(at), number) if len(self._horizons) > 1 else (5 * at) // (horizon + 1))
-        joined = [np.concatenate(part).astype(np.intp) for part in (runs, places, groups)]
-        every = max(1, -(-len(joined[0]) // most))
-        return Windows(self, *(part[::every] for part in joined))
+            run = np.full(len(at), number)
+            parts.append((run, at, run if len(self._horizons) > 1 else (5 * at) // (horizon + 1)))
+        runs, places, groups = (np.concatenate(part).astype(np.intp) for part in zip(*parts, strict=True))
+        every = max(1, -(-len(runs) // most))
+        return Windows(self, runs[::every], places[::every], groups[::every])
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,7 +100,6 @@ class Windows:
     """The places in recordings from which so many steps before and after are recorded.
 
     Attributes:
-        recorded: the steps of the recordings.
         runs, places: the recording, and the step in it, shape ``(N,)``.
         groups: the part of the recordings in which each lies, shape ``(N,)``.
     """
@@ -126,6 +122,10 @@ class Windows:
     def inputs(self, shift: int = 0) -> Array:
         """Return the recorded inputs so many steps later, shape ``(N, m)``."""
         return np.asarray(self.recorded.all_inputs[self.recorded.first_input[self.runs] + self.places + shift])
+
+    def pairs(self, shift: int = 0) -> Array:
+        """Return the recorded states and inputs so many steps later, shape ``(N, n + m)``."""
+        return np.concatenate([self.states(shift), self.inputs(shift)], axis=1)
 
 
 def predicted(model: Model, where: Windows, steps: int) -> tuple[Array, Array]:
@@ -208,15 +208,14 @@ def regions(model: Model, recorded: RecordedSteps) -> tuple[Region, ...]:
     if not known.any():
         return ()
     overall = float(np.sqrt((error[known] ** 2).mean()))
-    values = np.concatenate([where.states(), where.inputs()], axis=1)[known]
+    values = where.pairs()[known]
     labels = recorded.recordings.states | recorded.recordings.inputs
     results: list[Region] = []
     for (name, unit), column in zip(labels.items(), values.T, strict=True):
         edges = np.unique(np.quantile(column, np.linspace(0, 1, 6)))
         bins = np.clip(np.searchsorted(edges, column, side="right") - 1, 0, max(len(edges) - 2, 0))
-        for k in range(len(edges) - 1):
+        for k, (low, high) in enumerate(pairwise(edges.tolist())):
             inside = error[known][bins == k]
             rms = float(np.sqrt((inside**2).mean())) if len(inside) else 0.0
-            ratio = rms / overall if overall > 0 else 1.0
-            results.append(Region(name, unit, float(edges[k]), float(edges[k + 1]), len(inside), rms, ratio))
+            results.append(Region(name, unit, low, high, len(inside), rms, rms / overall if overall > 0 else 1.0))
     return tuple(results)

@@ -19,9 +19,6 @@ from ctxval.core.trajectory import Transitions
 from ctxval.learning import PosteriorSettings, learn_posterior
 from ctxval.studies.replay.accuracy import RecordedSteps, Windows, stepped
 
-# Delays of the inputs that are tried in whole steps; tenths of a step are tried around the best of them.
-_SHIFTS = tuple(range(-3, 11))
-
 
 @dataclass(frozen=True)
 class ResidualShare(ShortRepr):
@@ -52,28 +49,28 @@ class ResidualShare(ShortRepr):
 def residual_shares(model: Model, recorded: RecordedSteps, seed: int) -> tuple[ResidualShare, ...]:
     """Return how much of the residual of each state can be explained; none if there are too few recorded steps."""
     where = recorded.windows(1, 1, 12_000)
-    pairs, earlier = (np.concatenate([where.states(k), where.inputs(k)], axis=1) for k in (0, -1))
-    residuals, earlier_residuals = (
-        where.states(k + 1) - stepped(model, where.states(k), where.inputs(k)) for k in (0, -1)
-    )
-    past = np.concatenate([pairs, earlier, earlier_residuals], axis=1)
-    finite: Mask = np.asarray((np.isfinite(residuals) & np.isfinite(earlier_residuals)).all(axis=1))
-    where, pairs, past, residuals = where[finite], pairs[finite], past[finite], residuals[finite]
+    residuals, earlier = (where.states(k + 1) - stepped(model, where.states(k), where.inputs(k)) for k in (0, -1))
+    finite: Mask = np.asarray((np.isfinite(residuals) & np.isfinite(earlier)).all(axis=1))
+    where, residuals, earlier = where[finite], residuals[finite], earlier[finite]
+    pairs, past = where.pairs(), np.concatenate([where.pairs(), where.pairs(-1), earlier], axis=1)
     groups = np.unique(where.groups)
     folds = np.searchsorted(groups, where.groups) * min(4, len(groups)) // max(len(groups), 1)
     if len(residuals) < 20 or len(np.unique(folds)) < 2:
         return ()
-    rest, linear, history = (np.zeros_like(residuals) for _ in range(3))
-    for fold in np.unique(folds):
-        held = folds == fold
-        linear[held] = _affine(pairs, residuals, held)
-        rest[held] = residuals[held] - _learned(model, where, folds, held, seed)
-    affine = residuals - linear
+
+    def left_by(predict: Callable[[Mask], Array], targets: Array) -> Array:
+        """Return what is left of targets if those of each fold are predicted from the other folds."""
+        left = np.zeros_like(targets)
+        for fold in np.unique(folds):
+            held = folds == fold
+            left[held] = targets[held] - predict(held)
+        return left
+
+    affine = left_by(lambda held: _affine(pairs, residuals, held), residuals)
+    rest = left_by(lambda held: _learned(model, where, folds, held, seed), residuals)
     better = (affine**2).mean(axis=0) < (rest**2).mean(axis=0)
     rest[:, better] = affine[:, better]
-    for fold in np.unique(folds):
-        held = folds == fold
-        history[held] = _affine(past, rest, held)
+    history = left_by(lambda held: _affine(past, rest, held), rest)
     follows: Mask = (np.diff(where.runs) == 0) & (np.diff(where.places) == 1)
 
     def share(errors: Array, size: float) -> float:
@@ -87,11 +84,11 @@ def residual_shares(model: Model, recorded: RecordedSteps, seed: int) -> tuple[R
             return 0.0
         return float(np.corrcoef(first, second)[0, 1])
 
-    size, left = (residuals**2).mean(axis=0).tolist(), (rest**2).mean(axis=0).tolist()
+    sizes, left = (residuals**2).mean(axis=0).tolist(), (rest**2).mean(axis=0).tolist()
     return tuple(
         ResidualShare(
-            *(name, unit, math.sqrt(size[i]), share(affine[:, i], size[i]), share(rest[:, i], size[i])),
-            *(share(rest[:, i] - history[:, i], left[i]), correlation(rest[:, i]), math.sqrt(left[i])),
+            *(name, unit, math.sqrt(sizes[i]), share(affine[:, i], sizes[i]), share(rest[:, i], sizes[i])),
+            *(share(history[:, i], left[i]), correlation(rest[:, i]), math.sqrt(left[i])),
         )
         for i, (name, unit) in enumerate(recorded.recordings.states.items())
     )
@@ -152,31 +149,35 @@ def suggestions(model: Model, recorded: RecordedSteps) -> tuple[Suggestion, ...]
 
 def _delay(model: Model, recorded: RecordedSteps) -> Suggestion | None:
     """Suggest a delay if the model, or an affine model of the recordings themselves, predicts better with it."""
-    if not recorded.recordings.inputs:
+    first, last = -3, 10  # delays in steps that are tried
+    where = recorded.windows(last + 1, 1 - first, 8000)
+    if not recorded.recordings.inputs or not len(where):
         return None
-    where = recorded.windows(max(_SHIFTS) + 1, 1 - min(_SHIFTS), 8000)
-    if not len(where):
-        return None
-    x, reached = where.states(), where.states(1)
-    changes, of_delay = reached - x, (0.85, 0.5)
+    x, reached, groups = where.states(), where.states(1), where.groups
 
-    def delayed(shift: float) -> Array:
-        """Return the mean input of each step if an input acts so many steps later."""
+    def errors(of: Callable[[Array], Array], shift: float) -> Array:
+        """Return the squared errors of states that depend on the mean input of each step, if inputs act so late."""
         whole = math.floor(shift)
-        part = shift - whole
-        now = where.inputs(-whole)
-        return now + part * (where.inputs(-whole - 1) - now) if part else now
+        u, part = where.inputs(-whole), shift - whole
+        u = u + part * (where.inputs(-whole - 1) - u) if part else u
+        return _squared(of(u), reached - x)
 
-    by_model = _over_shifts(lambda shift: _errors(stepped(model, x, delayed(shift)) - reached, changes))
-    chosen, of_model = _chosen(by_model, where.groups, 0.0, *of_delay), True
-    if chosen is None:
-        groups, of_model = where.groups, False
-        fitted = _over_shifts(lambda shift: _errors(_affine_errors(x, delayed(shift), reached, groups), changes))
-        chosen = _chosen(fitted, groups, 0.0, *of_delay)
+    def chosen(of: Callable[[Array], Array]) -> tuple[dict[float, Array], tuple[float, float, float] | None]:
+        """Return the errors for whole steps, and for tenths around the best of them, and what they choose."""
+        known = {float(shift): errors(of, shift) for shift in range(first, last + 1)}
+        best = min(known, key=lambda shift: known[shift].mean())
+        tenths = sorted({round(best + k / 10, 1) for k in range(-9, 10)} - {best})
+        known |= {shift: errors(of, shift) for shift in tenths if first <= shift <= last}
+        return known, _chosen(known, groups, 0.0, 0.85, 0.5)
+
+    by_model, change = chosen(lambda u: stepped(model, x, u) - reached)
+    of_model = change is not None
+    if change is None:
+        fitted, change = chosen(lambda u: _affine_errors(x, u, reached, groups))
         # A model that predicts better than these affine models was not learned with inputs of another time.
-        if chosen is None or by_model[0].mean() <= fitted[chosen[0]].mean():
+        if change is None or by_model[0].mean() <= fitted[change[0]].mean():
             return None
-    shift, ratio, agreeing = chosen
+    shift, ratio, agreeing = change
     delay = shift * recorded.recordings.dt
     when = (
         f"if the inputs act {abs(delay):.3g} s ({abs(shift):g} steps) {'after' if shift > 0 else 'before'} the time at "
@@ -192,28 +193,28 @@ def _delay(model: Model, recorded: RecordedSteps) -> Suggestion | None:
     return Suggestion("delay", delay, ratio, agreeing, sentence)
 
 
-def _over_shifts(errors_of: Callable[[float], Array]) -> dict[float, Array]:
-    """Return the errors for all delays in whole steps, and in tenths of steps around the best of them."""
-    errors = {float(shift): errors_of(shift) for shift in _SHIFTS}
-    best = min(errors, key=lambda shift: errors[shift].mean())
-    around = {round(best + k / 10, 1) for k in range(-9, 10)} - {best}
-    return errors | {s: errors_of(s) for s in sorted(around) if min(_SHIFTS) <= s <= max(_SHIFTS)}
-
-
 def _time_step(model: Model, recorded: RecordedSteps) -> Suggestion | None:
     """Suggest another time step of the model if it then predicts better."""
     multiples = (2, 3, 4, 5, 10)
     where = recorded.windows(0, max(multiples), 8000)
     if not len(where):
         return None
-    errors: dict[float, Array] = {1.0: _relative(model, where, 1, 1)}
+
+    def errors(of_model: int, steps: int) -> Array:
+        """Return squared errors if so many steps of the model and of the recordings take the same time."""
+        x = start = where.states()
+        held = np.mean([where.inputs(k) for k in range(steps)], axis=0)
+        for _ in range(of_model):
+            x = stepped(model, x, held)
+        return _squared(x - where.states(steps), where.states(steps) - start)
+
+    known: dict[float, Array] = {1.0: errors(1, 1)}
     for k in multiples:
-        errors[1 / k] = _relative(model, where, k, 1)
-        errors[float(k)] = _relative(model, where, 1, k)
-    chosen = _chosen(errors, where.groups, 1.0, 0.7, 0.0)
-    if chosen is None:
+        known |= {1 / k: errors(k, 1), float(k): errors(1, k)}
+    change = _chosen(known, where.groups, 1.0, 0.7, 0.0)
+    if change is None:
         return None
-    factor, ratio, agreeing = chosen
+    factor, ratio, agreeing = change
     dt = factor * recorded.recordings.dt
     sentence = (
         f"the error relative to the motion falls to {100 * ratio:.0f} % if one step of the model takes {dt:g} s "
@@ -222,17 +223,7 @@ def _time_step(model: Model, recorded: RecordedSteps) -> Suggestion | None:
     return Suggestion("time step", dt, ratio, agreeing, sentence)
 
 
-def _relative(model: Model, where: Windows, of_model: int, steps: int) -> Array:
-    """Return squared errors relative to the recorded change, if so many steps of each take the same time."""
-    x = start = where.states()
-    held = np.mean([where.inputs(k) for k in range(steps)], axis=0)
-    for _ in range(of_model):
-        x = stepped(model, x, held)
-    reached = where.states(steps)
-    return _errors(x - reached, reached - start)
-
-
-def _errors(errors: Array, changes: Array) -> Array:
+def _squared(errors: Array, changes: Array) -> Array:
     """Return the mean over the states of squared errors relative to their changes, ``(N,)``; large if not finite."""
     sizes = np.sqrt((changes**2).mean(axis=0))
     sizes[sizes == 0] = np.inf
@@ -273,8 +264,7 @@ def _chosen(
     values = list(errors)
     table = np.array([[errors[value][groups == group].mean() for group in known] for value in values])
     base = table[values.index(usual)]
-    halves = [np.arange(len(known)) % 2 == k for k in (0, 1)]
-    picked = [values[int(np.argmin(table[:, half].sum(axis=1)))] for half in halves]
+    picked = [values[int(np.argmin(table[:, half::2].sum(axis=1)))] for half in (0, 1)]
     # Smaller errors are rounding.
     if abs(picked[0] - picked[1]) > alike or usual in picked or base.mean() < 1e-9**2:
         return None

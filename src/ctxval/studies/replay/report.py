@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -95,19 +95,16 @@ def replay(
 
     Args:
         model: the model M, with the time step of the recordings.
-        recordings: the recordings.
         steps: numbers of steps after which errors are computed.
         validation: an experiment with this model, whose tasks are then judged too; its system is never executed.
         executions: number of executions of the experiment that are proposed.
-        seed: seed of all random numbers.
     """
     if not steps or not all(isinstance(k, int) and not isinstance(k, bool) and k >= 1 for k in steps):
         raise InputError(f"steps must be positive integers, got {list(steps)}.")
     if validation is not None:
         _require_same_step(validation, recordings)
     require_time_step(model, recordings.dt, "the recording")
-    seen = _seen(model, recordings)
-    every = range(len(recordings.runs))
+    seen, every = _seen(model, recordings), range(len(recordings.runs))
     used = [number for number in every if number not in seen] or list(every)
     recorded = RecordedSteps(recordings, used)
     with single_threaded():
@@ -119,31 +116,18 @@ def replay(
     if validation is not None:
         logged = [run.trajectory for run in recordings.runs]
         tasks = predicted_tasks(validation, logged, executions=executions, seed=seed)
-    data = RecordedData(
-        tuple(dict.fromkeys(run.source for run in recordings.runs)),
-        len(recordings.runs),
-        recordings.steps,
-        recordings.dt,
-        recordings.states,
-        recordings.inputs,
-        recordings.breaks,
-        recordings.notes,
-        len(seen),
-    )
-    sentences = [
-        *_of_data(data),
-        *(change.sentence for change in changes),
-        *_of_errors(errors, len(used)),
-        *_of_residuals(errors, residuals),
-        *_of_regions(errors, where),
-        *_of_tasks([*data.states, *data.inputs], tasks),
-    ]
+    sources = tuple(dict.fromkeys(run.source for run in recordings.runs))
+    names = recordings.states, recordings.inputs
+    counts = len(recordings.runs), recordings.steps, recordings.dt
+    data = RecordedData(sources, *counts, *names, recordings.breaks, recordings.notes, len(seen))
+    report = ReplayReport(data, errors, where, residuals, changes, tasks, ())
+    sentences = [*_insights(report, len(used)), *_insights_of_tasks([*data.states, *data.inputs], tasks)]
     if validation is not None and tasks is None:
         sentences.append(
             "nothing is predicted of the tasks: the model explains the recordings, or no controller can be designed "
             "for a task"
         )
-    return ReplayReport(data, errors, where, residuals, changes, tasks, tuple(sentences))
+    return replace(report, insights=tuple(sentences))
 
 
 def _seen(model: Model, recordings: Recordings) -> set[int]:
@@ -188,11 +172,10 @@ def plain_numbers(value: Any) -> Any:
 
 # What follows, in sentences
 
-_SHARE = 0.3  # share of a residual from which an explanation is named
-_SMALL = 1e-3  # a one-step error below this share of the change is called small, and its causes are not named
 
-
-def _of_data(data: RecordedData) -> Iterator[str]:
+def _insights(report: ReplayReport, used: int) -> Iterator[str]:
+    """Yield what follows for the model from so many recordings, the most important sentence first."""
+    data, errors, single = report.data, report.errors, [error for error in report.errors if error.steps == 1]
     if data.breaks:
         places = {(gap.source, gap.time): gap.seconds for gap in data.breaks}  # several fields may lack one time
         yield (
@@ -203,66 +186,61 @@ def _of_data(data: RecordedData) -> Iterator[str]:
         yield "the model was learned from all of these recordings, so its errors on others are larger"
     elif data.seen:
         yield f"the model was learned from {data.seen} of these recordings; the errors are those of the others"
-
-
-def _of_errors(errors: Sequence[StepError], held_out: int) -> Iterator[str]:
-    single = [error for error in errors if error.steps == 1]
+    yield from (change.sentence for change in report.suggestions)
     if not single:
         yield "no recording has a single step, so nothing can be compared"
         return
-    worst = max(single, key=lambda one: one.relative)
+    worst = max(single, key=lambda error: error.relative)
     if worst.relative >= 1:
         yield (
             f"the model predicts {worst.state} no better than no change at all: its one-step error is "
             f"{100 * worst.relative:.0f} % of the recorded change"
         )
-    last = max(errors, key=lambda one: one.steps)
-    late = ", ".join(error.state for error in errors if error.steps == last.steps and error.relative >= 1)
+    steps = max(error.steps for error in errors)
+    late = ", ".join(error.state for error in errors if error.steps == steps and error.relative >= 1)
     if late and worst.relative < 1:
-        yield f"after {last.steps} steps the model predicts {late} no better than no change at all"
-    diverged = max(errors, key=lambda one: one.diverged)
+        yield f"after {steps} steps the model predicts {late} no better than no change at all"
+    diverged = max(errors, key=lambda error: error.diverged)
     if diverged.diverged > 0:
         yield f"{100 * diverged.diverged:.2g} % of the predictions of {diverged.steps} steps diverge"
-    if held_out == 1:
+    if used == 1:
         yield "there is only one recording, so the spread is that over five parts of it"
+    # Causes of an error that is small, as a share of the change, are not named.
+    not_small = {error.state for error in single if not error.relative < 1e-3}
+    for residual in report.residuals:
+        if residual.state in not_small:
+            yield from _causes(residual)
+    if not_small:
+        for region in sorted(report.regions, key=lambda region: -region.ratio)[:3]:
+            if region.ratio >= 1.5:
+                yield (
+                    f"the one-step error is {region.ratio:.2g} times as large as on average where {region.variable} is "
+                    f"between {region.low:.3g} and {f'{region.high:.3g} {region.unit}'.rstrip()}"
+                )
 
 
-def _of_residuals(errors: Sequence[StepError], residuals: Sequence[ResidualShare]) -> Iterator[str]:
-    relative = {error.state: error.relative for error in errors if error.steps == 1}
-    for one in residuals:
-        if relative.get(one.state, 0.0) < _SMALL:
-            continue
-        left = f"{one.rest:.3g} {one.unit}".rstrip()
-        if one.explained >= _SHARE:
-            how = "an affine function" if one.linear > 0.9 * one.explained else "a function"
-            yield (
-                f"{100 * one.explained:.0f} % of the residual of {one.state} is {how} of state and input: a better "
-                f"model can be learned from these recordings, with {left} of one-step error left"
-            )
-        elif one.history < _SHARE:
-            yield (
-                f"state and input explain {100 * one.explained:.0f} % of the residual of {one.state}: the rest of "
-                f"{left} is noise, or has a cause that is not recorded"
-            )
-        if one.history >= _SHARE and one.rest > 0.05 * one.rms:
-            yield (
-                f"the step before explains {100 * one.history:.0f} % of what state and input leave of the residual of "
-                f"{one.state}: the system has a state that is not recorded, a delay, or filtered measurements"
-            )
+def _causes(residual: ResidualShare) -> Iterator[str]:
+    """Yield the causes of the residual of a state: an explanation is named if it is at least 0.3 of it."""
+    left = f"{residual.rest:.3g} {residual.unit}".rstrip()
+    if residual.explained >= 0.3:
+        how = "an affine function" if residual.linear > 0.9 * residual.explained else "a function"
+        yield (
+            f"{100 * residual.explained:.0f} % of the residual of {residual.state} is {how} of state and input: a "
+            f"better model can be learned from these recordings, with {left} of one-step error left"
+        )
+    elif residual.history < 0.3:
+        yield (
+            f"state and input explain {100 * residual.explained:.0f} % of the residual of {residual.state}: the rest "
+            f"of {left} is noise, or has a cause that is not recorded"
+        )
+    if residual.history >= 0.3 and residual.rest > 0.05 * residual.rms:
+        yield (
+            f"the step before explains {100 * residual.history:.0f} % of what state and input leave of the residual of "
+            f"{residual.state}: the system has a state that is not recorded, a delay, or filtered measurements"
+        )
 
 
-def _of_regions(errors: Sequence[StepError], where: Sequence[Region]) -> Iterator[str]:
-    if max((error.relative for error in errors if error.steps == 1), default=0.0) < _SMALL:
-        return
-    for region in sorted(where, key=lambda region: -region.ratio)[:3]:
-        if region.ratio >= 1.5:
-            yield (
-                f"the one-step error is {region.ratio:.2g} times as large as on average where {region.variable} is "
-                f"between {region.low:.3g} and {f'{region.high:.3g} {region.unit}'.rstrip()}"
-            )
-
-
-def _of_tasks(names: Sequence[str], tasks: PredictedTasks | None) -> Iterator[str]:
+def _insights_of_tasks(names: Sequence[str], tasks: PredictedTasks | None) -> Iterator[str]:
     if tasks is None or not tasks.worst:
         return
     worst = tasks.worst[0]
