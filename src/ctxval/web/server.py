@@ -18,11 +18,10 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from ctxval.errors import InputError
 from ctxval.web.app import application
-from ctxval.web.live import LiveCampaign
+from ctxval.web.jobs import OpenCampaign
 from ctxval.web.security import Access, Hosts, is_loopback
-from ctxval.web.served import OpenCampaign
 from ctxval.web.service import CampaignService
-from ctxval.web.state import PageState
+from ctxval.web.state import LiveCampaign, PageState
 
 
 def serve(
