@@ -41,6 +41,8 @@ RUN = "run"
 LEADING_KINDS = ("auto", "posterior", "audit")
 """The kinds of certificates that most people need."""
 
+ERROR = ("error: ", "bold red")
+
 out, notes, err = Screen(), Screen(stderr=True), Screen(stderr=True)
 """What ``--json`` silences, on stdout and on stderr, and what is always said, on stderr."""
 
@@ -140,7 +142,7 @@ def _run(function: Callable[[], Any], as_json: bool, stated: set[str]) -> None:
     finally:
         out.quiet = notes.quiet = False
     if failure is not None:
-        (err.say if status == INTERRUPTED else say_error)(failure)
+        err.say(*([] if status == INTERRUPTED else [ERROR]), failure)
         if as_json:
             _print_failure(failure)
     if status:
@@ -187,11 +189,6 @@ def _show_warning(message: Warning | str, category: type[Warning], *place: Any, 
         err.say(warnings.formatwarning(message, category, *place[:2]).rstrip("\n"))
 
 
-def say_error(sentence: str) -> None:
-    """Print an error message."""
-    err.say(("error:", "bold red"), f" {sentence}")
-
-
 def status_of(verdict: Verdict | None) -> int:
     """Return the exit status of a verdict."""
     return FALSIFIED if verdict is not None and verdict.answer == "falsified" else 0
@@ -207,8 +204,7 @@ def failures_of(trials: Iterable[Trial]) -> list[dict[str, Any]]:
     by_reason: dict[str, list[int]] = {}
     for trial in trials:
         if trial.state == "failed":
-            reason = shortened(trial.failure or "no reason was stated")
-            by_reason.setdefault(reason, []).append(trial.number)
+            by_reason.setdefault(shortened(trial.failure or "no reason was stated"), []).append(trial.number)
     ordered = sorted(by_reason.items(), key=lambda item: -len(item[1]))
     return [{"reason": reason, "trials": numbers} for reason, numbers in ordered]
 

@@ -53,10 +53,8 @@ def ask(
     if stated > 1:
         raise InputError("--set, --draw, --again, --trial and --explore cannot be combined.")
     if stated and (threshold is not None or budget is not None):
-        raise InputError(
-            "--threshold and --budget are for a trial that decides a verdict; --set, --draw, --again, --trial and "
-            "--explore open another one."
-        )
+        others = "--set, --draw, --again, --trial and --explore open another one"
+        raise InputError(f"--threshold and --budget are for a trial that decides a verdict; {others}.")
     if because is not None and again is None:
         raise InputError("--because needs --again TRIAL: it states why the task is executed again.")
     if out_ is not None:
@@ -76,13 +74,10 @@ def ask(
             verdict = campaign.verdict(limit, certificate=certificate)
             print_verdict(verdict)
             if verdict.answer == "undecided":
-                out.say(
-                    "the budget is spent: --budget plans more executions, and --explore opens a trial without a "
-                    "verdict."
-                )
+                more = "--budget plans more executions, and --explore opens a trial without a verdict"
+                out.say(f"the budget is spent: {more}.")
             decided = {"verdict": verdict.answer, "reason": verdict.reason, "threshold": limit, "store": str(path)}
-            report = {"trial": None, "executions": campaign.executions, **decided}
-            return report, status_of(verdict)
+            return {"trial": None, "executions": campaign.executions, **decided}, status_of(verdict)
         waiting = asked
     else:
         chosen = None if again is None else parameters_of_trial(campaign, again)

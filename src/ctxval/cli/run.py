@@ -19,6 +19,7 @@ from ctxval.campaign.storage.other_stores import other_stores
 from ctxval.certificates.verdict import usable_bound
 from ctxval.cli.base import (
     CANNOT_GO_ON,
+    ERROR,
     RUN,
     command,
     err,
@@ -28,7 +29,6 @@ from ctxval.cli.base import (
     print_other_stores,
     print_table,
     print_verdict,
-    say_error,
     status_of,
     worst_of,
 )
@@ -78,10 +78,8 @@ def run(
     experiment = settings.load()
     certificate = settings.certificate_options
     if truth and experiment.truth is None:
-        raise InputError(
-            f"the true maximum of {experiment.name!r} is not known. Only experiments with a `truth` function have it, "
-            "such as the cases of the paper."
-        )
+        who = "Only experiments with a `truth` function have it, such as the cases of the paper"
+        raise InputError(f"the true maximum of {experiment.name!r} is not known. {who}.")
     limit, units = limit_of(experiment, settings), experiment.units
     path = settings.store_path(experiment.name)
     campaign = settings.campaign(experiment, path, accept_change=accept_change)
@@ -167,7 +165,7 @@ def run(
     if verdict is not None:
         print_other_stores(report["other_stores"])
     if campaign.failed and not campaign.completed:
-        say_error(f"all {len(campaign.failed)} executions failed, so there is no distance.")
+        err.say(ERROR, f"all {len(campaign.failed)} executions failed, so there is no distance.")
         return report, CANNOT_GO_ON
     return report, status_of(verdict)
 

@@ -6,7 +6,7 @@ import math
 import secrets
 import zlib
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
@@ -25,19 +25,15 @@ from ctxval.web.state import PageState
 
 @dataclass(frozen=True)
 class Problem:
-    """Why a form was not accepted.
+    """Why a form was not accepted, with what the operator typed, which the form shows again, and the status of HTTP.
 
-    Attributes:
-        where: the form: ``choose``, or the kind of the result and the number of the trial, such as ``recording-3``.
-        sentence: the reason.
-        fields: what the operator typed, which the form shows again.
-        status: the status of HTTP.
+    The form is ``choose``, or the kind of the result and the number of the trial, such as ``recording-3``.
     """
 
     where: str
     sentence: str
-    fields: Mapping[str, str] = field(default_factory=dict)
-    status: int = 422
+    fields: Mapping[str, str]
+    status: int
 
 
 class Page:
@@ -160,9 +156,6 @@ class Page:
         if not 0 <= number < len(trials) or trials[number].state == "open":
             return None
         return text(result_sentence(trials[number], self._units), 1_000)
-
-
-# Trials in words
 
 
 _ORIGINS = {

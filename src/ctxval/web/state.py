@@ -53,41 +53,29 @@ class Work:
 class PageState:
     """What the page shows, for any number of browsers. All of it belongs to the event loop of the server.
 
-    Attributes:
-        served: the campaign, of which only what does not change may be read here.
-        live: whether a command executes the tasks, so that the page only shows them.
-        choosing, judging: present work.
-        enough: whether the last choice found that the verdict is reached or the budget is spent.
-        chosen: the number of the trial that was opened last from this page.
-        certificate: the certificate of a campaign without a threshold, which has no verdict.
-        judged: the trials that the verdict is about, as :attr:`Snapshot.ended`.
-        files: the files of open trials by number; a text says why there are none.
-        interval: the largest executed distance and a preliminary bound, while a command executes the tasks.
-        outcome: how the command that executed the tasks has ended.
-        version: a number that grows with each change, also when the server is started again.
-        shown: the version that was last sent to a browser.
+    Only what does not change of the served campaign may be read here.
     """
 
-    live = False
+    live = False  # whether a command executes the tasks, so that the page only shows them
     choosing: Work | None = None
     judging: Work | None = None
     choice_error: str | None = None
-    enough: bool = False
-    chosen: int | None = None
+    enough: bool = False  # whether the last choice found that the verdict is reached or the budget is spent
+    chosen: int | None = None  # the trial that was opened last from this page
     verdict: Verdict | None = None
-    certificate: Certificate | None = None
-    judged: tuple[int, int] | None = None
+    certificate: Certificate | None = None  # of a campaign without a threshold, which has no verdict
+    judged: tuple[int, int] | None = None  # the trials that the verdict is about, as Snapshot.ended
     judgement_error: str | None = None
     store_error: str | None = None
-    interval: str | None = None
-    outcome: str | None = None
+    interval: str | None = None  # the largest executed distance and a preliminary bound, of a command
+    outcome: str | None = None  # how the command that executed the tasks has ended
 
     def __init__(self, served: ServedCampaign, snapshot: Snapshot) -> None:
         self.served, self.snapshot = served, snapshot
         self.pictures: Pictures = {}
-        self.files: dict[int, Files | str] = {}
-        self.version = time.time_ns()
-        self.listeners = self.shown = 0
+        self.files: dict[int, Files | str] = {}  # of open trials; a text says why there are none
+        self.version = time.time_ns()  # which grows with each change, also when the server is started again
+        self.listeners = self.shown = 0  # open pages, and the version that was last sent to one
         self._changed = asyncio.Event()
         self._tasks: set[asyncio.Task[Any]] = set()
         self._closing = False
@@ -127,6 +115,10 @@ class PageState:
         finally:
             self.listeners -= 1
 
+    def end_from_elsewhere(self) -> None:
+        """Let all listeners end; any thread may call this."""
+        self._loop.call_soon_threadsafe(self.end_events)
+
     def end_events(self) -> None:
         """Let all listeners end, because the server stops."""
         self._closing = True
@@ -144,11 +136,7 @@ class PageState:
 
     def _follow_progress(self, kind: str) -> Listener:
         """Return a listener for another thread, which shows how far choosing or judging is."""
-
-        def hear(progress: Progress) -> None:
-            self._loop.call_soon_threadsafe(self._progressed, kind, progress)
-
-        return hear
+        return lambda progress: self._loop.call_soon_threadsafe(self._progressed, kind, progress)
 
     def _progressed(self, kind: str, progress: Progress) -> None:
         work: Work | None = getattr(self, kind)

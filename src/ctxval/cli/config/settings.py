@@ -184,23 +184,19 @@ class Settings(BaseModel):
         return experiment if validation is given else replace(experiment, validation=validation)
 
     def _named(self, experiment: str) -> Experiment:
-        given = [name for name in (*_WHOLE, "distance", "name") if getattr(self, name) is not None]
-        if given:
-            raise InputError(
-                f"the file has both 'experiment' and {given[0]!r}: remove one of them, because a named experiment has "
-                f"its own {given[0]}."
-            )
+        for name in (*_WHOLE, "distance", "name"):
+            if getattr(self, name) is not None:
+                why = f"remove one of them, because a named experiment has its own {name}"
+                raise InputError(f"the file has both 'experiment' and {name!r}: {why}.")
         if "seed" in self.options:
             raise InputError("[options] must not contain the seed: write it at the top of the file, or give --seed.")
         return named_experiment(experiment, self.seed, self.options, self.folder)
 
     def _described(self) -> Experiment:
-        missing = [name for name in _WHOLE if getattr(self, name) is None]
+        missing = ", ".join(name for name in _WHOLE if getattr(self, name) is None)
         if missing:
-            raise InputError(
-                "the file must name an experiment, as in experiment = 'pendulum', or describe one: "
-                f"it has no {', '.join(missing)}."
-            )
+            how = "name an experiment, as in experiment = 'pendulum', or describe one"
+            raise InputError(f"the file must {how}: it has no {missing}.")
         if self.options:
             raise InputError(
                 "[options] is only for a named experiment (experiment = ...); this file describes its own."
@@ -256,7 +252,7 @@ class Settings(BaseModel):
 
     @property
     def certificate_options(self) -> CertificateOptions:
-        """The kind, the options and the confidence of the certificate for the verdict."""
+        """The certificate for the verdict."""
         return self.certificate.options(self.confidence)
 
     @property
@@ -291,9 +287,8 @@ def read_settings(target: str, overrides: dict[str, Any]) -> Settings:
         raise InputError(not_an_experiment(target))
     content = _read_toml(Path(target)) if is_file else {"experiment": target}
     if "folder" in content:
-        raise InputError(
-            f"{target}: no setting is called 'folder'; modules and files are read from the folder of this file."
-        )
+        where = "modules and files are read from the folder of this file"
+        raise InputError(f"{target}: no setting is called 'folder'; {where}.")
     given = {key: value for key, value in overrides.items() if value is not None}
     options = {**_table(content, "options"), **given.pop("options", {})}
     search = _table(content, "search")
