@@ -62,7 +62,8 @@ def command(name: str | None = None, /, *, with_json: bool = True, **words: Any)
         groups: dict[str, tuple[Any, list[str]]] = {}
         parameters: list[inspect.Parameter] = []
         for parameter in inspect.signature(function, eval_str=True).parameters.values():
-            group, options = parameter.annotation, [parameter]
+            group: Any = parameter.annotation
+            options = [parameter]
             if is_dataclass(group):
                 options = [*inspect.signature(group, eval_str=True).parameters.values()]
                 groups[parameter.name] = group, [each.name for each in options]

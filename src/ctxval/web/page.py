@@ -50,7 +50,11 @@ class Page:
             trim_blocks=True,
             lstrip_blocks=True,
         )
-        self._templates.filters["text"] = text
+        self._templates.filters |= {
+            "text": text,
+            "task": lambda trial: in_words(trial, self._space.units),
+            "distance": lambda trial: "" if trial.distance is None else f"{trial.distance:.4g} {self._units}".rstrip(),
+        }
 
     def campaign(
         self,
@@ -74,16 +78,12 @@ class Page:
             snapshot=snapshot,
             opened=[self._open_trial(trial) for trial in snapshot.waiting],
             enough=self._enough(),
-            rows=[self._row(trial) for trial in reversed(shown)],
-            left_out=len(snapshot.trials) - len(shown),
-            again=[(trial.number, in_words(trial, space.units)) for trial in shown if trial.executed],
+            shown=shown[::-1],
             parameters=list(zip(space.labels, space.low, space.high, strict=True)),
-            worst=None if snapshot.worst is None else self._row(snapshot.worst),
             certificate=certificate,
             bound=None if certificate is None else with_error(certificate.upper_bound, certificate.error),
-            news=self._news(),
             told=None if told is None else self.ended(told),
-            replaced=[self._row(trial) for trial in snapshot.trials if trial.told and trial.number == replaced],
+            replaced=[trial for trial in snapshot.trials if trial.told and trial.number == replaced],
             problem=problem,
             given=lambda where, field: problem.fields.get(field, "") if problem and problem.where == where else "",
             token=form_token,
@@ -112,30 +112,6 @@ class Page:
             "files_error": prepared if isinstance(prepared, str) else None,
             "columns": header.split(",") if header else [],
         }
-
-    def _row(self, trial: Trial) -> dict[str, Any]:
-        return {
-            "number": trial.number,
-            "task": in_words(trial, self._space.units),
-            "origin": trial.origin,
-            "state": trial.state,
-            "told": trial.told,
-            "distance": "" if trial.distance is None else f"{trial.distance:.4g} {self._units}".rstrip(),
-            "remark": "" if trial.failure is None else text(trial.failure),
-        }
-
-    def _news(self) -> str:
-        """Return what is new, for a screen reader."""
-        state = self._state
-        if state.live:
-            return state.outcome or ""
-        if state.choosing is not None:
-            return "A task is being chosen."
-        if state.choice_error is not None:
-            return "No task was chosen."
-        if state.chosen is not None:
-            return f"Trial {state.chosen} is open."
-        return self._enough() or ""
 
     def _enough(self) -> str | None:
         """Return why no further task is needed for the verdict; None if one may be."""
@@ -168,7 +144,6 @@ _ORIGINS = {
 }
 
 _SEARCHES = {
-    "initial": "The task is one of the first tasks of the search, which are spread over the task space.",
     "filling": "The task is in the largest gap between the tasks so far.",
     "improvement": "The search expects here the largest improvement over the largest distance so far.",
     "bound": "The upper confidence bound of the distance is largest at this task.",

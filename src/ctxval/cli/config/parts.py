@@ -205,8 +205,20 @@ def _typed(what: str, hint: Any, value: Any) -> Any:
     try:
         return adapter.validate_python(given, strict=True)
     except ValidationError as error:
-        message = error.errors()[0]["msg"].lower()
-        raise InputError(f"{what}: {message}, got {value!r}.") from error
+        raise InputError(f"{what}{refusal_of(error.errors()[0])}, got {value!r}.") from error
+
+
+def refusal_of(problem: Mapping[str, Any]) -> str:
+    """Return what follows the name of a value that pydantic refuses, such as `` must be a positive integer``."""
+    match problem:
+        case {"type": "greater_than_equal", "ctx": {"ge": 1}}:
+            return " must be a positive integer"
+        case {"type": "greater_than_equal", "ctx": {"ge": bound}}:
+            return f" must be at least {bound}"
+        case {"type": "greater_than", "ctx": {"gt": 0}}:
+            return " must be a positive number"
+    message = str(problem["msg"]).lower()
+    return message.replace("input should", " must", 1) if message.startswith("input should") else f": {message}"
 
 
 def with_distribution(

@@ -22,7 +22,15 @@ from ctxval.campaign.storage.store import Store
 from ctxval.certificates import KINDS, RESOLUTION, CertificateOptions, require_use
 from ctxval.certificates.options import CONFIDENCE, LEAST_CONFIDENCE, MOST_VOLUME, WITHIN
 from ctxval.certificates.prediction_tests import TESTS
-from ctxval.cli.config.parts import argument, named_experiment, part, require_types, task_function, with_distribution
+from ctxval.cli.config.parts import (
+    argument,
+    named_experiment,
+    part,
+    refusal_of,
+    require_types,
+    task_function,
+    with_distribution,
+)
 from ctxval.cli.config.signatures import code_named, signed
 from ctxval.core.experiment import Experiment
 from ctxval.core.labels import Labels, labels_of
@@ -351,20 +359,10 @@ def _read_toml(path: Path) -> dict[str, Any]:
 def sentence_of(source: str, error: ValidationError) -> str:
     """Return what is wrong with a setting, in one sentence that names it, after the text of its source."""
     first = error.errors()[0]
-    name = ".".join(map(str, first["loc"]))
-    match first:
-        case {"type": "use", "msg": sentence}:
-            return f"{source}{sentence}"
-        case {"type": "extra_forbidden"}:
-            return f"{source}{UnknownNameError.among('setting', str(first['loc'][-1]), Settings.model_fields)}"
-        case {"type": "greater_than_equal", "ctx": {"ge": 1}}:
-            must = "be a positive integer"
-        case {"type": "greater_than_equal", "ctx": {"ge": bound}}:
-            must = f"be at least {bound}"
-        case {"type": "greater_than", "ctx": {"gt": 0}}:
-            must = "be a positive number"
-        case {"msg": message}:
-            must = message.lower().removeprefix("input should ")
-    value = first["input"]
+    if first["type"] == "use":
+        return f"{source}{first['msg']}"
+    if first["type"] == "extra_forbidden":
+        return f"{source}{UnknownNameError.among('setting', str(first['loc'][-1]), Settings.model_fields)}"
+    name, value = ".".join(map(str, first["loc"])), first["input"]
     shown = repr(value[:100]) if isinstance(value, str) else str(value)[:100]
-    return f"{source}{name} must {must}, got {shown}."
+    return f"{source}{name}{refusal_of(first)}, got {shown}."
