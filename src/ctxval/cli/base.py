@@ -10,7 +10,6 @@ import sys
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext, redirect_stdout, suppress
-from dataclasses import is_dataclass
 from json import dumps  # code of users may replace what is in a module
 from typing import Annotated, Any, TypeVar
 
@@ -64,7 +63,7 @@ def command(name: str | None = None, /, *, with_json: bool = True, **words: Any)
         for parameter in inspect.signature(function, eval_str=True).parameters.values():
             group: Any = parameter.annotation
             options = [parameter]
-            if is_dataclass(group):
+            if hasattr(group, "__dataclass_fields__"):
                 options = [*inspect.signature(group, eval_str=True).parameters.values()]
                 groups[parameter.name] = group, [each.name for each in options]
             parameters += options

@@ -53,8 +53,8 @@ def ask(
     if stated > 1:
         raise InputError("--set, --draw, --again, --trial and --explore cannot be combined.")
     if stated and (threshold is not None or budget is not None):
-        others = "--set, --draw, --again, --trial and --explore open another one"
-        raise InputError(f"--threshold and --budget are for a trial that decides a verdict; {others}.")
+        flags = "--set, --draw, --again, --trial and --explore"
+        raise InputError(f"--threshold and --budget are for a trial that decides a verdict; {flags} open another one.")
     if because is not None and again is None:
         raise InputError("--because needs --again TRIAL: it states why the task is executed again.")
     if out_ is not None:

@@ -71,7 +71,13 @@ def run(
     option: list[str] | None = None,
 ) -> Any:
     """``ctxval run``."""
-    stated = {"budget": budget, "search": search, "threshold": threshold, "confidence": confidence, "seed": seed}
+    stated: dict[str, Any] = {
+        "budget": budget,
+        "search": search,
+        "threshold": threshold,
+        "confidence": confidence,
+        "seed": seed,
+    }
     stated |= {"explore": explore, "within": within, "store": store, "options": named_values(option)}
     settings = read_settings(target, stated)
     settings = settings.certified_as({"stochastic": stochastic, "resolution": resolution, "tests": tests})

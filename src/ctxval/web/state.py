@@ -136,7 +136,11 @@ class PageState:
 
     def _follow_progress(self, kind: str) -> Listener:
         """Return a listener for another thread, which shows how far choosing or judging is."""
-        return lambda progress: self._loop.call_soon_threadsafe(self._progressed, kind, progress)
+
+        def hear(progress: Progress) -> None:
+            self._loop.call_soon_threadsafe(self._progressed, kind, progress)
+
+        return hear
 
     def _progressed(self, kind: str, progress: Progress) -> None:
         work: Work | None = getattr(self, kind)
