@@ -32,6 +32,14 @@ def page() -> str:
     group = get_command(app)
     text = get_docs_for_click(obj=group, ctx=Context(group, info_name="ctxval"), name="ctxval")
     sections = text[text.index("## `ctxval ") :]
+    for name, command in getattr(group, "commands").items():  # noqa: B009
+        advanced = [each for each in command.params if getattr(each, "rich_help_panel", None) == "Advanced"]
+        if advanced:  # they are the last ones
+            heading, rest = re.split(rf"(?<=\n## `ctxval {name}`\n)", f"\n{sections}", maxsplit=1)
+            rest = rest.replace(
+                f"* `{advanced[0].opts[-1]}", f"\n**Advanced options**:\n\n* `{advanced[0].opts[-1]}", 1
+            )
+            sections = f"{heading}{rest}".removeprefix("\n")
     sections = re.sub(r"^\* `--help`: .*\n", "", sections, flags=re.MULTILINE)
     sections = sections.replace("```console\n", "```text\n").replace("**Usage**:\n\n", "")
     names = re.findall(r"^## `ctxval (\w+)`$", sections, re.MULTILINE)

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from ctxval.campaign.campaign import Campaign, OpenTrial
     from ctxval.campaign.storage.store import Store
     from ctxval.certificates.verdict import Verdict
+    from ctxval.cli.config.settings import load_experiment
     from ctxval.core.experiment import Experiment
     from ctxval.core.labels import Labels
     from ctxval.core.plan import Outcome, Plan
@@ -75,6 +76,7 @@ __all__ = [
     "cached_truth",
     "compare",
     "grid_truth",
+    "load_experiment",
     "part",
     "refine",
     "rollout",
@@ -127,6 +129,7 @@ _LAZY = {
     "cached_truth": "core.truth",
     "compare": "studies.comparison",
     "grid_truth": "core.truth",
+    "load_experiment": "cli.config.settings",
     "part": "_util.registry",
     "refine": "studies.refinement",
     "rollout": "core.rollout",

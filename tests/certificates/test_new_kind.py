@@ -15,7 +15,7 @@ from conftest import make_validation
 from ctxval import Campaign
 from ctxval.certificates import KINDS, CertificateOptions
 from ctxval.cli import app
-from ctxval.cli.config.tables import CertificateTable
+from ctxval.cli.config.settings import CertificateTable
 
 RECIPE = '''
 """A bound on d* for a distance whose slope is known."""

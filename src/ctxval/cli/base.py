@@ -1,4 +1,4 @@
-"""What all commands share: errors in one sentence, exit statuses, and how things are printed."""
+"""What all commands share: options with their texts, errors in one sentence, exit statuses, and printing."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ import io
 import os
 import sys
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext, redirect_stdout, suppress
 from json import dumps  # code of users may replace what is in a module
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
 import typer
 from rich.table import Table
@@ -21,21 +21,26 @@ from ctxval._util.progress_display import progress_shown
 from ctxval._util.texts import reason_of, shortened
 from ctxval.campaign.goals_of_model import GoalWarning
 from ctxval.campaign.storage.disks import StoreWarning
+from ctxval.certificates import KINDS
 from ctxval.certificates.bounds import as_text
 from ctxval.certificates.verdict import Verdict
-from ctxval.cli.commands import app
-from ctxval.cli.options import described
+from ctxval.cli.commands import TEXTS, app
 from ctxval.cli.screen import Screen, line
 from ctxval.core.experiment import UnitsWarning
 from ctxval.core.preflight import CostWarning, DistanceWarning
 from ctxval.core.trial import Trial
 from ctxval.errors import CertificateError, CtxvalError, InputError, StoreError
+from ctxval.searches import REGISTRY as SEARCHES
 
 FALSIFIED, BAD_INPUT, CANNOT_GO_ON, INTERRUPTED, CUT_OFF = 1, 2, 3, 130, 141
-_BAD = (InputError, StoreError, CertificateError)
 
 RUN = "run"
 """Key under which a store keeps the verdict of its last run and the report that was written."""
+
+LEADING_KINDS = ("auto", "posterior", "audit")
+"""The kinds of certificates that most people need."""
+
+ERROR = ("error: ", "bold red")
 
 out, notes, err = Screen(), Screen(stderr=True), Screen(stderr=True)
 """What ``--json`` silences, on stdout and on stderr, and what is always said, on stderr."""
@@ -47,50 +52,36 @@ def command(name: str | None = None, /, *, with_json: bool = True, **words: Any)
     """Make a function a command of ``ctxval``, which ends with one sentence and an exit status if it fails.
 
     The command returns the JSON object, or the object and the exit status. With ``--json`` nothing else is printed, and
-    an error is the object ``{"error": sentence}``.
-
-    Args:
-        name: the name of the command; None for that of the function.
-        with_json: whether the command has the option ``--json``.
-        words: what replaces the words in braces in the texts of the options.
+    an error is the object ``{"error": sentence}``. A parameter that is a dataclass stands for its fields, which are
+    options that several commands have. ``words`` replace the words in braces in the texts of the options.
     """
 
     def register(function: Command) -> Command:
+        title = name or function.__name__
+        groups: dict[str, tuple[Any, list[str]]] = {}
+        parameters: list[inspect.Parameter] = []
+        for parameter in inspect.signature(function, eval_str=True).parameters.values():
+            group: Any = parameter.annotation
+            options = [parameter]
+            if hasattr(group, "__dataclass_fields__"):
+                options = [*inspect.signature(group, eval_str=True).parameters.values()]
+                groups[parameter.name] = group, [each.name for each in options]
+            parameters += options
+        if with_json:
+            parameters.append(
+                inspect.Parameter("as_json", inspect.Parameter.KEYWORD_ONLY, default=False, annotation=bool)
+            )
+
         @functools.wraps(function)
         def wrapped(*, as_json: bool = False, **given: Any) -> None:
-            warnings.showwarning = _show_warning
-            failure, status = None, 0
-            out.quiet = notes.quiet = as_json
-            try:
-                with _stdout_to_stderr() if as_json else nullcontext() as stdout, progress_shown(not as_json, err):
-                    result = function(**given)
-                    report, status = result if isinstance(result, tuple) else (result, 0)
-                    if stdout is not None:
-                        print(dumps(describe(report), allow_nan=False), file=stdout, flush=True)
-            except CtxvalError as error:
-                failure, status = str(error), BAD_INPUT if isinstance(error, _BAD) else CANNOT_GO_ON
-            except (typer.Exit, typer.Abort):
-                raise
-            except KeyboardInterrupt:
-                failure, status = _STOPPED, INTERRUPTED
-            except BaseException as error:  # users' code may raise anything
-                if isinstance(error.__context__, BrokenPipeError):
-                    raise typer.Exit(CUT_OFF) from None  # the reader of the output has ended, as in `| head`
-                # Python's own exit status here would be 1, which means that a model is falsified.
-                failure, status = reason_of(error), CANNOT_GO_ON
-            finally:
-                out.quiet = notes.quiet = False
-            if failure is not None:
-                (err.say if status == INTERRUPTED else say_error)(failure)
-                if as_json:
-                    _print_failure(failure)
-            if status:
-                raise typer.Exit(status)
+            stated = {key for key, value in given.items() if value is not None}
+            for key, (group, fields) in groups.items():
+                given[key] = group(**{field: given.pop(field) for field in fields})
+            _run(functools.partial(function, **given), as_json, stated)
 
-        title = name or function.__name__
-        parameters = [*inspect.signature(function, eval_str=True).parameters.values(), _AS_JSON]
-        taken = parameters if with_json else parameters[:-1]
-        signature = inspect.Signature([described(each, title, words).replace(kind=each.KEYWORD_ONLY) for each in taken])
+        leading = {option: place for place, option in enumerate(TEXTS["leading"].get(title, ()))}
+        parameters.sort(key=lambda each: leading.get(each.name, len(leading)))
+        signature = inspect.Signature([_described(each, title, words) for each in parameters])
         vars(wrapped)["__signature__"] = signature
         app.command(title)(wrapped)
         return function
@@ -98,8 +89,64 @@ def command(name: str | None = None, /, *, with_json: bool = True, **words: Any)
     return register
 
 
-_AS_JSON = inspect.Parameter("as_json", inspect.Parameter.KEYWORD_ONLY, default=False, annotation=bool)
-_STOPPED = "stopped. All executions are stored; run the same command to resume."
+def _described(parameter: inspect.Parameter, command: str, words: Mapping[str, Any]) -> inspect.Parameter:
+    """Return a parameter of a command as typer takes it, with its text; words replace those in braces."""
+    text = {**TEXTS["options"], **TEXTS.get(command, {})}[parameter.name]
+    words = {
+        **words,
+        "target": "CASE|FILE.toml|module:attr",
+        "searches": ", ".join(sorted(SEARCHES.built_in)),
+        "certificates": ", ".join(kind for kind in KINDS.built_in if kind not in LEADING_KINDS),
+    }
+    known: dict[str, Any] = {
+        key: value.format(**words) if isinstance(value, str) else value
+        for key, value in ({"help": text} if isinstance(text, str) else text).items()
+    }
+    if "argument" in known:
+        info: Any = typer.Argument(metavar=known.pop("argument"), **known)
+    else:
+        leading = TEXTS["leading"].get(command)
+        panel = None if leading is None or parameter.name in leading else "Advanced"
+        # Without its name, a flag would have a second option that switches it off.
+        flags = known.pop("flags", [f"--{parameter.name.strip('_').replace('_', '-')}"])
+        info = typer.Option(*flags, rich_help_panel=panel, **known)
+    return parameter.replace(annotation=Annotated[parameter.annotation, info], kind=parameter.KEYWORD_ONLY)
+
+
+def _run(function: Callable[[], Any], as_json: bool, stated: set[str]) -> None:
+    """Run a command, print its result as JSON if that is asked for, and end with a sentence if it fails."""
+    warnings.showwarning = _show_warning
+    failure, status = None, 0
+    out.quiet = notes.quiet = as_json
+    try:
+        with _stdout_to_stderr() if as_json else nullcontext() as stdout, progress_shown(not as_json, err):
+            result = function()
+            report, status = result if isinstance(result, tuple) else (result, 0)
+            if stdout is not None:
+                print(dumps(describe(report), allow_nan=False), file=stdout, flush=True)
+    except CtxvalError as error:
+        bad = isinstance(error, InputError | StoreError | CertificateError)
+        failure, status = str(error), BAD_INPUT if bad else CANNOT_GO_ON
+        name, must, rest = failure.partition(" must be ")
+        if must and name.replace(" ", "_") in stated:  # the value of an option
+            failure = f"--{name.replace('_', '-')}{must}{rest}"
+    except (typer.Exit, typer.Abort):
+        raise
+    except KeyboardInterrupt:
+        failure, status = "stopped. All executions are stored; run the same command to resume.", INTERRUPTED
+    except BaseException as error:  # users' code may raise anything
+        if isinstance(error.__context__, BrokenPipeError):
+            raise typer.Exit(CUT_OFF) from None  # the reader of the output has ended, as in `| head`
+        # Python's own exit status here would be 1, which means that a model is falsified.
+        failure, status = reason_of(error), CANNOT_GO_ON
+    finally:
+        out.quiet = notes.quiet = False
+    if failure is not None:
+        err.say(*([] if status == INTERRUPTED else [ERROR]), failure)
+        if as_json:
+            _print_failure(failure)
+    if status:
+        raise typer.Exit(status)
 
 
 def _print_failure(sentence: str) -> None:
@@ -142,9 +189,9 @@ def _show_warning(message: Warning | str, category: type[Warning], *place: Any, 
         err.say(warnings.formatwarning(message, category, *place[:2]).rstrip("\n"))
 
 
-def say_error(sentence: str) -> None:
-    """Print an error message."""
-    err.say(("error:", "bold red"), f" {sentence}")
+def status_of(verdict: Verdict | None) -> int:
+    """Return the exit status of a verdict."""
+    return FALSIFIED if verdict is not None and verdict.answer == "falsified" else 0
 
 
 def worst_of(trial: Trial | None) -> dict[str, Any] | None:
@@ -157,8 +204,7 @@ def failures_of(trials: Iterable[Trial]) -> list[dict[str, Any]]:
     by_reason: dict[str, list[int]] = {}
     for trial in trials:
         if trial.state == "failed":
-            reason = shortened(trial.failure or "no reason was stated")
-            by_reason.setdefault(reason, []).append(trial.number)
+            by_reason.setdefault(shortened(trial.failure or "no reason was stated"), []).append(trial.number)
     ordered = sorted(by_reason.items(), key=lambda item: -len(item[1]))
     return [{"reason": reason, "trials": numbers} for reason, numbers in ordered]
 
@@ -171,9 +217,6 @@ def print_failures(failures: list[dict[str, Any]]) -> None:
         notes.say((f"{which} failed", "yellow"), f": {failure['reason']}")
     if len(failures) > 3:
         notes.say(f"and {len(failures) - 3} other reasons; `ctxval export` lists them.")
-
-
-_COLOURS = {"validated": "green", "falsified": "red", "undecided": "yellow"}
 
 
 def print_table(rows: dict[str, Any], units: str = "") -> None:
@@ -215,7 +258,8 @@ def print_other_stores(others: list[str]) -> None:
 
 def print_verdict(verdict: Verdict, units: str = "") -> None:
     """Print the verdict, its reason and its assumptions."""
-    answer = (verdict.answer.upper(), f"bold {_COLOURS[verdict.answer]}")
-    out.say(answer, f" against {f'{verdict.threshold:g} {units}'.rstrip()}: {verdict.reason}", wrap=True)
+    colour = {"validated": "green", "falsified": "red", "undecided": "yellow"}[verdict.answer]
+    threshold = f"{verdict.threshold:g} {units}".rstrip()
+    out.say((verdict.answer.upper(), f"bold {colour}"), f" against {threshold}: {verdict.reason}", wrap=True)
     if verdict.rests_on is not None:
         out.say(verdict.rests_on, wrap=True)

@@ -19,10 +19,10 @@ from ctxval.cli.screen import Screen, line
 TEXTS: dict[str, Any] = tomllib.loads(Path(__file__).with_name("texts.toml").read_text("utf-8"))
 """Every text of the command line."""
 
-PANELS: dict[str, dict[str, tuple[str, str]]] = TEXTS["groups"]
-"""For each group of the help, in order: the commands, the module of each, and its first sentence."""
+PANELS: dict[str, dict[str, list[str]]] = TEXTS["groups"]
+"""For each group of the help, in order: the commands, the module of each, and the paragraphs of its help."""
 
-MODULES = {name: f"ctxval.cli.{module}" for names in PANELS.values() for name, (module, _) in names.items()}
+MODULES = {name: f"ctxval.cli.{module}" for names in PANELS.values() for name, (module, *_) in names.items()}
 """The module of each command."""
 
 
@@ -33,11 +33,11 @@ class Commands(TyperGroup):
         super().__init__(**attributes)
         loaded, self.commands = self.commands, {}
         for panel, names in PANELS.items():
-            for name, (_, sentence) in names.items():
-                command = self.commands[name] = loaded.get(name) or TyperCommand(name, help=sentence)
+            for name, (_, *paragraphs) in names.items():
+                command = loaded.get(name) or TyperCommand(name)
+                command.help = "\n\n".join(paragraphs)
                 vars(command)["rich_help_panel"] = panel
-                # typer keeps the line breaks of the source in all paragraphs but the first.
-                command.help = "\n\n".join(" ".join(each.split()) for each in (command.help or "").split("\n\n"))
+                self.commands[name] = command
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         """Return the command that the arguments name, loaded, and the other arguments."""

@@ -16,15 +16,14 @@ from ctxval.campaign.known import KnownExecution
 from ctxval.campaign.storage.other_stores import STORE_SUFFIXES
 from ctxval.campaign.storage.store import Store
 from ctxval.campaign.telling import ToldResult, parameters_of_trial, result_sentence, tell_result
-from ctxval.cli.base import FALSIFIED, command, out, print_verdict
+from ctxval.cli.base import command, out, print_verdict, status_of
 from ctxval.cli.config.settings import Settings
-from ctxval.cli.config.stored_settings import trusted_settings
-from ctxval.cli.options import named_values, require_folder
-from ctxval.cli.trust import Opened, budget_of, limit_of, open_store, open_target
+from ctxval.cli.config.stored_settings import Opened, budget_of, limit_of, open_store, open_target, trusted_settings
+from ctxval.cli.options import Allowed, named_values, require_folder
 from ctxval.core.exchange import TASK_FORMAT
 from ctxval.core.trial import CONVERGED, Trial
 from ctxval.errors import InputError
-from ctxval.web.served import ServedCampaign
+from ctxval.web.jobs import ServedCampaign
 
 _WAIT = 60.0
 """Seconds to wait for other terminals: each of them locks the store while it chooses a task."""
@@ -33,6 +32,7 @@ _WAIT = 60.0
 @command()
 def ask(
     target: str,
+    allowed: Allowed,
     store: Path | None = None,
     out_: Path | None = None,
     parameters: list[str] | None = None,
@@ -46,56 +46,48 @@ def ask(
     search: str | None = None,
     seed: int | None = None,
     force: bool = False,
-    experiment: str | None = None,
-    trust: bool = False,
-    accept_change: str | None = None,
     option: list[str] | None = None,
 ) -> Any:
-    """Open the next trial of a system that people operate, and write its task and controller to files."""
+    """``ctxval ask``."""
     stated = sum((bool(parameters), draw, again is not None, trial is not None, explore))
     if stated > 1:
         raise InputError("--set, --draw, --again, --trial and --explore cannot be combined.")
     if stated and (threshold is not None or budget is not None):
-        raise InputError(
-            "--threshold and --budget are for a trial that decides a verdict; --set, --draw, --again, --trial and "
-            "--explore open another one."
-        )
+        flags = "--set, --draw, --again, --trial and --explore"
+        raise InputError(f"--threshold and --budget are for a trial that decides a verdict; {flags} open another one.")
     if because is not None and again is None:
         raise InputError("--because needs --again TRIAL: it states why the task is executed again.")
     if out_ is not None:
         require_folder(out_, TRIAL_FILES, TASK_FORMAT, force=force)
     if Path(target).suffix in STORE_SUFFIXES and not Path(target).exists():
         raise InputError(f"there is no store at {target}; `ctxval ask FILE.toml --store {target}` creates one.")
-    overrides = {"store": store, "search": search, "seed": seed, "option": named_values(option) or None}
-    opened = open_target(target, overrides, experiment, trust, accept_change)
-    made, settings, campaign, path = opened.experiment, opened.settings, opened.campaign, opened.path
-    limit = limit_of(made, settings, threshold)
+    overrides = {"store": store, "search": search, "seed": seed, "options": named_values(option) or None}
+    opened = open_target(target, overrides, allowed)
+    experiment, settings, campaign, path = opened.experiment, opened.settings, opened.campaign, opened.path
+    limit = limit_of(experiment, settings, threshold)
     if trial is not None:
         waiting = campaign.reopen(trial)
     elif limit is not None and not stated and (threshold is not None or not settings.explores):
-        certificate, total = settings.certificate_options, budget_of(made, settings, budget)
+        certificate, total = settings.certificate_options, budget_of(experiment, settings, budget)
         asked = campaign.ask_for_verdict(limit, total, certificate=certificate, wait=_WAIT)
         if asked is None:
             verdict = campaign.verdict(limit, certificate=certificate)
             print_verdict(verdict)
             if verdict.answer == "undecided":
-                out.say(
-                    "the budget is spent: --budget plans more executions, and --explore opens a trial without a "
-                    "verdict."
-                )
+                more = "--budget plans more executions, and --explore opens a trial without a verdict"
+                out.say(f"the budget is spent: {more}.")
             decided = {"verdict": verdict.answer, "reason": verdict.reason, "threshold": limit, "store": str(path)}
-            report = {"trial": None, "executions": campaign.executions, **decided}
-            return report, FALSIFIED if verdict.answer == "falsified" else 0
+            return {"trial": None, "executions": campaign.executions, **decided}, status_of(verdict)
         waiting = asked
     else:
         chosen = None if again is None else parameters_of_trial(campaign, again)
         if parameters:
-            chosen = parameters_from(parameters, made.validation.space)
+            chosen = parameters_from(parameters, experiment.validation.space)
         waiting = campaign.ask(chosen, draw=draw, because=because, wait=_WAIT)
     folder = path.with_suffix(".trials") / str(waiting.number) if out_ is None else out_
     if out_ is None:
         require_folder(folder, TRIAL_FILES, TASK_FORMAT, force=force)
-    files = write_files(folder, made, waiting)
+    files = write_files(folder, experiment, waiting)
     others = [each.number for each in campaign.trials if each.state == "open" and each.number != waiting.number]
     task = ", ".join(f"{name} = {value}" for name, value in waiting.trial.parameters.items())
     out.say(f"trial {waiting.number}: {task}")
@@ -123,6 +115,7 @@ def ask(
 def tell(
     store: Path,
     trial: int,
+    allowed: Allowed,
     trajectory: Path | None = None,
     npz: Path | None = None,
     distance: float | None = None,
@@ -130,11 +123,8 @@ def tell(
     resample: bool = False,
     start_tolerance: float | None = None,
     replace: str | None = None,
-    experiment: str | None = None,
-    trust: bool = False,
-    accept_change: str | None = None,
 ) -> Any:
-    """Record the result of an open trial: exactly one of --trajectory, --npz, --distance and --failed."""
+    """``ctxval tell``."""
     stated = {"--trajectory": trajectory, "--npz": npz, "--distance": distance, "--failed": failed}
     if sum(value is not None for value in stated.values()) != 1:
         raise InputError(f"exactly one of {', '.join(stated)} must be given.")
@@ -142,8 +132,8 @@ def tell(
         raise InputError('--failed needs a reason, such as "the motor cut out".')
     if trajectory is None and npz is None and (resample or start_tolerance is not None):
         raise InputError("--resample and --start-tolerance need a recording: give --trajectory or --npz.")
-    require("--start-tolerance", NonNegativeFloat | None, start_tolerance)
-    opened = open_store(Store.existing(store), store, experiment, trust, accept_change)
+    require("start tolerance", NonNegativeFloat | None, start_tolerance)
+    opened = open_store(store, allowed)
     campaign, file, mapping = opened.campaign, trajectory or npz, opened.settings.log_mapping
     result = ToldResult(file, distance, failed, npz is not None, resample, start_tolerance, mapping, replace)
     ended = tell_result(campaign, opened.experiment, trial, result)
@@ -155,27 +145,22 @@ def tell(
 def import_runs(
     store: Path,
     files: list[Path],
+    allowed: Allowed,
     parameters: list[str] | None = None,
     resample: bool = False,
     start_tolerance: float | None = None,
-    experiment: str | None = None,
-    trust: bool = False,
-    accept_change: str | None = None,
 ) -> Any:
-    """Import earlier executions into a store.
-
-    Each one counts in the budget. A run that is already in the store is not imported again.
-    """
-    require("--start-tolerance", NonNegativeFloat | None, start_tolerance)
-    opened = open_store(Store.existing(store), store, experiment, trust, accept_change)
-    campaign, made, mapping = opened.campaign, opened.experiment, opened.settings.log_mapping
-    space = made.validation.space
+    """``ctxval import``."""
+    require("start tolerance", NonNegativeFloat | None, start_tolerance)
+    opened = open_store(store, allowed)
+    campaign, experiment, mapping = opened.campaign, opened.experiment, opened.settings.log_mapping
+    space = experiment.validation.space
     runs = read_runs(files, parameters_from(parameters, space) if parameters else None, space)
     checked = list[KnownExecution]()
     with stage("checking", len(runs), "runs"):
         for run in runs:  # all of them before any is stored
             try:
-                checked.append(run.checked(campaign.validation, made, resample, start_tolerance, mapping))
+                checked.append(run.checked(campaign.validation, experiment, resample, start_tolerance, mapping))
             except InputError as error:
                 raise InputError(f"{run.where}: {error}") from error
             advance(1)
@@ -183,7 +168,7 @@ def import_runs(
     new = [trial for trial in ended if trial is not None]
     known = len(ended) - len(new)
     for trial in new[:10]:
-        out.say(result_sentence(trial, made.units, campaign.start_offset(trial)))
+        out.say(result_sentence(trial, experiment.units, campaign.start_offset(trial)))
     if len(new) > 10:
         out.say(f"... and {len(new) - 10} other trials; --json lists them.")
     out.say(f"{len(new)} runs imported, {known} already in the store.")
@@ -206,26 +191,20 @@ def _ended(trial: Trial, executions: int, store: Path) -> dict[str, Any]:
 @command(with_json=False)
 def serve(
     store: Path,
+    allowed: Allowed,
     host: str = "127.0.0.1",
     port: int = 8765,
     token: str | None = None,
     allow_host: list[str] | None = None,
     threshold: float | None = None,
     budget: int | None = None,
-    experiment: str | None = None,
-    trust: bool = False,
-    accept_change: str | None = None,
 ) -> Any:
-    """Serve a page for the people who execute the tasks of a store by hand.
-
-    The page shows the next task and its files. It takes recordings and failures, and shows the verdict. Ctrl-C stops
-    the server.
-    """
+    """``ctxval serve``."""
     web = web_server()
-    settings = trusted_settings(Store.existing(store), experiment=experiment, trust=trust)
+    settings = trusted_settings(Store.existing(store), experiment=allowed.experiment, trust=allowed.trust)
 
     def first() -> ServedCampaign:
-        return _served(open_store(Store.existing(store), store, experiment, trust, accept_change), threshold, budget)
+        return _served(open_store(store, allowed), threshold, budget)
 
     def say_started(place: str, secret: str | None) -> None:
         out.say(f"the page is at {place}" + ("" if secret is None else f"?token={secret}"))
@@ -239,14 +218,15 @@ def serve(
 
 def _reopened(settings: Settings, path: Path, threshold: float | None, budget: int | None) -> ServedCampaign:
     """Open a store by settings that the user has allowed to run here: those in it may have been changed since."""
-    made = settings.load()
-    return _served(Opened(settings, made, settings.campaign(made, Store.existing(path)), path), threshold, budget)
+    experiment = settings.load()
+    campaign = settings.campaign(experiment, Store.existing(path))
+    return _served(Opened(settings, experiment, campaign, path), threshold, budget)
 
 
 def _served(opened: Opened, threshold: float | None, budget: int | None) -> ServedCampaign:
-    made, settings = opened.experiment, opened.settings
-    limit, total = limit_of(made, settings, threshold), budget_of(made, settings, budget)
-    return ServedCampaign(made, opened.campaign, limit, settings.certificate_options, total)
+    experiment, settings = opened.experiment, opened.settings
+    limit, total = limit_of(experiment, settings, threshold), budget_of(experiment, settings, budget)
+    return ServedCampaign(experiment, opened.campaign, limit, settings.certificate_options, total)
 
 
 def web_server() -> Any:

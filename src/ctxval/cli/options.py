@@ -1,44 +1,24 @@
-"""Arguments and options with their texts, values of ``--option NAME=VALUE``, and files that commands write."""
+"""Options that several commands have, values of ``--option NAME=VALUE``, and files that commands write."""
 
 from __future__ import annotations
 
 import tomllib
 from collections.abc import Iterable, Mapping, Sequence
-from inspect import Parameter
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
-
-from typer import Argument, Option
+from typing import Any
 
 from ctxval._util.files import make_folder_of, require_made_by_us
-from ctxval.certificates import KINDS
-from ctxval.cli.commands import TEXTS
 from ctxval.errors import InputError
-from ctxval.searches import REGISTRY as SEARCHES
-
-TARGET = "CASE|FILE.toml|module:attr"
-"""The three ways to name an experiment."""
-
-_WORDS = {
-    "target": TARGET,
-    "searches": ", ".join(sorted(SEARCHES.built_in)),
-    "certificates": ", ".join(KINDS.built_in),
-}
 
 
-def described(parameter: Parameter, command: str, words: Mapping[str, Any]) -> Parameter:
-    """Return a parameter of a command as typer takes it, with its text; words replace those in braces."""
-    text = {**TEXTS["options"], **TEXTS.get(command, {})}[parameter.name]
-    table = {"help": text} if isinstance(text, str) else dict(text)
-    known: dict[str, Any] = {
-        key: value.format(**_WORDS, **words) if isinstance(value, str) else value for key, value in table.items()
-    }
-    if "argument" in known:
-        info = Argument(metavar=known.pop("argument"), **known)
-    else:
-        # Without its name, a flag would have a second option that switches it off.
-        info = Option(*known.pop("flags", [f"--{parameter.name.strip('_').replace('_', '-')}"]), **known)
-    return parameter.replace(annotation=Annotated[parameter.annotation, info])
+@dataclass(frozen=True)
+class Allowed:
+    """What may be done with the experiment of a store: whose code may run, and why it may have changed."""
+
+    experiment: str | None = None
+    trust: bool = False
+    accept_change: str | None = None
 
 
 def named_values(given: Sequence[str] | None, flag: str = "--option", /, **named: Any) -> dict[str, Any]:

@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, get_args
 
 from ctxval._util.texts import shortened
 from ctxval.cli.base import CANNOT_GO_ON, FALSIFIED, command, err, notes, out, print_columns
 from ctxval.cli.config.check import task_text
+from ctxval.cli.config.parts import part
 from ctxval.cli.config.references import reference, require_function
-from ctxval.cli.config.settings import Settings, named_model, read_settings
+from ctxval.cli.config.settings import Settings, read_settings
 from ctxval.cli.options import named_values, parsed, require_outputs
 from ctxval.core.experiment import Experiment
 from ctxval.core.labels import labels_of, names_of
+from ctxval.core.model import Model, as_model
 from ctxval.data import Field, LogMapping, Recordings, read_recordings
 from ctxval.errors import ExecutionError, InputError
+from ctxval.models import REGISTRY, read_model
+from ctxval.models.mujoco import is_sysid_result
 from ctxval.report.replay_page import write_replay_page
 from ctxval.studies.fitting import FitReport, FittedParameter, fit
 from ctxval.studies.fitting.excitation import Excitation, SignalKind
@@ -27,56 +31,104 @@ from ctxval.studies.replay import PredictedTask, ReplayReport
 from ctxval.studies.replay import replay as compared
 from ctxval.studies.replay.report import STEPS as REPLAYED
 
-DEFAULT_STEPS: dict[str, Any] = {"replayed": ",".join(map(str, REPLAYED)), "fitted": ",".join(map(str, FITTED))}
-"""Words of the text of ``--steps``."""
+
+@dataclass(frozen=True)
+class Logs:
+    """How logs are read: with the mapping of a file, or with that of fields on the command line."""
+
+    mapping: Path | None = None
+    state: list[str] | None = None
+    input_: list[str] | None = None
+    time: str | None = None
+    dt: float | None = None
+    delay: float | None = None
+
+    def read(
+        self, logs: Sequence[Path], settings: Settings | None = None, experiment: Experiment | None = None
+    ) -> Recordings:
+        """Return the recordings in files and folders, with the names and units of the experiment if they fit."""
+        mapping = None if settings is None else settings.log_mapping
+        if self.state or self.input_:
+            if self.mapping is not None:
+                raise InputError("--mapping cannot be combined with --state and --input.")
+            if not self.state:
+                raise InputError("--input needs --state: name the fields of all states too.")
+            mapping = LogMapping(_fields(self.state), _fields(self.input_ or ()))
+        elif self.mapping is not None:
+            mapping = LogMapping.from_toml(self.mapping)
+        stated = {"time": self.time, "dt": self.dt, "delay": self.delay}
+        changes = {name: value for name, value in stated.items() if value is not None}
+        states, inputs = ({}, {}) if experiment is None else _names(experiment)
+        recordings = read_recordings(logs, mapping, states=states, inputs=inputs, **changes)
+        same = (len(states), len(inputs)) == (len(recordings.states), len(recordings.inputs))
+        if not same or states.keys() & inputs.keys():
+            return recordings
+        units = zip(
+            [*recordings.states.values(), *recordings.inputs.values()],
+            [*states.values(), *inputs.values()],
+            strict=True,
+        )
+        if any(unit not in ("", known) for unit, known in units):
+            return recordings
+        return replace(recordings, states=states, inputs=inputs)
 
 
-# Commands
+@dataclass(frozen=True)
+class StepFunction:
+    """The user's step function whose parameters are estimated, and their bounds."""
+
+    step: str | None = None
+    parameter: list[str] | None = None
+    vectorized: bool = False
+
+    @property
+    def bounds(self) -> dict[str, Any]:
+        """The bounds of the parameters by name."""
+        return named_values(self.parameter, "--parameter")
+
+    def load(self) -> Any:
+        """Return the function; None if none is named."""
+        if self.step is None:
+            return None
+        return require_function(f"--step {self.step}", reference(self.step), "(x, u, theta) -> x_next")
 
 
-@command(**DEFAULT_STEPS)
+_STEPS: dict[str, Any] = {"replayed": ",".join(map(str, REPLAYED)), "fitted": ",".join(map(str, FITTED))}
+
+
+@command(**_STEPS)
 def replay(
     logs: list[Path],
+    reading: Logs,
     model: str | None = None,
     option: list[str] | None = None,
     experiment: str | None = None,
-    mapping: Path | None = None,
-    state: list[str] | None = None,
-    input_: list[str] | None = None,
-    time: str | None = None,
-    dt: float | None = None,
-    delay: float | None = None,
     steps: str | None = None,
     executions: int = 10,
     seed: int = 0,
     html: Path | None = None,
     force: bool = False,
 ) -> Any:
-    """Compare a model with recordings of its system. Nothing is executed, and no experiment file is needed.
-
-    The command shows errors over one and several steps on recordings that the model has not seen, where they are large,
-    how much of them a better model could explain, and mistakes of timing. With --experiment it also predicts the worst
-    tasks, and proposes the executions that would tell most.
-    """
-    require_outputs({"--html .html": html}, [*logs, model, experiment, mapping], force=force)
+    """``ctxval replay``."""
+    require_outputs({"--html .html": html}, [*logs, model, experiment, reading.mapping], force=force)
     settings = None if experiment is None else read_settings(experiment, {})
-    made = None if settings is None else settings.load()
-    if model is None and made is None:
-        raise InputError("a model is needed: give --model, or --experiment for the model of an experiment.")
-    recordings = read_logs(logs, mapping, state, input_, settings, made, time=time, dt=dt, delay=delay)
-    if model is None and made is not None:
-        chosen, name = made.validation.model, made.name
+    loaded = None if settings is None else settings.load()
+    recordings = reading.read(logs, settings, loaded)
+    if model is not None:
+        chosen, name = named_model(model, named_values(option), recordings.dt), Path(model).name
+    elif loaded is not None:
+        chosen, name = loaded.validation.model, loaded.name
     else:
-        chosen, name = named_model(str(model), named_values(option), recordings.dt), Path(str(model)).name
+        raise InputError("a model is needed: give --model, or --experiment for the model of an experiment.")
     report = compared(
         chosen,
         recordings,
         steps=REPLAYED if steps is None else numbers(steps),
-        validation=None if made is None else made.validation.with_model(chosen),
+        validation=None if loaded is None else loaded.validation.with_model(chosen),
         executions=executions,
         seed=seed,
     )
-    units = "" if made is None else made.units
+    units = "" if loaded is None else loaded.units
     _print_replay(report, recordings, units)
     if html is None:
         return report.to_json()
@@ -91,42 +143,39 @@ def _print_replay(report: ReplayReport, recordings: Recordings, units: str) -> N
     out.say(f"{data.recordings} recordings, {data.steps} steps of {data.dt:g} s ({data.steps * data.dt:.4g} s)")
     out.say(f"states: {', '.join(data.states)}; inputs: {', '.join(data.inputs) or 'none'}")
     print_breaks(recordings)
-    order = list(data.states).index
-    errors = [
-        (
-            each.state,
-            str(each.steps),
-            f"{each.rms:.3g} {each.unit}".rstrip(),
-            f"{each.lowest:.3g} to {each.highest:.3g}",
-            f"{each.upper:.3g}",
-            f"{100 * each.relative:.3g} %",
-        )
-        for each in sorted(report.errors, key=lambda error: order(error.state))
+    rows = [
+        (*_error_cells(each), f"{each.lowest:.3g} to {each.highest:.3g}", f"{each.upper:.3g}")
+        for each in sorted(report.errors, key=lambda error: list(data.states).index(error.state))
     ]
-    columns: tuple[str, ...] = ("state", "steps", "rms error", "of recordings", "95 % below", "of the change")
-    print_columns(columns, errors, "error of the prediction")
-    residuals = [
-        (
-            each.state,
-            f"{each.rms:.3g} {each.unit}".rstrip(),
-            f"{100 * each.explained:.0f} %",
-            f"{100 * each.linear:.0f} %",
-            f"{each.rest:.3g} {each.unit}".rstrip(),
-            f"{100 * each.history:.0f} %",
-        )
-        for each in report.residuals
-    ]
-    columns = ("state", "rms", "explained by (x, u)", "affine part", "rest", "explained by the step before")
-    if residuals:
+    columns = ["state", "steps", "rms error", "of the change", "of recordings", "95 % below"]
+    print_columns(columns, rows, "error of the prediction")
+    if report.residuals:
+        residuals = [
+            (
+                each.state,
+                f"{each.rms:.3g} {each.unit}".rstrip(),
+                *(f"{100 * share:.0f} %" for share in (each.explained, each.linear, each.history)),
+                f"{each.rest:.3g} {each.unit}".rstrip(),
+            )
+            for each in report.residuals
+        ]
+        columns = ["state", "rms", "explained by (x, u)", "affine part", "explained by the step before", "rest"]
         print_columns(columns, residuals, "one-step residual on held-out recordings")
     if report.tasks is not None:
         _print_tasks("largest predicted distances, which no execution has tested", report.tasks.worst, units)
         upper = f"{report.tasks.upper:.4g} {units}".rstrip()
-        out.say(f"largest distance over all tasks: {report.tasks.median:.4g}, at most {upper} in 95 % of the draws")
+        median = f"{report.tasks.median:.4g}"
+        out.say(f"largest distance over all tasks: {median}, at most {upper} in 95 % of the posterior samples")
         _print_tasks("executions that would tell most of the largest distance", report.tasks.executions, units)
     out.say("")
     for sentence in report.insights:
         out.say(("- ", "bold"), sentence, wrap=True)
+
+
+def _error_cells(error: Any) -> tuple[str, ...]:
+    """Return the state, the number of steps, the error, and its share of the recorded change."""
+    rms = f"{error.rms:.3g} {error.unit}".rstrip()
+    return error.state, str(error.steps), rms, f"{100 * error.relative:.3g} %"
 
 
 def _print_tasks(title: str, tasks: Sequence[PredictedTask], units: str) -> None:
@@ -139,19 +188,12 @@ def _print_tasks(title: str, tasks: Sequence[PredictedTask], units: str) -> None
     print_columns(columns, rows, title)
 
 
-@command("fit", kinds=", ".join(KINDS), **DEFAULT_STEPS)
+@command("fit", kinds=", ".join(KINDS), **_STEPS)
 def fit_models(
     logs: list[Path],
+    reading: Logs,
+    function: StepFunction,
     kind: str | None = None,
-    step: str | None = None,
-    parameter: list[str] | None = None,
-    vectorized: bool = False,
-    mapping: Path | None = None,
-    state: list[str] | None = None,
-    input_: list[str] | None = None,
-    time: str | None = None,
-    dt: float | None = None,
-    delay: float | None = None,
     given: str | None = None,
     hold_out: float = HOLD_OUT,
     steps: str | None = None,
@@ -159,24 +201,19 @@ def fit_models(
     force: bool = False,
     seed: int = 0,
 ) -> Any:
-    """Learn models from recordings, and compare their errors on recordings that were held out.
-
-    The most accurate model is that with the smallest error after the largest number of steps. Its file contains the
-    recorded steps that it was learned from, so that the search `auto` begins with them. If its error after one step or
-    after the largest number of steps is at least the recorded change, the command ends with status 1.
-    """
-    kinds: Any = kind.split(",") if kind else (["parameters"] if step is not None else list(KINDS[:3]))
-    if (step is None) != (not parameter):
+    """``ctxval fit``."""
+    kinds: Any = kind.split(",") if kind else (["parameters"] if function.step is not None else list(KINDS[:3]))
+    if (function.step is None) != (not function.parameter):
         raise InputError("--step and --parameter must be given together.")
-    bounds = named_values(parameter, "--parameter")
-    require_model_file(out_, [*logs, mapping, given], force=force)
-    recordings = read_logs(logs, mapping, state, input_, time=time, dt=dt, delay=delay)
+    bounds = function.bounds
+    require_model_file(out_, [*logs, reading.mapping, given], force=force)
+    recordings = reading.read(logs)
     report = fit(
         recordings,
         [name.strip() for name in kinds],
-        step=step_function(step),
+        step=function.load(),
         bounds=bounds,
-        vectorized=vectorized,
+        vectorized=function.vectorized,
         given=None if given is None else named_model(given, {}, recordings.dt),
         hold_out=hold_out,
         steps=FITTED if steps is None else numbers(steps),
@@ -196,16 +233,11 @@ def fit_models(
                 f"no model that was learned ({kinds_learned}) can be written to a file that ends in {out_.suffix}."
             )
         best = holds[0]
-        written = write_model_file(out_, best.model, step)
+        written = write_model_file(out_, best.model, function.step)
         out.say(f"the {best.kind} model is in {' and '.join(written)}")
     if best.useless is not None:
         notes.say(("not good: ", "bold red"), f"{best.useless}.", wrap=True)
     return {**report.to_json(), "files": written}, 0 if best.useless is None else FALSIFIED
-
-
-def step_function(step: str | None) -> Any:
-    """Return the function that --step names; None if there is none."""
-    return None if step is None else require_function(f"--step {step}", reference(step), "(x, u, theta) -> x_next")
 
 
 def require_model_file(path: Path | None, inputs: Iterable[object], *, force: bool) -> None:
@@ -225,20 +257,14 @@ def print_parameters(parameters: Sequence[FittedParameter]) -> None:
 
 
 def _print_fit(report: FitReport) -> None:
-    held, own = report.held_out, report.learned_from
+    held, learned = report.held_out, report.learned_from
     out.say(
-        f"learned from {own.steps} steps of {len(own.runs)} recordings; errors on {held.steps} steps of "
+        f"learned from {learned.steps} steps of {len(learned.runs)} recordings; errors on {held.steps} steps of "
         f"{len(held.runs)} others"
     )
     order = list(held.states).index
     rows = [
-        (
-            model.kind,
-            each.state,
-            str(each.steps),
-            f"{each.rms:.3g} {each.unit}".rstrip(),
-            f"{100 * each.relative:.3g} %",
-        )
+        (model.kind, *_error_cells(each))
         for model in report.fitted
         for each in sorted(model.errors, key=lambda error: order(error.state))
     ]
@@ -263,18 +289,14 @@ def collect(
     seed: int = 0,
     option: list[str] | None = None,
 ) -> Any:
-    """Execute random tasks with a signal added to the inputs, and record them for `ctxval fit` and `ctxval replay`.
-
-    Each execution is written to the folder when it ends. If the command is interrupted, run it again: executions whose
-    files exist are not repeated.
-    """
+    """``ctxval collect``."""
     settings = read_settings(target, {"options": named_values(option), "seed": seed})
     experiment = settings.load()
-    allowed = None if limits is None else parsed(limits)
     size = parsed(amplitude)
     if not isinstance(size, int | float | list):
         raise InputError(f"--amplitude must be a number or a list such as [1.0, 0.5], got {amplitude!r}.")
-    made = Excitation(experiment.validation, kind, size, allowed, seed)  # type: ignore[arg-type]
+    allowed = None if limits is None else parsed(limits)
+    excitation = Excitation(experiment.validation, kind, size, allowed, seed)  # type: ignore[arg-type]
     try:
         out_.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -286,7 +308,7 @@ def collect(
             known += 1
             continue
         try:
-            run = made.run(number)
+            run = excitation.run(number)
             states, inputs = experiment.names(run.states.shape[-1], run.inputs.shape[-1])
             run.to_csv(path, states=labels_of(states), inputs=labels_of(inputs))
             recorded.append(str(path))
@@ -296,50 +318,6 @@ def collect(
     out.say(f"{len(recorded)} executions recorded in {out_}, {known} were there before, {len(failed)} failed.")
     report = {"recorded": recorded, "known": known, "failed": failed, "folder": str(out_)}
     return (report, CANNOT_GO_ON) if failed and not recorded and not known else report
-
-
-# Logs
-
-
-def read_logs(
-    logs: Sequence[Path],
-    mapping: Path | None,
-    states: Sequence[str] | None,
-    inputs: Sequence[str] | None,
-    settings: Settings | None = None,
-    experiment: Experiment | None = None,
-    **stated: Any,
-) -> Recordings:
-    """Return the recordings in logs.
-
-    Args:
-        logs: files or folders.
-        mapping: the file of the mapping; None for ``states`` and ``inputs``, for that of the settings, or for that of
-            usual names.
-        states, inputs: texts ``NAME=FIELD``.
-        settings, experiment: of an experiment whose recordings these are.
-        stated: other fields of the mapping that the command line may state: the time, dt and the delay.
-    """
-    if not (states or inputs):
-        given = None if settings is None else settings.log_mapping
-        used = given if mapping is None else LogMapping.from_toml(mapping)
-    elif mapping is not None:
-        raise InputError("--mapping cannot be combined with --state and --input.")
-    elif not states:
-        raise InputError("--input needs --state: name the fields of all states too.")
-    else:
-        used = LogMapping(_fields(states), _fields(inputs or ()))
-    changes = {name: value for name, value in stated.items() if value is not None}
-    own_states, own_inputs = ({}, {}) if experiment is None else _names(experiment)
-    recordings = read_recordings(logs, used, states=own_states, inputs=own_inputs, **changes)
-    units = [*recordings.states.values(), *recordings.inputs.values()]
-    own_units = [*own_states.values(), *own_inputs.values()]
-    same = (len(own_states), len(own_inputs)) == (len(recordings.states), len(recordings.inputs))
-    if not same or own_states.keys() & own_inputs.keys():
-        return recordings
-    if any(unit not in ("", own) for unit, own in zip(units, own_units, strict=True)):
-        return recordings
-    return replace(recordings, states=own_states, inputs=own_inputs)
 
 
 def _names(experiment: Experiment) -> tuple[dict[str, str], dict[str, str]]:
@@ -376,3 +354,24 @@ def print_breaks(recordings: Recordings) -> None:
         notes.say(("split:", "yellow"), f" {split}")
     if len(recordings.breaks) > 5:
         notes.say(f"and {len(recordings.breaks) - 5} other places; --json lists them.")
+
+
+def named_model(text: str, options: Mapping[str, Any], dt: float | None = None) -> Model:
+    """Return a model from a file, an experiment, ``module:attr`` or a name of the registry."""
+    path = Path(text)
+    if path.suffix in (".toml", ".npz"):
+        if options:
+            of = "of" if path.suffix == ".toml" else "in"
+            raise InputError(f"the model {of} {text} takes no options, got {', '.join(options)}.")
+        return read_model(path) if path.suffix == ".npz" else read_settings(text, {}).load().validation.model
+    table: dict[str, Any] = {"type": text}
+    if path.suffix == ".onnx":
+        table = {"type": "Onnx", "source": text}
+    elif path.suffix == ".xml" or is_sysid_result(path):
+        table = {"type": "MuJoCo", "mjcf": text, "dt": dt}
+    elif ":" not in text and text not in REGISTRY.built_in and text not in REGISTRY.installed:
+        raise InputError(
+            f"a model must be a file that ends in .onnx, .npz, .xml or .toml, a result of mujoco.sysid, module:attr, "
+            f"or one of {', '.join(REGISTRY.built_in)}, got {text!r}."
+        )
+    return as_model(part("model", {**table, **options}))

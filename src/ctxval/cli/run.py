@@ -19,7 +19,7 @@ from ctxval.campaign.storage.other_stores import other_stores
 from ctxval.certificates.verdict import usable_bound
 from ctxval.cli.base import (
     CANNOT_GO_ON,
-    FALSIFIED,
+    ERROR,
     RUN,
     command,
     err,
@@ -29,22 +29,22 @@ from ctxval.cli.base import (
     print_other_stores,
     print_table,
     print_verdict,
-    say_error,
+    status_of,
     worst_of,
 )
 from ctxval.cli.certify import page_path
 from ctxval.cli.config.settings import Settings, read_settings
+from ctxval.cli.config.stored_settings import budget_of, limit_of
 from ctxval.cli.hand import web_server
 from ctxval.cli.options import named_values
-from ctxval.cli.trust import budget_of, limit_of
 from ctxval.core.trial import designs_sentence
 from ctxval.errors import CertificateError, InputError
 from ctxval.report.context import context_of_campaign
 from ctxval.report.page import write_page
-from ctxval.web.served import ServedCampaign
+from ctxval.web.jobs import ServedCampaign
 
 if TYPE_CHECKING:
-    from ctxval.web.live import LiveCampaign
+    from ctxval.web.state import LiveCampaign
 
 
 @command()
@@ -69,28 +69,23 @@ def run(
     with_report: bool = True,
     live: bool = False,
     option: list[str] | None = None,
-    variant: str | None = None,
-    model: str | None = None,
-    dim: int | None = None,
 ) -> Any:
-    """Execute the tasks that decide whether the model can be trusted, and give the verdict.
-
-    The campaign stops when the threshold lies outside of the interval of the largest distance, or when the budget is
-    spent. If the store exists, the campaign is resumed. Options that are not given have the values in the experiment
-    file.
-    """
-    options = named_values(option, variant=variant, model=model, dim=dim)
-    stated = {"budget": budget, "search": search, "threshold": threshold, "confidence": confidence, "seed": seed}
-    ending = {"explore": explore, "within": within}
-    settings = read_settings(target, {**stated, **ending, "store": store, "options": options})
+    """``ctxval run``."""
+    stated: dict[str, Any] = {
+        "budget": budget,
+        "search": search,
+        "threshold": threshold,
+        "confidence": confidence,
+        "seed": seed,
+    }
+    stated |= {"explore": explore, "within": within, "store": store, "options": named_values(option)}
+    settings = read_settings(target, stated)
     settings = settings.certified_as({"stochastic": stochastic, "resolution": resolution, "tests": tests})
     experiment = settings.load()
     certificate = settings.certificate_options
     if truth and experiment.truth is None:
-        raise InputError(
-            f"the true maximum of {experiment.name!r} is not known. Only experiments with a `truth` function have it, "
-            "such as the cases of the paper."
-        )
+        who = "Only experiments with a `truth` function have it, such as the cases of the paper"
+        raise InputError(f"the true maximum of {experiment.name!r} is not known. {who}.")
     limit, units = limit_of(experiment, settings), experiment.units
     path = settings.store_path(experiment.name)
     campaign = settings.campaign(experiment, path, accept_change=accept_change)
@@ -176,9 +171,9 @@ def run(
     if verdict is not None:
         print_other_stores(report["other_stores"])
     if campaign.failed and not campaign.completed:
-        say_error(f"all {len(campaign.failed)} executions failed, so there is no distance.")
+        err.say(ERROR, f"all {len(campaign.failed)} executions failed, so there is no distance.")
         return report, CANNOT_GO_ON
-    return report, FALSIFIED if verdict is not None and verdict.answer == "falsified" else 0
+    return report, status_of(verdict)
 
 
 @contextmanager

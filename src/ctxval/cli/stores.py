@@ -10,14 +10,14 @@ from ctxval._util.files import MADE_BY
 from ctxval.campaign.storage.recovery import export, recover
 from ctxval.campaign.storage.store import Store
 from ctxval.cli.base import RUN, command, failures_of, out, print_failures, print_table, worst_of
-from ctxval.cli.options import require_folder
-from ctxval.cli.trust import open_store
+from ctxval.cli.config.stored_settings import open_store
+from ctxval.cli.options import Allowed, require_folder
 from ctxval.errors import StoreAccessError
 
 
 @command()
 def status(store: Path) -> Any:
-    """Summarise the trials in a store. Nothing is executed."""
+    """``ctxval status``."""
     opened = Store.existing(store)
     with opened.snapshot():
         description, trials, changes = opened.description(), opened.trials(), opened.history()
@@ -51,10 +51,7 @@ def status(store: Path) -> Any:
 
 @command("export")
 def export_store(store: Path, out_: Path | None = None, force: bool = False) -> Any:
-    """Write the trials of a store as CSV and JSON.
-
-    If the store is damaged, everything that can be read is written.
-    """
+    """``ctxval export``."""
     content = recover(store)
     if content.damaged and not content.trials and not content.trajectories:
         raise StoreAccessError(f"nothing can be read from {store}: it is not a store, or it is damaged completely.")
@@ -71,15 +68,10 @@ def export_store(store: Path, out_: Path | None = None, force: bool = False) -> 
 
 
 @command()
-def remeasure(store: Path, experiment: str | None = None, trust: bool = False, accept_change: str | None = None) -> Any:
-    """Recompute the distances of all stored executions, after you changed the distance function.
-
-    Nothing is executed. If an experiment file defines the distance, name the file with --experiment. The history of the
-    store keeps the earlier values.
-    """
-    known = Store.existing(store)
-    before = {trial.number: trial.distance for trial in known.trials()}
-    campaign = open_store(known, store, experiment, trust, accept_change, remeasure=True).campaign
+def remeasure(store: Path, allowed: Allowed) -> Any:
+    """``ctxval remeasure``."""
+    before = {trial.number: trial.distance for trial in Store.existing(store).trials()}
+    campaign = open_store(store, allowed, remeasure=True).campaign
     trials = campaign.trials
     report: dict[str, Any] = {
         "measured": sum(trial.state == "completed" for trial in trials),

@@ -8,7 +8,6 @@ import io
 import tempfile
 import zipfile
 from collections.abc import AsyncIterator, Awaitable, Callable
-from pathlib import Path
 
 from python_multipart.exceptions import FormParserError
 from starlette.applications import Starlette
@@ -16,7 +15,8 @@ from starlette.datastructures import UploadFile
 from starlette.exceptions import HTTPException
 from starlette.requests import Request
 from starlette.responses import HTMLResponse, RedirectResponse, Response, StreamingResponse
-from starlette.routing import Route
+from starlette.routing import BaseRoute, Mount, Route
+from starlette.staticfiles import StaticFiles
 
 from ctxval._util.texts import shortened, visible
 from ctxval.errors import CampaignError, CtxvalError, InputError, StoreError
@@ -25,8 +25,6 @@ from ctxval.web.page import Page, Problem
 from ctxval.web.security import MOST_UPLOAD, Access, Guard, Hosts
 from ctxval.web.service import CampaignService
 from ctxval.web.state import PageState
-
-_TYPES = {".css": "text/css", ".js": "text/javascript", ".svg": "image/svg+xml"}
 
 _OUT_OF_DATE = (
     "the server was started again after this page was loaded. Send the form once more; a file must be chosen again."
@@ -42,12 +40,12 @@ class PageRoutes:
         self.state, self.access = state, access
         self.page = Page(state)
 
-    def routes(self) -> list[Route]:
+    def routes(self) -> list[BaseRoute]:
         """Return all routes; every one but the static files and the entrance needs a session."""
         return [
             Route("/", self.start, methods=["GET"]),
             Route("/enter", self.enter, methods=["POST"]),
-            Route("/static/{name}", static, methods=["GET"]),
+            Mount("/static", StaticFiles(packages=[("ctxval.web", "static")])),
             Route("/pictures/{name}.svg", self._inside(self.picture), methods=["GET"]),
             Route("/events", self._inside(self.events), methods=["GET"]),
         ]
@@ -116,12 +114,12 @@ class PageRoutes:
 
     async def picture(self, request: Request, session: str) -> Response:
         """Return a picture of the campaign."""
-        found = self.state.pictures.get(request.path_params["name"])
-        if not isinstance(found, bytes):
+        picture = self.state.pictures.get(request.path_params["name"])
+        if not isinstance(picture, bytes):
             return self._message("No picture", "There is no such picture yet.")
         # A picture has styles of its own, and must not run anything if it is opened alone.
         policy = {"Content-Security-Policy": "default-src 'none'; style-src 'unsafe-inline'; sandbox"}
-        return Response(found, media_type=_TYPES[".svg"], headers=policy)
+        return Response(picture, media_type="image/svg+xml", headers=policy)
 
     async def events(self, request: Request, session: str) -> Response:
         """Send an event for each change of the page."""
@@ -137,7 +135,7 @@ class OperatorPage(PageRoutes):
         super().__init__(service, access)
         self.service = service
 
-    def routes(self) -> list[Route]:
+    def routes(self) -> list[BaseRoute]:
         """Return the further routes, too."""
         inside = self._inside
         return [
@@ -241,18 +239,6 @@ async def _form(request: Request, **limits: int) -> AsyncIterator[tuple[dict[str
 def _download(content: bytes, name: str) -> Response:
     headers = {"Content-Disposition": f'attachment; filename="{name}"'}
     return Response(content, media_type="application/octet-stream", headers=headers)
-
-
-_STATIC = {file.name: file.read_bytes() for file in (Path(__file__).parent / "static").iterdir()}
-
-
-async def static(request: Request) -> Response:
-    """Return a file of this package."""
-    name = request.path_params["name"]
-    if name not in _STATIC:
-        return Response("not found", 404, media_type="text/plain")
-    headers = {"Cache-Control": "no-cache"}
-    return Response(_STATIC[name], media_type=_TYPES[name[name.rindex(".") :]], headers=headers)
 
 
 def application(state: PageState, access: Access, hosts: Hosts, most: int = MOST_UPLOAD) -> Guard:

@@ -17,21 +17,14 @@ from typing import Any
 from ctxval._util.progress import Listener, Progress, listening, stage
 from ctxval._util.texts import reason_of
 from ctxval.errors import CampaignError, CtxvalError
-from ctxval.web.served import OpenCampaign, ServedCampaign
-
-Job = Callable[..., Any]
-"""A function of a module, called in the child process with the served campaign and the job's arguments."""
+from ctxval.web.jobs import OpenCampaign, ServedCampaign
 
 
 class BackgroundProcess:
     """A process that opens the campaign once and then does one job at a time.
 
     A process keeps the server responsive while Python computes, keeps users' code of two campaigns apart, and may crash
-    without harm. The next job starts it again.
-
-    Args:
-        open_campaign: opens the campaign in the child process; it must be picklable.
-        on_progress: called in another thread with the progress of the job.
+    without harm. The next job starts it again. The listener is called in another thread.
     """
 
     def __init__(self, open_campaign: OpenCampaign, on_progress: Listener) -> None:
@@ -42,8 +35,11 @@ class BackgroundProcess:
         self._lock = threading.Lock()  # a process must not start while this object is closed
         self._closed = False
 
-    def submit(self, job: Job, *arguments: Any) -> cf.Future[Any]:
-        """Do a job after the earlier ones; its future raises a CampaignError if the job fails or the process ends."""
+    def submit(self, job: Callable[..., Any], *arguments: Any) -> cf.Future[Any]:
+        """Do a job after the earlier ones; its future raises a CampaignError if the job fails or the process ends.
+
+        The job is a function of a module, which the child process calls with the served campaign and the arguments.
+        """
         return self._thread.submit(self._do, job, arguments)
 
     def close(self) -> None:
@@ -52,11 +48,16 @@ class BackgroundProcess:
             self._closed = True
             self._thread.shutdown(wait=False, cancel_futures=True)
             if self._process is not None and self._process.is_alive():
-                _kill(self._process.pid)
+                with contextlib.suppress(ProcessLookupError, PermissionError):
+                    own_group = sys.platform != "win32" and os.getpgid(self._process.pid) == self._process.pid
+                    if own_group:  # with its own children
+                        os.killpg(self._process.pid, signal.SIGKILL)
+                    else:
+                        self._process.kill()
                 self._process.join()
         self._thread.shutdown()
 
-    def _do(self, job: Job, arguments: tuple[Any, ...]) -> Any:
+    def _do(self, job: Callable[..., Any], arguments: tuple[Any, ...]) -> Any:
         with self._lock:
             if self._closed:
                 raise CampaignError("the server is being stopped.")
@@ -83,23 +84,8 @@ class BackgroundProcess:
             raise CampaignError(f"the background process ended with the status {status}. Try again.") from error
 
 
-def _kill(process: int) -> None:
-    """Kill a child and its own children, which are in its process group."""
-    with contextlib.suppress(ProcessLookupError, PermissionError):
-        if sys.platform == "win32":
-            os.kill(process, signal.SIGTERM)
-            return
-        if os.getpgid(process) == process:
-            os.killpg(process, signal.SIGKILL)
-        else:  # it has not made its group yet
-            os.kill(process, signal.SIGKILL)
-
-
-# In the child process
-
-
 def _serve(pipe: Connection, open_campaign: OpenCampaign) -> None:
-    """Do jobs until the server ends, however it ends."""
+    """Do jobs in the child process until the server ends, however it ends."""
     if sys.platform != "win32":
         os.setpgid(0, 0)  # Ctrl-C at the terminal is for the server alone
     served: ServedCampaign | None = None

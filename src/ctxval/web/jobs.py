@@ -1,25 +1,30 @@
-"""The jobs of the background processes: choosing a task, writing its files, judging, and drawing."""
+"""The campaign behind the page, and the jobs of the background processes: choosing, writing files, judging, drawing."""
 
 from __future__ import annotations
 
 import io
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from ctxval._util.progress import stage
 from ctxval._util.texts import reason_of
 from ctxval.campaign.by_hand import write_files
+from ctxval.campaign.campaign import Campaign
 from ctxval.campaign.choices import OpenTrial
+from ctxval.campaign.interval_search import require_decisive
 from ctxval.campaign.plot import overview, worst_trajectories
 from ctxval.campaign.telling import parameters_of_trial
-from ctxval.certificates import Verdict
+from ctxval.certificates import CertificateOptions, Verdict
 from ctxval.certificates import judge as judge_trials
+from ctxval.core.experiment import Experiment
 from ctxval.core.labels import labels_of
+from ctxval.core.trial import Trial
 from ctxval.errors import InputError
-from ctxval.web.served import ServedCampaign
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -27,9 +32,81 @@ if TYPE_CHECKING:
 Files = dict[str, bytes]
 """The files of a trial by name."""
 
-
 Pictures = dict[str, bytes | str]
 """Pictures by name as SVG; a text says why a picture is missing."""
+
+
+@dataclass(frozen=True, eq=False)
+class Snapshot:
+    """The trials of the store at one moment: the open ones with their tasks by number, and the number of executions."""
+
+    signature: tuple[int, int, int]
+    trials: tuple[Trial, ...]
+    tasks: dict[int, dict[str, Any]]
+    executions: int
+    worst: Trial | None
+
+    @property
+    def ended(self) -> tuple[int, int]:
+        """Identifies the trials that have ended, which are those that a verdict is about."""
+        total, waiting, changes = self.signature
+        return total - waiting, changes
+
+    @property
+    def waiting(self) -> list[Trial]:
+        """The open trials, which people execute, or which a program is executing."""
+        return [trial for trial in self.trials if trial.state == "open"]
+
+
+@dataclass(frozen=True, eq=False)
+class ServedCampaign:
+    """A campaign with what the page needs besides it; only the thread that opened the campaign may use it."""
+
+    experiment: Experiment
+    campaign: Campaign
+    threshold: float | None
+    certificate: CertificateOptions
+    budget: int
+
+    @property
+    def store_name(self) -> str:
+        """The name of the file of the store."""
+        path = self.campaign.store.path
+        return "a store in memory" if path is None else path.name
+
+    @property
+    def decides(self) -> bool:
+        """Whether executions can be chosen that decide the verdict."""
+        try:
+            require_decisive(self.certificate)
+        except InputError:
+            return False
+        return self.threshold is not None
+
+    def snapshot(self, tasks: dict[int, dict[str, Any]] | None = None, changes: int = 0) -> Snapshot:
+        """Return the trials that the campaign knows; the last number of the signature counts changes of results."""
+        trials = self.campaign.trials
+        signature = (len(trials), sum(trial.state == "open" for trial in trials), changes)
+        executions = sum(trial.executed for trial in trials)
+        return Snapshot(signature, trials, tasks or {}, executions, self.campaign.worst)
+
+    def read(self) -> Snapshot:
+        """Read the trials in the store, with what people must know of the open tasks before they execute them."""
+        self.campaign.refresh()
+        # The trials were read after this process's last change, so their counts are those of the signature.
+        tasks = {trial.number: self._task(trial) for trial in self.campaign.trials if trial.state == "open"}
+        return self.snapshot(tasks, self.campaign.store.signature()[2])
+
+    def _task(self, trial: Trial) -> dict[str, Any]:
+        validation = self.campaign.validation
+        task = validation.task(validation.space.parameters(validation.space.point(trial.parameters)))
+        start = np.atleast_1d(task.initial_state).tolist()
+        states, _ = self.experiment.names(len(start), 0)
+        return {"start": list(zip(labels_of(states), start, strict=True)), "horizon": task.horizon, "dt": task.dt}
+
+
+OpenCampaign = Callable[[], ServedCampaign]
+"""A function that opens the campaign in the thread or the process in which it is called."""
 
 
 @dataclass(frozen=True)
@@ -119,10 +196,8 @@ def pictures_of(served: ServedCampaign) -> Pictures:
     """Return the pictures of the trials that the campaign knows."""
     import matplotlib
 
-    if not served.campaign.completed:
-        return {}
     pictures: Pictures = {}
-    for name, figure in (("distance", _distance_picture), ("worst", _worst_picture)):
+    for name, figure in (("distance", _distance_picture), ("worst", _worst_picture)) if served.campaign.worst else ():
         # Names of parameters may contain a $, which is not mathematics; a stated id makes equal pictures equal files.
         try:
             with matplotlib.rc_context({"text.parse_math": False, "svg.hashsalt": "ctxval"}):
@@ -143,10 +218,9 @@ def _distance_picture(served: ServedCampaign) -> Figure:
 
 
 def _worst_picture(served: ServedCampaign) -> Figure:
-    campaign = served.campaign
-    assert campaign.worst is not None  # it is drawn only if a distance is known
-    model, _ = campaign.trajectories(campaign.worst)
+    worst: Any = served.campaign.worst
+    model, _ = served.campaign.trajectories(worst)
     if model is None:
-        raise InputError(f"the trajectories of trial {campaign.worst.number} are not in the store.")
+        raise InputError(f"the trajectories of trial {worst.number} are not in the store.")
     states, inputs = served.experiment.names(model.states.shape[-1], model.inputs.shape[-1])
-    return worst_trajectories(campaign, states=labels_of(states), inputs=labels_of(inputs))
+    return worst_trajectories(served.campaign, states=labels_of(states), inputs=labels_of(inputs))

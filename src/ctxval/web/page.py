@@ -6,7 +6,7 @@ import math
 import secrets
 import zlib
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
@@ -25,19 +25,15 @@ from ctxval.web.state import PageState
 
 @dataclass(frozen=True)
 class Problem:
-    """Why a form was not accepted.
+    """Why a form was not accepted, with what the operator typed, which the form shows again, and the status of HTTP.
 
-    Attributes:
-        where: the form: ``choose``, or the kind of the result and the number of the trial, such as ``recording-3``.
-        sentence: the reason.
-        fields: what the operator typed, which the form shows again.
-        status: the status of HTTP.
+    The form is ``choose``, or the kind of the result and the number of the trial, such as ``recording-3``.
     """
 
     where: str
     sentence: str
-    fields: Mapping[str, str] = field(default_factory=dict)
-    status: int = 422
+    fields: Mapping[str, str]
+    status: int
 
 
 class Page:
@@ -54,7 +50,11 @@ class Page:
             trim_blocks=True,
             lstrip_blocks=True,
         )
-        self._templates.filters["text"] = text
+        self._templates.filters |= {
+            "text": text,
+            "task": lambda trial: in_words(trial, self._space.units),
+            "distance": lambda trial: "" if trial.distance is None else f"{trial.distance:.4g} {self._units}".rstrip(),
+        }
 
     def campaign(
         self,
@@ -78,16 +78,12 @@ class Page:
             snapshot=snapshot,
             opened=[self._open_trial(trial) for trial in snapshot.waiting],
             enough=self._enough(),
-            rows=[self._row(trial) for trial in reversed(shown)],
-            left_out=len(snapshot.trials) - len(shown),
-            again=[(trial.number, in_words(trial, space.units)) for trial in shown if trial.executed],
+            shown=shown[::-1],
             parameters=list(zip(space.labels, space.low, space.high, strict=True)),
-            worst=None if snapshot.worst is None else self._row(snapshot.worst),
             certificate=certificate,
             bound=None if certificate is None else with_error(certificate.upper_bound, certificate.error),
-            news=self._news(),
             told=None if told is None else self.ended(told),
-            replaced=[self._row(trial) for trial in snapshot.trials if trial.told and trial.number == replaced],
+            replaced=[trial for trial in snapshot.trials if trial.told and trial.number == replaced],
             problem=problem,
             given=lambda where, field: problem.fields.get(field, "") if problem and problem.where == where else "",
             token=form_token,
@@ -117,30 +113,6 @@ class Page:
             "columns": header.split(",") if header else [],
         }
 
-    def _row(self, trial: Trial) -> dict[str, Any]:
-        return {
-            "number": trial.number,
-            "task": in_words(trial, self._space.units),
-            "origin": trial.origin,
-            "state": trial.state,
-            "told": trial.told,
-            "distance": "" if trial.distance is None else f"{trial.distance:.4g} {self._units}".rstrip(),
-            "remark": "" if trial.failure is None else text(trial.failure),
-        }
-
-    def _news(self) -> str:
-        """Return what is new, for a screen reader."""
-        state = self._state
-        if state.live:
-            return state.outcome or ""
-        if state.choosing is not None:
-            return "A task is being chosen."
-        if state.choice_error is not None:
-            return "No task was chosen."
-        if state.chosen is not None:
-            return f"Trial {state.chosen} is open."
-        return self._enough() or ""
-
     def _enough(self) -> str | None:
         """Return why no further task is needed for the verdict; None if one may be."""
         state, budget = self._state, self._served.budget
@@ -162,9 +134,6 @@ class Page:
         return text(result_sentence(trials[number], self._units), 1_000)
 
 
-# Trials in words
-
-
 _ORIGINS = {
     "iid": "The task is an independent random draw.",
     "spread": "The task tests a prediction where nobody chose to look.",
@@ -175,7 +144,6 @@ _ORIGINS = {
 }
 
 _SEARCHES = {
-    "initial": "The task is one of the first tasks of the search, which are spread over the task space.",
     "filling": "The task is in the largest gap between the tasks so far.",
     "improvement": "The search expects here the largest improvement over the largest distance so far.",
     "bound": "The upper confidence bound of the distance is largest at this task.",

@@ -47,8 +47,7 @@ HEADERS = {
 class Access:
     """Who may use the page: the token of the server, sessions in signed cookies, and tokens of forms.
 
-    The key of the signatures lives as long as the server. Without a token, every browser on this computer may use the
-    page. Browsers share cookies among the ports of one computer.
+    The key of the signatures lives as long as the server. Without a token, every browser on this computer is admitted.
     """
 
     def __init__(self, token: str | None, port: int) -> None:
@@ -57,7 +56,7 @@ class Access:
         self._token = token
         self._key = secrets.token_bytes(32)
         self.needs_token = token is not None
-        self.cookie = f"ctxval-session-{port}"
+        self.cookie = f"ctxval-session-{port}"  # browsers share cookies among the ports of one computer
 
     def admits(self, token: str) -> bool:
         """Return whether this is the token of the server. The comparison takes the same time for every text."""
@@ -94,14 +93,10 @@ def _same(known: str, given: str) -> bool:
 
 @dataclass(frozen=True)
 class Hosts:
-    """The names under which a browser may address the server.
+    """The names in lower case under which a browser may address the server, and whether every IP address is one too.
 
     A page of another site can direct its own name to this computer (DNS rebinding), and its requests would then be
-    requests of the same site. They still carry that name.
-
-    Attributes:
-        names: the permitted names, in lower case.
-        any_address: whether every IP address is permitted too. A site cannot direct an address elsewhere.
+    requests of the same site. They still carry that name. A site cannot direct an address elsewhere.
     """
 
     names: frozenset[str]
@@ -113,8 +108,8 @@ class Hosts:
         names = {"localhost", "127.0.0.1", "::1", host.lower(), *(name.lower() for name in more)}
         local = is_loopback(host)
         if not local:
-            own = socket.gethostname().lower()
-            names |= {own, f"{own.partition('.')[0]}.local"}
+            computer = socket.gethostname().lower()
+            names |= {computer, f"{computer.partition('.')[0]}.local"}
         return Hosts(frozenset(names), not local)
 
     def permit(self, header: str | None) -> bool:
@@ -172,8 +167,7 @@ class _Body:
 
     def require(self, size: int) -> None:
         if size > self.most:
-            mega = self.most >= 2**20
-            limit = f"{self.most / 2**20:g} MiB" if mega else f"{self.most / 2**10:g} KiB"
+            limit = f"{self.most / 2**20:g} MiB" if self.most >= 2**20 else f"{self.most / 2**10:g} KiB"
             self.refused = 413, f"This is too large: at most {limit} are accepted here. Nothing is stored."
             raise ClientDisconnect
 

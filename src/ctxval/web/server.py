@@ -18,11 +18,10 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from ctxval.errors import InputError
 from ctxval.web.app import application
-from ctxval.web.live import LiveCampaign
+from ctxval.web.jobs import OpenCampaign
 from ctxval.web.security import Access, Hosts, is_loopback
-from ctxval.web.served import OpenCampaign
 from ctxval.web.service import CampaignService
-from ctxval.web.state import PageState
+from ctxval.web.state import LiveCampaign, PageState
 
 
 def serve(
@@ -37,14 +36,8 @@ def serve(
 ) -> None:
     """Serve a campaign until the process gets SIGINT or SIGTERM.
 
-    Args:
-        open_campaign: opens the campaign of the server.
-        reopen: opens the campaign in a child process; it must be picklable.
-        on_start: called with the address of the page and its token, if it has one, before the first request.
-        host: the address to listen at; other computers reach the page only if it is not a loopback address.
-        port: the port; 0 for any free one.
-        token: the token that a browser must show once; None for a random one, or for none at a loopback address.
-        names: further names under which browsers may address the server.
+    ``reopen`` opens it in a child process, and must be picklable. ``on_start`` is called with the address of the page
+    and its token before the first request. Without a token there is a random one, or none at a loopback address.
     """
     with contextlib.closing(listening(host, port)) as listener:
         if token is None and not is_loopback(host):
@@ -52,7 +45,7 @@ def serve(
         port = listener.getsockname()[1]
         access = Access(token, port)
         service = CampaignService(open_campaign, reopen)
-        server = _server(service, access, Hosts.of(host, names))
+        server = Server(service, access, Hosts.of(host, names))
         on_start(page_address(host, port), token)
         try:
             server.run(sockets=[listener])
@@ -66,7 +59,7 @@ def showing(live: LiveCampaign) -> Iterator[str]:
     host = "127.0.0.1"
     with contextlib.closing(listening(host, 0)) as listener:
         port = listener.getsockname()[1]
-        server = _server(live, Access(None, port), Hosts.of(host))
+        server = Server(live, Access(None, port), Hosts.of(host))
         thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]}, daemon=True)
         thread.start()
         try:
@@ -78,40 +71,33 @@ def showing(live: LiveCampaign) -> Iterator[str]:
             thread.join()
 
 
-def _server(state: PageState, access: Access, hosts: Hosts) -> _Server:
-    config = uvicorn.Config(
-        application(state, access, hosts),
-        log_level="error",  # whoever sends nonsense must not fill the terminal
-        access_log=False,  # an address may contain the token
-        server_header=False,
-        proxy_headers=False,
-        limit_concurrency=256,  # requests and open pages
-        timeout_graceful_shutdown=5,
-        lifespan="on",
-        http=partial(Connection, Waiting()),  # type: ignore[arg-type]
-        ws="none",
-    )
-    return _Server(config, state.end_events)
-
-
-class _Server(uvicorn.Server):
+class Server(uvicorn.Server):
     """A server whose listeners end before it waits for its connections."""
 
-    def __init__(self, config: uvicorn.Config, end_events: Callable[[], None]) -> None:
+    def __init__(self, state: PageState, access: Access, hosts: Hosts) -> None:
+        config = uvicorn.Config(
+            application(state, access, hosts),
+            log_level="error",  # whoever sends nonsense must not fill the terminal
+            access_log=False,  # an address may contain the token
+            server_header=False,
+            proxy_headers=False,
+            limit_concurrency=256,  # requests and open pages
+            timeout_graceful_shutdown=5,
+            lifespan="on",
+            http=partial(Connection, Waiting()),  # type: ignore[arg-type]
+            ws="none",
+        )
         super().__init__(config)
-        self._end_events = end_events
-
-    async def serve(self, sockets: list[socket.socket] | None = None) -> None:
-        self._loop = asyncio.get_running_loop()
-        await super().serve(sockets)
+        self._state = state
 
     def handle_exit(self, sig: int, frame: FrameType | None) -> None:
+        """End the server at a signal."""
         super().handle_exit(sig, frame)  # which asks whether the end has begun already
         self.end()
 
     def end(self) -> None:
         """End the server; any thread may call this."""
-        self._loop.call_soon_threadsafe(self._end_events)
+        self._state.end_from_elsewhere()
         self.should_exit = True
 
 
@@ -133,14 +119,10 @@ def page_address(host: str, port: int) -> str:
     return f"http://[{name}]:{port}/" if ":" in name else f"http://{name}:{port}/"
 
 
-# Connections that wait
-
-
 class Waiting:
     """The connections without a request of a session, in the order in which they began to wait.
 
-    If there are too many, the oldest one of the address with the most ends. A browser sends its request as a whole and
-    at once, so it does not wait long enough, even if it shares its address with those who do.
+    If there are too many, the oldest one of the address with the most ends. A browser sends its request at once.
     """
 
     def __init__(self) -> None:
@@ -151,8 +133,8 @@ class Waiting:
         self.remove(connection)
         self._ends[connection] = connection.loop.call_later(10.0, connection.transport.abort)
         if len(self._ends) > 128:
-            ((busiest, _),) = Counter(waiting.address for waiting in self._ends).most_common(1)
-            oldest = next(waiting for waiting in self._ends if waiting.address == busiest)
+            ((busiest, _),) = Counter(waiting.client and waiting.client[0] for waiting in self._ends).most_common(1)
+            oldest = next(waiting for waiting in self._ends if (waiting.client and waiting.client[0]) == busiest)
             self.remove(oldest)
             oldest.transport.abort()
 
@@ -173,11 +155,6 @@ class Connection(H11Protocol):
         super().__init__(**options)
         self.waiting = waiting
         self.app_state = {**self.app_state, "connection": self}
-
-    @property
-    def address(self) -> str | None:
-        """The address of the other side."""
-        return self.client[0] if self.client else None
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         """Begin to wait for a request."""

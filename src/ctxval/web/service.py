@@ -13,9 +13,8 @@ from ctxval.campaign.telling import ToldResult, tell_result
 from ctxval.core.trial import Trial
 from ctxval.errors import CampaignError, CtxvalError, DistanceError, InputError
 from ctxval.web import jobs
-from ctxval.web.background import BackgroundProcess, Job
-from ctxval.web.jobs import Files, TaskRequest
-from ctxval.web.served import OpenCampaign, ServedCampaign
+from ctxval.web.background import BackgroundProcess
+from ctxval.web.jobs import Files, OpenCampaign, ServedCampaign, TaskRequest
 from ctxval.web.state import PageState, Work
 
 Result = TypeVar("Result")
@@ -110,7 +109,7 @@ class CampaignService(PageState):
 
         return await asyncio.get_running_loop().run_in_executor(self._thread, guarded)
 
-    async def _background(self, process: BackgroundProcess, job: Job, *arguments: Any) -> Any:
+    async def _background(self, process: BackgroundProcess, job: Callable[..., Any], *arguments: Any) -> Any:
         return await asyncio.wrap_future(process.submit(job, *arguments))
 
     async def _choose(self, request: TaskRequest) -> None:

@@ -1,10 +1,14 @@
-"""The state of the page: the trials, the work in progress, the verdict and the pictures."""
+"""The state of the page: the trials, the work in progress, the verdict and the pictures.
+
+A command that executes a campaign gives its page what it shows; that page takes nothing.
+"""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
 import json
+import threading
 import time
 from collections.abc import AsyncIterator
 from dataclasses import dataclass, replace
@@ -12,9 +16,11 @@ from typing import Any
 
 from ctxval._util.progress import Listener, Progress
 from ctxval._util.progress_display import amount
+from ctxval.campaign.interval_search import IntervalSearch
 from ctxval.certificates import Certificate, Verdict
-from ctxval.web.jobs import Files, Pictures
-from ctxval.web.served import ServedCampaign, Snapshot
+from ctxval.core.trial import Trial
+from ctxval.web.background import Innermost
+from ctxval.web.jobs import Files, Pictures, ServedCampaign, Snapshot, pictures_of
 
 
 @dataclass(frozen=True)
@@ -47,41 +53,29 @@ class Work:
 class PageState:
     """What the page shows, for any number of browsers. All of it belongs to the event loop of the server.
 
-    Attributes:
-        served: the campaign, of which only what does not change may be read here.
-        live: whether a command executes the tasks, so that the page only shows them.
-        choosing, judging: present work.
-        enough: whether the last choice found that the verdict is reached or the budget is spent.
-        chosen: the number of the trial that was opened last from this page.
-        certificate: the certificate of a campaign without a threshold, which has no verdict.
-        judged: the trials that the verdict is about, as :attr:`Snapshot.ended`.
-        files: the files of open trials by number; a text says why there are none.
-        interval: the largest executed distance and a preliminary bound, while a command executes the tasks.
-        outcome: how the command that executed the tasks has ended.
-        version: a number that grows with each change, also when the server is started again.
-        shown: the version that was last sent to a browser.
+    Only what does not change of the served campaign may be read here.
     """
 
-    live = False
+    live = False  # whether a command executes the tasks, so that the page only shows them
     choosing: Work | None = None
     judging: Work | None = None
     choice_error: str | None = None
-    enough: bool = False
-    chosen: int | None = None
+    enough: bool = False  # whether the last choice found that the verdict is reached or the budget is spent
+    chosen: int | None = None  # the trial that was opened last from this page
     verdict: Verdict | None = None
-    certificate: Certificate | None = None
-    judged: tuple[int, int] | None = None
+    certificate: Certificate | None = None  # of a campaign without a threshold, which has no verdict
+    judged: tuple[int, int] | None = None  # the trials that the verdict is about, as Snapshot.ended
     judgement_error: str | None = None
     store_error: str | None = None
-    interval: str | None = None
-    outcome: str | None = None
+    interval: str | None = None  # the largest executed distance and a preliminary bound, of a command
+    outcome: str | None = None  # how the command that executed the tasks has ended
 
     def __init__(self, served: ServedCampaign, snapshot: Snapshot) -> None:
         self.served, self.snapshot = served, snapshot
         self.pictures: Pictures = {}
-        self.files: dict[int, Files | str] = {}
-        self.version = time.time_ns()
-        self.listeners = self.shown = 0
+        self.files: dict[int, Files | str] = {}  # of open trials; a text says why there are none
+        self.version = time.time_ns()  # which grows with each change, also when the server is started again
+        self.listeners = self.shown = 0  # open pages, and the version that was last sent to one
         self._changed = asyncio.Event()
         self._tasks: set[asyncio.Task[Any]] = set()
         self._closing = False
@@ -121,6 +115,10 @@ class PageState:
         finally:
             self.listeners -= 1
 
+    def end_from_elsewhere(self) -> None:
+        """Let all listeners end; any thread may call this."""
+        self._loop.call_soon_threadsafe(self.end_events)
+
     def end_events(self) -> None:
         """Let all listeners end, because the server stops."""
         self._closing = True
@@ -156,3 +154,75 @@ class PageState:
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
         return task
+
+
+class LiveCampaign(PageState):
+    """The state of a campaign that this process executes in another thread, by a search unless the campaign explores.
+
+    The thread of the campaign calls ``hear``, :meth:`take` and :meth:`end`; the rest belongs to the server.
+    """
+
+    live = True
+
+    def __init__(self, served: ServedCampaign, search: IntervalSearch | None) -> None:
+        super().__init__(served, served.snapshot())
+        self._search = search
+        self.hear = Innermost(self._follow_progress("choosing"))
+        self._drawn = self._cost = 0.0
+        self.started = threading.Event()
+
+    async def start(self) -> None:
+        """Begin to follow the campaign."""
+        await super().start()
+        self._spawn(self._watch())
+        self.started.set()
+
+    # In the thread of the campaign
+
+    def take(self, trial: Trial) -> None:
+        """Show the interval and the pictures after a trial has ended."""
+        changes: dict[str, Any] = {}
+        if self._search is not None:
+            low, high = self._search.interval
+            bound = "not known yet" if high is None else f"{high:.4g}"
+            changes["interval"] = f"from {low:.4g} to {bound} {self.served.experiment.units}".rstrip()
+        begun = time.monotonic()
+        if begun - self._drawn >= 10 * self._cost:  # pictures take at most about a tenth of the time
+            changes["pictures"] = pictures_of(self.served)
+            self._drawn = time.monotonic()
+            self._cost = self._drawn - begun
+        self._post(changes)
+
+    def end(self, verdict: Verdict | None, certificate: Certificate | None, report: str | None) -> None:
+        """Show the verdict, and the path of the report."""
+        outcome = "the campaign has ended, and so will this page" + (f". The report is {report}" if report else "")
+        shown = {"verdict": verdict, "certificate": certificate, "pictures": pictures_of(self.served)}
+        self._post({**shown, "choosing": None, "interval": None, "outcome": outcome})
+
+    def wait_until_seen(self) -> None:
+        """Give open pages time to load the last state: until one has, at most 5 s, and a moment for the others."""
+        end = time.monotonic() + 5
+        while self.listeners and time.monotonic() < end and (self.outcome is None or self.shown < self.version):
+            time.sleep(0.05)
+        if self.listeners:
+            time.sleep(0.5)
+
+    def _post(self, changes: dict[str, Any]) -> None:
+        self._loop.call_soon_threadsafe(lambda: self.update(**changes))
+
+    # In the event loop of the server
+
+    def _progressed(self, kind: str, progress: Progress) -> None:
+        if self.outcome is not None:
+            return
+        if self.choosing is None or self.choosing.progress.stage != progress.stage:
+            self.update(choosing=Work.begun(progress.stage))
+        super()._progressed(kind, progress)
+
+    async def _watch(self) -> None:
+        while True:
+            fresh = self.served.snapshot()
+            if (fresh.signature, fresh.executions) != (self.snapshot.signature, self.snapshot.executions):
+                self.snapshot = fresh
+                self.update()
+            await asyncio.sleep(0.5)

@@ -17,6 +17,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from typer.testing import CliRunner, Result
 
+import ctxval
 from conftest import make_validation, make_validation_without_inputs
 from ctxval import Experiment, Store, Task, TaskSpace, Trajectory, Validation, controllers, distances, systems
 from ctxval.cli import app
@@ -84,6 +85,15 @@ def test_the_file_of_init_passes_its_check(invoke: Any) -> None:
         in invoke("check", "experiment.toml", "--execute").stdout
     )
     assert not Path("runs").exists()
+
+
+def test_a_file_is_an_experiment_in_python_too(invoke: Any) -> None:
+    experiment = ctxval.load_experiment(Path("experiment.toml"))
+    assert (experiment.name, experiment.units, experiment.validation.space.names) == ("cart", "m", ("goal", "load"))
+    assert experiment.validation.distances(np.array([[1.0, 0.1]]))[0] > 0
+    assert ctxval.load_experiment("linear", seed=1, dim=2).validation.space.dimension == 4
+    with pytest.raises(InputError, match="there is no experiment file none"):
+        ctxval.load_experiment("none.toml")
 
 
 def test_init_overwrites_nothing(invoke: Any) -> None:

@@ -209,7 +209,7 @@ def test_an_experiment_by_name_is_one_or_a_function_of_a_seed() -> None:
         ("Rig", "must be an Experiment or a Validation"),
         ("builtin", "must be an Experiment or a Validation"),
         ("steps", "must be callable with a seed and its options; it takes (x, u, t)"),
-        ("experiment", "parts_here:experiment failed: ZeroDivisionError: inside"),
+        ("experiment", "parts_here:experiment cannot be made: ZeroDivisionError: inside"),
     ):
         with pytest.raises(InputError) as refused:
             Settings(experiment=f"parts_here:{name}").load()

@@ -42,36 +42,35 @@ def check_experiment(experiment: Experiment, *, execute: bool = False, seed: int
     """Check that the parts of an experiment fit together."""
     validation = experiment.validation
     plans: list[Plan] = []
-    findings = [*_checked("space", lambda: _space(validation))]
-    findings += _checked("tasks", lambda: _tasks(validation, seed, plans))
+    findings = _checked({"space": lambda: _space(validation), "tasks": lambda: _tasks(validation, seed, plans)})
     if not plans:
         return findings
-    counts = {
-        "states": plans[0].model_trajectory.states.shape[-1],
-        "inputs": plans[0].model_trajectory.inputs.shape[-1],
-    }
-    checks: dict[str, Callable[[], Findings]] = {
-        "controller on the model": lambda: _goals(validation, plans),
-        "convergence of the designs": lambda: _convergence_of(validation, plans),
-        "names": lambda: _names(experiment, counts),
-        "system": lambda: _system(validation, plans[0], counts),
-        "model": lambda: _model(validation, counts),
-        "batches": lambda: _batches(validation, plans),
-        "distance": lambda: _distance(experiment, plans),
-        "execution": lambda: _executions(validation, plans[1], execute),
-        "cost": lambda: _cost(validation, plans),
-    }
+    run = plans[0].model_trajectory
+    counts = {"states": run.states.shape[-1], "inputs": run.inputs.shape[-1]}
+    return findings + _checked(
+        {
+            "controller on the model": lambda: _goals(validation, plans),
+            "convergence of the designs": lambda: _convergence_of(validation, plans),
+            "names": lambda: _names(experiment, counts),
+            "system": lambda: _system(validation, plans[0], counts),
+            "model": lambda: _model(validation, counts),
+            "batches": lambda: _batches(validation, plans),
+            "distance": lambda: _distance(experiment, plans),
+            "execution": lambda: _executions(validation, plans[1], execute),
+            "cost": lambda: _cost(validation, plans),
+        }
+    )
+
+
+def _checked(checks: Mapping[str, Callable[[], Findings]]) -> list[Checked]:
+    findings = list[Checked]()
     for name, check in checks.items():
-        findings += _checked(name, check)
+        try:
+            findings += [Checked(name, state, text) for state, text in check()]
+        except Exception as error:  # a user's own part may raise anything
+            reason = str(error) if isinstance(error, CtxvalError) else reason_of(error)
+            findings.append(Checked(name, "failed", reason))
     return findings
-
-
-def _checked(name: str, check: Callable[[], Findings]) -> Iterator[Checked]:
-    try:
-        for state, text in check():
-            yield Checked(name, state, text)
-    except Exception as error:  # a user's own part may raise anything
-        yield Checked(name, "failed", str(error) if isinstance(error, CtxvalError) else reason_of(error))
 
 
 def _space(validation: Validation) -> Findings:
@@ -122,7 +121,6 @@ def _convergence_of(validation: Validation, plans: Sequence[Plan]) -> Findings:
 
 
 def _convergence(failed: Sequence[dict[str, Any]], designs: int) -> Findings:
-    """State how many designs converged."""
     if not designs:
         yield "skipped", "the controllers do not tell whether they converged"
     elif not failed:
@@ -155,15 +153,14 @@ def _names(experiment: Experiment, counts: Mapping[str, int]) -> Findings:
 
 
 def _system(validation: Validation, plan: Plan, counts: Mapping[str, int]) -> Findings:
-    """Compare the time step, the states and the inputs of the system with those of the task and the model."""
     system, task = validation.system, plan.task
     dt = getattr(system, "dt", None)
     if isinstance(dt, int | float) and not np.isclose(dt, task.dt, rtol=1e-9, atol=0):
         yield "failed", f"the time step of the system is {dt:g} s, that of the task is {task.dt:g} s"
     for kind, count in counts.items():
-        own = names_of(system, kind)
-        if own and len(own) != count:
-            yield "failed", f"the system has {len(own)} {kind}, the model has {count}: {', '.join(own)}"
+        names = names_of(system, kind)
+        if names and len(names) != count:
+            yield "failed", f"the system has {len(names)} {kind}, the model has {count}: {', '.join(names)}"
 
 
 def _model(validation: Validation, counts: Mapping[str, int]) -> Findings:
@@ -223,7 +220,6 @@ def _distance(experiment: Experiment, plans: Sequence[Plan]) -> Findings:
 
 
 def _executions(validation: Validation, plan: Plan, execute: bool) -> Findings:
-    """Execute one task twice, and check the initial state and the repeatability."""
     if getattr(validation.system, "manual", False):
         yield "skipped", "people execute this system: see `ctxval ask`"
         return
@@ -236,15 +232,13 @@ def _executions(validation: Validation, plan: Plan, execute: bool) -> Findings:
         if gap > 1e-6:
             yield "failed", f"the execution starts {gap:.3g} away from the initial state of the task"
     noise = float(np.abs(first.states - second.states).max())
-    one, other = validation.measure(plan, first), validation.measure(plan, second)
+    distance, again = validation.measure(plan, first), validation.measure(plan, second)
     if noise == 0:
-        yield "ok", f"two executions of one task are the same; the distance is {one:.4g}"
-        return
-    yield (
-        "noted",
-        f"two executions of one task differ by up to {noise:.3g} in a state and {abs(one - other):.3g} in the "
-        "distance: the system is stochastic; give --stochastic, or stochastic = true in [certificate]",
-    )
+        yield "ok", f"two executions of one task are the same; the distance is {distance:.4g}"
+    else:
+        text = f"two executions of one task differ by up to {noise:.3g} in a state and {abs(distance - again):.3g} in "
+        text += "the distance: the system is stochastic; give --stochastic, or stochastic = true in [certificate]"
+        yield "noted", text
 
 
 def _cost(validation: Validation, plans: Sequence[Plan]) -> Findings:
@@ -255,26 +249,22 @@ def _cost(validation: Validation, plans: Sequence[Plan]) -> Findings:
     if thinking.choice is not None:
         text += f"; the choice of a task takes about {thinking.choice:.2g} s, and the verdict {thinking.verdict:.2g} s"
     if thinking.suggestion is not None:
-        text += (
-            f"; with --explore, a suggestion takes about {thinking.suggestion:.2g} s if it thinks thoroughly "
-            f"({thinking.designs} designs) and {thinking.fast:.2g} s if it thinks fast"
-        )
+        text += f"; with --explore, a suggestion takes about {thinking.suggestion:.2g} s if it thinks thoroughly "
+        text += f"({thinking.designs} designs) and {thinking.fast:.2g} s if it thinks fast"
     # Seconds for a suggestion that the user should know of.
     yield "noted" if max(thinking.choice or 0.0, thinking.suggestion or 0.0) >= 30.0 else "ok", text
 
 
-# Aspect 1
-
-
 def aspect1_findings(report: Aspect1Report) -> list[Checked]:
     """Return what simulations of M show of its tasks and controllers, as sentences."""
-    checks: dict[str, Callable[[], Findings]] = {
-        "tasks on the model": lambda: _completion(report),
-        "neighbouring tasks": lambda: _flips(report),
-        "limits of the inputs": lambda: _saturated(report),
-        "convergence of the designs": lambda: _convergence(report.not_converged, report.designs),
-    }
-    return [finding for name, check in checks.items() for finding in _checked(name, check)]
+    return _checked(
+        {
+            "tasks on the model": lambda: _completion(report),
+            "neighbouring tasks": lambda: _flips(report),
+            "limits of the inputs": lambda: _saturated(report),
+            "convergence of the designs": lambda: _convergence(report.not_converged, report.designs),
+        }
+    )
 
 
 def _completion(report: Aspect1Report) -> Findings:
@@ -310,12 +300,10 @@ def _flips(report: Aspect1Report) -> Findings:
     if not flips.flipped:
         yield "ok", f"the inputs on M of {flips.pairs} pairs of neighbouring tasks differ by at most {largest}"
         return
-    pairs = f"{flips.flipped} of {flips.pairs} pairs of neighbouring tasks"
-    between = " and ".join(map(task_text, report.flipped))
-    yield (
-        "noted",
-        f"{pairs} have controllers that differ abruptly, such as {between}, whose inputs on M differ by {largest}",
+    text = (
+        f"{flips.flipped} of {flips.pairs} pairs of neighbouring tasks have controllers that differ abruptly, such as "
     )
+    yield "noted", f"{text}{' and '.join(map(task_text, report.flipped))}, whose inputs on M differ by {largest}"
 
 
 def _saturated(report: Aspect1Report) -> Findings:

@@ -6,7 +6,7 @@ A table names a part of a registry, or ``module:attr``. Only the latter, and par
 from __future__ import annotations
 
 import inspect
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin, get_type_hints
@@ -19,7 +19,6 @@ from ctxval import cases, controllers, distances, models, systems
 from ctxval._util.files import read_bytes
 from ctxval._util.npz import Archive
 from ctxval._util.registry import Declaration, Registry, construct, declaration_of
-from ctxval._util.texts import reason_of
 from ctxval.cli.config.references import accepts, is_function, reference, require_function, require_part
 from ctxval.core.experiment import Experiment
 from ctxval.core.model import Model
@@ -115,7 +114,14 @@ def recorded(files: Any, folder: Path | None = None) -> Transitions:
         raise InputError(f"data must be a file of recorded trajectories or a list of files, got {files!r}.")
     parts, logs = list[Transitions](), dict[str, list[Path]]()
     for path in (Path(folder or "", path) for path in paths):
-        stored = None if mapping is not None or path.suffix != ".npz" else _transitions(path)
+        stored = None
+        if mapping is None and path.suffix == ".npz":
+            try:
+                stored = stored_transitions(Archive(read_bytes(path)))
+            except ShapeError:
+                raise
+            except InputError as error:
+                raise InputError(f"{path} cannot be read as recorded data: {error}.") from error
         if stored is not None:
             parts.append(stored)
         else:  # arrays in NPZ files have other names than columns
@@ -123,25 +129,12 @@ def recorded(files: Any, folder: Path | None = None) -> Transitions:
     return Transitions.joined([*parts, *(read_recordings(each, mapping).transitions()[0] for each in logs.values())])
 
 
-def _transitions(path: Path) -> Transitions | None:
-    """Return the transitions in an NPZ file with x, u and x_next; None if the file is another one."""
-    try:
-        return stored_transitions(Archive(read_bytes(path)))
-    except ShapeError:
-        raise
-    except InputError as error:
-        raise InputError(f"{path} cannot be read as recorded data: {error}.") from error
-
-
-# Tasks
-
-
 @dataclass(frozen=True)
 class TaskTable:
     """A task function without code: every component is a number, or a task parameter by name."""
 
-    initial_state: tuple[float | str, ...]
-    goal: tuple[float | str, ...] | None
+    initial_state: list[float | str]
+    goal: list[float | str] | None
     horizon: int
     dt: float
 
@@ -175,23 +168,17 @@ def task_function(given: str | Mapping[str, Any], space: TaskSpace, system: Any,
         raise InputError(f"[task] needs {', '.join(missing)}.")
     for name in ("initial_state", "goal"):
         entries = table[name]
-        if name == "goal" and entries is None:
-            continue
-        plain = isinstance(entries, list) and all(type(entry) in (int, float, str) for entry in entries)
-        if not plain or not entries:
+        plain = isinstance(entries, list) and entries and all(type(entry) in (int, float, str) for entry in entries)
+        if not plain and (name, entries) != ("goal", None):
             raise InputError(f"{name} of [task] must be a list of numbers and of names of parameters, got {entries!r}.")
-        table[name] = tuple(entries)
-    made = TaskTable(**table)
+    task = TaskTable(**table)
     try:
-        made(space.parameters(space.low))
-    except CtxvalError:
-        raise
+        task(space.parameters(space.low))
     except (ValueError, IndexError, TypeError) as error:
+        if isinstance(error, CtxvalError):
+            raise
         raise InputError(f"[task] cannot be used: {error}.") from error
-    return made
-
-
-# Options of plain types
+    return task
 
 
 def require_types(what: str, function: Any, options: Mapping[str, Any]) -> dict[str, Any]:
@@ -218,13 +205,20 @@ def _typed(what: str, hint: Any, value: Any) -> Any:
     try:
         return adapter.validate_python(given, strict=True)
     except ValidationError as error:
-        message = error.errors()[0]["msg"].lower()
-        raise InputError(f"{what}: {message}, got {value!r}.") from error
+        raise InputError(f"{what}{refusal_of(error.errors()[0])}, got {value!r}.") from error
 
 
-def space_of(bounds: Mapping[str, Sequence[Any]]) -> TaskSpace:
-    """Return a task space from ``name = [low, high, "unit"]``."""
-    return TaskSpace(**{name: tuple(bound) for name, bound in bounds.items()})
+def refusal_of(problem: Mapping[str, Any]) -> str:
+    """Return what follows the name of a value that pydantic refuses, such as `` must be a positive integer``."""
+    match problem:
+        case {"type": "greater_than_equal", "ctx": {"ge": 1}}:
+            return " must be a positive integer"
+        case {"type": "greater_than_equal", "ctx": {"ge": bound}}:
+            return f" must be at least {bound}"
+        case {"type": "greater_than", "ctx": {"gt": 0}}:
+            return " must be a positive number"
+    message = str(problem["msg"]).lower()
+    return message.replace("input should", " must", 1) if message.startswith("input should") else f": {message}"
 
 
 def with_distribution(
@@ -239,10 +233,11 @@ def with_distribution(
     if set(tables) == {"sampler"} and set(tables["sampler"]) == {"ref"} and "sampler" not in space.names:
         return space.sampled(argument(tables["sampler"], folder))
     for name in tables:
-        space.columns(name)
+        space.columns(name)  # which refuses names that are not in the space
     stated = {name: table for name, table in tables.items() if table.get("type") != "uniform"}
-    found = {name: _distribution(name, table, folder) for name, table in stated.items()}
-    return space.distributed(**found) if found else space
+    if not stated:
+        return space
+    return space.distributed(**{name: _distribution(name, table, folder) for name, table in stated.items()})
 
 
 def _distribution(name: str, table: Mapping[str, Any], folder: Path | None) -> Any:
@@ -259,35 +254,25 @@ def _distribution(name: str, table: Mapping[str, Any], folder: Path | None) -> A
     return Normal(**given)
 
 
-# Experiments that are not described in a file
-
-
 def named_experiment(text: str, seed: int, options: dict[str, Any], folder: Path | None = None) -> Experiment:
     """Return the experiment of a case, or of a reference, which runs the code of its module."""
     if ":" not in text:
         if options:
             options = require_types(f"case {text!r}", cases.REGISTRY.find(text), options)
         return cases.by_name(text, seed, **options)
-    made = reference(text, folder)
-    if is_function(made) and not isinstance(made, Validation | Experiment):
-        if not accepts(made, 1, **options):
+    experiment = reference(text, folder)
+    if is_function(experiment) and not isinstance(experiment, Validation | Experiment):
+        if not accepts(experiment, 1, **options):
             given = f" {', '.join(options)}" if options else ""
-            takes = f"it takes {inspect.signature(made)}"
+            takes = f"it takes {inspect.signature(experiment)}"
             raise InputError(f"{text} must be callable with a seed and its options{given}; {takes}.")
-        try:
-            made = made(seed, **options)
-        except CtxvalError:
-            raise
-        except Exception as error:
-            raise InputError(f"{text} failed: {reason_of(error)}.") from error
-    if isinstance(made, Validation):
-        return Experiment(text.partition(":")[2], made)
-    if not isinstance(made, Experiment):
-        raise InputError(
-            f"{text} must be an Experiment or a Validation, or a function of a seed that makes one, "
-            f"got {type(made).__name__}."
-        )
-    return made
+        experiment = construct(text, experiment, options, seed)
+    if isinstance(experiment, Validation):
+        return Experiment(text.partition(":")[2], experiment)
+    if not isinstance(experiment, Experiment):
+        kinds = "an Experiment or a Validation, or a function of a seed that makes one"
+        raise InputError(f"{text} must be {kinds}, got {type(experiment).__name__}.")
+    return experiment
 
 
 def plain_options(case: str) -> dict[str, Any]:

@@ -76,11 +76,13 @@ def _require_place(text: str, module: str, home: str) -> None:
             f"{text} cannot be loaded: no module named {module!r} is in {home} or installed. The modules of an "
             "experiment file must be in the folder of the file, and those of the command line in the current one."
         )
-    clashes = list[tuple[str, str | None, str]]()
+    clash = (
+        "{} cannot be loaded: a module named {!r} is already in use, {}, and {}. Rename one, or use another process."
+    )
     used = _place(getattr(loaded, "__file__", None), getattr(loaded, "__path__", None))
     if used not in (None, found):
         other = f"none of this name is in {home} or installed" if found is None else f"the reference means {found}"
-        clashes.append((module, used, other))
+        raise InputError(clash.format(text, module, used, other))
     # No loaded module of another experiment's folder may have the name of any module in this folder.
     others = _added - {home}
     for name, each in list(sys.modules.items()):
@@ -88,12 +90,7 @@ def _require_place(text: str, module: str, home: str) -> None:
         folder = os.path.dirname(used or "")
         apart = "." in name or used is None or not {folder, os.path.dirname(folder)} & others
         if not apart and PathFinder.find_spec(name, [home]) is not None:
-            clashes.append((name, used, f"there is one in {home} too"))
-    for name, used, other in clashes:
-        raise InputError(
-            f"{text} cannot be loaded: a module named {name!r} is already in use, {used}, and {other}. Rename one of "
-            "them, or use another process."
-        )
+            raise InputError(clash.format(text, name, used, f"there is one in {home} too"))
 
 
 def _found(module: str) -> str | None:

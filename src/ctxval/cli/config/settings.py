@@ -1,4 +1,7 @@
-"""Settings: the content of an experiment file with the options of the command line, as a store keeps them."""
+"""Settings: the content of an experiment file with the options of the command line, as a store keeps them.
+
+:func:`load_experiment` is the way from Python to an experiment file.
+"""
 
 from __future__ import annotations
 
@@ -10,30 +13,120 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic_core import PydanticCustomError
 
 from ctxval.campaign.campaign import Campaign
 from ctxval.campaign.interval_search import is_decisive
 from ctxval.campaign.storage.store import Store
-from ctxval.certificates import CertificateOptions
-from ctxval.certificates.options import CONFIDENCE, LEAST_CONFIDENCE, WITHIN
-from ctxval.cli.config.parts import named_experiment, part, space_of, task_function, with_distribution
+from ctxval.certificates import KINDS, RESOLUTION, CertificateOptions, require_use
+from ctxval.certificates.options import CONFIDENCE, LEAST_CONFIDENCE, MOST_VOLUME, WITHIN
+from ctxval.certificates.prediction_tests import TESTS
+from ctxval.cli.config.parts import (
+    argument,
+    named_experiment,
+    part,
+    refusal_of,
+    require_types,
+    task_function,
+    with_distribution,
+)
 from ctxval.cli.config.signatures import code_named, signed
-from ctxval.cli.config.tables import Aspect1Table, CertificateTable, SearchTable
 from ctxval.core.experiment import Experiment
 from ctxval.core.labels import Labels, labels_of
-from ctxval.core.model import Model, as_model
+from ctxval.core.space import TaskSpace
 from ctxval.core.validation import Validation
 from ctxval.data import LogMapping
-from ctxval.errors import InputError, UnknownNameError
-from ctxval.models import REGISTRY, Refined, read_model, read_refined
-from ctxval.models.mujoco import is_sysid_result
+from ctxval.errors import CertificateError, InputError, UnknownNameError
+from ctxval.models import Refined, read_refined
 from ctxval.searches import DEFAULT as DEFAULT_SEARCH
-from ctxval.studies.aspect1 import Aspect1Report
-from ctxval.studies.aspect1 import check as check_aspect1
+from ctxval.searches import REGISTRY as SEARCHES
+from ctxval.searches import Search, by_name
+from ctxval.studies.aspect1 import TASKS
 
 Part = str | dict[str, Any]
 """``module:attr``, or a table with a type and its arguments."""
+
+
+class CertificateTable(BaseModel):
+    """The table ``[certificate]``: the certificate for the verdict, chosen before the campaign is run.
+
+    A kind of certificate from another package has its own options in the table.
+
+    Attributes:
+        volume: the share of the task space that may exceed the threshold.
+        tests: the number of executions that must have been predicted beforehand at tasks drawn over the task space.
+        resolution: the largest distance between a task and its nearest trial, in diagonals of the task space.
+        discard: the number of largest distances to discard, for ``sampling-discarding``.
+    """
+
+    model_config = ConfigDict(extra="allow")
+
+    kind: str = "auto"
+    stochastic: bool = False
+    volume: float = Field(default=0.0, ge=0, le=MOST_VOLUME, strict=True)
+    tests: int = Field(default=TESTS, ge=0, strict=True)
+    resolution: float = Field(default=RESOLUTION, gt=0, allow_inf_nan=False, strict=True)
+    discard: int | None = Field(default=None, ge=0)
+
+    @model_validator(mode="after")
+    def _used(self) -> CertificateTable:
+        if self.kind not in KINDS.imported:
+            return self  # it is checked when it is used: reading imports nothing, and a store must stay readable
+        fields = {name: field for name, field in type(self).model_fields.items() if name != "kind"}
+        changed = [name for name, field in fields.items() if getattr(self, name) != field.default]
+        try:
+            for name in self.model_extra or {}:
+                if name not in (names := {*type(self).model_fields, *KINDS[self.kind].options()}):
+                    raise UnknownNameError.among("setting", name, names)
+            require_use(self.kind, sorted({*changed, *(self.model_extra or {})}))
+            require_types(f"certificate {self.kind!r}", KINDS[self.kind], self.model_extra or {})
+        except (CertificateError, InputError) as error:
+            raise PydanticCustomError("use", str(error)) from error
+        return self
+
+    def options(
+        self, confidence: float, *, kind: str | None = None, stated: Mapping[str, Any] | None = None
+    ) -> CertificateOptions:
+        """Return the kind, the options and the confidence of the certificate for the verdict."""
+        given, chosen = dict(stated or {}), KINDS.find(kind or self.kind)
+        planned_kind = kind is None or kind == self.kind
+        require_use(chosen.name, given)
+        # For another kind than the planned one, only those settings of the file hold that are not about one kind.
+        planned = self.model_dump(include=None if planned_kind else {"stochastic", "resolution", "volume", "tests"})
+        own = {**(self.model_extra or {}), **given} if planned_kind else given
+        merged = {**planned, **require_types(f"certificate {chosen.name!r}", chosen, own)}
+        return CertificateOptions(chosen.of(merged), confidence, merged["volume"])
+
+
+class SearchTable(BaseModel):
+    """The table ``[search]``: the name of a search, and its options."""
+
+    model_config = ConfigDict(extra="allow")
+
+    name: str = DEFAULT_SEARCH
+    repeats: int = Field(default=1, ge=1)
+
+    def build(self, folder: Path | None = None) -> Search:
+        """Return the search."""
+        options = {key: argument(value, folder) for key, value in (self.model_extra or {}).items()}
+        options = require_types(f"search {self.name!r}", SEARCHES.find(self.name), options)
+        return by_name(self.name, repeats=self.repeats, **options)
+
+
+class Aspect1Table(BaseModel):
+    """The table ``[aspect1]``, which ``ctxval check --aspect1`` reads; a campaign does not use it.
+
+    The distance tells how far a trajectory is from completing its task; by default it is derived from that of the
+    experiment. The threshold is in the units of the goal.
+    """
+
+    model_config = ConfigDict(extra="forbid")
+
+    distance: str | dict[str, Any] | None = None
+    threshold: float | None = Field(default=None, gt=0, allow_inf_nan=False, strict=True)
+    tasks: int = Field(default=TASKS, ge=2)
+
 
 _WHOLE = ("space", "task", "system", "model", "synthesizer")
 
@@ -44,12 +137,10 @@ class Settings(BaseModel):
     Either ``experiment`` names the experiment, or ``name`` to ``units`` describe it completely.
 
     Attributes:
-        distribution: the distribution of a task parameter by its name, such as ``{type = "normal", mean = 0.0,
-            deviation = 0.3}`` or ``{ref = "module:attr"}``; all others are uniform. Or ``sampler``, the reference of a
-            function that draws whole tasks. A named experiment may have one too.
-            longest: the largest horizon.
+        distribution: see :func:`~ctxval.cli.config.parts.with_distribution`; a named experiment may have one too.
+        longest: the largest horizon.
         explore, within: as the options of ``ctxval run``, so that a store knows the command that made it.
-            refined: the file of a model that `ctxval refine` has learned from executions; it replaces the given model.
+        refined: the file of a model that `ctxval refine` has learned from executions; it replaces the given model.
         folder: the folder of modules and files, which is that of the experiment file; None for the current folder.
     """
 
@@ -85,45 +176,41 @@ class Settings(BaseModel):
 
     def load(self) -> Experiment:
         """Return the experiment."""
-        made = self._described() if self.experiment is None else self._named(self.experiment)
-        validation = given = made.validation
+        experiment = self._described() if self.experiment is None else self._named(self.experiment)
+        validation = given = experiment.validation
         if self.refined is not None:  # a model that was learned from executions of the given one
             path = (self.folder or Path()) / self.refined
             refined = read_refined(path, given.model)
             if refined.data is None:
                 raise InputError(f"{path} lacks the recorded steps that the model was learned from.")
             validation = validation.with_model(Refined(refined, refined.data, given.model))
-            made = replace(made, truth=None)
+            experiment = replace(experiment, truth=None)
         if self.longest is not None:
             validation = validation.with_longest(self.longest)
         if self.distribution is not None:
-            space = with_distribution(validation.space, self.distribution, self.folder)
-            validation = validation.with_space(space)
-        return made if validation is given else replace(made, validation=validation)
+            validation = validation.with_space(with_distribution(validation.space, self.distribution, self.folder))
+        return experiment if validation is given else replace(experiment, validation=validation)
 
     def _named(self, experiment: str) -> Experiment:
-        given = [name for name in (*_WHOLE, "distance", "name") if getattr(self, name) is not None]
-        if given:
-            raise InputError(
-                f"the file has both 'experiment' and {given[0]!r}: remove one of them, because a named experiment has "
-                f"its own {given[0]}."
-            )
+        for name in (*_WHOLE, "distance", "name"):
+            if getattr(self, name) is not None:
+                why = f"remove one of them, because a named experiment has its own {name}"
+                raise InputError(f"the file has both 'experiment' and {name!r}: {why}.")
         if "seed" in self.options:
             raise InputError("[options] must not contain the seed: write it at the top of the file, or give --seed.")
         return named_experiment(experiment, self.seed, self.options, self.folder)
 
     def _described(self) -> Experiment:
-        missing = [name for name in _WHOLE if getattr(self, name) is None]
+        missing = ", ".join(name for name in _WHOLE if getattr(self, name) is None)
         if missing:
-            raise InputError(
-                "the file must name an experiment, as in experiment = 'pendulum', or describe one: "
-                f"it has no {', '.join(missing)}."
-            )
+            how = "name an experiment, as in experiment = 'pendulum', or describe one"
+            raise InputError(f"the file must {how}: it has no {missing}.")
         if self.options:
             raise InputError(
                 "[options] is only for a named experiment (experiment = ...); this file describes its own."
             )
-        space, system = space_of(self.space or {}), part("system", self.system or {}, self.folder)
+        space = TaskSpace(**{name: tuple(bounds) for name, bounds in (self.space or {}).items()})
+        system = part("system", self.system or {}, self.folder)
         validation = Validation(
             space=space,
             task=task_function(self.task or {}, space, system, self.folder),
@@ -147,10 +234,9 @@ class Settings(BaseModel):
 
         The signature lets later commands run the code that the settings name without asking.
         """
-        search = self.search.build(self.folder)
         campaign = Campaign(
             experiment.validation,
-            search=search,
+            search=self.search.build(self.folder),
             store=store,
             seed=self.seed,
             name=experiment.name,
@@ -169,12 +255,12 @@ class Settings(BaseModel):
         try:
             table = CertificateTable.model_validate({**self.certificate.model_dump(), **given})
         except ValidationError as error:
-            raise InputError(sentence_of("certificate", error)) from error
+            raise InputError(sentence_of("", error)) from error
         return self.model_copy(update={"certificate": table})
 
     @property
     def certificate_options(self) -> CertificateOptions:
-        """The kind, the options and the confidence of the certificate for the verdict."""
+        """The certificate for the verdict."""
         return self.certificate.options(self.confidence)
 
     @property
@@ -186,17 +272,6 @@ class Settings(BaseModel):
         if self.explore is not None:
             return self.explore
         return self.search.name != DEFAULT_SEARCH or not is_decisive(self.certificate_options)
-
-    def aspect1_of(self, experiment: Experiment, tasks: int | None, threshold: float | None) -> Aspect1Report:
-        """Return whether the model of an experiment completes its tasks; S is never executed."""
-        table = self.aspect1
-        return check_aspect1(
-            experiment.validation,
-            threshold=table.threshold if threshold is None else threshold,
-            distance=None if table.distance is None else part("distance", table.distance, self.folder),
-            tasks=table.tasks if tasks is None else tasks,
-            seed=self.seed,
-        )
 
     @property
     def log_mapping(self) -> LogMapping | None:
@@ -220,13 +295,8 @@ def read_settings(target: str, overrides: dict[str, Any]) -> Settings:
         raise InputError(not_an_experiment(target))
     content = _read_toml(Path(target)) if is_file else {"experiment": target}
     if "folder" in content:
-        raise InputError(
-            f"{target}: no setting is called 'folder'; modules and files are read from the folder of this file."
-        )
-    if "experiment" not in content and not any(key in content for key in _WHOLE):
-        raise InputError(
-            f"{target} has no experiment: name one, as in experiment = 'pendulum' or 'module:attr', or describe one."
-        )
+        where = "modules and files are read from the folder of this file"
+        raise InputError(f"{target}: no setting is called 'folder'; {where}.")
     given = {key: value for key, value in overrides.items() if value is not None}
     options = {**_table(content, "options"), **given.pop("options", {})}
     search = _table(content, "search")
@@ -239,16 +309,31 @@ def read_settings(target: str, overrides: dict[str, Any]) -> Settings:
     try:
         return Settings.model_validate(whole)
     except ValidationError as error:
-        option = error.errors()[0]["loc"][:1]
-        source = "the command line" if option and overrides.get(str(option[0])) is not None else target
-        raise InputError(sentence_of(source, error)) from error
+        field = str(next(iter(error.errors()[0]["loc"]), ""))
+        raise InputError(sentence_of("" if given.get(field) is not None else f"{target}: ", error)) from error
+
+
+def load_experiment(target: str | Path, *, seed: int | None = None, **options: Any) -> Experiment:
+    """Return the experiment of a TOML file, of a case, or of a reference ``module:attr``, as ``ctxval run`` loads it.
+
+    A reference in the file runs the code of its module, which must be in the folder of the file or installed.
+
+    Args:
+        target: the path of the file, or the name or reference.
+        seed: the seed of a case, or of the function that makes the experiment (default: that of the file, or 0).
+        options: options of a case, or of that function.
+
+    Raises:
+        InputError: if the file or a part that it describes cannot be used.
+    """
+    return read_settings(str(target), {"seed": seed, "options": options or None}).load()
 
 
 def not_an_experiment(target: str, *others: str) -> str:
     """Return the sentence that another file is no experiment, with what else it may be."""
-    said = ", ".join(("neither a case", "an experiment file (.toml)", *others))
+    kinds = ", ".join(("neither a case", "an experiment file (.toml)", *others))
     attribute = f" (here {Path(target).stem}:NAME)" if Path(target).suffix == ".py" else ""
-    return f"{target} is {said} nor a reference module:attr{attribute}."
+    return f"{target} is {kinds} nor a reference module:attr{attribute}."
 
 
 def _table(content: dict[str, Any], key: str) -> dict[str, Any]:
@@ -271,35 +356,13 @@ def _read_toml(path: Path) -> dict[str, Any]:
         raise InputError(f"{path} is not valid TOML: {error}.") from error
 
 
-def sentence_of(target: str, error: ValidationError) -> str:
-    """Return what is wrong with a setting, in one sentence that names it."""
+def sentence_of(source: str, error: ValidationError) -> str:
+    """Return what is wrong with a setting, in one sentence that names it, after the text of its source."""
     first = error.errors()[0]
-    where = ".".join(str(part) for part in first["loc"])
     if first["type"] == "use":
-        return f"{target}: {first['msg']}"
+        return f"{source}{first['msg']}"
     if first["type"] == "extra_forbidden":
-        return f"{target}: {UnknownNameError.among('setting', str(first['loc'][-1]), Settings.model_fields)}"
-    value = first["input"]
+        return f"{source}{UnknownNameError.among('setting', str(first['loc'][-1]), Settings.model_fields)}"
+    name, value = ".".join(map(str, first["loc"])), first["input"]
     shown = repr(value[:100]) if isinstance(value, str) else str(value)[:100]
-    return f"{target}: {where}: {first['msg'].lower()}, got {shown}."
-
-
-def named_model(text: str, options: Mapping[str, Any], dt: float | None = None) -> Model:
-    """Return a model from a file, an experiment, ``module:attr`` or a name of the registry."""
-    path = Path(text)
-    if path.suffix in (".toml", ".npz"):
-        if options:
-            of = "of" if path.suffix == ".toml" else "in"
-            raise InputError(f"the model {of} {text} takes no options, got {', '.join(options)}.")
-        return read_model(path) if path.suffix == ".npz" else read_settings(text, {}).load().validation.model
-    table: dict[str, Any] = {"type": text}
-    if path.suffix == ".onnx":
-        table = {"type": "Onnx", "source": text}
-    elif path.suffix == ".xml" or is_sysid_result(path):
-        table = {"type": "MuJoCo", "mjcf": text, "dt": dt}
-    elif ":" not in text and text not in REGISTRY.built_in and text not in REGISTRY.installed:
-        raise InputError(
-            f"a model must be a file that ends in .onnx, .npz, .xml or .toml, a result of mujoco.sysid, module:attr, "
-            f"or one of {', '.join(REGISTRY.built_in)}, got {text!r}."
-        )
-    return as_model(part("model", {**table, **options}))
+    return f"{source}{name}{refusal_of(first)}, got {shown}."

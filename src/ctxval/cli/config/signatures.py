@@ -13,7 +13,7 @@ import os
 import secrets
 import stat
 import tempfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -43,15 +43,11 @@ def key_path() -> Path:
 def signed(settings: Mapping[str, Any], before: Mapping[str, Any]) -> dict[str, Any]:
     """Return settings with a signature of this user; without one if the user's key cannot be made."""
     plain = _plain(settings)
-    others = _signatures(before) if _plain(before) == plain else []
-    try:
-        own = _signature(_made_key(), plain)
-    except OSError:
-        own = None
-    if own is not None and own not in others:
-        others = [own, *others]
-    # Largest number of signatures that settings keep, one for each user and computer.
-    return {**plain, **({SIGNATURES: others[:16]} if others else {})}
+    signatures = _signatures(before) if _plain(before) == plain else []
+    with suppress(OSError):
+        signatures = list(dict.fromkeys([_signature(_made_key(), plain), *signatures]))
+    # At most 16, one for each user and computer.
+    return {**plain, **({SIGNATURES: signatures[:16]} if signatures else {})}
 
 
 def verifies(settings: Mapping[str, Any]) -> bool:
@@ -108,11 +104,9 @@ def _made_key() -> bytes:
             os.fsync(file.fileno())
         try:
             os.link(name, path)
-        except FileExistsError:
-            pass  # another process was faster
         except OSError:
-            # This disk has no hard links. If two processes make a key at the same moment, the last one is kept, and the
-            # store of the other process asks the user again.
+            # Another process was faster, or this disk has no hard links. In the latter case, if two processes make a
+            # key at the same moment, the last one is kept, and the store of the other process asks the user again.
             if not path.exists():
                 os.replace(name, path)
     finally:
@@ -125,13 +119,16 @@ def _read_key(path: Path) -> bytes:
     with path.open("rb") as file:
         mode = os.fstat(file.fileno()).st_mode
         key = file.read(_BYTES + 1)
-    again = "a new key is made, and for stores that carry the old signature the question is asked again"
+    problem = None
     if os.name == "posix" and mode & 0o077:
         who = f"other users (mode {stat.filemode(mode)}), who may have signed stores with it"
-        raise InputError(f"the key {path} can be read or written by {who}. Delete it: {again}.")
-    if len(key) != _BYTES:
+        problem = f"can be read or written by {who}"
+    elif len(key) != _BYTES:
         size = len(key) if len(key) < _BYTES else "more"
-        raise InputError(f"the key {path} is damaged: it must have {_BYTES} bytes, got {size}. Delete it: {again}.")
+        problem = f"is damaged: it must have {_BYTES} bytes, got {size}"
+    if problem is not None:
+        again = "a new key is made, and for stores that carry the old signature the question is asked again"
+        raise InputError(f"the key {path} {problem}. Delete it: {again}.")
     return key
 
 
@@ -145,25 +142,23 @@ def code_named(settings: Mapping[str, Any]) -> list[str]:
     runs programs or other libraries, and every case, part, search and certificate that this package does not have. An
     installed package may have it, and its code would be imported. This function does not search the packages.
     """
+    # The key of a setting that names a part, the key of the name if it is a table, and the parts that are known.
+    named: list[tuple[str, str, Any]] = [
+        ("experiment", "", cases.REGISTRY),
+        *((kind, "type", registry) for kind, registry in REGISTRIES.items()),
+        ("search", "name", searches.REGISTRY),
+        ("certificate", "kind", KINDS),
+    ]
     try:
         code = [_shown("task", settings["task"])] if isinstance(settings.get("task"), str) else []
-        for key, name_key, is_data in _NAMED:
+        for key, name_key, registry in named:
             given = settings.get(key)
             name = given.get(name_key) if name_key and isinstance(given, Mapping) else given
-            if name is not None and not is_data(name):
+            if name is not None and not registry.is_data(name):
                 code.append(_shown(key, given))
         return [*code, *_references("", settings)]
     except RecursionError:
         return ["settings that are nested too deeply to be checked"]
-
-
-_NAMED: tuple[tuple[str, str | None, Callable[[Any], bool]], ...] = (
-    ("experiment", None, cases.REGISTRY.is_data),
-    *((kind, "type", registry.is_data) for kind, registry in REGISTRIES.items()),
-    ("search", "name", searches.REGISTRY.is_data),
-    ("certificate", "kind", KINDS.is_data),
-)
-"""Settings that name a part: the key, the key of the name if it is a table, and whether a name is known to be data."""
 
 
 def _references(where: str, value: Any) -> Iterator[str]:

@@ -1,20 +1,30 @@
-"""The settings in a store, and which of them may be used: those that name code must be signed by this user."""
+"""The settings in a store, which of them may be used, and the campaign that they open.
+
+Settings that name code must be signed by this user.
+"""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from pydantic import ValidationError
 
+from ctxval._util.checked import PositiveFloat, PositiveInt, require
 from ctxval._util.registry import declaration_of
+from ctxval.campaign.campaign import Campaign
+from ctxval.campaign.storage.other_stores import STORE_SUFFIXES
 from ctxval.campaign.storage.store import Store
 from ctxval.certificates import KINDS
 from ctxval.cli.config.parts import REGISTRIES
-from ctxval.cli.config.settings import Settings, read_settings, sentence_of
-from ctxval.cli.config.signatures import code_named, unsigned, verifies
+from ctxval.cli.config.settings import Settings, not_an_experiment, read_settings, sentence_of
+from ctxval.cli.config.signatures import code_named, unsigned, verifies, why_no_key
+from ctxval.cli.options import Allowed
+from ctxval.cli.screen import Screen
+from ctxval.core.experiment import Experiment
 from ctxval.errors import InputError
 
 
@@ -45,7 +55,7 @@ def _of_store(kept: dict[str, Any]) -> Settings:
     try:
         return Settings.model_validate(unsigned(kept))
     except ValidationError as error:
-        raise InputError(sentence_of("the store's settings", error)) from error
+        raise InputError(sentence_of("the store's settings: ", error)) from error
 
 
 def trusted_settings(store: Store, *, experiment: str | None = None, trust: bool = False) -> Settings:
@@ -71,19 +81,18 @@ def trusted_settings(store: Store, *, experiment: str | None = None, trust: bool
         return settings
     if trust:
         return settings.model_copy(update={"folder": folder})
+    unknown = "You did not make the store on this computer, or it was changed since"
+    known = "If you know its experiment, name it with --experiment FILE.toml (or module:attr). If you trust the"
     if not code:
+        files = "; ".join(outside[:8])
         raise InputError(
-            f"{store.path} names files outside its folder: {'; '.join(outside[:8])}. You did not make the store "
-            "on this computer, or it was changed since. If you know its experiment, name it with --experiment "
-            "FILE.toml (or module:attr). If you trust the store, give --trust."
+            f"{store.path} names files outside its folder: {files}. {unknown}. {known} store, give --trust."
         )
     more = f" and {len(code) - 8} more" if len(code) > 8 else ""
     raise InputError(
         f"{store.path} would import or run code: {'; '.join(code[:8])}{more}, from the folder "
-        f"{ascii(str(folder))[:200]}. You did not make the store on this computer, or it was changed since, or an "
-        "older version made it. If you know its experiment, name it with --experiment FILE.toml (or module:attr). If "
-        "you trust the code that the store names, give --trust. The store then carries your signature, and the "
-        "question will not be asked again."
+        f"{ascii(str(folder))[:200]}. {unknown}, or an older version made it. {known} code that the store names, give "
+        "--trust. The store then carries your signature, and the question will not be asked again."
     )
 
 
@@ -101,7 +110,8 @@ _FILE_KEYS = {"refined", "data", "logs"}.union(
 def _files_outside(kept: dict[str, Any], folder: Path, home: Path) -> list[str]:
     """Return the files that settings name outside a folder, each as a text to show."""
     parts = {key: value for key, value in kept.items() if key in (*REGISTRIES, "refined")}
-    named = [name for text in _texts(parts, False) for name in (_IN_XML.findall(text) if "<" in text else [text])]
+    in_xml = re.compile(r"""(?:file|dir)\s*=\s*["']([^"']+)""")
+    named = [name for text in _texts(parts, False) for name in (in_xml.findall(text) if "<" in text else [text])]
     return [ascii(name)[:200] for name in named if "\0" in name or not (folder / name).resolve().is_relative_to(home)]
 
 
@@ -117,4 +127,69 @@ def _texts(value: Any, path: bool) -> Iterator[str]:
         yield value
 
 
-_IN_XML = re.compile(r"""(?:file|dir)\s*=\s*["']([^"']+)""")
+# Campaigns
+
+
+@dataclass(frozen=True, eq=False)
+class Opened:
+    """A store, with its settings, its experiment and its campaign."""
+
+    settings: Settings
+    experiment: Experiment
+    campaign: Campaign
+    path: Path
+
+
+def limit_of(experiment: Experiment, settings: Settings, given: float | None = None) -> float | None:
+    """Return the threshold of the verdict: the given one, or else that of the settings, or else of the experiment."""
+    known = (value for value in (given, settings.threshold, experiment.threshold) if value is not None)
+    return require("threshold", PositiveFloat | None, next(known, None))  # type: ignore[no-any-return]
+
+
+def budget_of(experiment: Experiment, settings: Settings, given: int | None = None) -> int:
+    """Return the budget: the given one, or else that of the settings, or else of the experiment."""
+    known = (value for value in (given, settings.budget, experiment.budget) if value is not None)
+    return require("budget", PositiveInt, next(known))  # type: ignore[no-any-return]
+
+
+def open_store(path: Path, allowed: Allowed, *, remeasure: bool = False) -> Opened:
+    """Build the experiment of a store, and its campaign."""
+    store = Store.existing(path)
+    settings = trusted_settings(store, experiment=allowed.experiment, trust=allowed.trust)
+    asked = (allowed.trust or allowed.experiment is not None) and not verifies(store.settings())
+    try:
+        experiment = settings.load()
+    except InputError as error:
+        if settings.folder is None or settings.folder.is_dir():
+            raise
+        raise InputError(
+            f"{error} The store names the folder {str(settings.folder)!a}, which does not exist any more: name the "
+            "experiment at its present place with --experiment FILE.toml or module:attr."
+        ) from error
+    campaign = settings.campaign(experiment, store, accept_change=allowed.accept_change, remeasure=remeasure)
+    if asked and code_named(store.settings()):
+        reason = why_no_key()
+        does = "now carries your signature, and the question will not be asked again"
+        if reason is not None:
+            does = f"cannot carry your signature, and the question will be asked again: {reason}"
+        Screen(stderr=True).say(f"{path} {does}.")
+    return Opened(settings, experiment, campaign, path)
+
+
+def open_target(target: str, overrides: dict[str, Any], allowed: Allowed) -> Opened:
+    """Open the store that an argument names, or the campaign of an experiment with options of the command line."""
+    path = Path(target)
+    if path.suffix in STORE_SUFFIXES or (path.suffix not in (".toml", ".py") and path.is_file()):
+        if any(value is not None for value in overrides.values()):
+            *first, last = (f"--{name.removesuffix('s')}" for name in overrides)
+            flags = f"{', '.join(first)} and {last}"
+            raise InputError(f"{target} is a store and keeps its own settings: remove {flags}.")
+        return open_store(path, allowed)
+    if path.suffix and ":" not in target and path.suffix != ".toml":
+        raise InputError(not_an_experiment(target, f"a store ({', '.join(STORE_SUFFIXES)})"))
+    if allowed.experiment is not None or allowed.trust:
+        raise InputError(f"--experiment and --trust need a store as the first argument, and {target} is an experiment.")
+    settings = read_settings(target, overrides)
+    experiment = settings.load()
+    path = settings.store_path(experiment.name)
+    return Opened(settings, experiment, settings.campaign(experiment, path, accept_change=allowed.accept_change), path)

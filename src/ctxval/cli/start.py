@@ -1,4 +1,4 @@
-"""``ctxval init`` and ``ctxval check``: write and check experiment files."""
+"""``ctxval init``, ``check``, ``cases`` and ``reproduce``: experiment files, the built-in cases and the paper."""
 
 from __future__ import annotations
 
@@ -9,19 +9,23 @@ from pathlib import Path
 from string import Template
 from typing import Any
 
+from rich.progress import Progress, TextColumn
+
+from ctxval import cases as known_cases
 from ctxval._util.files import write_text
-from ctxval.cli.base import BAD_INPUT, FALSIFIED, command, out
+from ctxval.cli.base import BAD_INPUT, FALSIFIED, command, err, out, print_table
 from ctxval.cli.config.check import aspect1_findings, check_experiment
+from ctxval.cli.config.parts import part, plain_options
 from ctxval.cli.config.settings import read_settings
 from ctxval.cli.options import named_values
 from ctxval.core.experiment import UnitsWarning
 from ctxval.errors import InputError
-from ctxval.studies.aspect1 import TASKS
+from ctxval.studies import aspect1 as model_alone
 
 
 @command()
 def init(file: Path = Path("experiment.toml")) -> Any:
-    """Write an example experiment file and the Python module of its system."""
+    """``ctxval init``."""
     if file.suffix != ".toml":
         raise InputError(f"an experiment file ends in .toml, got {str(file)!r}.")
     module = "".join(c if c.isascii() and c.isalnum() else "_" for c in file.stem) + "_system"
@@ -40,7 +44,7 @@ def init(file: Path = Path("experiment.toml")) -> Any:
     return {"files": written}
 
 
-@command(tasks=TASKS)
+@command(tasks=model_alone.TASKS)
 def check(
     target: str,
     execute: bool = False,
@@ -49,7 +53,7 @@ def check(
     threshold: float | None = None,
     option: list[str] | None = None,
 ) -> Any:
-    """Check that the parts of an experiment fit together. The system is executed only if --execute is given."""
+    """``ctxval check``."""
     if not aspect1 and (tasks is not None or threshold is not None):
         raise InputError(f"{'--tasks' if tasks is not None else '--threshold'} needs --aspect1.")
     settings = read_settings(target, {"options": named_values(option)})
@@ -60,9 +64,16 @@ def check(
     settings.search.build(settings.folder)
     findings = check_experiment(experiment, execute=execute, seed=settings.seed)
     failed = any(finding.state == "failed" for finding in findings)
-    status = BAD_INPUT if failed else 0
-    simulated = settings.aspect1_of(experiment, tasks, threshold) if aspect1 and not failed else None
-    if simulated is not None:
+    status, simulated = BAD_INPUT if failed else 0, None
+    if aspect1 and not failed:
+        table = settings.aspect1
+        simulated = model_alone.check(
+            experiment.validation,
+            threshold=table.threshold if threshold is None else threshold,
+            distance=None if table.distance is None else part("distance", table.distance, settings.folder),
+            tasks=table.tasks if tasks is None else tasks,
+            seed=settings.seed,
+        )
         findings += aspect1_findings(simulated)
         status = FALSIFIED if simulated.exceeding and simulated.completes is False else 0
     colours = {"ok": "green", "noted": "yellow", "failed": "bold red", "skipped": "dim"}
@@ -72,3 +83,47 @@ def check(
     if aspect1:
         report["aspect1"] = None if simulated is None else simulated.to_json()
     return report, status
+
+
+@command()
+def cases(name: str | None = None) -> Any:
+    """``ctxval cases``."""
+    listed: dict[str, tuple[str, dict[str, Any]]] = {}
+    for each in list(known_cases.REGISTRY) if name is None else [name]:
+        try:
+            listed[each] = known_cases.text_of(each), plain_options(each)
+        except InputError as error:
+            if name is not None:
+                raise
+            listed[each] = str(error), {}
+    rows = {}
+    for each, (text, options) in listed.items():
+        texts = [key if default is None else f"{key}={default}" for key, default in options.items()]
+        rows[each] = f"{text}; options: {', '.join(texts)}" if texts else text
+    print_table(rows)
+    if name is None:
+        return {each: text for each, (text, _) in listed.items()}
+    text, options = listed[name]
+    return {"case": name, "text": text, "options": options}
+
+
+@command(with_json=False)
+def reproduce(
+    name: str, quick: bool = False, out_: Path = Path("reproduction"), results: Path | None = None, workers: int = 2
+) -> None:
+    """``ctxval reproduce``."""
+    from ctxval import reproduce as paper  # imported here: the other commands do not need it
+
+    with Progress(TextColumn("runs"), *Progress.get_default_columns(), console=err) as progress:
+        line = progress.add_task("")
+        table = paper.reproduce(
+            name,
+            out_,
+            stored=results,
+            scale=paper.QUICK if quick else paper.FULL,
+            workers=workers,
+            on_start=lambda missing: progress.update(line, total=missing),
+            on_done=lambda job: progress.update(line, advance=1, description=job.key),
+        )
+    out.say(f"table: {table}")
+    out.say(f"figures and data: {out_}")
