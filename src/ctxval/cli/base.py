@@ -27,8 +27,9 @@ from ctxval.cli.commands import app
 from ctxval.cli.options import described
 from ctxval.cli.screen import Screen, line
 from ctxval.core.experiment import UnitsWarning
-from ctxval.core.preflight import CostWarning, DistanceWarning
+from ctxval.core.preflight import DistanceWarning
 from ctxval.core.trial import Trial
+from ctxval.core.validation import CostWarning
 from ctxval.errors import CertificateError, CtxvalError, InputError, StoreError
 
 FALSIFIED, BAD_INPUT, CANNOT_GO_ON, INTERRUPTED, CUT_OFF = 1, 2, 3, 130, 141

@@ -71,14 +71,11 @@ class Limits(ShortRepr):
         except ValueError:
             fits = False
         if not fits:
-            raise ShapeError(
-                "low and high of the limits must be numbers, or one for each input, "
-                f"got shapes {self.low.shape} and {self.high.shape}."
-            )
+            got = f"shapes {self.low.shape} and {self.high.shape}"
+            raise ShapeError(f"low and high of the limits must be numbers, or one for each input, got {got}.")
         if not (self.low < self.high).all():
-            raise InputError(
-                f"limits must be low < high for every input, got {self.low.tolist()} and {self.high.tolist()}."
-            )
+            got = f"{self.low.tolist()} and {self.high.tolist()}"
+            raise InputError(f"limits must be low < high for every input, got {got}.")
 
     @classmethod
     def of(cls, limits: LimitsLike, inputs: int | None = None) -> Limits:
@@ -92,22 +89,21 @@ class Limits(ShortRepr):
         if inputs is None:
             return box
         if any(bound.shape not in ((), (inputs,)) for bound in (box.low, box.high)):
-            raise ShapeError(
-                f"limits must be numbers or have shape ({inputs},), got {box.low.shape} and {box.high.shape}."
-            )
+            got = f"{box.low.shape} and {box.high.shape}"
+            raise ShapeError(f"limits must be numbers or have shape ({inputs},), got {got}.")
         return cls(*(np.array(np.broadcast_to(bound, (inputs,))) for bound in (box.low, box.high)))
 
     @classmethod
     def _read(cls, limits: Any) -> Limits:
         spellings = (
-            "write one number h for -h to h of every input, { low = 0.0, high = 8.0 } (in Python also Limits(low=0.0, "
-            "high=8.0)) with numbers or one for each input, or rows [[low, high], ...], one for each input"
+            "write one number h for -h to h of every input, { low = 0.0, high = 8.0 } with numbers or one for each input "
+            "(in Python also Limits(low=0.0, high=8.0)), or rows [[low, high], ...], one for each input"
         )
         if isinstance(limits, Mapping):
             if set(limits) != {"low", "high"}:
                 given = ", ".join(map(str, limits)) or "neither"
                 raise InputError(
-                    f"limits must have low and high, of which one may be infinite, got {given}; {spellings}."
+                    f"limits must have low and high, one of them may be infinite, got {given}; {spellings}."
                 )
             return cls(limits["low"], limits["high"])
         try:
@@ -165,8 +161,7 @@ class AffineFeedback(ShortRepr):
         steps = self.inputs.shape[-2]
         if not 0 <= t < steps:
             raise InputError(f"the controller has inputs for the steps 0 to {steps - 1}, got step {t}.")
-        deviation = x - self.states[..., t, :]
-        u = self.inputs[..., t, :] + fed_back(self.gains[..., t, :, :], deviation)
+        u = self.inputs[..., t, :] + fed_back(self.gains[..., t, :, :], x - self.states[..., t, :])
         return u if self.limits is None else self.limits.clip(u)
 
     def __getitem__(self, index: int) -> AffineFeedback:
@@ -187,11 +182,7 @@ class Policy(ShortRepr):
     """
 
     def __init__(
-        self,
-        policy: Callable[[int, Array, Task], Array],
-        *,
-        vectorized: bool = True,
-        limits: LimitsLike | None = None,
+        self, policy: Callable[[int, Array, Task], Array], *, vectorized: bool = True, limits: LimitsLike | None = None
     ) -> None:
         self.policy = policy
         self.batched = vectorized

@@ -70,9 +70,7 @@ class TaskSpace:
         names, lows, highs = list[str](), list[Array](), list[Array]()
         for name, bound in bounds.items():
             if name == "points" or name.startswith("_"):
-                raise InputError(
-                    f"a task parameter must not be called 'points' or begin with an underscore, got {name!r}."
-                )
+                raise InputError(f"a task parameter must not be called 'points' or begin with _, got {name!r}.")
             low, high, self._units[name] = _bounds(name, bound)
             scalar, start = low.ndim == 0, len(names)
             self._columns[name] = start if scalar else slice(start, start + low.size)
@@ -175,9 +173,8 @@ class TaskSpace:
         outside = (point < self.low) | (point > self.high)
         if outside.any():
             i = int(np.argmax(outside))
-            raise InputError(
-                f"{self.names[i]} = {point[i]:g} is outside the task space, [{self.low[i]:g}, {self.high[i]:g}]."
-            )
+            bounds = f"[{self.low[i]:g}, {self.high[i]:g}]"
+            raise InputError(f"{self.names[i]} = {point[i]:g} is outside the task space, {bounds}.")
         return point
 
     def describe_point(self, point: Array) -> dict[str, Point]:
