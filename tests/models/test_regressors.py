@@ -97,14 +97,14 @@ def test_a_formula_predicts_as_its_regressor_with_its_derivatives(regressor: Any
     h = 1e-5
     moves = h * np.eye(3)
     differences = [(regressor.predict(ROWS + move) - regressor.predict(ROWS - move)) / (2 * h) for move in moves]
-    np.testing.assert_allclose(smooth.jacobian(ROWS), np.stack(differences, axis=-1), rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(smooth.expanded(ROWS)[1], np.stack(differences, axis=-1), rtol=1e-6, atol=1e-6)
 
 
 def test_at_a_centre_the_derivatives_are_finite() -> None:
     for nu in (0.5, 1.5, np.inf):
         smooth = smooth_map(fitted(process(Matern(1.0, nu=nu))))
         assert smooth is not None
-        assert np.isfinite(smooth.jacobian(X)).all()
+        assert np.isfinite(smooth.expanded(X)[1]).all()
 
 
 def test_a_single_target_is_one_column() -> None:
@@ -112,7 +112,7 @@ def test_a_single_target_is_one_column() -> None:
         smooth = smooth_map(fitted(regressor, Y[:, 0]))
         assert smooth is not None
         np.testing.assert_allclose(smooth.value(ROWS), regressor.predict(ROWS)[:, None], rtol=1e-9)
-        assert smooth.jacobian(ROWS).shape == (6, 1, 3)
+        assert smooth.expanded(ROWS)[1].shape == (6, 1, 3)
 
 
 class Doubled(Ridge):

@@ -96,14 +96,14 @@ class Limits(ShortRepr):
     @classmethod
     def _read(cls, limits: Any) -> Limits:
         spellings = (
-            "write one number h for -h to h of every input, { low = 0.0, high = 8.0 } with numbers or one for each input "
-            "(in Python also Limits(low=0.0, high=8.0)), or rows [[low, high], ...], one for each input"
+            "write one number h for -h to h of every input, { low = 0.0, high = 8.0 } (in Python also Limits(low=0.0, "
+            "high=8.0)) with numbers or one for each input, or rows [[low, high], ...], one for each input"
         )
         if isinstance(limits, Mapping):
             if set(limits) != {"low", "high"}:
                 given = ", ".join(map(str, limits)) or "neither"
                 raise InputError(
-                    f"limits must have low and high, one of them may be infinite, got {given}; {spellings}."
+                    f"limits must have low and high, of which one may be infinite, got {given}; {spellings}."
                 )
             return cls(limits["low"], limits["high"])
         try:

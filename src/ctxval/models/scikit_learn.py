@@ -14,6 +14,7 @@ from ctxval.core.model import central_differences, paired
 from ctxval.core.trajectory import Transitions
 from ctxval.errors import InputError, ShapeError
 from ctxval.models.regressors import smooth_map
+from ctxval.models.scaling import require_finite
 from ctxval.models.smooth_maps import SmoothMap
 
 
@@ -45,8 +46,7 @@ class ScikitLearn(ShortRepr):
     @classmethod
     def fit(cls, regressor: Any, data: Transitions, *, increments: bool = True) -> ScikitLearn:
         """Fit a regressor on recorded transitions. The regressor itself is fitted, not a copy."""
-        if not len(data) or not all(np.isfinite(part).all() for part in (data.x, data.u, data.x_next)):
-            raise InputError("a model needs finite transitions to be learned from, got none, NaN or infinity.")
+        require_finite(data)
         if not callable(getattr(regressor, "fit", None)):
             raise InputError(f"the regressor must have fit and predict, got {regressor!r}.")
         targets = data.x_next - data.x if increments else data.x_next
@@ -64,10 +64,7 @@ class ScikitLearn(ShortRepr):
         finite: Mask = np.asarray(np.isfinite(rows).all(axis=-1, keepdims=True))
         complete = rows if finite.all() else np.where(finite, rows, 0.0)
         formula = self._formula()
-        if formula is None:
-            outputs = _as_columns(self.regressor.predict(complete))
-        else:
-            outputs = np.concatenate([formula.value(block) for block in _blocks(complete)])
+        outputs = formula.value(complete) if formula else _as_columns(self.regressor.predict(complete))
         _require_states(outputs, x.shape[-1])
         outputs = (outputs if finite.all() else np.where(finite, outputs, np.nan)).reshape(*batch, -1)
         return x + outputs if self.increments else outputs
@@ -80,7 +77,7 @@ class ScikitLearn(ShortRepr):
             return central_differences(self.step, x, u)
         if formula.constant:
             rows, batch = np.zeros((1, self.features)), ()
-        whole = np.concatenate([formula.jacobian(block) for block in _blocks(rows)])
+        whole = formula.expanded(rows)[1]
         _require_states(whole, n)
         whole = whole.reshape(*batch, *whole.shape[1:])
         A, B = whole[..., :n], whole[..., n:]
@@ -102,11 +99,6 @@ class ScikitLearn(ShortRepr):
 def _require_states(outputs: Array, n: int) -> None:
     if outputs.shape[1] != n:
         raise ShapeError(f"the regressor must predict as many states as it takes, {n}, got shape {outputs.shape}.")
-
-
-def _blocks(rows: Array) -> list[Array]:
-    """Return blocks of 1024 rows: enough to be fast, few enough for the cache."""
-    return [rows[first : first + 1024] for first in range(0, max(1, len(rows)), 1024)]
 
 
 def _as_columns(output: Any) -> Array:
