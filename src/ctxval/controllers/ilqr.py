@@ -121,7 +121,6 @@ class _Descent:
         return ~self.converged & ~stuck & (self.iterations < self.settings.iterations)
 
     def advance(self, rows: Rows) -> None:
-        """Take one step for these tasks, or mark them as converged."""
         around, policy = self._step(rows)
         gain = -policy.change.at(1.0)
         arrived = gain <= self.settings.tolerance * (np.abs(self.J[rows]) + self.settings.tolerance)
@@ -166,7 +165,6 @@ class _Descent:
         return around, minimise(self.cost, around, self.limits, self.damping[rows])
 
     def _keep(self, policy: InputStep, chosen: Rows, rows: Rows) -> None:
-        """Keep the gains of some of the tasks of a step."""
         self.K[:, rows[chosen]] = policy.K[:, chosen] if policy.K.ndim == 4 else policy.K[:, None]
 
     def _line_search(self, rows: Rows, policy: InputStep, waiting: Rows) -> Rows:
@@ -222,7 +220,6 @@ class _Descent:
         return X, U, self._costs(rows, X, U)
 
     def _costs(self, rows: Rows, X: Array, U: Array) -> Array:
-        """Return the costs of the loops of these tasks; infinity if one is not finite."""
         J = self.cost.value(X - self.reference[:, rows], U)
         return np.where(np.isfinite(J), J, np.inf)
 

@@ -96,10 +96,8 @@ class StationaryLQR(ShortRepr):
 
 def _require_inputs(cost: QuadraticCost, B: Array) -> None:
     if not B.shape[-1]:
-        raise InputError(
-            "LQR designs inputs, and the model has 0 inputs; use a synthesizer of your own, whose controllers return "
-            "inputs of shape (..., 0)."
-        )
+        advice = "use a synthesizer of your own, whose controllers return inputs of shape (..., 0)"
+        raise InputError(f"LQR designs inputs, and the model has 0 inputs; {advice}.")
     if B.shape[-1] != len(cost.R):
         raise InputError(f"R must weigh the model's {B.shape[-1]} inputs, got a weight of {len(cost.R)} inputs.")
 
@@ -113,17 +111,16 @@ def _stationary_gain(cost: QuadraticCost, A: Array, B: Array) -> Array:
         return np.stack(gains).reshape(*batch, *gains[0].shape)
     from scipy.linalg import solve_discrete_are
 
+    failure = "no stationary feedback stabilises the model at the goal"
     try:
         P = solve_discrete_are(A, B, cost.Q, cost.R)
     except (np.linalg.LinAlgError, ValueError) as error:
-        raise DesignError(f"no stationary feedback stabilises the model at the goal: {error}") from error
+        raise DesignError(f"{failure}: {error}") from error
     K = -np.linalg.solve(cost.R + B.T @ P @ B, B.T @ P @ A)
     radius = float(np.abs(np.linalg.eigvals(A + B @ K)).max())
     if not radius < 1:
-        raise DesignError(
-            "no stationary feedback stabilises the model at the goal: the largest eigenvalue of its closed loop has "
-            f"modulus {radius:.6g}, which must be below 1."
-        )
+        largest = f"the largest eigenvalue of its closed loop has modulus {radius:.6g}, which must be below 1"
+        raise DesignError(f"{failure}: {largest}.")
     return np.asarray(K)
 
 

@@ -112,10 +112,8 @@ class _Problem:
             A, B = linearize(self.model, X[:-1], U)
             change = self._improved(X, U, A, B)
             if change is None:
-                raise DesignError(
-                    f"MPC finds no inputs at step {t} that keep the prediction from {self.x.tolist()} within the "
-                    "state limits; a violation_cost makes them soft."
-                )
+                aim = f"that keep the prediction from {self.x.tolist()} within the state limits"
+                raise DesignError(f"MPC finds no inputs at step {t} {aim}; a violation_cost makes them soft.")
             if A.ndim == 2 and B.ndim == 2:
                 U = self.settings.limits.clip(U + change)
                 return self._predicted(U), U
@@ -165,7 +163,7 @@ class _Problem:
         return X, U, True
 
     def _merit(self, X: Array, U: Array) -> float:
-        """Return the merit: the cost plus the weighted violation of the state limits."""
+        """Return the cost plus the weighted violation of the state limits."""
         deviations = X[1:] - self.reference
         cost = 0.5 * (
             ((self.Q @ deviations[..., None])[..., 0] * deviations).sum() + ((U @ self.settings.cost.R) * U).sum()

@@ -23,13 +23,11 @@ Controller = Callable[[int, Array], Array]
 class Synthesizer(Protocol):
     """A method that designs a controller for a task on a model.
 
-    A synthesizer that can design for a batch of tasks in one call has an attribute ``batched = True``. If its
-    controllers of a batch have ``__getitem__``, which returns the controller of one task, tasks are also designed in a
-    batch if the system executes them one at a time.
+    With ``batched = True`` it designs for a batch of tasks in one call. If its controllers then have ``__getitem__``, which
+    returns the controller of one task, tasks are also designed together if the system executes them one at a time.
 
-    A controller whose design is iterative may have an attribute ``converged``: whether the design converged, a boolean,
-    or booleans of the batch shape ``(...)``. Reports and ``ctxval check --aspect1`` name the tasks whose design did
-    not. :func:`converged_of` reads it, and :func:`ctxval.testing.check_synthesizer` checks it.
+    A controller may tell whether its design ``converged``, by a boolean or booleans of the batch shape ``(...)``. Reports and
+    ``ctxval check --aspect1`` name the tasks whose design did not.
     """
 
     def design(self, task: Task, model: Model) -> Controller:
@@ -79,11 +77,10 @@ class Limits(ShortRepr):
 
     @classmethod
     def of(cls, limits: LimitsLike, inputs: int | None = None) -> Limits:
-        """Return limits from any form that users may give.
+        """Return limits from any form that users may give; single numbers are expanded if the number of inputs is given.
 
-        It is one number h for ``-h`` to ``h`` of every input; ``Limits(low=, high=)`` or a mapping of low and high,
-        numbers or ``(m,)``; or rows ``[low, high]``, one for each input. Single numbers are expanded if the number of
-        inputs is given.
+        It is one number h for ``-h`` to ``h`` of every input; ``Limits(low=, high=)`` or a mapping of low and high, numbers
+        or ``(m,)``; or rows ``[low, high]``, one for each input.
         """
         box = limits if isinstance(limits, Limits) else cls._read(limits)
         if inputs is None:

@@ -17,8 +17,8 @@ class Task:
     """One control task, or a batch of them.
 
     Args:
-        initial_state: the first state: a list of n components, each a number or an array ``(...)`` over the batch; or
-            one array ``(..., n)``.
+        initial_state: the first state: n components, each a number or an array ``(...)`` over the batch; or an array
+            ``(..., n)``.
         horizon: number of steps H.
         dt: length of a step, seconds.
         goal: the state to reach, given like ``initial_state``; a goal is a constant reference.

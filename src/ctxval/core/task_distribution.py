@@ -38,10 +38,9 @@ class Continuous(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Normal(ShortRepr):
-    """The normal distribution of a task parameter; a task space truncates it to the parameter's bounds.
+    """The normal distribution of a task parameter, with a mean and a deviation, numbers or one for each component.
 
-    Mean and standard deviation, before the truncation, are in the parameter's units: a number, or one for each
-    component.
+    They are in the parameter's units, and hold before the task space truncates the distribution to the parameter's bounds.
     """
 
     mean: ArrayLike

@@ -129,10 +129,9 @@ class Trajectory:
     def from_npz(
         source: bytes | str | Path, *, shape: tuple[int, int] | None = None, most: int = MOST_BYTES
     ) -> Trajectory:
-        """Read a trajectory from NPZ bytes or an NPZ file; no code in it is ever run.
+        """Read a trajectory from NPZ bytes or an NPZ file of at most so many bytes; no code in it is ever run.
 
-        The states of a complete trajectory must have the shape ``(H + 1, n)``, if it is given. At most so many bytes
-        are read.
+        The states of a complete trajectory must have the shape ``(H + 1, n)``, if it is given.
         """
         name = "these bytes" if isinstance(source, bytes) else str(source)
         try:
@@ -184,15 +183,14 @@ class Trajectory:
     ) -> Trajectory:
         """Read one trajectory from CSV with the columns ``t, x0.., u0..``, or with named columns.
 
-        A column may state its unit, as in ``angle [deg]`` or ``angle_deg``, and is converted to that of its name; one
-        without a unit has that of its name, and times are in seconds. Other columns are ignored, and so are the inputs
-        in the last row. Columns are separated by commas, or by semicolons or tabs, with which decimal commas are read.
+        A column may state its unit, as in ``angle [deg]`` or ``angle_deg``, and is converted to that of its name; times are in
+        seconds. Other columns and the inputs in the last row are ignored. Columns are separated by commas, or by semicolons or
+        tabs, with which decimal commas are read.
 
         Args:
             states, inputs: names of the columns, with or without units. If the file has none of the names, the
                 numbered columns ``x0, x1, ...`` and ``u0, u1, ...`` are read.
-            most_rows: largest number of rows below the header; a file with more rows is refused. None allows any
-                number up to the largest size of a file.
+            most_rows: largest number of rows below the header; a file with more rows is refused.
         """
         table = CsvTable(path)
         time = time_column(str(path), table.names)
@@ -272,7 +270,6 @@ def _listed(names: Sequence[str]) -> str:
 
 
 def _chosen(table: CsvTable, letter: str, names: Sequence[str] | None) -> dict[str, float]:
-    """Return the columns of the states or inputs, each with the factor to its unit; numbered ones if none is named."""
     path, wanted = str(table.path), dict(parted(name) for name in names or ())
     columns = {name: column_of(path, table.names, name) for name in wanted}
     if not any(columns.values()):

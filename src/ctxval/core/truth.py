@@ -88,7 +88,7 @@ def search_truth(
         agreement: relative difference of the two best repeats at which the search ends.
         population: number of points in a generation, for each dimension.
         generations: largest number of generations in one repeat.
-        climbs: number of climbs from random starts in one repeat; each starts at the best of sixteen random points.
+        climbs: climbs from random starts in one repeat; each starts at the best of sixteen random points.
     """
     search = _TruthSearch(validation, population, generations, climbs)
     maxima: list[tuple[float, Array]] = []
@@ -158,7 +158,6 @@ class _TruthSearch:
 
 
 def _gap(maxima: list[tuple[float, Array]]) -> float:
-    """Return the relative difference of the two best values; infinity if there are fewer than two."""
     values = sorted((value for value, _ in maxima if math.isfinite(value)), reverse=True)
     if len(values) < 2:
         return math.inf
@@ -171,9 +170,9 @@ def cached_truth(
 ) -> Truth:
     """Return a truth from its file in a folder, or find it and write that file.
 
-    The name of the file is a digest of sources and settings: those of the validation and of the method, for instance
-    ``functools.partial(search_truth, seed=1)``. The file keeps the truths of systems that differ in numbers alone. A
-    truth is used only if new executions of S on its task and on some others give the stored distances again.
+    The name of the file is a digest of the sources and settings of the validation and of the method, for instance
+    ``functools.partial(search_truth, seed=1)``. The file keeps the truths of systems that differ in numbers alone; a truth
+    is used only if new executions of S on its task and on some others give the stored distances again.
     """
     # The signature adds the default values, which the description of a function leaves out.
     parts = [describe(compute), str(inspect.signature(compute))]

@@ -50,10 +50,9 @@ class Validation:
         synthesizer: designs the controllers on M.
         distance: the distance d between the trajectories of M and S.
         start_tolerance: the largest permitted difference between the first state of an execution and the initial state
-            of its task. It is a fraction of the range of each state in the trajectory of the model, or of its initial
-            value if that is larger.
-        labels: the names and units of states, inputs and distance for files, pictures and reports; a distance may name
-            states by them.
+            of its task, as a fraction of the range of each state in the trajectory of the model, or of its initial value
+            if that is larger.
+        labels: the names and units of states, inputs and distance for files, pictures and reports.
         longest: the largest horizon that is planned.
 
     Its methods raise a DesignError if the synthesizer fails, a ModelError if the model fails or its closed loop is not
@@ -103,8 +102,7 @@ class Validation:
     def on_model(self, distance: Distance, *, units: str | None = None) -> Validation:
         """Return this validation with M itself in the place of S, which is never executed (the paper's Aspect 1).
 
-        The distance, with its units, is how far M is from completing its task, such as
-        :class:`ctxval.distances.GoalError`.
+        The distance, with its units, is how far M is from completing its task, as :class:`ctxval.distances.GoalError`.
         """
         labels = self.labels if units is None else replace(self.labels, units=units)
         return self._with(system=Simulated(self.model), distance=distance, labels=labels, start_tolerance=START)
@@ -160,7 +158,7 @@ class Validation:
             raise ExecutionError(str(error)) from error
 
     def require(self, plan: Plan, trajectory: object, start_tolerance: float | None = None) -> Trajectory:
-        """Check that a trajectory is a complete and finite execution of a plan; return it.
+        """Return a trajectory that is a complete and finite execution of a plan; refuse any other.
 
         An InputError says that it belongs to another task. A start tolerance replaces that of this validation.
         """
@@ -213,11 +211,7 @@ class Validation:
         return bool(getattr(self.system, "batched", False) and getattr(self.synthesizer, "batched", False))
 
     def plans(self, points: ArrayLike) -> list[Plan]:
-        """Return the plans of the tasks at ``(N, d)``, as :meth:`plan` makes them one by one.
-
-        If the synthesizer takes batches, the controllers of many tasks are designed in one call, and the results agree
-        with those of single designs up to rounding.
-        """
+        """Return the plans of the tasks at ``(N, d)``, as :meth:`plan` makes them up to rounding, designed together if possible."""
         return list(self._planned(require_shape("points", as_floats("points", points), (self.space.dimension,))))
 
     def _planned(self, points: Array) -> Iterator[Plan]:
@@ -225,7 +219,6 @@ class Validation:
             yield from self._planned_together(chunk) or map(self.plan, chunk)
 
     def _planned_together(self, points: Array) -> list[Plan] | None:
-        """Return the plans of points ``(N, d)`` from one design; None if a part takes no batches, or a task fails."""
         if len(points) == 1 or not getattr(self.synthesizer, "batched", False):
             return None
         try:

@@ -112,9 +112,9 @@ class Corrected(ShortRepr):
     """The model ``M'(x, u) = M(x, u) + r(x, u)`` of a model M and a correction r.
 
     Args:
-        linearised: ``"corrected"`` for the Jacobian of M', or ``"model"`` for that of M. With the second one, a
-            synthesizer that linearises once, such as LQR, designs nearly the controllers that it designed on M: the
-            Jacobian of M' at one point may say less of the tasks than a linear model that was fitted to all of them.
+        linearised: ``"corrected"`` for the Jacobian of M', or ``"model"`` for that of M. The Jacobian of M' at one point may
+            say less of the tasks than a linear model that was fitted to all of them, for instance to LQR, which linearises
+            once.
         data: the transitions that the correction was learned from, if any.
     """
 
@@ -147,8 +147,8 @@ class Corrected(ShortRepr):
 class Refined(ShortRepr):
     """A model that was learned again from executions, with all transitions that are known, and the model before.
 
-    The transitions are coverage for what is learned next. A residual of the refined model itself would be misleadingly
-    small at them. What learns from executions therefore takes the residual of the model before.
+    What learns from executions takes the residual of the model before, because that of the refined model would be
+    misleadingly small at its own data.
 
     Args:
         data: all transitions that are known, those of the executions of earlier models included.
@@ -171,10 +171,7 @@ class Refined(ShortRepr):
 
 
 def before_refinement(model: Model) -> Model:
-    """Return the model whose residual is learned from executions: that before a refinement, or the model itself.
-
-    A refined model explains its own data better than it explains the system elsewhere.
-    """
+    """Return the model whose residual is learned from executions: that before a refinement, or the model itself."""
     if isinstance(model, Refined):
         return model.before
     return model.model if isinstance(model, Corrected) else model

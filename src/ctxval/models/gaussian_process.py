@@ -21,11 +21,7 @@ from ctxval.models.smooth_maps import Slopes, SmoothMap, kernel_sum
 
 @dataclass(frozen=True, eq=False)
 class SquaredExponential(ShortRepr):
-    """``k(z, z') = v exp(-1/2 sum_j ((z_j - z'_j) / l_j)^2)``: rigid-body dynamics are smooth.
-
-    Attributes:
-        length_scales: l, shape ``(k,)``.
-    """
+    """``k(z, z') = v exp(-1/2 sum_j ((z_j - z'_j) / l_j)^2)``, with length-scales l ``(k,)``: rigid bodies move smoothly."""
 
     variance: float
     length_scales: Array
@@ -80,7 +76,7 @@ class GaussianProcessModel(IncrementModel):
     ) -> GaussianProcessModel:
         """Condition on recorded transitions, with the most likely hyperparameters (eq. 5.8, summed over the states).
 
-        It is conditioned on so many points, drawn at random; the effort grows with their cube.
+        So many points are drawn at random; the effort grows with their cube.
         """
         scaling = IncrementScaling.of(data)
         rows = np.random.default_rng(seed).permutation(len(data))[:points]

@@ -58,7 +58,7 @@ class IncrementModel(ShortRepr, ABC):
 
     def step(self, x: Array, u: Array) -> Array:
         z = self.scaling.inputs(x, u)
-        outputs = self._map.value(rows_of(z)).reshape(*z.shape[:-1], -1)
+        outputs = self._map.value(rows_of(z)).reshape(*z.shape[:-1], len(self.scaling.shift_out))
         return x + self.scaling.shift_out + self.scaling.scale_out * outputs
 
     def jacobian(self, x: Array, u: Array) -> tuple[Array, Array]:

@@ -22,10 +22,10 @@ from ctxval.models.smooth_maps import SmoothMap
 class ScikitLearn(ShortRepr):
     """A fitted scikit-learn regressor as a model: a pipeline, a forest, ridge regression, a Gaussian process.
 
-    Its features are the state, then the input. Networks, Gaussian processes, kernel ridge regression, linear models,
-    and pipelines of these with scalers and polynomial features, have an exact Jacobian from their formula. All others
-    are differentiated by central differences. The regressor must be smooth for LQR and iLQR: a forest or nearest
-    neighbours are piecewise constant, and their Jacobian is zero.
+    Its features are the state, then the input. Networks, Gaussian processes, kernel ridge regression, linear models, and
+    pipelines of these with scalers and polynomial features, have an exact Jacobian from their formula; all others are
+    differentiated by central differences. A forest or nearest neighbours are piecewise constant: their Jacobian is zero,
+    with which LQR and iLQR cannot design.
 
     Args:
         regressor: the fitted regressor, whose ``predict`` maps features ``(N, n + m)`` to ``(N, n)``.
@@ -55,10 +55,9 @@ class ScikitLearn(ShortRepr):
         return cls(regressor, increments=increments, data=data)
 
     def step(self, x: Array, u: Array) -> Array:
-        """Return the next state; shapes ``(..., n), (..., m) -> (..., n)``.
+        """Return the next states ``(..., n)``, NaN for a pair that is not finite.
 
         The formula gives what ``predict`` gives, without its checks, which take longer than the formula on few rows.
-        A pair that is not finite leads to NaN.
         """
         rows, batch = self._rows(x, u)
         finite: Mask = np.asarray(np.isfinite(rows).all(axis=-1, keepdims=True))
@@ -84,7 +83,6 @@ class ScikitLearn(ShortRepr):
         return (A + np.eye(n) if self.increments else A), B
 
     def _rows(self, x: Array, u: Array) -> tuple[Array, tuple[int, ...]]:
-        """Return states and inputs side by side, shape ``(N, n + m)``, and the shape of their batch."""
         n, m = x.shape[-1], u.shape[-1]
         if n + m != self.features:
             raise ShapeError(f"the regressor was fitted on {self.features} features, got {n} states and {m} inputs.")

@@ -123,7 +123,6 @@ class FMU(ShortRepr):
 
     @contextlib.contextmanager
     def _process(self) -> Iterator[_Process]:
-        """Yield an idle or a new process; it is not used again after an error."""
         idle = self._idle.setdefault(os.getpid(), [])
         try:
             process = idle.pop()

@@ -80,10 +80,7 @@ class Subprocess(ShortRepr):
         self._home = Path.cwd()
 
     def describe(self) -> dict[str, object]:
-        """Return what identifies this system in a store: its program, and digests of the files that the command names.
-
-        Other arguments are left out, because they may be secrets.
-        """
+        """Return its program, and digests of the files that the command names; other arguments may be secrets."""
         named = [*self._located[1:], *(self._located[:1] if not os.path.isabs(self.command[0]) else [])]
         files = {Path(name).name: Path(name).read_bytes() for name in named if os.path.isfile(name)}
         digests = {name: hashlib.sha256(content).hexdigest()[:16] for name, content in files.items()}
@@ -124,7 +121,6 @@ class Subprocess(ShortRepr):
 
 
 def signal_name(number: int) -> str:
-    """Return the name of a signal."""
     try:
         return signal.Signals(number).name
     except ValueError:
@@ -132,7 +128,6 @@ def signal_name(number: int) -> str:
 
 
 def _trajectory(folder: Path, task: Task) -> Trajectory:
-    """Return the trajectory that the command wrote, if it has the shape and the times of the task."""
     shape = task.horizon + 1, task.initial_state.size
     try:
         if os.path.lexists(folder / "trajectory.npz"):
