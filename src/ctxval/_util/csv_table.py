@@ -120,7 +120,7 @@ class CsvTable:
 
 
 class _Lines:
-    """The lines of a text; ``in_row`` counts the characters since the end of the last row, which may have several lines."""
+    """The lines of a text; ``in_row`` counts the characters since the end of the last row."""
 
     def __init__(self, text: io.TextIOWrapper, most: int) -> None:
         self.text, self.left, self.in_row, self.last = text, most, 0, ""

@@ -23,11 +23,12 @@ Controller = Callable[[int, Array], Array]
 class Synthesizer(Protocol):
     """A method that designs a controller for a task on a model.
 
-    With ``batched = True`` it designs for a batch of tasks in one call. If its controllers then have ``__getitem__``, which
-    returns the controller of one task, tasks are also designed together if the system executes them one at a time.
+    With ``batched = True`` it designs for a batch of tasks in one call. If its controllers then have ``__getitem__``,
+    which returns the controller of one task, tasks are also designed together if the system executes them one at a
+    time.
 
-    A controller may tell whether its design ``converged``, by a boolean or booleans of the batch shape ``(...)``. Reports and
-    ``ctxval check --aspect1`` name the tasks whose design did not.
+    A controller may tell whether its design ``converged``, by a boolean or booleans of the batch shape ``(...)``.
+    Reports and ``ctxval check --aspect1`` name the tasks whose design did not.
     """
 
     def design(self, task: Task, model: Model) -> Controller:
@@ -77,7 +78,7 @@ class Limits(ShortRepr):
 
     @classmethod
     def of(cls, limits: LimitsLike, inputs: int | None = None) -> Limits:
-        """Return limits from any form that users may give; single numbers are expanded if the number of inputs is given.
+        """Return limits from any form that users may give; single numbers are expanded if ``inputs`` is given.
 
         It is one number h for ``-h`` to ``h`` of every input; ``Limits(low=, high=)`` or a mapping of low and high, numbers
         or ``(m,)``; or rows ``[low, high]``, one for each input.

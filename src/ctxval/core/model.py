@@ -82,9 +82,9 @@ def linearize(model: Model, x: Array, u: Array) -> tuple[Array, Array]:
 def central_differences(step: Step, x: Array, u: Array, precision: float | None = None) -> tuple[Array, Array]:
     """Return A ``(..., n, n)`` and B ``(..., n, m)`` at states ``(..., n)`` and inputs ``(..., m)`` by differences.
 
-    The steps suit the precision of the model, which is found out if it is not given: 6e-6 in double precision, 5e-3 in single
-    precision. All differences are taken in one batch, in blocks that fit into the processor's cache. Complex steps would be
-    silently wrong wherever a model uses ``abs``, ``maximum`` or a branch.
+    The steps suit the precision of the model, which is found out if it is not given: 6e-6 in double precision, 5e-3 in
+    single precision. All differences are taken in one batch, in blocks that fit into the processor's cache. Complex
+    steps would be silently wrong wherever a model uses ``abs``, ``maximum`` or a branch.
     """
     n, width, batch = x.shape[-1], x.shape[-1] + u.shape[-1], x.shape[:-1]
     z = np.concatenate([x, u], axis=-1).reshape(-1, width)
@@ -109,7 +109,8 @@ def central_differences(step: Step, x: Array, u: Array, precision: float | None 
 def _precision(step: Step, z: Array, n: int) -> float:
     """Return the relative rounding of a model's numbers: that of single precision if it loses a change of 1e-8.
 
-    A change a thousand times as large shows how much the model should change. Most points decide, as few are next to a kink.
+    A change a thousand times as large shows how much the model should change. Most points decide, as few are next to a
+    kink.
     """
     some = z[:: max(1, len(z) // 3)][:3]
     # A change that single precision hardly resolves, and one that it does.

@@ -200,8 +200,9 @@ class TaskSpace:
     def distributed(self, **by_name: Continuous) -> TaskSpace:
         """Return this space with a distribution of tasks: independent parameters, all others uniform.
 
-        Independent draws of tasks follow it, and a volume is then the probability under it; searches are not affected. Each
-        parameter has a :class:`Normal` or a frozen continuous distribution of ``scipy.stats``, truncated to its bounds.
+        Independent draws of tasks follow it, and a volume is then the probability under it; searches are not affected.
+        Each parameter has a :class:`Normal` or a frozen continuous distribution of ``scipy.stats``, truncated to its
+        bounds.
 
         >>> space = TaskSpace(goal=(-1, 1), load=(0, 5)).distributed(goal=Normal(0.0, 0.3))
         """
@@ -214,7 +215,8 @@ class TaskSpace:
     def sampled(self, sampler: Sampler) -> TaskSpace:
         """Return this space with a distribution of tasks that a function draws from.
 
-        The sampler ``(rng, n)`` returns n independent tasks, rows ``(n, d)`` within the bounds and in the units of the space.
+        The sampler ``(rng, n)`` returns n independent tasks, rows ``(n, d)`` within the bounds and in the units of the
+        space.
         """
         if not callable(sampler):
             raise InputError(f"sampler must be a function (rng, n) -> rows (n, d), got {sampler!r}.")

@@ -40,7 +40,8 @@ class Continuous(Protocol):
 class Normal(ShortRepr):
     """The normal distribution of a task parameter, with a mean and a deviation, numbers or one for each component.
 
-    They are in the parameter's units, and hold before the task space truncates the distribution to the parameter's bounds.
+    They are in the parameter's units, and hold before the task space truncates the distribution to the parameter's
+    bounds.
     """
 
     mean: ArrayLike

@@ -183,9 +183,9 @@ class Trajectory:
     ) -> Trajectory:
         """Read one trajectory from CSV with the columns ``t, x0.., u0..``, or with named columns.
 
-        A column may state its unit, as in ``angle [deg]`` or ``angle_deg``, and is converted to that of its name; times are in
-        seconds. Other columns and the inputs in the last row are ignored. Columns are separated by commas, or by semicolons or
-        tabs, with which decimal commas are read.
+        A column may state its unit, as in ``angle [deg]`` or ``angle_deg``, and is converted to that of its name; times
+        are in seconds. Other columns and the inputs in the last row are ignored. Columns are separated by commas, or by
+        semicolons or tabs, with which decimal commas are read.
 
         Args:
             states, inputs: names of the columns, with or without units. If the file has none of the names, the

@@ -171,8 +171,8 @@ def cached_truth(
     """Return a truth from its file in a folder, or find it and write that file.
 
     The name of the file is a digest of the sources and settings of the validation and of the method, for instance
-    ``functools.partial(search_truth, seed=1)``. The file keeps the truths of systems that differ in numbers alone; a truth
-    is used only if new executions of S on its task and on some others give the stored distances again.
+    ``functools.partial(search_truth, seed=1)``. The file keeps the truths of systems that differ in numbers alone; a
+    truth is used only if new executions of S on its task and on some others give the stored distances again.
     """
     # The signature adds the default values, which the description of a function leaves out.
     parts = [describe(compute), str(inspect.signature(compute))]

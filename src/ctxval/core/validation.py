@@ -50,8 +50,8 @@ class Validation:
         synthesizer: designs the controllers on M.
         distance: the distance d between the trajectories of M and S.
         start_tolerance: the largest permitted difference between the first state of an execution and the initial state
-            of its task, as a fraction of the range of each state in the trajectory of the model, or of its initial value
-            if that is larger.
+            of its task, as a fraction of the range of each state in the trajectory of the model, or of its initial
+            value if that is larger.
         labels: the names and units of states, inputs and distance for files, pictures and reports.
         longest: the largest horizon that is planned.
 
@@ -211,7 +211,7 @@ class Validation:
         return bool(getattr(self.system, "batched", False) and getattr(self.synthesizer, "batched", False))
 
     def plans(self, points: ArrayLike) -> list[Plan]:
-        """Return the plans of the tasks at ``(N, d)``, as :meth:`plan` makes them up to rounding, designed together if possible."""
+        """Return the plans of the tasks at ``(N, d)`` as :meth:`plan` does, but designed together if possible."""
         return list(self._planned(require_shape("points", as_floats("points", points), (self.space.dimension,))))
 
     def _planned(self, points: Array) -> Iterator[Plan]:

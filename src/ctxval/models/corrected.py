@@ -112,9 +112,9 @@ class Corrected(ShortRepr):
     """The model ``M'(x, u) = M(x, u) + r(x, u)`` of a model M and a correction r.
 
     Args:
-        linearised: ``"corrected"`` for the Jacobian of M', or ``"model"`` for that of M. The Jacobian of M' at one point may
-            say less of the tasks than a linear model that was fitted to all of them, for instance to LQR, which linearises
-            once.
+        linearised: ``"corrected"`` for the Jacobian of M', or ``"model"`` for that of M. The Jacobian of M' at one
+            point may say less of the tasks than a linear model that was fitted to all of them, for instance to LQR,
+            which linearises once.
         data: the transitions that the correction was learned from, if any.
     """
 

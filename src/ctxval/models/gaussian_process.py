@@ -21,7 +21,7 @@ from ctxval.models.smooth_maps import Slopes, SmoothMap, kernel_sum
 
 @dataclass(frozen=True, eq=False)
 class SquaredExponential(ShortRepr):
-    """``k(z, z') = v exp(-1/2 sum_j ((z_j - z'_j) / l_j)^2)``, with length-scales l ``(k,)``: rigid bodies move smoothly."""
+    """``v exp(-1/2 sum_j ((z_j - z'_j) / l_j)^2)``, with length-scales l ``(k,)``: rigid bodies move smoothly."""
 
     variance: float
     length_scales: Array

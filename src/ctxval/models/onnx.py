@@ -20,8 +20,9 @@ from ctxval.errors import InputError, ShapeError
 class Onnx(ShortRepr):
     """A network from an ONNX file as a model; any toolbox may have written the file, and nothing in it is run as code.
 
-    The network takes the state and the input as two inputs in this order, or as one input with the state first. Its Jacobian
-    is taken by central differences that suit its precision; in single precision about three digits are correct.
+    The network takes the state and the input as two inputs in this order, or as one input with the state first. Its
+    Jacobian is taken by central differences that suit its precision; in single precision about three digits are
+    correct.
 
     Args:
         source: the file, or its bytes.

@@ -22,10 +22,10 @@ from ctxval.models.smooth_maps import SmoothMap
 class ScikitLearn(ShortRepr):
     """A fitted scikit-learn regressor as a model: a pipeline, a forest, ridge regression, a Gaussian process.
 
-    Its features are the state, then the input. Networks, Gaussian processes, kernel ridge regression, linear models, and
-    pipelines of these with scalers and polynomial features, have an exact Jacobian from their formula; all others are
-    differentiated by central differences. A forest or nearest neighbours are piecewise constant: their Jacobian is zero,
-    with which LQR and iLQR cannot design.
+    Its features are the state, then the input. Networks, Gaussian processes, kernel ridge regression, linear models,
+    and pipelines of these with scalers and polynomial features, have an exact Jacobian from their formula; all others
+    are differentiated by central differences. A forest or nearest neighbours are piecewise constant: their Jacobian is
+    zero, with which LQR and iLQR cannot design.
 
     Args:
         regressor: the fitted regressor, whose ``predict`` maps features ``(N, n + m)`` to ``(N, n)``.

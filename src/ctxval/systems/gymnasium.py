@@ -30,16 +30,18 @@ StateSetter = Callable[[Any, Array], None]
 class Gymnasium(ShortRepr):
     """A gymnasium environment with continuous actions as the true system.
 
-    An execution resets the environment with its seed, sets the task's initial state and runs the closed loop. The state of
-    MuJoCo environments is ``(qpos, qvel)``; others need ``get_state`` and ``set_state``. Actions go to the environment
-    unchanged, in the type of its action space; the environment clips them, and the trajectory keeps the unclipped inputs.
+    An execution resets the environment with its seed, sets the task's initial state and runs the closed loop. The state
+    of MuJoCo environments is ``(qpos, qvel)``; others need ``get_state`` and ``set_state``. Actions go to the
+    environment unchanged, in the type of its action space; the environment clips them, and the trajectory keeps the
+    unclipped inputs.
 
     If the environment terminates or truncates the episode, or MuJoCo warns, for instance of an unstable state, the
-    trajectory ends: its remaining values are NaN and ``ended`` gives the reason, so that a campaign records a failed trial.
+    trajectory ends: its remaining values are NaN and ``ended`` gives the reason, so that a campaign records a failed
+    trial.
 
     Args:
-        environment: an id such as ``"Reacher-v5"``, a function that makes an environment, or an environment, which is copied
-            for executions at the same time. Of a vector environment, give the one that it repeats.
+        environment: an id such as ``"Reacher-v5"``, a function that makes an environment, or an environment, which is
+            copied for executions at the same time. Of a vector environment, give the one that it repeats.
         get_state: function ``environment -> x`` of the environment without wrappers.
         set_state: function ``(environment, x)`` of the environment without wrappers; by default the first components
             of x go to MuJoCo's ``set_state``.

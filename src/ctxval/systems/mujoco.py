@@ -28,8 +28,9 @@ class MuJoCo(ShortRepr):
     the model's defaults (activations, mocap bodies, ...) at the task's qpos and qvel. Inputs are MuJoCo's ``ctrl``,
     held over a step. MuJoCo clamps them to a ``ctrlrange``; the trajectory keeps the unclamped inputs.
 
-    If MuJoCo warns (unstable state or acceleration, full contact buffer), it silently resets the simulation and continues.
-    Such a simulation has failed: its states are NaN from that step on, and the trajectory's ``ended`` names the warning.
+    If MuJoCo warns (unstable state or acceleration, full contact buffer), it silently resets the simulation and
+    continues. Such a simulation has failed: its states are NaN from that step on, and the trajectory's ``ended`` names
+    the warning.
 
     Args:
         mjcf: the model as XML text, or the path of its file.
@@ -142,7 +143,7 @@ class _Execution:
 
 
 class _Batch:
-    """Simulations of one model: qpos ``(N, nq)``, qvel ``(N, nv)``, ctrl ``(N, nu)``, site positions ``(N, nsite, 3)``."""
+    """Simulations of one model: qpos ``(N, nq)``, qvel ``(N, nv)``, ctrl ``(N, nu)``, sites ``(N, nsite, 3)``."""
 
     def __init__(self, model: Any, count: int, threads: int) -> None:
         from mujoco import mjtStage

@@ -12,8 +12,6 @@ import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
-import numpy as np
-
 from ctxval._util.checked import TimeLimit
 from ctxval._util.registry import part
 from ctxval._util.representation import ShortRepr
@@ -22,7 +20,7 @@ from ctxval.core.controller import Controller
 from ctxval.core.exchange import write_controller, write_task
 from ctxval.core.labels import require_names
 from ctxval.core.task import Task
-from ctxval.core.trajectory import COMPLETE, Trajectory
+from ctxval.core.trajectory import COMPLETE, Trajectory, require_times
 from ctxval.errors import ExecutionError, InputError
 from ctxval.systems.episode import require_one
 from ctxval.systems.supervised import run_supervised
@@ -121,6 +119,7 @@ class Subprocess(ShortRepr):
 
 
 def signal_name(number: int) -> str:
+    """Return the name of a signal, also of one that Python does not know."""
     try:
         return signal.Signals(number).name
     except ValueError:
@@ -136,19 +135,8 @@ def _trajectory(folder: Path, task: Task) -> Trajectory:
             trajectory = Trajectory.from_csv(folder / "trajectory.csv", most_rows=shape[0])
         else:
             raise ExecutionError("the command ended well but wrote neither trajectory.npz nor trajectory.csv")
+        if trajectory.ended == COMPLETE:
+            require_times(trajectory, task.times)
     except (InputError, OSError, MemoryError) as error:
         raise ExecutionError(f"the command's trajectory cannot be used: {error}") from error
-    if trajectory.ended != COMPLETE:
-        return trajectory
-    if trajectory.states.shape != shape:
-        raise ExecutionError(
-            f"the command's trajectory must have states of shape {shape}, got {trajectory.states.shape}"
-        )
-    misses = np.abs(trajectory.times - trajectory.times[0] - task.times)
-    if not (misses <= 0.01 * task.dt).all():
-        worst = int(np.argmax(np.where(np.isnan(misses), np.inf, misses)))
-        raise ExecutionError(
-            f"the command's trajectory must have steps of {task.dt:g} s: time {worst} must be {task.times[worst]:g} s "
-            f"after the first, got {trajectory.times[worst] - trajectory.times[0]:g} s"
-        )
     return trajectory
