@@ -136,7 +136,7 @@ def test_names_and_units_go_into_the_files_and_folders_can_be_kept(tmp_path: Pat
         (RIG.replace('task["horizon"]', "5"), r"states of shape \(21, 2\), got \(6, 2\)"),
         (
             RIG.replace('t * task["dt"]', "t * 0.2"),
-            r"steps of 0\.1 s: time 1 must be 0\.1 s after the first, got 0\.2 s",
+            r"steps of 0\.1 s: time 1 must be 0\.1 s after",
         ),
     ],
 )

@@ -80,8 +80,8 @@ class Limits(ShortRepr):
     def of(cls, limits: LimitsLike, inputs: int | None = None) -> Limits:
         """Return limits from any form that users may give; single numbers are expanded if ``inputs`` is given.
 
-        It is one number h for ``-h`` to ``h`` of every input; ``Limits(low=, high=)`` or a mapping of low and high, numbers
-        or ``(m,)``; or rows ``[low, high]``, one for each input.
+        It is one number h for ``-h`` to ``h`` of every input; ``Limits(low=, high=)`` or a mapping of low and high,
+        numbers or ``(m,)``; or rows ``[low, high]``, one for each input.
         """
         box = limits if isinstance(limits, Limits) else cls._read(limits)
         if inputs is None:

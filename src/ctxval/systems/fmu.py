@@ -128,13 +128,12 @@ class FMU(ShortRepr):
             process = idle.pop()
         except IndexError:
             process = _Process(self._setup)
+        ended = False
         try:
             yield process
-        except BaseException:
-            process.sound = False
-            raise
+            ended = True
         finally:
-            if process.sound:
+            if ended and process.sound:
                 idle.append(process)
             else:
                 process.end()
