@@ -23,7 +23,6 @@ from ctxval.core.task import Task
 from ctxval.errors import InputError, ShapeError
 
 CONTROLLER_FORMAT, TASK_FORMAT, VERSION = "ctxval controller", "ctxval task", 1
-
 LAW = "u = min(max(inputs[t] + gains[t] (x - states[t]), low), high) at the steps t = 0, ..., horizon - 1"
 
 Content = TypeVar("Content")

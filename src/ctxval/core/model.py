@@ -61,9 +61,9 @@ def as_model(model: Model | Step) -> Model:
 
 def require_time_step(model: object, dt: float, whose: str) -> None:
     """Refuse a model whose own ``dt``, or that of its ``data``, is not the step of what it is used with."""
-    own = getattr(model, "dt", None) or getattr(getattr(model, "data", None), "dt", None)
-    if isinstance(own, int | float) and not np.isclose(own, dt, rtol=1e-3, atol=0):
-        steps = f"steps of {own:g} s and {whose} has steps of {dt:g} s"
+    step = getattr(model, "dt", None) or getattr(getattr(model, "data", None), "dt", None)
+    if isinstance(step, int | float) and not np.isclose(step, dt, rtol=1e-3, atol=0):
+        steps = f"steps of {step:g} s and {whose} has steps of {dt:g} s"
         raise InputError(f"the model has {steps}: use a model of these steps.")
 
 

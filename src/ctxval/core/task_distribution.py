@@ -62,14 +62,14 @@ class Normal(ShortRepr):
 
     def ppf(self, q: ArrayLike) -> Array:
         """Return the value that is exceeded with probability 1 - q."""
-        return np.asarray(self.mean) + np.asarray(self.deviation) * scipy.special.ndtri(q)
+        return np.asarray(self.mean + np.asarray(self.deviation) * scipy.special.ndtri(q))
 
     def isf(self, q: ArrayLike) -> Array:
         """Return the value that is exceeded with probability q."""
-        return np.asarray(self.mean) - np.asarray(self.deviation) * scipy.special.ndtri(q)
+        return np.asarray(self.mean - np.asarray(self.deviation) * scipy.special.ndtri(q))
 
     def _standard(self, x: ArrayLike) -> Array:
-        return (np.asarray(x) - np.asarray(self.mean)) / np.asarray(self.deviation)
+        return np.asarray((np.asarray(x) - np.asarray(self.mean)) / np.asarray(self.deviation))
 
     def describe(self) -> dict[str, Any]:
         """Return what identifies the distribution in a store."""

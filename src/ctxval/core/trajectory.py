@@ -58,8 +58,8 @@ class Transitions(ShortRepr):
         steps = [part.dt for part in parts if part.dt is not None]
         if steps and not np.allclose(steps, steps[0], rtol=1e-3, atol=0):
             raise InputError(f"recorded steps must have one length, got {min(steps):g} s and {max(steps):g} s.")
-        arrays = (np.concatenate([getattr(part, name) for part in parts]) for name in ("x", "u", "x_next"))
-        return Transitions(*arrays, dt=steps[0] if steps else None)
+        x, u, x_next = (np.concatenate([getattr(part, name) for part in parts]) for name in ("x", "u", "x_next"))
+        return Transitions(x, u, x_next, steps[0] if steps else None)
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ctxval._util.arrays import Array, Mask, rows_of
+from ctxval._util.arrays import Array, Mask, as_finite, rows_of
 from ctxval._util.representation import ShortRepr
 from ctxval.core.model import Model, linearize
 from ctxval.core.trajectory import Transitions
@@ -62,8 +62,7 @@ class Correction(ShortRepr):
             value = getattr(self, name)
             if value.shape != shape:
                 raise ShapeError(f"{name} of a correction must have shape {shape}, got {value.shape}.")
-            if not np.isfinite(value).all():
-                raise InputError(f"{name} of a correction must be finite.")
+            as_finite(f"{name} of a correction", value)
         if min(float(scale.min()) for scale in (self.scale, self.length_scales, self.fade)) <= 0:
             raise InputError("the scales of a correction must be positive.")
 
@@ -139,9 +138,8 @@ class Corrected(ShortRepr):
         A, B = linearize(self.model, x, u)
         if self.linearised == "model":
             return A, B
-        own = self.correction.jacobian(x, u)
-        n = x.shape[-1]
-        return A + own[..., :n], B + own[..., n:]
+        slope, n = self.correction.jacobian(x, u), x.shape[-1]
+        return A + slope[..., :n], B + slope[..., n:]
 
 
 class Refined(ShortRepr):

@@ -88,14 +88,14 @@ def state_space(system: Any, dt: Seconds) -> Linear:
     A, B = as_finite("A", system.A), as_finite("B", system.B)
     if A.ndim != 2 or A.shape[0] != A.shape[1] or B.ndim != 2 or len(B) != len(A):
         raise ShapeError(f"a state-space model needs A (n, n) and B (n, m), got {A.shape} and {B.shape}.")
-    own = getattr(system, "dt", None)
-    if not own:
+    step = getattr(system, "dt", None)
+    if not step:
         from scipy.linalg import expm
 
         # For an input that is held over dt: the exponential of [[A, B], [0, 0]] dt.
         n, m = B.shape
         whole = expm(np.block([[A, B], [np.zeros((m, n + m))]]) * dt)
         return Linear(whole[:n, :n], whole[:n, n:])
-    if own is not True and not np.isclose(own, dt, rtol=1e-9, atol=0):
-        raise InputError(f"dt must be that of the discrete system, {own:g} s, got {dt:g} s.")
+    if step is not True and not np.isclose(step, dt, rtol=1e-9, atol=0):
+        raise InputError(f"dt must be that of the discrete system, {step:g} s, got {dt:g} s.")
     return Linear(A, B)

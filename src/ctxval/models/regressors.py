@@ -164,9 +164,9 @@ def _times(slopes: list[Slope], other: Array | float) -> list[Slope]:
 
 def _joined(first: Kernel, second: Kernel, *, is_sum: bool) -> Kernel:
     def kernel(Z: Array, X: Array) -> tuple[Array | float, Slopes]:
-        (one, one_slopes), (two, two_slopes) = first(Z, X), second(Z, X)
+        (K, slopes), (L, other_slopes) = first(Z, X), second(Z, X)
         if is_sum:
-            return one + two, lambda: [*one_slopes(), *two_slopes()]
-        return one * two, lambda: [*_times(one_slopes(), two), *_times(two_slopes(), one)]
+            return K + L, lambda: [*slopes(), *other_slopes()]
+        return K * L, lambda: [*_times(slopes(), L), *_times(other_slopes(), K)]
 
     return kernel

@@ -86,12 +86,12 @@ class Gymnasium(ShortRepr):
             raise InputError(f"the environment must have continuous actions, a Box, got {space}.")
         self.inputs = int(np.prod(space.shape))
         bare = first.unwrapped
-        own = getattr(bare, "dt", None)
-        step = own if dt is None else dt
+        stated = getattr(bare, "dt", None)
+        step = stated if dt is None else dt
         if not isinstance(step, int | float | np.number) or not (np.isfinite(step) and step > 0):
             raise InputError(f"dt must be the positive number of seconds in one step of the environment, got {step!r}.")
-        if own is not None and not np.isclose(own, step, rtol=1e-9, atol=0):
-            raise InputError(f"dt must be that of the environment, {own:g} s, got {step:g} s.")
+        if stated is not None and not np.isclose(stated, step, rtol=1e-9, atol=0):
+            raise InputError(f"dt must be that of the environment, {stated:g} s, got {step:g} s.")
         self.dt = float(step)
         is_mujoco = hasattr(bare, "set_state") and hasattr(getattr(bare, "data", None), "qpos")
         if (get_state is None or set_state is None) and not is_mujoco:

@@ -45,8 +45,7 @@ class Subprocess(ShortRepr):
         timeout: seconds after which the command and all processes that it started are killed.
         states, inputs: names of the states and inputs with their units, for the files.
         keep: a folder in which the folders of all executions are kept, to examine failures.
-        folder: folder in which the files that the command names are searched first; by default, and if they are not
-            there, the current folder is used.
+        folder: folder in which the files that the command names are searched before the current one.
     """
 
     def __init__(
