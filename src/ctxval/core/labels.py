@@ -51,10 +51,9 @@ def require_names(states: Iterable[str], inputs: Iterable[str]) -> None:
     for label, name in zip(labels, names, strict=True):
         plain = bool(name) and label == label.strip() and label.isprintable()
         if not plain or name in TIMES or names.count(name) > 1:
-            raise InputError(
-                "each state and input needs a name of its own, not t or time, without blanks around it or control "
-                f"characters, because recordings have columns of these names; got {shortened(repr(label), 60)}."
-            )
+            wanted = "a name of its own, not t or time, without blanks around it or control characters"
+            reason = f"because recordings have columns of these names; got {shortened(repr(label), 60)}"
+            raise InputError(f"each state and input needs {wanted}, {reason}.")
 
 
 TIMES = ("t", "time")

@@ -51,7 +51,9 @@ class Task:
             self.batch_shape: tuple[int, ...] = np.broadcast_shapes(state.shape[:-1], target.shape[:-2])
         except ValueError:
             got = f"{target.shape[:-2]} and {state.shape[:-1]}"
-            raise ShapeError(f"goal or reference and initial_state must have one batch shape, got {got}.") from None
+            raise ShapeError(
+                f"goal or reference and initial_state must have the same batch shape, got {got}."
+            ) from None
         self.initial_state: Array = np.broadcast_to(state, (*self.batch_shape, n))
         """Shape ``(..., n)``."""
         self.reference: Array = np.broadcast_to(target, (*self.batch_shape, self.horizon + 1, n))

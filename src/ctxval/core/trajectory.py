@@ -247,10 +247,9 @@ def require_times(trajectory: Trajectory, times: Array) -> None:
     misses = np.abs(recorded - times)
     if not (misses <= _TIMES * dt).all():
         k = int(np.argmax(~(misses <= _TIMES * dt)))
-        raise InputError(
-            f"the trajectory must have steps of {dt:g} s: time {k} must be {times[k]:g} s after the first, "
-            f"got {recorded[k]:g} s. The largest difference is {np.max(misses):.3g} s{advice}."
-        )
+        first = f"time {k} must be {times[k]:g} s after the first, got {recorded[k]:g} s"
+        largest = f"The largest difference is {np.max(misses):.3g} s{advice}"
+        raise InputError(f"the trajectory must have steps of {dt:g} s: {first}. {largest}.")
 
 
 def _advice(period: float, dt: float) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 import warnings
 from collections.abc import Sequence
@@ -93,6 +94,6 @@ class FeedforwardReLU(IncrementModel):
                 trained.append(regressor.fit(scaling.inputs(data.x, data.u), scaling.targets(data)))
         return cls.from_sklearn(min(trained, key=lambda regressor: regressor.loss_), scaling, data)
 
-    @property
+    @functools.cached_property
     def _map(self) -> SmoothMap:
         return network(self.weights, self.biases, "relu")

@@ -35,20 +35,21 @@ class SmoothMap:
 
     def value(self, Z: Array) -> Array:
         """Return the values ``(N, o)`` at rows ``(N, k)``."""
+        if len(Z) <= self.block:
+            return self.linearised(Z)[0]
         return np.concatenate([self.linearised(rows)[0] for rows in self._blocks(Z)])
 
     def expanded(self, Z: Array) -> tuple[Array, Array]:
         """Return the values ``(N, o)`` and the derivatives ``(N, o, k)`` at rows ``(N, k)``."""
-        parts = []
-        for rows in self._blocks(Z):
-            values, pull_back = self.linearised(rows)
-            count, outputs = values.shape
-            parts.append((values, pull_back(np.broadcast_to(np.eye(outputs), (count, outputs, outputs)))))
-        values, derivatives = map(np.concatenate, zip(*parts, strict=True))
-        return values, derivatives
+        if len(Z) > self.block:
+            values, derivatives = map(np.concatenate, zip(*map(self.expanded, self._blocks(Z)), strict=True))
+            return values, derivatives
+        values, pull_back = self.linearised(Z)
+        outputs = values.shape[1]
+        return values, pull_back(np.broadcast_to(np.eye(outputs), (len(values), outputs, outputs)))
 
     def _blocks(self, Z: Array) -> list[Array]:
-        return [Z[first : first + self.block] for first in range(0, max(1, len(Z)), self.block)]
+        return [Z[first : first + self.block] for first in range(0, len(Z), self.block)]
 
 
 def affine(W: Array, b: Array) -> SmoothMap:
@@ -95,7 +96,7 @@ ACTIVATIONS: dict[str, tuple[Callable[[Array], Array], Callable[[Array], Array]]
     "identity": (lambda z: z, np.ones_like),
     "logistic": (expit, lambda a: a * (1 - a)),
     "tanh": (np.tanh, lambda a: 1 - a * a),
-    "relu": (lambda z: np.maximum(z, 0), lambda a: (a > 0).astype(np.float64)),
+    "relu": (lambda z: np.maximum(z, 0.0), lambda a: (a > 0).astype(np.float64)),
 }
 """The functions of units by scikit-learn's names, and their derivatives as functions of their own values.
 
@@ -198,12 +199,14 @@ def kernel_sum(kernel: Kernel, centres: Array, weights: Array, block: int = 1024
         (count, k), outputs, shape = Z.shape, weights.shape[1], (len(Z), len(centres))
 
         def pull_back(G: Array) -> Array:
-            derivatives = np.zeros((count, outputs, k))
+            derivatives: Array | float = 0.0
             for factor, pull, weight in slopes():
                 sums = np.broadcast_to(factor, shape) @ columns()
                 drawn = sums[:, outputs:].reshape(count, outputs, k)
-                derivatives += (drawn - pull * sums[:, :outputs, None] * Z[:, None, :]) * weight
-            return np.asarray(G @ derivatives)
+                if pull:
+                    drawn = drawn - pull * sums[:, :outputs, None] * Z[:, None, :]
+                derivatives = derivatives + drawn * weight
+            return np.asarray(G @ np.broadcast_to(derivatives, (count, outputs, k)))
 
         return np.broadcast_to(covariances, shape) @ weights, pull_back
 

@@ -135,6 +135,8 @@ def _trajectory(folder: Path, task: Task) -> Trajectory:
         else:
             raise ExecutionError("the command ended well but wrote neither trajectory.npz nor trajectory.csv")
         if trajectory.ended == COMPLETE:
+            if trajectory.states.shape != shape:
+                raise InputError(f"it must have states of shape {shape}, got {trajectory.states.shape}")
             require_times(trajectory, task.times)
     except (InputError, OSError, MemoryError) as error:
         raise ExecutionError(f"the command's trajectory cannot be used: {error}") from error
