@@ -48,8 +48,10 @@ def check_model(
         A_numeric, B_numeric = central_differences(model.step, x, u)
         # Central differences with steps of about 6e-6 magnify rounding errors by this factor.
         allowed = max(1e-5, 2e5 * tolerance)
-        for name, own, numeric in (("A", A, A_numeric), ("B", B, B_numeric)):
-            _require_close(f"{name} of jacobian", np.broadcast_to(own, numeric.shape), "differences", numeric, allowed)
+        for name, given, numeric in (("A", A, A_numeric), ("B", B, B_numeric)):
+            _require_close(
+                f"{name} of jacobian", np.broadcast_to(given, numeric.shape), "differences", numeric, allowed
+            )
 
 
 def check_system(system: System, controller: Controller, task: Task, *, tolerance: float = _TOLERANCE) -> None:
@@ -129,10 +131,8 @@ def check_search(search: Search, *, dimension: int = 2, seed: int = 3, budget: i
         search.reset(dimension, seed)
         search.tell(history[0][:count], history[1][:count])
         resumed, point = search.ask(1)[0], history[0][count]
-        sentence = (
-            f"after tell of the first {count} trials, ask must return the same next point, {point}, got {resumed}"
-        )
-        _require(np.array_equal(resumed, point), sentence)
+        same = f"ask must return the same next point, {point}, got {resumed}"
+        _require(np.array_equal(resumed, point), f"after tell of the first {count} trials, {same}")
 
 
 def _trial_run(search: Search, dimension: int, seed: int, budget: int) -> tuple[Array, Array]:

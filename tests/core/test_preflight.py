@@ -9,7 +9,8 @@ import pytest
 from conftest import make_validation
 from ctxval import Campaign, Task, Validation, distances, searches
 from ctxval.core.labels import Labels
-from ctxval.core.preflight import CostWarning, DistanceWarning, start_offset
+from ctxval.core.preflight import DistanceWarning, start_offset
+from ctxval.core.validation import CostWarning
 from ctxval.distances import AtCrossing, AtTimes, CrossingTime, FinalState, GoalError, RelativeDeviation, TrackingError
 from ctxval.errors import DistanceError, InputError, UnknownNameError
 
@@ -102,7 +103,7 @@ def test_a_horizon_that_is_too_long_is_refused_with_its_cost() -> None:
 
 
 def test_the_cost_of_a_long_horizon_is_stated_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("ctxval.core.preflight._LONG", 50)
+    monkeypatch.setattr("ctxval.core.validation._LONG", 50)
     validation = long(60)
     with pytest.warns(CostWarning, match="each plan with a horizon of 60 needs about"):
         validation.plan([0.5])

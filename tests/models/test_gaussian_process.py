@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -105,7 +107,9 @@ def test_batches_of_any_shape_are_what_the_loop_gives(
 ) -> None:
     rng = np.random.default_rng(0)
     x, u = rng.normal(size=(4, 5, 2)), rng.normal(size=(4, 5, 1))
-    monkeypatch.setattr(gaussian_process, "_BLOCK", 7)  # so that there are several blocks, the last not full
+    monkeypatch.setitem(
+        vars(model), "_map", replace(model._map, block=7)
+    )  # so that there are several blocks, the last not full
     steps, (A, B) = model.step(x, u), model.jacobian(x, u)
     assert (A.shape, B.shape) == ((4, 5, 2, 2), (4, 5, 2, 1))
     for i, j in np.ndindex(4, 5):

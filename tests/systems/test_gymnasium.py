@@ -54,6 +54,28 @@ def test_mujoco_environments_keep_the_contract_of_a_system(name: str, controller
     testing.check_system(Gymnasium(name), controller, task, tolerance=0)
 
 
+def test_an_environment_is_used_itself_and_copied_for_another_execution_at_the_same_time() -> None:
+    environment = gymnasium.make("Reacher-v5")
+    system, made = Gymnasium(environment), Gymnasium("Reacher-v5")
+    expected = made.execute(damp, REACHER).states
+    inner = [np.empty(0)]
+
+    def busy(t: int, x: Array) -> Array:
+        if t == 3:
+            inner[0] = system.execute(damp, REACHER).states
+        return damp(t, x)
+
+    np.testing.assert_array_equal(system.execute(busy, REACHER).states, expected)
+    np.testing.assert_array_equal(inner[0], expected)
+    described = describe(system)["environment"]
+    assert described["id"] == "Reacher-v5"
+    assert "ReacherEnv" in str(described["class"])
+    with pytest.raises(InputError, match="options are for environments that are made"):
+        Gymnasium(environment, width=100)
+    with pytest.raises(InputError, match="the environment must be a single one"):
+        Gymnasium(gymnasium.make_vec("Reacher-v5", num_envs=2))
+
+
 def test_a_terminated_episode_ends_the_trajectory() -> None:
     trajectory = Gymnasium("InvertedPendulum-v5").execute(idle, PENDULUM)
     assert trajectory.ended == "the environment terminated the episode at step 7"

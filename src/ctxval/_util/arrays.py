@@ -30,9 +30,8 @@ _SHOWN.maxstring = _SHOWN.maxother = 200
 
 def as_floats(name: str, value: ArrayLike) -> Array:
     if _is_masked(value):
-        raise InputError(
-            f"{name} must be numbers without masked entries; fill in the masked entries, or replace them with NaN."
-        )
+        advice = "fill in the masked entries, or replace them with NaN"
+        raise InputError(f"{name} must be numbers without masked entries; {advice}.")
     try:
         if np.iscomplexobj(value):
             raise TypeError
@@ -101,8 +100,7 @@ _thread_pools = functools.cache(ThreadpoolController)
 
 def single_threaded() -> AbstractContextManager[Any]:
     """Limit BLAS to one thread inside the context."""
-    limits: AbstractContextManager[Any] = _thread_pools().limit(limits=1)
-    return limits
+    return _thread_pools().limit(limits=1)  # type: ignore[no-any-return]
 
 
 def held_means(times: Array, values: Array, edges: Array, slack: float) -> Array:

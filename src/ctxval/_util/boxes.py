@@ -37,10 +37,8 @@ def climb(
     bounds = list(zip(np.tile(low, count), np.tile(high, count), strict=True))
     limits = {"maxiter": iterations, "maxfun": evaluations}
     options = {key: value for key, value in limits.items() if value is not None}
-    found = scipy.optimize.minimize(
-        negative, starts.ravel(), jac=True, method="L-BFGS-B", bounds=bounds, options=options
-    )
-    return np.asarray(np.clip(found.x.reshape(starts.shape), low, high)), -float(found.fun) * scale
+    end = scipy.optimize.minimize(negative, starts.ravel(), jac=True, method="L-BFGS-B", bounds=bounds, options=options)
+    return np.asarray(np.clip(end.x.reshape(starts.shape), low, high)), -float(end.fun) * scale
 
 
 def moves_to_bounds(points: Array, low: Array, high: Array) -> Array:
@@ -52,10 +50,7 @@ def moves_to_bounds(points: Array, low: Array, high: Array) -> Array:
 
 
 def separated_rows(points: Array, reach: float, count: int) -> list[int]:
-    """Return the first rows of points ``(n, d)`` that are farther than ``reach`` from every row chosen before them.
-
-    Of points that are sorted by their values, these are the best ones that are not neighbours of a better one.
-    """
+    """Return the first rows of points ``(n, d)`` that are farther than ``reach`` from every row chosen before them."""
     chosen: list[int] = []
     left = np.ones(len(points), dtype=bool)
     while len(chosen) < count and left.any():

@@ -163,13 +163,11 @@ def _globals(module: types.ModuleType | None, names: set[str]) -> list[_Global]:
 
 
 def _names(code: types.CodeType) -> set[str]:
-    """Return the global names and the attributes that a function and the functions inside it use."""
     inner = (_names(item) for item in code.co_consts if isinstance(item, types.CodeType))
     return set(code.co_names).union(*inner)
 
 
 def _loaded(nodes: Iterable[ast.AST]) -> set[str]:
-    """Return the names and attributes in statements, outside functions."""
     names: set[str] = set()
     for node in nodes:
         names |= {node.id} if isinstance(node, ast.Name) else {node.attr} if isinstance(node, ast.Attribute) else set()

@@ -69,9 +69,8 @@ def in_seconds(source: str, times: Array, unit: str) -> Array:
     try:
         return np.asarray(times * conversion(unit or "s", "s"))
     except InputError:
-        raise InputError(
-            f"{source}: the unit of its times must be s, ms, us, ns, min or h, got {unit[:40]!r}."
-        ) from None
+        known = "s, ms, us, ns, min or h"
+        raise InputError(f"{source}: the unit of its times must be {known}, got {unit[:40]!r}.") from None
 
 
 def unit_advice(period: float, dt: float) -> str:

@@ -35,8 +35,8 @@ def on_all_cores(function: Callable[[Part], Result], parts: Sequence[Part]) -> l
         with pool, forking():
             results = []
             for result in pool.map(_call, parts):
-                advance()
                 results.append(result)
+                advance()
             return results
     except BrokenProcessPool:  # the system may have ended a process because memory was short
         return [function(part) for part in parts]

@@ -26,11 +26,7 @@ MOST_ROW = 2**20  # largest number of characters in a row
 
 
 class CsvTable:
-    """The cells of a CSV file of at most so many bytes.
-
-    Attributes:
-        names: the names of the columns; a column without a name has an empty one.
-    """
+    """The cells of a CSV file of at most so many bytes, and the names of its columns, empty ones where it has none."""
 
     def __init__(self, path: str | Path, most: int = MOST_BYTES) -> None:
         self.path, self._most, self._separator = path, most, ","
@@ -60,7 +56,6 @@ class CsvTable:
     def columns(
         self, names: Sequence[str], *, missing: Sequence[str] = (), last: Sequence[str] = (), most: int | None = None
     ) -> dict[str, Array]:
-        """Return columns as numbers."""
         places = {name: place for place, name in enumerate(self.names)}
         columns = {name: array("d") for name in names}
         wrong: InputError | None = None
@@ -94,11 +89,8 @@ class CsvTable:
             if mark:
                 self._marks.setdefault(mark, line)
             if len(self._marks) > 1:
-                first, second = self._marks[","], self._marks["."]
-                raise InputError(
-                    f"{self.path} has decimal commas (line {first}) and points (line {second}) in numbers: "
-                    "use one mark."
-                )
+                commas, points = f"commas (line {self._marks[',']})", f"points (line {self._marks['.']})"
+                raise InputError(f"{self.path} has decimal {commas} and {points} in numbers: use one mark.")
             text = cell.replace(",", ".")
         try:
             if "_" in text:
@@ -128,12 +120,7 @@ class CsvTable:
 
 
 class _Lines:
-    """The lines of a text; a row of CSV may extend over several lines.
-
-    Attributes:
-        in_row: number of characters since the end of the last row; the reader of rows resets it to 0.
-        last: the line that was read last.
-    """
+    """The lines of a text; ``in_row`` counts the characters since the end of the last row."""
 
     def __init__(self, text: io.TextIOWrapper, most: int) -> None:
         self.text, self.left, self.in_row, self.last = text, most, 0, ""

@@ -6,7 +6,6 @@ value: attributes, closures, globals and defaults may be secrets.
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import inspect
 import math
@@ -54,9 +53,8 @@ def describe(value: Any, depth: int = 6) -> Any:
     if is_own(type(value)) and hasattr(type(value), "describe"):
         settings = value.describe()
     elif is_own(type(value)):
-        fields = dataclasses.fields(value) if dataclasses.is_dataclass(value) else ()
-        names = [field.name for field in fields] or getattr(value, "__dict__", {})
-        settings = {name: getattr(value, name) for name in names if not name.startswith("_")}
+        fields = getattr(value, "__dataclass_fields__", None) or getattr(value, "__dict__", {})
+        settings = {name: getattr(value, name) for name in fields if not name.startswith("_")}
     return {"type": type(value).__qualname__, **{str(key): describe(item, depth - 1) for key, item in settings.items()}}
 
 

@@ -27,19 +27,13 @@ MOST_JSON = 16 * 2**20  # largest size of a JSON file in bytes; reading it takes
 MADE_BY = "Made by ctxval"
 """What every file contains that an option of a command names, so that the next run may replace it."""
 
-_KINDS = {
-    stat.S_IFDIR: "it is a folder",
-    stat.S_IFIFO: "it is a FIFO and not a regular file",
-    stat.S_IFSOCK: "it is a socket and not a regular file",
-    stat.S_IFLNK: "it is a link and not a regular file",
-    stat.S_IFCHR: "it is a device and not a regular file",
-    stat.S_IFBLK: "it is a device and not a regular file",
-}
-
 
 def why_not_regular(mode: int) -> str:
     """Return what a file of a mode is; empty if it is a regular file."""
-    return "" if stat.S_ISREG(mode) else _KINDS.get(stat.S_IFMT(mode), "it is not a file")
+    if stat.S_ISREG(mode) or stat.S_ISDIR(mode):
+        return "it is a folder" if stat.S_ISDIR(mode) else ""
+    kinds = {stat.S_IFIFO: "FIFO", stat.S_IFSOCK: "socket", stat.S_IFLNK: "link"}
+    return f"it is a {kinds.get(stat.S_IFMT(mode), 'device')} and not a regular file"
 
 
 def open_regular(path: str | Path, most: int = MOST_BYTES) -> BinaryIO:
@@ -48,8 +42,7 @@ def open_regular(path: str | Path, most: int = MOST_BYTES) -> BinaryIO:
         descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
     except (OSError, ValueError) as error:  # a ValueError for a NUL in the name
         folder = os.path.isdir(path)  # which Windows does not open
-        reason = _KINDS[stat.S_IFDIR] if folder else str(getattr(error, "strerror", None) or error)
-        raise InputError(reason) from error
+        raise InputError("it is a folder" if folder else str(getattr(error, "strerror", None) or error)) from error
     status = os.fstat(descriptor)
     reason = why_not_regular(status.st_mode)
     if not reason and status.st_size > most:
@@ -93,9 +86,8 @@ def require_made_by_us(path: Path, mark: bytes = MADE_BY.encode()) -> None:
     except InputError as error:
         raise InputError(f"{path} cannot be written: {error}.") from error
     if not known:
-        raise InputError(
-            f"{path} is there already, and ctxval did not write it: give another name, or --force to replace it."
-        )
+        advice = "give another name, or --force to replace it"
+        raise InputError(f"{path} is there already, and ctxval did not write it: {advice}.")
 
 
 def make_folder_of(path: str | Path) -> None:

@@ -48,7 +48,6 @@ class Interrupts:
 
     @contextmanager
     def shielded(self) -> Iterator[None]:
-        """Let the code inside finish after the first SIGINT."""
         before, self._shielded = self._shielded, True
         try:
             yield

@@ -16,9 +16,8 @@ Key = tuple[Any, ...]
 class JsonLines(Mapping[Key, Record]):
     """The records of a file of JSON lines; of several records with one key, the last one counts.
 
-    One process appends, and its workers hand it what they have computed. If that process is killed in the middle of a
-    line, the incomplete last line is ignored, and it is removed before the next record is appended. The file is read
-    once, when it is first asked; it is made, with its folder, by the first record.
+    One process appends. If it is killed in the middle of a line, the incomplete last line is ignored, and it is removed
+    before the next record is appended. The file is read once, when it is first asked, and made by the first record.
     """
 
     def __init__(self, path: Path, key: Sequence[str]) -> None:
@@ -39,7 +38,6 @@ class JsonLines(Mapping[Key, Record]):
         return [record for record in self.values() if all(record.get(name) == fields[name] for name in fields)]
 
     def append(self, record: Mapping[str, Any]) -> None:
-        """Store one more record."""
         # What is read again later is what is known now: tuples are lists, for instance.
         line = json.dumps(dict(record))
         stored: Record = json.loads(line)
@@ -63,8 +61,7 @@ class JsonLines(Mapping[Key, Record]):
                 lines.append(last)
             for number, line in enumerate(lines, start=1):
                 where = f"{self.path}, line {number}"
-                record = _parsed(line)
-                if record is None:
+                if (record := _parsed(line)) is None:
                     start = line[:40].decode(errors="replace")
                     raise InputError(f"{where}: a line must be a JSON object, got {start!r}.")
                 self._records[self._key_of(record, where)] = record

@@ -57,12 +57,10 @@ else:
             self.close = self._connection.close
 
         def acquire(self) -> None:
-            """Take the lock; it is held until it is released or the process ends."""
             try:
                 self._connection.execute("BEGIN EXCLUSIVE")
             except sqlite3.DatabaseError as error:
                 raise LockedError("the lock is held") if "locked" in str(error) else OSError(str(error)) from error
 
         def release(self) -> None:
-            """Release the lock."""
             self._connection.execute("ROLLBACK")

@@ -8,6 +8,8 @@ import re
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from ctxval._util.extras import require_extra
 from ctxval._util.files import read_bytes
 from ctxval._util.texts import shortened
@@ -30,6 +32,13 @@ def compile_mjcf(mjcf: str | Path) -> tuple[str, Any]:
     except ValueError as error:
         reason = shortened(" ".join(str(error).split())).rstrip(".")  # MuJoCo writes several lines
         raise InputError(f"MuJoCo cannot compile the model: {reason}.") from error
+
+
+def warning_of(counts: Any) -> str:
+    """Return the name of the first warning of MuJoCo whose count is not 0."""
+    from mujoco import mjtWarning
+
+    return str(mjtWarning(int(np.argmax(np.asarray(counts) > 0))).name.removeprefix("mjWARN_"))
 
 
 def _digest(text: bytes, home: Path) -> str:

@@ -20,15 +20,11 @@ Width = int | None  # number of values in one row; None if the file leaves it op
 
 
 class OnnxNetwork(ShortRepr):
-    """A network that maps rows of numbers to rows of numbers, on one thread of the processor.
+    """A network that maps rows of numbers to rows of numbers, on one thread; an ONNX file holds no code.
 
     Its inputs and its output have one row for each task, shapes ``(N, k)``. If the file fixes N to 1, or the shapes are
-    ``(k,)``, the network is called row by row. An ONNX file holds no code.
-
-    Attributes:
-        widths: the number of values in a row of each input; None if the file leaves it open.
-        width: the number of values in a row of the output; None if the file leaves it open.
-        precision: the relative rounding of the network's numbers: 1e-7 in single, 2e-16 in double precision.
+    ``(k,)``, the network is called row by row. Its widths are the numbers of values in a row of each input and of the
+    output, None if the file leaves them open; its precision is its relative rounding.
     """
 
     def __init__(self, source: str | Path | bytes) -> None:
@@ -110,8 +106,7 @@ def _session(source: bytes | str) -> Any:
 def _rows(node: Any) -> tuple[bool, Width, Width]:
     """Return whether an input or output is one flat row, and its numbers of rows and of values in a row, if fixed."""
     if node.type not in _TYPES or not isinstance(node.shape, list) or len(node.shape) not in (1, 2):
-        raise InputError(
-            f"the network's {node.name!r} must be real numbers (N, k) or (k,), got {node.type} of shape {node.shape}."
-        )
+        got = f"{node.type} of shape {node.shape}"
+        raise InputError(f"the network's {node.name!r} must be real numbers (N, k) or (k,), got {got}.")
     *count, width = (size if isinstance(size, int) else None for size in node.shape)
     return not count, count[0] if count else None, width

@@ -14,15 +14,10 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Progress:
-    """How far a stage is.
+    """How far a stage is: what is being done, how much of it, of how much if that is known, in which unit.
 
-    Attributes:
-        stage: what is being done, such as "choosing a task".
-        done, expected: how much of it is done, and an estimate of the whole; None if it is not known.
-        unit: what is counted, such as "designs" or "s".
-        note: a sentence about what has just been done.
-        depth: the number of stages that this one is a part of.
-        ended: whether this is the last report of the stage.
+    The note is a sentence about what has just been done, the depth the number of stages that this one is a part of, and
+    ``ended`` is true in the last report of a stage.
     """
 
     stage: str
@@ -121,7 +116,6 @@ def advance(count: float = 1, note: str = "") -> None:
 
 
 def expect(expected: float) -> None:
-    """State how much the innermost stage will be in all."""
     current = _innermost.get()
     if current is not None:
         current.expected = expected

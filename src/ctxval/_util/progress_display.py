@@ -65,28 +65,24 @@ class OnScreen:
     """Shows one bar for each stage while it lasts. Notes stay on the screen, one line for each."""
 
     def __init__(self, console: Console) -> None:
-        self._console = console
-        self._bars: Bars | None = None
+        self._bars = _bars(console)
         self._rows: dict[int, Any] = {}
 
     def __call__(self, progress: Progress) -> None:
-        if self._bars is None:
-            self._bars = _bars(self._console)
-            self._bars.start()
         bars = self._bars
+        if not self._rows:
+            bars.start()
         if progress.note:
             bars.console.print(_in_one_line(progress.note), soft_wrap=True, markup=False, highlight=False)
         if progress.depth not in self._rows:
             self._rows[progress.depth] = bars.add_task(progress.stage, text="")
         row = self._rows[progress.depth]
-        task = bars.tasks[bars.task_ids.index(row)]
-        text = amount(progress, task.elapsed or 0.0)
-        bars.update(row, completed=progress.done, total=progress.expected, text=text)
+        elapsed = bars.tasks[bars.task_ids.index(row)].elapsed or 0.0
+        bars.update(row, completed=progress.done, total=progress.expected, text=amount(progress, elapsed))
         if progress.ended:
             bars.remove_task(self._rows.pop(progress.depth))
             if not self._rows:
                 bars.stop()
-                self._bars = None
 
 
 def _bars(console: Console) -> Bars:

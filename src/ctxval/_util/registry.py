@@ -22,15 +22,7 @@ Made = TypeVar("Made")
 
 @dataclass(frozen=True)
 class Declaration:
-    """What a registry must know of a part beyond its class.
-
-    Attributes:
-        runs_code: whether plain arguments, such as a text, can make the part run code: a program, a library, a module.
-        files: arguments that are paths of files.
-        folder: the argument that is a folder, which is the experiment's by default; None if there is none.
-        functions: arguments that are functions, each with its form, such as ``(x, u) -> x_next``.
-        aliases: older names by which the part is found too; they are not listed.
-    """
+    """What a registry must know of a part beyond its class; :func:`part` explains the fields."""
 
     name: str
     runs_code: bool = False
@@ -54,14 +46,20 @@ def part(
 ) -> Callable[[Part], Part]:
     """Declare a class, or a function that makes an object, as a part that is found by name; check its arguments.
 
-    A part of this package is found once its package exports it in ``__all__``, by the name of the class unless another
-    name is given; :class:`Declaration` explains the arguments.
+    A part of this package is found once its package exports it in ``__all__``.
+
+    Args:
+        name: the name of the class by default.
+        runs_code: whether plain arguments, such as a text, can make the part run code: a program, a library, a module.
+        files: arguments that are paths of files.
+        folder: the argument that is a folder, which is the experiment's by default.
+        functions: arguments that are functions, each with its form, such as ``(x, u) -> x_next``.
+        aliases: older names by which the part is found too; they are not listed.
     """
 
     def declare(made: Part) -> Part:
-        declaration = Declaration(name or made.__name__, runs_code, files, folder, functions or {}, aliases)
         made = checked(made)
-        _declarations[made] = declaration
+        _declarations[made] = Declaration(name or made.__name__, runs_code, files, folder, functions or {}, aliases)
         return made
 
     return declare
@@ -101,9 +99,8 @@ class Registry(Mapping[str, Any], Generic[Made]):
     def collect(self) -> None:
         """Take the parts that the package exports; for a registry that is made before the package's ``__all__``."""
         exported = vars(sys.modules[self.group])
-        for made in (exported.get(name) for name in exported["__all__"]):
-            declared = declaration_of(made)
-            if declared is not None:
+        for made in map(exported.get, exported["__all__"]):
+            if (declared := declaration_of(made)) is not None:
                 self._built_in[declared.name] = made
                 self.aliases |= dict.fromkeys(declared.aliases, declared.name)
 
@@ -140,9 +137,8 @@ class Registry(Mapping[str, Any], Generic[Made]):
             raise UnknownNameError.among(self.kind, name, [*self.built_in, *self.installed])
         packages = sorted("of unknown name" if point.dist is None else str(point.dist.name) for point in points)
         if len(points) > 1:
-            raise InputError(
-                f"two installed packages have a {self.kind} {name!r}: {' and '.join(packages)}; uninstall one of them."
-            )
+            both = " and ".join(packages)
+            raise InputError(f"two installed packages have a {self.kind} {name!r}: {both}; uninstall one of them.")
         what, value = f"the {self.kind} {name!r} of the installed package {packages[0]}", points[0].value
         try:
             made = points[0].load()
@@ -154,8 +150,7 @@ class Registry(Mapping[str, Any], Generic[Made]):
         return made
 
     def summary(self, name: str) -> str:
-        lines = (inspect.getdoc(self.find(name)) or "").splitlines()
-        return lines[0].removesuffix(".") if lines else ""
+        return (inspect.getdoc(self.find(name)) or "").partition("\n")[0].removesuffix(".")
 
     def make(self, name: str, /, **arguments: Any) -> Made:
         return self.require_made(name, construct(f"the {self.kind} {name}", self.find(name), arguments))
@@ -190,10 +185,8 @@ class Registry(Mapping[str, Any], Generic[Made]):
         try:
             return list(entry_points(group=self.group))
         except Exception as error:  # metadata is files of others, in which anything may stand
-            raise InputError(
-                f"the entry points of installed packages cannot be read, in which a {self.kind} is sought: "
-                f"{reason_of(error)}."
-            ) from error
+            what = f"the entry points of installed packages cannot be read, in which a {self.kind} is sought"
+            raise InputError(f"{what}: {reason_of(error)}.") from error
 
 
 def has_method(cls: type, method: str | None) -> bool:
@@ -204,10 +197,9 @@ def has_method(cls: type, method: str | None) -> bool:
 def construct(what: str, build: Any, arguments: Mapping[str, Any], *first: Any) -> Any:
     try:
         taken = inspect.signature(build).parameters
-        if not any(parameter.kind is parameter.VAR_KEYWORD for parameter in taken.values()):
-            for key in arguments:
-                if key not in taken:
-                    raise UnknownNameError.among(f"argument of {what}", key, taken)
+        open_ended = any(parameter.kind is parameter.VAR_KEYWORD for parameter in taken.values())
+        for key in () if open_ended else [key for key in arguments if key not in taken]:
+            raise UnknownNameError.among(f"argument of {what}", key, taken)
         return build(*first, **arguments)
     except CtxvalError:
         raise

@@ -24,10 +24,8 @@ from ctxval._util.arrays import Array
 from ctxval._util.texts import plain, shortened, visible
 
 LONGEST, LINES = 600, 5  # characters and lines of one object
-LINE = 150  # characters of one line of several
-_CALL = 240  # characters of an object in a single line
-_VALUE = 90  # characters of a value inside an object
-_ITEMS = 6  # items of a collection that are shown
+LINE, _CALL = 150, 240  # characters of one line of several, and of an object in a single line
+_VALUE, _ITEMS = 90, 6  # characters of a value inside an object, and items of a collection that are shown
 
 
 class Shown(str):
@@ -71,11 +69,8 @@ def fields_of(owner: Any) -> dict[str, Any]:
         fields = {field.name: getattr(owner, field.name, None) for field in dataclasses.fields(owner) if field.repr}
     else:
         fields = {name: value for name, value in vars(owner).items() if not name.startswith("_")}
-    return {
-        name: value
-        for name, value in fields.items()
-        if value is not None and not (isinstance(value, str | Sequence | Mapping) and not len(value))
-    }
+    empty = {name for name, value in fields.items() if isinstance(value, str | Sequence | Mapping) and not len(value)}
+    return {name: value for name, value in fields.items() if value is not None and name not in empty}
 
 
 class ShortRepr:
@@ -192,10 +187,7 @@ def _rest(count: int) -> list[str]:
 
 
 def _object(value: Any) -> str:
-    """Return what an object says of itself in one line; the name of its class if that is nothing readable.
-
-    Of our own objects that is their first line.
-    """
+    """Return what an object says of itself in one line, of ours the first; its class if that is nothing readable."""
     kind: Any = type(value)
     if kind.__repr__ is object.__repr__:
         return name_of(kind)
@@ -206,8 +198,8 @@ def _object(value: Any) -> str:
         return name_of(kind)
     if re.search(r" at 0x|\barray\(", text):  # an address in memory, or raw numbers, which tell a reader nothing
         return name_of(kind)
-    own = str(kind.__module__).partition(".")[0] == __name__.partition(".")[0]
-    return cut(line(text.partition("\n")[0] if own else text, 4 * _VALUE), 2 * _VALUE)
+    is_ours = str(kind.__module__).partition(".")[0] == __name__.partition(".")[0]
+    return cut(line(text.partition("\n")[0] if is_ours else text, 4 * _VALUE), 2 * _VALUE)
 
 
 # HTML

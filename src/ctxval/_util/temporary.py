@@ -28,10 +28,9 @@ class TemporaryFolder:
         # no other process finds it unlocked. On a disk without locks there is none, and nobody else removes the folder.
         self._lock: FileLock | None = None
         with suppress(OSError):
-            held = FileLock(self._around / "new")
-            held.acquire()
-            self._lock = held
-        if self._lock is not None:
+            lock = FileLock(self._around / "new")
+            lock.acquire()
+            self._lock = lock
             (self._around / "new").rename(self._around / "lock")
         self.path = self._around / "files"
         self.path.mkdir()

@@ -44,9 +44,8 @@ def conversion(recorded: str, wanted: str) -> float:
         return 1.0
     source, target = _parsed(recorded), _parsed(wanted)
     if source is None or target is None or source[1] != target[1]:
-        raise InputError(
-            f"there is no known factor from {recorded or 'no unit'} to {wanted or 'no unit'}: give factor = ..."
-        )
+        units = f"from {recorded or 'no unit'} to {wanted or 'no unit'}"
+        raise InputError(f"there is no known factor {units}: give factor = ...")
     return source[0] / target[0]
 
 

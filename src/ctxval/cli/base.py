@@ -27,8 +27,9 @@ from ctxval.certificates.verdict import Verdict
 from ctxval.cli.commands import TEXTS, app
 from ctxval.cli.screen import Screen, line
 from ctxval.core.experiment import UnitsWarning
-from ctxval.core.preflight import CostWarning, DistanceWarning
+from ctxval.core.preflight import DistanceWarning
 from ctxval.core.trial import Trial
+from ctxval.core.validation import CostWarning
 from ctxval.errors import CertificateError, CtxvalError, InputError, StoreError
 from ctxval.searches import REGISTRY as SEARCHES
 

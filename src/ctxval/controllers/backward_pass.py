@@ -96,14 +96,14 @@ def _recursion(cost: QuadraticCost, around: Expansion, stage: _Stage) -> InputSt
     F, F_T = _joined(around, (horizon, batch))
     n = F.shape[-2]
     weights = np.block([[cost.Q, np.zeros((n, m))], [np.zeros((m, n)), cost.R]])
-    own = np.concatenate([around.deviations[:-1] @ cost.Q, around.inputs @ cost.R], axis=-1)
+    pulls = np.concatenate([around.deviations[:-1] @ cost.Q, around.inputs @ cost.R], axis=-1)
     v, V = around.deviations[-1] @ cost.Q_final, cost.Q_final
     slopes, Q_uu_k = np.empty((horizon, batch, m)), np.empty((horizon, batch, m))
     k_all, K_all = np.empty((horizon, batch, m)), np.empty((horizon, batch, m, n))
     for t in reversed(range(horizon)):
         M = (F_T[t] @ V) @ F[t]
         M += weights
-        q = own[t] + times(v, F[t])
+        q = pulls[t] + times(v, F[t])
         Q_u, Q_ux, Q_uu = q[:, n:], M[..., n:, :n], M[..., n:, n:]
         K, k = stage.solve(t, Q_uu, Q_u, Q_ux)
         slopes[t], Q_uu_k[t], k_all[t], K_all[t] = Q_u, times(k, Q_uu), k, K

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import functools
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from ctxval._util.arrays import Array, ArrayLike, as_weight
 from ctxval._util.representation import ShortRepr
+from ctxval.core.controller import Limits, LimitsLike
 from ctxval.core.task import Task
 from ctxval.errors import InputError, ShapeError
 
@@ -39,6 +41,19 @@ class QuadraticCost(ShortRepr):
         final = deviations[-1]
         cost = ((running @ self.Q) * running).sum(axis=(0, -1)) + ((inputs @ self.R) * inputs).sum(axis=(0, -1))
         return np.asarray(0.5 * (cost + ((final @ self.Q_final) * final).sum(axis=-1)))
+
+
+class QuadraticSynthesizer(ShortRepr):
+    """What synthesizers of a quadratic cost have in common: the cost, and the limits of the inputs if there are any."""
+
+    batched = True
+
+    def __init__(self, cost: QuadraticCost, limits: LimitsLike | None) -> None:
+        self.cost = cost
+        self.limits = None if limits is None else Limits.of(limits, len(cost.R))
+
+    def describe(self) -> dict[str, Any]:
+        return {"cost": self.cost, **({} if self.limits is None else {"limits": self.limits})}
 
 
 @dataclass(frozen=True, eq=False)

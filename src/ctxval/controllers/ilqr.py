@@ -12,8 +12,8 @@ from ctxval._util.checked import PositiveFloat, PositiveInt
 from ctxval._util.registry import part
 from ctxval._util.representation import ShortRepr
 from ctxval.controllers.backward_pass import Expansion, InputStep, minimise
-from ctxval.controllers.cost import QuadraticCost
-from ctxval.core.controller import AffineFeedback, Limits, LimitsLike, fed_back
+from ctxval.controllers.cost import QuadraticCost, QuadraticSynthesizer
+from ctxval.core.controller import AffineFeedback, LimitsLike, fed_back
 from ctxval.core.model import Model, linearize
 from ctxval.core.task import Task
 from ctxval.errors import DesignError, ModelError
@@ -37,7 +37,7 @@ class ILQRSolution(ShortRepr):
 
 
 @part()
-class ILQR(ShortRepr):
+class ILQR(QuadraticSynthesizer):
     """Finite-horizon iterative LQR on any model, for a whole batch of tasks at once.
 
     It minimises a quadratic cost on the deviation from the task's reference. On a linear model without limits it
@@ -53,8 +53,6 @@ class ILQR(ShortRepr):
         limits: limits of the inputs, in a form of :meth:`Limits.of`, such as one number h for -h to h.
     """
 
-    batched = True
-
     def __init__(
         self,
         Q: ArrayLike,
@@ -65,14 +63,12 @@ class ILQR(ShortRepr):
         tolerance: PositiveFloat = 1e-8,
         limits: LimitsLike | None = None,
     ) -> None:
-        self.cost = QuadraticCost(Q, R, Q_final)
+        super().__init__(QuadraticCost(Q, R, Q_final), limits)
         self.iterations = iterations
         self.tolerance = tolerance
-        self.limits = None if limits is None else Limits.of(limits, len(self.cost.R))
 
     def describe(self) -> dict[str, Any]:
-        fields = {"cost": self.cost, "iterations": self.iterations, "tolerance": self.tolerance}
-        return {**fields, **({} if self.limits is None else {"limits": self.limits})}
+        return {**super().describe(), "iterations": self.iterations, "tolerance": self.tolerance}
 
     def design(self, task: Task, model: Model) -> AffineFeedback:
         return self.solve(task, model).controller
@@ -121,7 +117,6 @@ class _Descent:
         return ~self.converged & ~stuck & (self.iterations < self.settings.iterations)
 
     def advance(self, rows: Rows) -> None:
-        """Take one step for these tasks, or mark them as converged."""
         around, policy = self._step(rows)
         gain = -policy.change.at(1.0)
         arrived = gain <= self.settings.tolerance * (np.abs(self.J[rows]) + self.settings.tolerance)
@@ -166,7 +161,6 @@ class _Descent:
         return around, minimise(self.cost, around, self.limits, self.damping[rows])
 
     def _keep(self, policy: InputStep, chosen: Rows, rows: Rows) -> None:
-        """Keep the gains of some of the tasks of a step."""
         self.K[:, rows[chosen]] = policy.K[:, chosen] if policy.K.ndim == 4 else policy.K[:, None]
 
     def _line_search(self, rows: Rows, policy: InputStep, waiting: Rows) -> Rows:
@@ -222,7 +216,6 @@ class _Descent:
         return X, U, self._costs(rows, X, U)
 
     def _costs(self, rows: Rows, X: Array, U: Array) -> Array:
-        """Return the costs of the loops of these tasks; infinity if one is not finite."""
         J = self.cost.value(X - self.reference[:, rows], U)
         return np.where(np.isfinite(J), J, np.inf)
 

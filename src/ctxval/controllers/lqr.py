@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from ctxval._util.arrays import Array, ArrayLike
 from ctxval._util.registry import part
-from ctxval._util.representation import ShortRepr
-from ctxval.controllers.cost import LinearGains, QuadraticCost, linear_gains
-from ctxval.core.controller import AffineFeedback, Limits, LimitsLike
+from ctxval.controllers.cost import LinearGains, QuadraticCost, QuadraticSynthesizer, linear_gains
+from ctxval.core.controller import AffineFeedback, LimitsLike
 from ctxval.core.model import Model, linearize
 from ctxval.core.task import Task
 from ctxval.errors import DesignError, InputError
 
 
 @part()
-class LQR(ShortRepr):
+class LQR(QuadraticSynthesizer):
     """The linear-quadratic regulator that tracks the task's reference over its horizon.
 
     A nonlinear model is linearised once, at the task's initial state and zero input.
@@ -30,13 +27,10 @@ class LQR(ShortRepr):
         limits: limits of the inputs, in a form of :meth:`Limits.of`, such as one number h for -h to h.
     """
 
-    batched = True
-
     def __init__(
         self, Q: ArrayLike, R: ArrayLike, Q_final: ArrayLike | None = None, *, limits: LimitsLike | None = None
     ) -> None:
-        self.cost = QuadraticCost(Q, R, Q_final)
-        self.limits = None if limits is None else Limits.of(limits, len(self.cost.R))
+        super().__init__(QuadraticCost(Q, R, Q_final), limits)
 
     def design(self, task: Task, model: Model) -> AffineFeedback:
         self.cost.require_task(task)
@@ -52,12 +46,9 @@ class LQR(ShortRepr):
             gains, feedforward = _riccati(self.cost, A, B, offset, task.reference)
         return AffineFeedback(gains, feedforward, np.zeros_like(task.reference[..., :-1, :]), self.limits)
 
-    def describe(self) -> dict[str, Any]:
-        return {"cost": self.cost, **({} if self.limits is None else {"limits": self.limits})}
-
 
 @part()
-class StationaryLQR(ShortRepr):
+class StationaryLQR(QuadraticSynthesizer):
     """The infinite-horizon linear-quadratic regulator, with one gain from the algebraic Riccati equation.
 
     The feedback ``u = u_g + K (x - r_t)`` follows the task's reference. The input u_g holds the task's goal as well as
@@ -71,11 +62,8 @@ class StationaryLQR(ShortRepr):
         limits: limits of the inputs, in a form of :meth:`Limits.of`, such as one number h for -h to h.
     """
 
-    batched = True
-
     def __init__(self, Q: ArrayLike, R: ArrayLike, *, limits: LimitsLike | None = None) -> None:
-        self.cost = QuadraticCost(Q, R)
-        self.limits = None if limits is None else Limits.of(limits, len(self.cost.R))
+        super().__init__(QuadraticCost(Q, R), limits)
 
     def design(self, task: Task, model: Model) -> AffineFeedback:
         self.cost.require_task(task)
@@ -90,16 +78,11 @@ class StationaryLQR(ShortRepr):
         inputs = np.repeat(holding[..., None, :], task.horizon, axis=-2)
         return AffineFeedback(gains, inputs, task.reference[..., :-1, :], self.limits)
 
-    def describe(self) -> dict[str, Any]:
-        return {"cost": self.cost, **({} if self.limits is None else {"limits": self.limits})}
-
 
 def _require_inputs(cost: QuadraticCost, B: Array) -> None:
     if not B.shape[-1]:
-        raise InputError(
-            "LQR designs inputs, and the model has 0 inputs; use a synthesizer of your own, whose controllers return "
-            "inputs of shape (..., 0)."
-        )
+        advice = "use a synthesizer of your own, whose controllers return inputs of shape (..., 0)"
+        raise InputError(f"LQR designs inputs, and the model has 0 inputs; {advice}.")
     if B.shape[-1] != len(cost.R):
         raise InputError(f"R must weigh the model's {B.shape[-1]} inputs, got a weight of {len(cost.R)} inputs.")
 
@@ -113,17 +96,16 @@ def _stationary_gain(cost: QuadraticCost, A: Array, B: Array) -> Array:
         return np.stack(gains).reshape(*batch, *gains[0].shape)
     from scipy.linalg import solve_discrete_are
 
+    failure = "no stationary feedback stabilises the model at the goal"
     try:
         P = solve_discrete_are(A, B, cost.Q, cost.R)
     except (np.linalg.LinAlgError, ValueError) as error:
-        raise DesignError(f"no stationary feedback stabilises the model at the goal: {error}") from error
+        raise DesignError(f"{failure}: {error}") from error
     K = -np.linalg.solve(cost.R + B.T @ P @ B, B.T @ P @ A)
     radius = float(np.abs(np.linalg.eigvals(A + B @ K)).max())
     if not radius < 1:
-        raise DesignError(
-            "no stationary feedback stabilises the model at the goal: the largest eigenvalue of its closed loop has "
-            f"modulus {radius:.6g}, which must be below 1."
-        )
+        largest = f"the largest eigenvalue of its closed loop has modulus {radius:.6g}, which must be below 1"
+        raise DesignError(f"{failure}: {largest}.")
     return np.asarray(K)
 
 

@@ -28,9 +28,9 @@ class MPC(ShortRepr):
     exact solution. Other models are linearised along the prediction, up to ``iterations`` times, with a line search.
     The input depends only on the step and the state: no call depends on an earlier one.
 
-    Input limits are never exceeded. State limits hold for the model's predictions. If the system differs from the
-    model, a state may leave them; if no inputs lead back at once, the problem has no solution, which is an error. A
-    ``violation_cost`` makes the state limits soft, so that there is always a solution.
+    Input limits are never exceeded. State limits hold for the model's predictions; if the system differs from the model
+    and no inputs lead back at once, the problem has no solution, which is an error. A ``violation_cost`` makes the
+    state limits soft, so that there is always a solution.
 
     Args:
         Q, R, Q_final: weights of the state, the input and the last state (Q by default), as diagonals or as matrices.
@@ -112,10 +112,8 @@ class _Problem:
             A, B = linearize(self.model, X[:-1], U)
             change = self._improved(X, U, A, B)
             if change is None:
-                raise DesignError(
-                    f"MPC finds no inputs at step {t} that keep the prediction from {self.x.tolist()} within the "
-                    "state limits; a violation_cost makes them soft."
-                )
+                aim = f"that keep the prediction from {self.x.tolist()} within the state limits"
+                raise DesignError(f"MPC finds no inputs at step {t} {aim}; a violation_cost makes them soft.")
             if A.ndim == 2 and B.ndim == 2:
                 U = self.settings.limits.clip(U + change)
                 return self._predicted(U), U
@@ -165,11 +163,10 @@ class _Problem:
         return X, U, True
 
     def _merit(self, X: Array, U: Array) -> float:
-        """Return the merit: the cost plus the weighted violation of the state limits."""
+        """Return the cost plus the weighted violation of the state limits."""
         deviations = X[1:] - self.reference
-        cost = 0.5 * (
-            ((self.Q @ deviations[..., None])[..., 0] * deviations).sum() + ((U @ self.settings.cost.R) * U).sum()
-        )
+        weighed = ((self.Q @ deviations[..., None])[..., 0] * deviations).sum()
+        cost = 0.5 * (weighed + ((U @ self.settings.cost.R) * U).sum())
         limits = self.settings.state_limits
         excess = np.maximum(np.maximum(limits.low - X[1:], X[1:] - limits.high), 0.0)
         violation = excess.sum() if self.settings.violation_cost is None else excess.max(axis=-1).sum()
@@ -197,12 +194,12 @@ def _softened(
     whole = np.zeros((size + steps, size + steps))
     whole[:size, :size] = hessian
     whole[size:, size:] = 1e-6 * cost * np.eye(steps)  # keeps the problem strictly convex
-    own = np.kron(np.eye(steps), np.ones((count // steps, 1)))
+    slack = np.kron(np.eye(steps), np.ones((count // steps, 1)))
     unlimited = np.full(count, np.inf)
     return _quadratic_program(
         whole,
         np.concatenate([slope, np.full(steps, cost)]),
-        np.block([[rows, own], [rows, -own]]),
+        np.block([[rows, slack], [rows, -slack]]),
         (np.append(box[0], np.zeros(steps)), np.append(box[1], np.full(steps, np.inf))),
         (np.append(gaps[0], -unlimited), np.append(unlimited, gaps[1])),
     )

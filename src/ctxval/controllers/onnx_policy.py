@@ -51,9 +51,8 @@ class OnnxPolicy(ShortRepr):
         self.scale = scale
         self.limits = None if limits is None else Limits.of(limits)
         if len(self.network.widths) != 1:
-            raise InputError(
-                f"a policy must have one input, the observations, but the network has {', '.join(self.network.names)}."
-            )
+            names = ", ".join(self.network.names)
+            raise InputError(f"a policy must have one input, the observations, but the network has {names}.")
 
     def inputs(self, t: int, x: Array, task: Task) -> Array:
         """Return the inputs ``(..., m)`` at step t before they are clipped."""

@@ -23,13 +23,12 @@ Controller = Callable[[int, Array], Array]
 class Synthesizer(Protocol):
     """A method that designs a controller for a task on a model.
 
-    A synthesizer that can design for a batch of tasks in one call has an attribute ``batched = True``. If its
-    controllers of a batch have ``__getitem__``, which returns the controller of one task, tasks are also designed in a
-    batch if the system executes them one at a time.
+    With ``batched = True`` it designs for a batch of tasks in one call. If its controllers then have ``__getitem__``,
+    which returns the controller of one task, tasks are also designed together if the system executes them one at a
+    time.
 
-    A controller whose design is iterative may have an attribute ``converged``: whether the design converged, a boolean,
-    or booleans of the batch shape ``(...)``. Reports and ``ctxval check --aspect1`` name the tasks whose design did
-    not. :func:`converged_of` reads it, and :func:`ctxval.testing.check_synthesizer` checks it.
+    A controller may tell whether its design ``converged``, by a boolean or booleans of the batch shape ``(...)``.
+    Reports and ``ctxval check --aspect1`` name the tasks whose design did not.
     """
 
     def design(self, task: Task, model: Model) -> Controller:
@@ -71,30 +70,25 @@ class Limits(ShortRepr):
         except ValueError:
             fits = False
         if not fits:
-            raise ShapeError(
-                "low and high of the limits must be numbers, or one for each input, "
-                f"got shapes {self.low.shape} and {self.high.shape}."
-            )
+            got = f"shapes {self.low.shape} and {self.high.shape}"
+            raise ShapeError(f"low and high of the limits must be numbers, or one for each input, got {got}.")
         if not (self.low < self.high).all():
-            raise InputError(
-                f"limits must be low < high for every input, got {self.low.tolist()} and {self.high.tolist()}."
-            )
+            got = f"{self.low.tolist()} and {self.high.tolist()}"
+            raise InputError(f"limits must be low < high for every input, got {got}.")
 
     @classmethod
     def of(cls, limits: LimitsLike, inputs: int | None = None) -> Limits:
-        """Return limits from any form that users may give.
+        """Return limits from any form that users may give; single numbers are expanded if ``inputs`` is given.
 
         It is one number h for ``-h`` to ``h`` of every input; ``Limits(low=, high=)`` or a mapping of low and high,
-        numbers or ``(m,)``; or rows ``[low, high]``, one for each input. Single numbers are expanded if the number of
-        inputs is given.
+        numbers or ``(m,)``; or rows ``[low, high]``, one for each input.
         """
         box = limits if isinstance(limits, Limits) else cls._read(limits)
         if inputs is None:
             return box
         if any(bound.shape not in ((), (inputs,)) for bound in (box.low, box.high)):
-            raise ShapeError(
-                f"limits must be numbers or have shape ({inputs},), got {box.low.shape} and {box.high.shape}."
-            )
+            got = f"{box.low.shape} and {box.high.shape}"
+            raise ShapeError(f"limits must be numbers or have shape ({inputs},), got {got}.")
         return cls(*(np.array(np.broadcast_to(bound, (inputs,))) for bound in (box.low, box.high)))
 
     @classmethod
@@ -165,8 +159,7 @@ class AffineFeedback(ShortRepr):
         steps = self.inputs.shape[-2]
         if not 0 <= t < steps:
             raise InputError(f"the controller has inputs for the steps 0 to {steps - 1}, got step {t}.")
-        deviation = x - self.states[..., t, :]
-        u = self.inputs[..., t, :] + fed_back(self.gains[..., t, :, :], deviation)
+        u = self.inputs[..., t, :] + fed_back(self.gains[..., t, :, :], x - self.states[..., t, :])
         return u if self.limits is None else self.limits.clip(u)
 
     def __getitem__(self, index: int) -> AffineFeedback:
@@ -187,11 +180,7 @@ class Policy(ShortRepr):
     """
 
     def __init__(
-        self,
-        policy: Callable[[int, Array, Task], Array],
-        *,
-        vectorized: bool = True,
-        limits: LimitsLike | None = None,
+        self, policy: Callable[[int, Array, Task], Array], *, vectorized: bool = True, limits: LimitsLike | None = None
     ) -> None:
         self.policy = policy
         self.batched = vectorized

@@ -23,7 +23,6 @@ from ctxval.core.task import Task
 from ctxval.errors import InputError, ShapeError
 
 CONTROLLER_FORMAT, TASK_FORMAT, VERSION = "ctxval controller", "ctxval task", 1
-
 LAW = "u = min(max(inputs[t] + gains[t] (x - states[t]), low), high) at the steps t = 0, ..., horizon - 1"
 
 Content = TypeVar("Content")
@@ -125,10 +124,8 @@ def _read(path: Path, expected: str, build: Callable[[Mapping[str, Any]], Conten
 def _controller(content: Mapping[str, Any]) -> ControllerFile:
     gains, inputs, states = (as_finite(name, content[name]) for name in ("gains", "inputs", "states"))
     if gains.ndim != 3 or inputs.shape != gains.shape[:2] or states.shape != (len(gains), gains.shape[2]):
-        raise ShapeError(
-            "it needs gains (H, m, n), inputs (H, m) and states (H, n), "
-            f"got {gains.shape}, {inputs.shape} and {states.shape}."
-        )
+        got = f"{gains.shape}, {inputs.shape} and {states.shape}"
+        raise ShapeError(f"it needs gains (H, m, n), inputs (H, m) and states (H, n), got {got}.")
     horizon, m, n = gains.shape
     if content["horizon"] != horizon:
         raise InputError(f"its horizon must be the number of its gains, {horizon}, got {str(content['horizon'])[:40]}.")
@@ -157,7 +154,6 @@ def _named(kind: str, names: Names | None, count: int) -> dict[str, list[str]]:
 def _names(kind: str, content: Mapping[str, Any], count: int) -> dict[str, str]:
     names, units = content[f"{kind}_names"], content[f"{kind}_units"]
     if not all(isinstance(text, str) for text in (*names, *units)) or not len(set(names)) == len(units) == count:
-        raise InputError(
-            f"it needs the names and units of {count} {kind}s, got {str(names)[:60]} and {str(units)[:60]}."
-        )
+        got = f"{str(names)[:60]} and {str(units)[:60]}"
+        raise InputError(f"it needs the names and units of {count} {kind}s, got {got}.")
     return dict(zip(names, units, strict=True))

@@ -21,18 +21,17 @@ class UnitsWarning(UserWarning):
 @checked
 @dataclass(frozen=True, eq=False)
 class Experiment:
-    """A validation with its defaults, as ``ctxval run`` runs it.
+    """A validation with its defaults, as ``ctxval run`` runs it; it gets the names and units as its labels.
+
+    A UnitsWarning says that the distance adds states of different units, and has neither weights nor scales.
 
     Attributes:
         name: a short name for files and displays.
         budget: the default number of executions of S.
         threshold: the default threshold tau; without a threshold there is no verdict.
-        truth: a function that finds d*, for simulated systems; None if there is none.
+        truth: a function that finds d*, for simulated systems.
         units: the units of the distance.
-        states, inputs: names of the states and inputs with their units, for files, pictures and reports.
-
-    The validation gets these names and units as its labels. What is not given here is taken from its labels. A
-    UnitsWarning says that the distance adds states of different units, and has neither weights nor scales.
+        states, inputs: names of the states and inputs with their units; by default the labels of the validation.
     """
 
     name: str

@@ -29,10 +29,7 @@ class Labels(ShortRepr):
         require_names(self.states, self.inputs)
 
     def names(self, system: object, states: int, inputs: int) -> tuple[dict[str, str], dict[str, str]]:
-        """Return the names of n states and m inputs with their units.
-
-        They are these labels, else the names that the system has, else ``x0, x1, ...`` and ``u0, u1, ...``.
-        """
+        """Return the names of n states and m inputs with units: these labels, the system's, or ``x0, ..., u0, ...``."""
         return (
             _named(self.states, names_of(system, "states"), "x", states),
             _named(self.inputs, names_of(system, "inputs"), "u", inputs),
@@ -54,10 +51,9 @@ def require_names(states: Iterable[str], inputs: Iterable[str]) -> None:
     for label, name in zip(labels, names, strict=True):
         plain = bool(name) and label == label.strip() and label.isprintable()
         if not plain or name in TIMES or names.count(name) > 1:
-            raise InputError(
-                "each state and input needs a name of its own, not t or time, without blanks around it or control "
-                f"characters, because recordings have columns of these names; got {shortened(repr(label), 60)}."
-            )
+            wanted = "a name of its own, not t or time, without blanks around it or control characters"
+            reason = f"because recordings have columns of these names; got {shortened(repr(label), 60)}"
+            raise InputError(f"each state and input needs {wanted}, {reason}.")
 
 
 TIMES = ("t", "time")
@@ -77,7 +73,8 @@ def names_of(system: object, kind: str) -> dict[str, str]:
     return dict.fromkeys(map(str, names), "") if isinstance(names, list | tuple) else {}
 
 
-def _named(labels: tuple[str, ...], own: dict[str, str], letter: str, count: int) -> dict[str, str]:
-    if len(labels) == count and len({parted(label)[0] for label in labels}) == count:
-        return dict(parted(label) for label in labels)
-    return own if len(own) == count else {f"{letter}{i}": "" for i in range(count)}
+def _named(labels: tuple[str, ...], of_system: dict[str, str], letter: str, count: int) -> dict[str, str]:
+    for names in (dict(map(parted, labels)), of_system):
+        if len(names) == count:
+            return names
+    return {f"{letter}{i}": "" for i in range(count)}

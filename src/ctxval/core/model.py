@@ -61,18 +61,16 @@ def as_model(model: Model | Step) -> Model:
 
 def require_time_step(model: object, dt: float, whose: str) -> None:
     """Refuse a model whose own ``dt``, or that of its ``data``, is not the step of what it is used with."""
-    own = getattr(model, "dt", None) or getattr(getattr(model, "data", None), "dt", None)
-    if isinstance(own, int | float) and not np.isclose(own, dt, rtol=1e-3, atol=0):
-        raise InputError(
-            f"the model has steps of {own:g} s and {whose} has steps of {dt:g} s: use a model of these steps."
-        )
+    step = getattr(model, "dt", None) or getattr(getattr(model, "data", None), "dt", None)
+    if isinstance(step, int | float) and not np.isclose(step, dt, rtol=1e-3, atol=0):
+        steps = f"steps of {step:g} s and {whose} has steps of {dt:g} s"
+        raise InputError(f"the model has {steps}: use a model of these steps.")
 
 
 def linearize(model: Model, x: Array, u: Array) -> tuple[Array, Array]:
-    """Return the Jacobians A = df/dx and B = df/du of a model at (x, u).
+    """Return the Jacobians A = df/dx and B = df/du of a model at (x, u), by its ``jacobian`` or by central differences.
 
-    They come from the model's own ``jacobian`` if it has one, and from central differences otherwise. Shapes
-    ``(..., n), (..., m) -> (..., n, n), (..., n, m)``; a model whose Jacobian is constant may leave out the batch axes.
+    Shapes ``(..., n), (..., m) -> (..., n, n), (..., n, m)``; a constant Jacobian may have no batch axes.
     """
     jacobian = getattr(model, "jacobian", None)
     A, B = jacobian(x, u) if jacobian is not None else central_differences(model.step, x, u)
@@ -84,12 +82,9 @@ def linearize(model: Model, x: Array, u: Array) -> tuple[Array, Array]:
 def central_differences(step: Step, x: Array, u: Array, precision: float | None = None) -> tuple[Array, Array]:
     """Return A ``(..., n, n)`` and B ``(..., n, m)`` at states ``(..., n)`` and inputs ``(..., m)`` by differences.
 
-    The steps suit the precision of the model, which is found out if it is not given: 6e-6 in double precision, and 5e-3
-    in single precision, in whose rounding smaller steps would be lost.
-
-    All differences are taken in one batch, in blocks that fit into the processor's cache. Complex steps would halve the
-    evaluations, but NumPy's complex functions take two to three times as long, and the result is silently wrong
-    wherever a model uses ``abs``, ``maximum`` or a branch.
+    The steps suit the precision of the model, which is found out if it is not given: 6e-6 in double precision, 5e-3 in
+    single precision. All differences are taken in one batch, in blocks that fit into the processor's cache. Complex
+    steps would be silently wrong wherever a model uses ``abs``, ``maximum`` or a branch.
     """
     n, width, batch = x.shape[-1], x.shape[-1] + u.shape[-1], x.shape[:-1]
     z = np.concatenate([x, u], axis=-1).reshape(-1, width)
@@ -114,8 +109,8 @@ def central_differences(step: Step, x: Array, u: Array, precision: float | None 
 def _precision(step: Step, z: Array, n: int) -> float:
     """Return the relative rounding of a model's numbers: that of single precision if it loses a change of 1e-8.
 
-    A change that is a thousand times as large shows how much the model should change. The answer of most points counts,
-    because a few may be next to a kink. What a model converts to double precision afterwards does not matter.
+    A change a thousand times as large shows how much the model should change. Most points decide, as few are next to a
+    kink.
     """
     some = z[:: max(1, len(z) // 3)][:3]
     # A change that single precision hardly resolves, and one that it does.

@@ -7,12 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from ctxval._util.arrays import Mask
 from ctxval._util.representation import ShortRepr
 from ctxval.core.controller import Controller
 from ctxval.core.space import Parameters
 from ctxval.core.task import Task
-from ctxval.core.trajectory import COMPLETE, Trajectory, require_times
+from ctxval.core.trajectory import Trajectory, require_times
 from ctxval.errors import InputError, ShapeError
 
 
@@ -53,9 +52,9 @@ def require_execution(plan: Plan, trajectory: Trajectory, start_tolerance: float
     expected = plan.model_trajectory
     require_times(trajectory, plan.task.times)
     if trajectory.states.shape != expected.states.shape or trajectory.inputs.shape != expected.inputs.shape:
+        wanted = f"states {expected.states.shape} and inputs {expected.inputs.shape}"
         raise ShapeError(
-            f"the trajectory must have states {expected.states.shape} and inputs {expected.inputs.shape}, "
-            f"got {trajectory.states.shape} and {trajectory.inputs.shape}."
+            f"the trajectory must have {wanted}, got {trajectory.states.shape} and {trajectory.inputs.shape}."
         )
     start = plan.task.initial_state
     ranges = np.ptp(expected.states, axis=0)
@@ -63,10 +62,9 @@ def require_execution(plan: Plan, trajectory: Trajectory, start_tolerance: float
     near = np.abs(trajectory.states[0] - start) <= start_tolerance * scale
     if not near.all():
         i = int(np.argmin(near))
+        wanted = f"{start[i]:g} within {start_tolerance * scale[i]:.3g}, got {trajectory.states[0, i]:g}"
         raise InputError(
-            f"the trajectory starts elsewhere: state {i} must start at {start[i]:g} within "
-            f"{start_tolerance * scale[i]:.3g}, got {trajectory.states[0, i]:g}. "
-            "Check that it belongs to this trial."
+            f"the trajectory starts elsewhere: state {i} must start at {wanted}. Check that it belongs to this trial."
         )
 
 
@@ -88,11 +86,3 @@ def gives_inputs(plan: Plan, trajectory: Trajectory, tolerance: float) -> bool:
             )
     except Exception:  # the user's controller, at states that it never reached by itself
         return False
-
-
-def executed_in(expected: Trajectory, batch: Trajectory) -> Mask:
-    """Return which tasks of a batch have a complete and finite trajectory, shape ``(N,)``."""
-    same = batch.states.shape == expected.states.shape and batch.inputs.shape == expected.inputs.shape
-    # If the batch ended early but all its values are finite, it is not known which task ended early.
-    unknown = batch.ended != COMPLETE and bool(batch.finite.all())
-    return batch.finite if same and not unknown else np.zeros(expected.finite.shape, dtype=bool)

@@ -31,15 +31,13 @@ def rollout(step: Step, controller: Controller, task: Task) -> Trajectory:
                 u = controller(t, x)
             # An attribute is looked at first, because other checks take as long as a small step.
             if getattr(u, "shape", None) != of_inputs and np.shape(u) != of_inputs:
-                raise ShapeError(
-                    f"the controller must return inputs of shape {of_inputs} at every step, got {np.shape(u)}."
-                )
+                wanted = f"inputs of shape {of_inputs} at every step"
+                raise ShapeError(f"the controller must return {wanted}, got {np.shape(u)}.")
             inputs[t] = u
             x = step(x, inputs[t])
             if getattr(x, "shape", None) != of_states and np.shape(x) != of_states:
-                raise ShapeError(
-                    f"a step from states of shape {of_states} must return the same shape, got {np.shape(x)}."
-                )
+                wanted = f"from states of shape {of_states} must return the same shape"
+                raise ShapeError(f"a step {wanted}, got {np.shape(x)}.")
             states[t + 1] = x
     trajectory = Trajectory(task.times, np.moveaxis(states, 0, -2), np.moveaxis(inputs, 0, -2))
     if trajectory.finite.all():

@@ -41,8 +41,8 @@ def flips(points: Array, inputs: Sequence[Array]) -> Flips | None:
     """Return how much the inputs on M, ``(H, m)``, of neighbouring tasks ``(N, d)`` differ; None if there are none.
 
     Neighbours are nearer than a tenth of the diagonal of the task space. A pair flips if the inputs differ at some time
-    by more than half of their range, and as signals by more than half of the sum of their norms. Two controllers that
-    only leave a limit at another time are alike.
+    by more than half of their range, and as signals by more than half of the sum of their norms, so that two
+    controllers that only leave a limit at another time are alike.
     """
     near = scipy.spatial.KDTree(points / np.sqrt(points.shape[1])).query_pairs(0.1)
     pairs = [(i, j) for i, j in sorted(near) if inputs[i].shape == inputs[j].shape and inputs[i].size]

@@ -70,9 +70,7 @@ class TaskSpace:
         names, lows, highs = list[str](), list[Array](), list[Array]()
         for name, bound in bounds.items():
             if name == "points" or name.startswith("_"):
-                raise InputError(
-                    f"a task parameter must not be called 'points' or begin with an underscore, got {name!r}."
-                )
+                raise InputError(f"a task parameter must not be called 'points' or begin with _, got {name!r}.")
             low, high, self._units[name] = _bounds(name, bound)
             scalar, start = low.ndim == 0, len(names)
             self._columns[name] = start if scalar else slice(start, start + low.size)
@@ -175,9 +173,8 @@ class TaskSpace:
         outside = (point < self.low) | (point > self.high)
         if outside.any():
             i = int(np.argmax(outside))
-            raise InputError(
-                f"{self.names[i]} = {point[i]:g} is outside the task space, [{self.low[i]:g}, {self.high[i]:g}]."
-            )
+            bounds = f"[{self.low[i]:g}, {self.high[i]:g}]"
+            raise InputError(f"{self.names[i]} = {point[i]:g} is outside the task space, {bounds}.")
         return point
 
     def describe_point(self, point: Array) -> dict[str, Point]:
@@ -203,9 +200,9 @@ class TaskSpace:
     def distributed(self, **by_name: Continuous) -> TaskSpace:
         """Return this space with a distribution of tasks: independent parameters, all others uniform.
 
-        Independent draws of tasks follow it, and a volume is then the probability under it. Searches are not affected.
+        Independent draws of tasks follow it, and a volume is then the probability under it; searches are not affected.
         Each parameter has a :class:`Normal` or a frozen continuous distribution of ``scipy.stats``, truncated to its
-        bounds; the components of a vector are independent.
+        bounds.
 
         >>> space = TaskSpace(goal=(-1, 1), load=(0, 5)).distributed(goal=Normal(0.0, 0.3))
         """
@@ -218,8 +215,8 @@ class TaskSpace:
     def sampled(self, sampler: Sampler) -> TaskSpace:
         """Return this space with a distribution of tasks that a function draws from.
 
-        The sampler ``(rng, n)`` returns n independent tasks, rows ``(n, d)`` within the bounds, in the space's own
-        units.
+        The sampler ``(rng, n)`` returns n independent tasks, rows ``(n, d)`` within the bounds and in the units of the
+        space.
         """
         if not callable(sampler):
             raise InputError(f"sampler must be a function (rng, n) -> rows (n, d), got {sampler!r}.")

@@ -17,8 +17,8 @@ class Task:
     """One control task, or a batch of them.
 
     Args:
-        initial_state: the first state: a list of n components, each a number or an array ``(...)`` over the batch; or
-            one array ``(..., n)``.
+        initial_state: the first state: n components, each a number or an array ``(...)`` over the batch; or an array
+            ``(..., n)``.
         horizon: number of steps H.
         dt: length of a step, seconds.
         goal: the state to reach, given like ``initial_state``; a goal is a constant reference.
@@ -50,9 +50,9 @@ class Task:
         try:
             self.batch_shape: tuple[int, ...] = np.broadcast_shapes(state.shape[:-1], target.shape[:-2])
         except ValueError:
+            got = f"{target.shape[:-2]} and {state.shape[:-1]}"
             raise ShapeError(
-                f"goal or reference and initial_state must have the same batch shape, got {target.shape[:-2]} and "
-                f"{state.shape[:-1]}."
+                f"goal or reference and initial_state must have the same batch shape, got {got}."
             ) from None
         self.initial_state: Array = np.broadcast_to(state, (*self.batch_shape, n))
         """Shape ``(..., n)``."""
@@ -78,12 +78,8 @@ class Task:
 
     def describe(self) -> dict[str, Any]:
         """Return what identifies one task in a store."""
-        return {
-            "horizon": self.horizon,
-            "dt": self.dt,
-            "initial_state": self.initial_state.tolist(),
-            "reference": self.reference,
-        }
+        start = self.initial_state.tolist()
+        return {"horizon": self.horizon, "dt": self.dt, "initial_state": start, "reference": self.reference}
 
     def __repr__(self) -> str:
         if self.batch_shape:
@@ -100,9 +96,8 @@ def _components(name: str, value: Any) -> Array:
         try:
             return np.stack(np.broadcast_arrays(*parts), axis=-1)
         except ValueError:
-            raise ShapeError(
-                f"the components of {name} must have the same batch shape, got {[part.shape for part in parts]}."
-            ) from None
+            shapes = [part.shape for part in parts]
+            raise ShapeError(f"the components of {name} must have the same batch shape, got {shapes}.") from None
     array = as_floats(name, value)
     if array.ndim == 0 or array.size == 0:
         raise ShapeError(f"{name} must be a list of components or an array (..., n), got {value!r}.")

@@ -38,10 +38,10 @@ class Continuous(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Normal(ShortRepr):
-    """The normal distribution of a task parameter; a task space truncates it to the parameter's bounds.
+    """The normal distribution of a task parameter, with a mean and a deviation, numbers or one for each component.
 
-    Mean and standard deviation, before the truncation, are in the parameter's units: a number, or one for each
-    component.
+    They are in the parameter's units, and hold before the task space truncates the distribution to the parameter's
+    bounds.
     """
 
     mean: ArrayLike
@@ -62,21 +62,14 @@ class Normal(ShortRepr):
 
     def ppf(self, q: ArrayLike) -> Array:
         """Return the value that is exceeded with probability 1 - q."""
-        return np.asarray(
-            as_floats("mean", self.mean) + as_floats("deviation", self.deviation) * scipy.special.ndtri(q)
-        )
+        return np.asarray(self.mean + np.asarray(self.deviation) * scipy.special.ndtri(q))
 
     def isf(self, q: ArrayLike) -> Array:
         """Return the value that is exceeded with probability q."""
-        return np.asarray(
-            as_floats("mean", self.mean) - as_floats("deviation", self.deviation) * scipy.special.ndtri(q)
-        )
-
-    def _of_standard(self, z: Array) -> Array:
-        return as_floats("mean", self.mean) + as_floats("deviation", self.deviation) * z
+        return np.asarray(self.mean - np.asarray(self.deviation) * scipy.special.ndtri(q))
 
     def _standard(self, x: ArrayLike) -> Array:
-        return (as_floats("x", x) - as_floats("mean", self.mean)) / as_floats("deviation", self.deviation)
+        return np.asarray((np.asarray(x) - np.asarray(self.mean)) / np.asarray(self.deviation))
 
     def describe(self) -> dict[str, Any]:
         """Return what identifies the distribution in a store."""
@@ -96,18 +89,15 @@ class ByParameter:
         for name, marginal in self.distributions.items():
             continuous = not _of_scipy(marginal) or hasattr(getattr(marginal, "dist", None), "pdf")
             if not (isinstance(marginal, Continuous) and continuous):
-                raise InputError(
-                    f"the distribution of {name} must be a Normal or a frozen continuous distribution of scipy.stats, "
-                    f"such as scipy.stats.expon(scale=2.0), got {marginal!r}."
-                )
+                wanted = "a Normal or a frozen continuous distribution of scipy.stats, as scipy.stats.expon(scale=2.0)"
+                raise InputError(f"the distribution of {name} must be {wanted}, got {marginal!r}.")
             low, high = self.low[self.columns[name]], self.high[self.columns[name]]
             try:
                 mass = np.maximum(marginal.cdf(high) - marginal.cdf(low), marginal.sf(low) - marginal.sf(high))
                 mass = np.broadcast_to(mass, low.shape)
             except ValueError:
-                raise InputError(
-                    f"the distribution of {name} must have one component or {len(low)}, got {marginal!r}."
-                ) from None
+                wanted = f"one component or {len(low)}"
+                raise InputError(f"the distribution of {name} must have {wanted}, got {marginal!r}.") from None
             if not (mass > 1e-12).all():
                 raise InputError(f"the distribution of {name} has no probability within its bounds.")
 
@@ -185,5 +175,4 @@ def distribution_text(described: object) -> str:
 
 
 def _of_scipy(distribution: object) -> bool:
-    """Return whether an object is a frozen distribution of ``scipy.stats``."""
     return hasattr(distribution, "dist") and hasattr(distribution, "kwds")

@@ -37,13 +37,10 @@ class Transitions(ShortRepr):
 
     def __post_init__(self) -> None:
         for name in ("x", "u", "x_next"):
-            array = as_floats(name, getattr(self, name))
-            object.__setattr__(self, name, array)
+            object.__setattr__(self, name, as_floats(name, getattr(self, name)))
         if self.x.ndim != 2 or self.u.ndim != 2 or self.x.shape != self.x_next.shape or len(self.x) != len(self.u):
-            raise ShapeError(
-                "transitions need x (N, n), u (N, m) and x_next (N, n), "
-                f"got {self.x.shape}, {self.u.shape} and {self.x_next.shape}."
-            )
+            got = f"{self.x.shape}, {self.u.shape} and {self.x_next.shape}"
+            raise ShapeError(f"transitions need x (N, n), u (N, m) and x_next (N, n), got {got}.")
 
     def __getitem__(self, rows: slice | Rows | Mask) -> Transitions:
         return Transitions(self.x[rows], self.u[rows], self.x_next[rows])
@@ -61,12 +58,8 @@ class Transitions(ShortRepr):
         steps = [part.dt for part in parts if part.dt is not None]
         if steps and not np.allclose(steps, steps[0], rtol=1e-3, atol=0):
             raise InputError(f"recorded steps must have one length, got {min(steps):g} s and {max(steps):g} s.")
-        return Transitions(
-            np.concatenate([part.x for part in parts]),
-            np.concatenate([part.u for part in parts]),
-            np.concatenate([part.x_next for part in parts]),
-            steps[0] if steps else None,
-        )
+        x, u, x_next = (np.concatenate([getattr(part, name) for part in parts]) for name in ("x", "u", "x_next"))
+        return Transitions(x, u, x_next, steps[0] if steps else None)
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,8 +101,7 @@ class Trajectory:
     @property
     def finite(self) -> Mask:
         """Whether every state and input is finite, shape ``(...)``."""
-        whole = np.isfinite(self.states).all(axis=(-1, -2)) & np.isfinite(self.inputs).all(axis=(-1, -2))
-        return np.asarray(whole)
+        return np.asarray(np.isfinite(self.states).all(axis=(-1, -2)) & np.isfinite(self.inputs).all(axis=(-1, -2)))
 
     def copy(self) -> Trajectory:
         """Return the same trajectory with arrays of its own, which may be changed."""
@@ -129,19 +121,17 @@ class Trajectory:
     def to_npz(self) -> bytes:
         """Return the trajectory as the bytes of an NPZ file."""
         buffer = io.BytesIO()
-        np.savez_compressed(
-            buffer, times=self.times, states=self.states, inputs=self.inputs, ended=np.array(self.ended)
-        )
+        arrays = {name: getattr(self, name) for name in ("times", "states", "inputs")}
+        np.savez_compressed(buffer, allow_pickle=False, **arrays, ended=np.array(self.ended))
         return buffer.getvalue()
 
     @staticmethod
     def from_npz(
         source: bytes | str | Path, *, shape: tuple[int, int] | None = None, most: int = MOST_BYTES
     ) -> Trajectory:
-        """Read a trajectory from NPZ bytes or an NPZ file; no code in it is ever run.
+        """Read a trajectory from NPZ bytes or an NPZ file of at most so many bytes; no code in it is ever run.
 
-        The states of a complete trajectory must have the shape ``(H + 1, n)``, if it is given. At most so many bytes
-        are read.
+        The states of a complete trajectory must have the shape ``(H + 1, n)``, if it is given.
         """
         name = "these bytes" if isinstance(source, bytes) else str(source)
         try:
@@ -157,9 +147,8 @@ class Trajectory:
         except ShapeError:
             raise
         except InputError as error:
-            raise InputError(
-                f"{name} cannot be read as a trajectory: an NPZ with times, states and inputs is needed; {error}."
-            ) from error
+            wanted = "an NPZ with times, states and inputs is needed"
+            raise InputError(f"{name} cannot be read as a trajectory: {wanted}; {error}.") from error
 
     def to_csv(
         self, path: str | Path, *, states: Sequence[str] | None = None, inputs: Sequence[str] | None = None
@@ -194,24 +183,21 @@ class Trajectory:
     ) -> Trajectory:
         """Read one trajectory from CSV with the columns ``t, x0.., u0..``, or with named columns.
 
-        A column may state its unit, as in ``angle [deg]`` or ``angle_deg``, and is converted to that of its name; one
-        without a unit has that of its name, and times are in seconds. Other columns are ignored, and so are the inputs
-        in the last row. Columns are separated by commas, or by semicolons or tabs, with which decimal commas are read.
+        A column may state its unit, as in ``angle [deg]`` or ``angle_deg``, and is converted to that of its name; times
+        are in seconds. Other columns and the inputs in the last row are ignored. Columns are separated by commas, or by
+        semicolons or tabs, with which decimal commas are read.
 
         Args:
             states, inputs: names of the columns, with or without units. If the file has none of the names, the
                 numbered columns ``x0, x1, ...`` and ``u0, u1, ...`` are read.
-            most_rows: largest number of rows below the header; a file with more rows is refused. None allows any
-                number up to the largest size of a file.
+            most_rows: largest number of rows below the header; a file with more rows is refused.
         """
         table = CsvTable(path)
         time = time_column(str(path), table.names)
         x, u = _chosen(table, "x", states), _chosen(table, "u", inputs)
         if any(table.names) and (time is None or not x):
-            raise InputError(
-                f"{path} must have the columns t, {', '.join(states or ('x0', '...'))}, "
-                f"{', '.join(inputs or ('u0', '...'))}; it has {_listed(table.names)}."
-            )
+            wanted = ", ".join(["t", *(states or ("x0", "...")), *(inputs or ("u0", "..."))])
+            raise InputError(f"{path} must have the columns {wanted}; it has {_listed(table.names)}.")
         column, unit = time or ("", "s")
         read = table.columns([column, *x, *u], last=list(u), most=most_rows)
         if len(times := read[column]) < 2:
@@ -235,9 +221,8 @@ class Trajectory:
         if period > FAR * dt:
             raise InputError(f"the recording has steps of {period:g} s instead of {dt:g} s{_advice(period, dt)}.")
         if not recorded[-1] >= wanted[-1] - _TIMES * dt:
-            raise InputError(
-                f"the recording ends after {recorded[-1]:g} s, and {wanted[-1]:g} s are needed{_advice(period, dt)}."
-            )
+            ends = f"the recording ends after {recorded[-1]:g} s, and {wanted[-1]:g} s are needed"
+            raise InputError(f"{ends}{_advice(period, dt)}.")
         states = np.stack([np.interp(wanted, recorded, column) for column in self.states.T], axis=-1)
         # A sample that belongs to a time may have been recorded just after it.
         inputs = held_means(recorded[:-1], self.inputs, wanted, 1e-6 * dt)
@@ -257,17 +242,14 @@ def require_times(trajectory: Trajectory, times: Array) -> None:
     period = float(np.median(np.diff(recorded)))
     advice = _advice(period, dt) or "; --resample interpolates a recording to these times"
     if len(recorded) != len(times):
-        raise InputError(
-            f"the trajectory must have {len(times)} times, {len(times) - 1} steps of {dt:g} s, "
-            f"got {len(recorded)} with steps of {period:g} s{advice}."
-        )
+        got = f"{len(recorded)} with steps of {period:g} s{advice}"
+        raise InputError(f"the trajectory must have {len(times)} times, {len(times) - 1} steps of {dt:g} s, got {got}.")
     misses = np.abs(recorded - times)
     if not (misses <= _TIMES * dt).all():
         k = int(np.argmax(~(misses <= _TIMES * dt)))
-        raise InputError(
-            f"the trajectory must have steps of {dt:g} s: time {k} must be {times[k]:g} s after the first, "
-            f"got {recorded[k]:g} s. The largest difference is {np.max(misses):.3g} s{advice}."
-        )
+        first = f"time {k} must be {times[k]:g} s after the first, got {recorded[k]:g} s"
+        largest = f"The largest difference is {np.max(misses):.3g} s{advice}"
+        raise InputError(f"the trajectory must have steps of {dt:g} s: {first}. {largest}.")
 
 
 def _advice(period: float, dt: float) -> str:
@@ -276,28 +258,17 @@ def _advice(period: float, dt: float) -> str:
 
 
 def _require_fitting(times: tuple[int, ...], states: tuple[int, ...], inputs: tuple[int, ...]) -> None:
-    """Check that these shapes match as times, states and inputs of one trajectory."""
-    if (
-        len(times) != 1
-        or len(states) < 2
-        or len(inputs) != len(states)
-        or states[:-2] != inputs[:-2]
-        or states[-2] != times[0]
-        or inputs[-2] != times[0] - 1
-    ):
-        raise ShapeError(
-            "a trajectory needs times (H+1,), states (..., H+1, n) and inputs (..., H, m), "
-            f"got {times}, {states} and {inputs}."
-        )
+    axes = len(times) == 1 and len(states) >= 2 and len(inputs) == len(states) and states[:-2] == inputs[:-2]
+    if not axes or states[-2] != times[0] or inputs[-2] != times[0] - 1:
+        got = f"{times}, {states} and {inputs}"
+        raise ShapeError(f"a trajectory needs times (H+1,), states (..., H+1, n) and inputs (..., H, m), got {got}.")
 
 
 def _listed(names: Sequence[str]) -> str:
-    """Return names for a message; long names and long lists are cut."""
     return enumerated((name[:60] for name in names), 20)
 
 
 def _chosen(table: CsvTable, letter: str, names: Sequence[str] | None) -> dict[str, float]:
-    """Return the columns of the states or inputs, each with the factor to its unit; numbered ones if none is named."""
     path, wanted = str(table.path), dict(parted(name) for name in names or ())
     columns = {name: column_of(path, table.names, name) for name in wanted}
     if not any(columns.values()):

@@ -36,16 +36,14 @@ class Trial:
 
     Attributes:
         number: number of the trial, from 0, in the order in which the search proposed them.
-        origin: the reason why p was chosen: iid, initial, acquisition, covering (p was far from all other trials, or
-            tests the bound) or manual.
-        state: open, completed, failed, or unmeasured.
+        origin: the reason why p was chosen; covering: p was far from all other trials, or tests the bound.
         unit_point: p in the unit cube, shape ``(d,)``.
         parameters: p by name.
         attempts: number of times that the execution was started.
         executed: whether an execution of S ended, successfully or not; the budget counts these.
         distance: d(p); None if the trial is not completed.
-        failure: the reason why the trial failed or its distance could not be measured; None otherwise.
-        seconds: duration of the execution in seconds, if known.
+        failure: the reason why the trial failed or its distance could not be measured.
+        seconds: duration of the execution, if known.
         note: values for JSON that the search attached when it chose p; it gets them back when a campaign resumes.
         because: what was changed on the system since an earlier trial of the same task that had another result.
     """

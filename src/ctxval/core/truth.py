@@ -6,6 +6,7 @@ import hashlib
 import inspect
 import json
 import math
+import warnings
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
@@ -23,7 +24,7 @@ from ctxval._util.files import written_whole
 from ctxval._util.progress import stage
 from ctxval._util.representation import ShortRepr
 from ctxval.core.space import AxisPoints, Parameters
-from ctxval.core.validation import Validation
+from ctxval.core.validation import CostWarning, Validation
 from ctxval.errors import InputError
 
 
@@ -38,13 +39,20 @@ class Truth(ShortRepr):
 
 @checked
 def grid_truth(validation: Validation, per_axis: AxisPoints = 2001, refinements: NonNegativeInt = 6) -> Truth:
-    """Return the maximum on a dense grid, refined around its best points. S is executed for each grid point."""
+    """Return the maximum on a dense grid, refined around its best points.
+
+    S is executed ``per_axis ** d`` times, and ``72 ** d`` times at most in a refinement of d parameters. A CostWarning
+    says so if these are more than ten million executions.
+    """
     space = validation.space
     cell = (space.high - space.low) / (per_axis - 1)
     corners = np.meshgrid(*[np.linspace(-1, 1, 9)] * len(cell), indexing="ij")
     offsets = np.stack(corners, axis=-1).reshape(-1, len(cell))
+    count = per_axis**space.dimension + 8 * refinements * len(offsets)
+    if count > 10_000_000:
+        sentence = f"grid_truth executes S {count:,} times; a smaller per_axis or search_truth takes fewer"
+        warnings.warn(f"{sentence}.", CostWarning, stacklevel=3)
     points, best, best_value = space.grid(per_axis), space.low, -np.inf
-    count = len(points) + 8 * refinements * len(offsets)
     with stage("searching the largest distance", count, "executions"):
         for refinement in range(refinements + 1):
             values = np.nan_to_num(validation.distances(points), nan=-np.inf)
@@ -80,13 +88,13 @@ def search_truth(
         agreement: relative difference of the two best repeats at which the search ends.
         population: number of points in a generation, for each dimension.
         generations: largest number of generations in one repeat.
-        climbs: number of climbs from random starts in one repeat; each starts at the best of sixteen random points.
+        climbs: climbs from random starts in one repeat; each starts at the best of sixteen random points.
     """
     search = _TruthSearch(validation, population, generations, climbs)
     maxima: list[tuple[float, Array]] = []
     with stage("searching the largest distance", unit="executions"):
         while len(maxima) < repeats and not _gap(maxima) <= agreement:
-            maxima.append(search.repeat(np.random.default_rng(np.random.SeedSequence([seed, len(maxima)]))))
+            maxima.append(search.repeat(np.random.default_rng([seed, len(maxima)])))
     distance, unit_point = max(maxima, key=lambda maximum: maximum[0])
     if not math.isfinite(distance):
         raise InputError("the truth is unknown: every execution of the search failed.")
@@ -102,19 +110,16 @@ class _TruthSearch:
     """Maximises d over the unit cube, a whole generation in one batch."""
 
     def __init__(self, validation: Validation, population: int, generations: int, climbs: int) -> None:
-        self.validation = validation
+        self.validation, self.dimension = validation, validation.space.dimension
         self.population, self.generations, self.climbs = population, generations, climbs
-        self.dimension = validation.space.dimension
         self.evaluations = 0
 
     def values(self, unit_points: Array) -> Array:
-        """Return d at points ``(N, d)`` of the cube; minus infinity if the execution fails."""
         self.evaluations += len(unit_points)
         values = self.validation.distances(self.validation.space.from_unit(unit_points))
         return np.where(np.isnan(values), -np.inf, values)
 
     def repeat(self, rng: np.random.Generator) -> tuple[float, Array]:
-        """Return the largest value of one search, and its point ``(d,)``."""
         evolved = scipy.optimize.differential_evolution(
             lambda columns: -self.values(columns.T),
             scipy.optimize.Bounds(np.zeros(self.dimension), np.ones(self.dimension)),
@@ -153,7 +158,6 @@ class _TruthSearch:
 
 
 def _gap(maxima: list[tuple[float, Array]]) -> float:
-    """Return the relative difference of the two best values; infinity if there are fewer than two."""
     values = sorted((value for value, _ in maxima if math.isfinite(value)), reverse=True)
     if len(values) < 2:
         return math.inf
@@ -166,15 +170,13 @@ def cached_truth(
 ) -> Truth:
     """Return a truth from its file in a folder, or find it and write that file.
 
-    The name of the file is a digest of sources and settings: those of the validation and of the method, for instance
-    ``functools.partial(search_truth, seed=1)``. The file keeps the truths of systems that differ in numbers alone. A
+    The name of the file is a digest of the sources and settings of the validation and of the method, for instance
+    ``functools.partial(search_truth, seed=1)``. The file keeps the truths of systems that differ in numbers alone; a
     truth is used only if new executions of S on its task and on some others give the stored distances again.
     """
     # The signature adds the default values, which the description of a function leaves out.
-    method = [describe(compute), str(inspect.signature(compute))]
-    identity = json.dumps(
-        [validation.space.describe(), without_numbers(validation.describe()), *method], sort_keys=True
-    )
+    parts = [describe(compute), str(inspect.signature(compute))]
+    identity = json.dumps([validation.space.describe(), without_numbers(validation.describe()), *parts], sort_keys=True)
     path = Path(folder) / f"{hashlib.sha256(identity.encode()).hexdigest()[:32]}.json"
     probes = validation.space.iid(16, np.random.default_rng(0))  # their distances show that a truth is of this system
     stored = list[Any]()

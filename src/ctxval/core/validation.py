@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import time
+import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import Any, NoReturn
+from weakref import WeakSet
 
 import numpy as np
 
@@ -19,8 +22,7 @@ from ctxval.core.controller import Synthesizer
 from ctxval.core.distance import Distance
 from ctxval.core.labels import Labels
 from ctxval.core.model import Model, Step, as_model, require_time_step
-from ctxval.core.plan import Measurement, Outcome, Plan, executed_in, require_execution
-from ctxval.core.preflight import LONGEST, require_affordable
+from ctxval.core.plan import Measurement, Outcome, Plan, require_execution
 from ctxval.core.rollout import rollout
 from ctxval.core.space import Parameters, TaskSpace
 from ctxval.core.system import Simulated, System
@@ -30,6 +32,12 @@ from ctxval.errors import CtxvalError, DesignError, DistanceError, ExecutionErro
 
 START = 0.05  # default start tolerance, as a fraction of the range of each state in the trajectory of the model
 
+_LONG = 100_000  # horizon from which on the cost of a plan is stated before the first one
+
+
+class CostWarning(UserWarning):
+    """A plan, or a search for d*, needs much time and memory."""
+
 
 @checked
 class Validation:
@@ -38,15 +46,13 @@ class Validation:
     Args:
         space: the task space P.
         task: a function ``p -> Task``, which is called with the named parameters of one task or of a batch.
-        system: the true system S.
-        model: the model M, or a function ``(x, u) -> x_next``.
+        system, model: the true system S, and the model M, which may be a function ``(x, u) -> x_next``.
         synthesizer: designs the controllers on M.
         distance: the distance d between the trajectories of M and S.
         start_tolerance: the largest permitted difference between the first state of an execution and the initial state
-            of its task. It is a fraction of the range of each state in the trajectory of the model, or of its initial
+            of its task, as a fraction of the range of each state in the trajectory of the model, or of its initial
             value if that is larger.
-        labels: the names and units of states, inputs and distance for files, pictures and reports; a distance may name
-            states by them.
+        labels: the names and units of states, inputs and distance for files, pictures and reports.
         longest: the largest horizon that is planned.
 
     Its methods raise a DesignError if the synthesizer fails, a ModelError if the model fails or its closed loop is not
@@ -65,7 +71,7 @@ class Validation:
         distance: Distance,
         start_tolerance: NonNegativeFloat = START,
         labels: Labels | None = None,
-        longest: PositiveInt = LONGEST,
+        longest: PositiveInt = 1_000_000,
     ) -> None:
         self.space = space
         self.task = task
@@ -80,7 +86,7 @@ class Validation:
         self.longest = int(longest)
 
     def describe(self) -> dict[str, Any]:
-        """Return the description that identifies this validation in a store."""
+        """Return what identifies this validation in a store."""
         parts = {part: describe(getattr(self, part)) for part in ("space", "task", "system", "synthesizer", "distance")}
         # The numbers of M are learned: its closed loops show whether it is the same.
         return {**parts, "model": without_numbers(describe(self.model))}
@@ -96,8 +102,7 @@ class Validation:
     def on_model(self, distance: Distance, *, units: str | None = None) -> Validation:
         """Return this validation with M itself in the place of S, which is never executed (the paper's Aspect 1).
 
-        The distance, with its units, is how far M is from completing its task, such as
-        :class:`ctxval.distances.GoalError`.
+        The distance, with its units, is how far M is from completing its task, as :class:`ctxval.distances.GoalError`.
         """
         labels = self.labels if units is None else replace(self.labels, units=units)
         return self._with(system=Simulated(self.model), distance=distance, labels=labels, start_tolerance=START)
@@ -126,7 +131,7 @@ class Validation:
         """Return the names of n states and m inputs with their units (:meth:`Labels.names`)."""
         return self.labels.names(self.system, states, inputs)
 
-    # One task, step by step
+    # The heart of the loop, for one task: plan, execute, accept
 
     def plan(self, point: ArrayLike) -> Plan:
         """Design the controller for the task at ``(d,)`` and run it on the model; S is not executed."""
@@ -153,7 +158,7 @@ class Validation:
             raise ExecutionError(str(error)) from error
 
     def require(self, plan: Plan, trajectory: object, start_tolerance: float | None = None) -> Trajectory:
-        """Check that a trajectory is a complete and finite execution of a plan; return it.
+        """Return a trajectory that is a complete and finite execution of a plan; refuse any other.
 
         An InputError says that it belongs to another task. A start tolerance replaces that of this validation.
         """
@@ -206,21 +211,14 @@ class Validation:
         return bool(getattr(self.system, "batched", False) and getattr(self.synthesizer, "batched", False))
 
     def plans(self, points: ArrayLike) -> list[Plan]:
-        """Return the plans of the tasks at ``(N, d)``, as :meth:`plan` makes them one by one.
-
-        If the synthesizer takes batches, the controllers of many tasks are designed in one call, and the results agree
-        with those of single designs up to rounding.
-        """
+        """Return the plans of the tasks at ``(N, d)`` as :meth:`plan` does, but designed together if possible."""
         return list(self._planned(require_shape("points", as_floats("points", points), (self.space.dimension,))))
 
     def _planned(self, points: Array) -> Iterator[Plan]:
-        # 256 tasks are planned in one call: more would hardly be faster.
-        for first in range(0, len(points), 256):
-            chunk = points[first : first + 256]
+        for chunk in (points[first : first + 256] for first in range(0, len(points), 256)):  # more is hardly faster
             yield from self._planned_together(chunk) or map(self.plan, chunk)
 
     def _planned_together(self, points: Array) -> list[Plan] | None:
-        """Return the plans of points ``(N, d)`` from one design; None if a part takes no batches, or a task fails."""
         if len(points) == 1 or not getattr(self.synthesizer, "batched", False):
             return None
         try:
@@ -257,22 +255,25 @@ class Validation:
         parameters = self.space.parameters(points)
         plan = self.plan_of(parameters, self.task_at(parameters))
         if plan.task.batch_shape != (len(points),):
+            wanted = f"a batch of {len(points)} tasks of as many points, got shape {plan.task.batch_shape}"
             raise ShapeError(
-                f"the task function must make a batch of {len(points)} tasks of as many points, "
-                f"got shape {plan.task.batch_shape}; use the parameters in the task, or broadcast them."
+                f"the task function must make {wanted}; use the parameters in the task, or broadcast them."
             )
-        if not plan.model_trajectory.finite.all():
-            where = self.space.describe_point(points[np.argmin(plan.model_trajectory.finite)])
+        expected = plan.model_trajectory
+        if not expected.finite.all():
+            where = self.space.describe_point(points[np.argmin(expected.finite)])
             raise ModelError(f"the model's closed loop is not finite for the task {where}.")
         try:
             trajectory = self.system.execute(plan.controller, plan.task)
-        except Exception:
-            # Only single executions show which task failed.
+        except Exception:  # only single executions show which task failed
             return np.array([self._distance_or_nan(self.plan(point)) for point in points])
-        values = self._distance(plan.task, plan.model_trajectory, trajectory)
+        values = self._distance(plan.task, expected, trajectory)
         if values.shape != (len(points),):
             raise DistanceError(f"the distance must have shape ({len(points)},) over the batch, got {values.shape}.")
-        executed = executed_in(plan.model_trajectory, trajectory)
+        fits = trajectory.states.shape == expected.states.shape and trajectory.inputs.shape == expected.inputs.shape
+        # If the batch ended early but all its values are finite, it is not known which task ended early.
+        known = fits and (trajectory.ended == COMPLETE or not trajectory.finite.all())
+        executed = trajectory.finite if known else np.zeros(len(points), dtype=bool)
         wrong = executed & ~(np.isfinite(values) & (values >= 0))
         if wrong.any():
             self._refuse_distance(values[np.argmax(wrong)], points[np.argmax(wrong)])
@@ -308,8 +309,28 @@ class Validation:
         if not isinstance(task, Task):
             raise InputError(f"the task function's result must be a Task, got {task!r}.")
         require_time_step(self.model, task.dt, "the task")
-        require_affordable(self, parameters, task)
+        if task.horizon > self.longest or (task.horizon > _LONG and self not in _stated):
+            self._state_cost(parameters, task)
         return task
+
+    def _state_cost(self, parameters: Parameters, task: Task) -> None:
+        """State the cost of a long horizon once, from the first steps of a plan; refuse one that is too long."""
+        steps, probed = task.horizon, min(100, task.horizon)
+        first = Task(task.initial_state, horizon=probed, dt=task.dt, reference=task.reference[..., : probed + 1, :])
+        begun = time.process_time()
+        trajectory = self.plan_of(parameters, first).model_trajectory
+        seconds = (time.process_time() - begun) * steps / probed
+        n, m = trajectory.states.shape[-1], trajectory.inputs.shape[-1]
+        # Two trajectories, and the gains of affine feedback.
+        size = 8e-9 * np.prod(task.batch_shape) * steps * (2 * (n + m) + n * m + m)
+        cost = (
+            f"each plan with a horizon of {steps} needs about {size:.2g} GB of memory and {seconds:.2g} s of CPU time"
+        )
+        if steps > self.longest:
+            permit = f"longest = {steps} permits them, in Validation or in the experiment file"
+            raise InputError(f"{cost}, and at most {self.longest} steps are permitted: {permit}.")
+        _stated.add(self)
+        warnings.warn(f"{cost}, and a simulated execution about as much.", CostWarning, stacklevel=2)
 
     def _distance(self, task: Task, model: Trajectory, system: Trajectory) -> Array:
         try:
@@ -332,3 +353,7 @@ class Validation:
             f"synthesizer: {shown(self.synthesizer)}",
             f"distance: {shown(self.distance)}, task: {shown(self.task)}",
         )
+
+
+_stated: WeakSet[Validation] = WeakSet()
+"""The validations whose cost was stated."""

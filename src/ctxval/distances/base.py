@@ -159,6 +159,5 @@ def require_numbers(name: str, given: ArrayLike | None, components: Sequence[int
         raise ShapeError(f"{name} must be a list with one number for each {wanted}, got {given!r}.")
     valid = (array >= 0).all() and array.any() if zero else (array > 0).all()
     if not valid:
-        raise InputError(
-            f"{name} must be {'numbers >= 0, not all of them 0' if zero else 'positive numbers'}, got {given!r}."
-        )
+        wanted = "numbers >= 0, not all of them 0" if zero else "positive numbers"
+        raise InputError(f"{name} must be {wanted}, got {given!r}.")

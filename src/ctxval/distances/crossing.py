@@ -22,12 +22,11 @@ Direction = Literal["up", "down", "either"]
 class AtCrossing(ErrorNorm):
     """Largest norm of the difference between the states at which M and S first cross a level, such as a gate.
 
-    The k-th crossing of S is compared with the k-th crossing of M. Between two samples the states are interpolated. A
-    trajectory that does not cross so often is compared at its final state.
+    The k-th crossing of S is compared with the k-th crossing of M, interpolated between two samples. A trajectory that
+    does not cross so often is compared at its final state.
 
     Attributes:
-        norm, components, weights, scales, angles: as in :class:`StateNorm`. An angle crosses the level wherever it does
-            on the circle.
+        norm, components, weights, scales, angles: as in :class:`StateNorm`. An angle crosses the level on the circle.
         state: index or name of the state that crosses the level.
         level: the level, in the unit of this state.
         direction: ``up``, ``down`` or ``either``: the direction in which the state crosses the level.
@@ -71,7 +70,7 @@ class CrossingTime(NamedStates):
     Attributes:
         state: index or name of the state that crosses the level, which is in the unit of this state.
         direction: ``up``, ``down`` or ``either``: the direction in which the state crosses the level.
-        angle: whether the state is an angle in radians, which crosses the level wherever it crosses it on the circle.
+        angle: whether the state is an angle in radians, which crosses the level on the circle.
     """
 
     state: int | str = 0

@@ -99,8 +99,8 @@ class RelativeDeviation(StateNorm):
 
     Attributes:
         norm, components, weights, scales, angles: as in :class:`StateNorm`.
-        least: smallest range that a gap is divided by, for each compared state in its unit. A smaller range of M counts
-            as this one, because a state at rest would otherwise have an unbounded relative error.
+        least: smallest range that a gap is divided by, for each compared state in its unit; a state at rest would
+            otherwise have an unbounded relative error.
     """
 
     norm: Norm = np.inf

@@ -8,13 +8,13 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ctxval._util.arrays import Array, Mask
+from ctxval._util.arrays import Array, Mask, as_finite, rows_of
 from ctxval._util.representation import ShortRepr
 from ctxval.core.model import Model, linearize
 from ctxval.core.trajectory import Transitions
 from ctxval.errors import InputError, ShapeError
 from ctxval.models.scaling import standardised_pairs
-from ctxval.models.smooth_maps import SmoothMap, kernel_sum, matern
+from ctxval.models.smooth_maps import SmoothMap, affine, kernel_sum, matern, total
 
 Linearised = Literal["corrected", "model"]
 """Whose Jacobian controllers are designed with."""
@@ -62,8 +62,7 @@ class Correction(ShortRepr):
             value = getattr(self, name)
             if value.shape != shape:
                 raise ShapeError(f"{name} of a correction must have shape {shape}, got {value.shape}.")
-            if not np.isfinite(value).all():
-                raise InputError(f"{name} of a correction must be finite.")
+            as_finite(f"{name} of a correction", value)
         if min(float(scale.min()) for scale in (self.scale, self.length_scales, self.fade)) <= 0:
             raise InputError("the scales of a correction must be positive.")
 
@@ -73,39 +72,26 @@ class Correction(ShortRepr):
 
     def __call__(self, x: Array, u: Array) -> Array:
         z = standardised_pairs(x, u, self.shift, self.scale)
-        rows = z.reshape(-1, z.shape[-1])
-        values = rows @ self.linear[:-1] + self.linear[-1]
-        for block in self._blocks(len(rows)):
-            values[block] += self._kernel_sum.value(rows[block])
-        values = np.clip(values, -self.limit, self.limit) * self._faded(rows)[:, None]
+        rows = rows_of(z)
+        values = np.clip(self._unlimited.value(rows), -self.limit, self.limit) * self._faded(rows)[:, None]
         return np.asarray(values.reshape(*z.shape[:-1], self.states))
 
     def jacobian(self, x: Array, u: Array) -> Array:
         z = standardised_pairs(x, u, self.shift, self.scale)
-        rows = z.reshape(-1, z.shape[-1])
-        parts = []
-        for block in self._blocks(max(1, len(rows))):
-            z_block = rows[block]
-            values, pull_back = self._kernel_sum.linearised(z_block)
-            slope = pull_back(np.eye(self.states)) + self.linear[:-1].T
-            values = values + z_block @ self.linear[:-1] + self.linear[-1]
-            limited: Mask = np.asarray(np.abs(values) > self.limit)
-            slope[limited] = 0.0
-            faded = self._faded(z_block)
-            slope *= faded[:, None, None]
-            values = np.clip(values, -self.limit, self.limit) * faded[:, None]
-            slope -= values[:, :, None] * (self._beyond(z_block) / self.fade**2)[:, None, :]
-            parts.append(slope / self.scale)
-        return np.concatenate(parts).reshape(*z.shape[:-1], self.states, z.shape[-1])
-
-    def _blocks(self, count: int) -> list[slice]:
-        """Return blocks of rows whose 40,000 covariances stay in the processor's cache."""
-        size = max(1, 40_000 // max(1, len(self.centres)))
-        return [slice(first, first + size) for first in range(0, count, size)]
+        rows = rows_of(z)
+        values, slope = self._unlimited.expanded(rows)
+        slope[np.abs(values) > self.limit] = 0.0
+        faded = self._faded(rows)
+        slope *= faded[:, None, None]
+        values = np.clip(values, -self.limit, self.limit) * faded[:, None]
+        slope -= values[:, :, None] * (self._beyond(rows) / self.fade**2)[:, None, :]
+        return np.asarray((slope / self.scale).reshape(*z.shape[:-1], self.states, z.shape[-1]))
 
     @functools.cached_property
-    def _kernel_sum(self) -> SmoothMap:
-        return kernel_sum(matern(self.length_scales, 2.5), self.centres, self.weights)
+    def _unlimited(self) -> SmoothMap:
+        block = max(1, 40_000 // max(1, len(self.centres)))  # whose covariances stay in the processor's cache
+        kernels = kernel_sum(matern(self.length_scales, 2.5), self.centres, self.weights, block)
+        return total(kernels, affine(self.linear[:-1], self.linear[-1]))
 
     def _beyond(self, rows: Array) -> Array:
         return np.asarray(rows - np.clip(rows, self.low, self.high))
@@ -125,9 +111,9 @@ class Corrected(ShortRepr):
     """The model ``M'(x, u) = M(x, u) + r(x, u)`` of a model M and a correction r.
 
     Args:
-        linearised: ``"corrected"`` for the Jacobian of M', or ``"model"`` for that of M. With the second one, a
-            synthesizer that linearises once, such as LQR, designs nearly the controllers that it designed on M: the
-            Jacobian of M' at one point may say less of the tasks than a linear model that was fitted to all of them.
+        linearised: ``"corrected"`` for the Jacobian of M', or ``"model"`` for that of M. The Jacobian of M' at one
+            point may say less of the tasks than a linear model that was fitted to all of them, for instance to LQR,
+            which linearises once.
         data: the transitions that the correction was learned from, if any.
     """
 
@@ -152,16 +138,15 @@ class Corrected(ShortRepr):
         A, B = linearize(self.model, x, u)
         if self.linearised == "model":
             return A, B
-        own = self.correction.jacobian(x, u)
-        n = x.shape[-1]
-        return A + own[..., :n], B + own[..., n:]
+        slope, n = self.correction.jacobian(x, u), x.shape[-1]
+        return A + slope[..., :n], B + slope[..., n:]
 
 
 class Refined(ShortRepr):
     """A model that was learned again from executions, with all transitions that are known, and the model before.
 
-    The transitions are coverage for what is learned next. A residual of the refined model itself would be misleadingly
-    small at them. What learns from executions therefore takes the residual of the model before.
+    What learns from executions takes the residual of the model before, because that of the refined model would be
+    misleadingly small at its own data.
 
     Args:
         data: all transitions that are known, those of the executions of earlier models included.
@@ -184,10 +169,7 @@ class Refined(ShortRepr):
 
 
 def before_refinement(model: Model) -> Model:
-    """Return the model whose residual is learned from executions: that before a refinement, or the model itself.
-
-    A refined model explains its own data better than it explains the system elsewhere.
-    """
+    """Return the model whose residual is learned from executions: that before a refinement, or the model itself."""
     if isinstance(model, Refined):
         return model.before
     return model.model if isinstance(model, Corrected) else model

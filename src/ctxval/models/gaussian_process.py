@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,18 +15,13 @@ from ctxval.core.trajectory import Transitions
 from ctxval.errors import ShapeError
 from ctxval.gp.cholesky import factorise
 from ctxval.gp.regression import log_likelihood_of_outputs, most_likely
-from ctxval.models.scaling import IncrementScaling
-
-_BLOCK = 2048  # points in one matrix of covariances: enough to be fast, few enough for the cache
+from ctxval.models.scaling import IncrementModel, IncrementScaling
+from ctxval.models.smooth_maps import Slopes, SmoothMap, kernel_sum
 
 
 @dataclass(frozen=True, eq=False)
 class SquaredExponential(ShortRepr):
-    """``k(z, z') = v exp(-1/2 sum_j ((z_j - z'_j) / l_j)^2)``: rigid-body dynamics are smooth.
-
-    Attributes:
-        length_scales: l, shape ``(k,)``.
-    """
+    """``v exp(-1/2 sum_j ((z_j - z'_j) / l_j)^2)``, with length-scales l ``(k,)``: rigid bodies move smoothly."""
 
     variance: float
     length_scales: Array
@@ -40,7 +36,7 @@ class SquaredExponential(ShortRepr):
 
 
 @part()
-class GaussianProcessModel(ShortRepr):
+class GaussianProcessModel(IncrementModel):
     """The posterior mean of Gaussian processes, one for each state's increment, that share a covariance.
 
     Sharing it lets one Cholesky factor and one matrix of covariances serve all states.
@@ -69,12 +65,9 @@ class GaussianProcessModel(ShortRepr):
         pair, states = len(scaling.shift_in), len(scaling.shift_out)
         fits = self.centres.ndim == 2 and self.weights.shape == (len(self.centres), states)
         if not fits or self.centres.shape[1] != pair or covariance.length_scales.shape != (pair,):
-            raise ShapeError(
-                f"a model of {states} states needs centres (M, {pair}), weights (M, {states}) and length-scales "
-                f"({pair},), got {self.centres.shape}, {self.weights.shape} and {covariance.length_scales.shape}."
-            )
-        moments = (self.weights[:, :, None] * self.centres[:, None, :]).reshape(len(self.centres), -1)
-        self._moments = np.concatenate([self.weights, moments], axis=1)
+            wanted = f"centres (M, {pair}), weights (M, {states}) and length-scales ({pair},)"
+            got = f"{self.centres.shape}, {self.weights.shape} and {covariance.length_scales.shape}"
+            raise ShapeError(f"a model of {states} states needs {wanted}, got {got}.")
 
     @classmethod
     @checked
@@ -83,7 +76,7 @@ class GaussianProcessModel(ShortRepr):
     ) -> GaussianProcessModel:
         """Condition on recorded transitions, with the most likely hyperparameters (eq. 5.8, summed over the states).
 
-        It is conditioned on so many points, drawn at random; the effort grows with their cube.
+        So many points are drawn at random; the effort grows with their cube.
         """
         scaling = IncrementScaling.of(data)
         rows = np.random.default_rng(seed).permutation(len(data))[:points]
@@ -111,25 +104,13 @@ class GaussianProcessModel(ShortRepr):
         """Return the model of standardised pairs ``(M, n + m)`` and increments ``(M, n)`` with a known covariance."""
         return cls(covariance, Z, factorise(covariance(Z, Z), noise).solve(Y), scaling, data)
 
-    def step(self, x: Array, u: Array) -> Array:
-        z = self.scaling.inputs(x, u)
-        output = self._contracted(z.reshape(-1, z.shape[-1]), self.weights)
-        return self.scaling.step(x, output.reshape(*z.shape[:-1], self.weights.shape[1]))
+    @functools.cached_property
+    def _map(self) -> SmoothMap:
+        def kernel(Z: Array, centres: Array) -> tuple[Array, Slopes]:
+            K = self.covariance(Z, centres)
+            return K, lambda: [(K, 1.0, self.covariance.length_scales**-2.0)]
 
-    def jacobian(self, x: Array, u: Array) -> tuple[Array, Array]:
-        z = self.scaling.inputs(x, u)
-        rows = z.reshape(-1, z.shape[-1])
-        n, k = self.weights.shape[1], rows.shape[1]
-        # dk(z, c)/dz = k(z, c) (c - z) / l^2: sums of k w and of k w c over the centres are all that it takes.
-        sums = self._contracted(rows, self._moments)
-        gradient = sums[:, n:].reshape(len(rows), n, k) - sums[:, :n, None] * rows[:, None, :]
-        gradient /= self.covariance.length_scales**2
-        return self.scaling.jacobian(gradient.reshape(*z.shape[:-1], n, k))
-
-    def _contracted(self, rows: Array, columns: Array) -> Array:
-        """Return ``k(rows, centres) @ columns``."""
-        blocks = [rows[i : i + _BLOCK] for i in range(0, max(1, len(rows)), _BLOCK)]
-        return np.concatenate([self.covariance(block, self.centres) @ columns for block in blocks])
+        return kernel_sum(kernel, self.centres, self.weights, block=2048)
 
 
 def log_likelihood(theta: Array, Z: Array, Y: Array) -> tuple[float, Array]:

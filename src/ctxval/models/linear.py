@@ -32,15 +32,11 @@ class Linear(ShortRepr):
         self.c: Array = np.zeros(n) if c is None else as_finite("c", c)
         self.data = data
         if self.A.shape != (n, n) or self.B.ndim != 2 or len(self.B) != n or self.c.shape != (n,):
-            raise ShapeError(
-                "a linear model needs A (n, n), B (n, m) and c (n,), "
-                f"got {self.A.shape}, {self.B.shape} and {self.c.shape}."
-            )
+            got = f"{self.A.shape}, {self.B.shape} and {self.c.shape}"
+            raise ShapeError(f"a linear model needs A (n, n), B (n, m) and c (n,), got {got}.")
         if data is not None and (data.x.shape[1], data.u.shape[1]) != self.B.shape:
-            raise ShapeError(
-                f"the model has {n} states and {self.B.shape[1]} inputs, and its data have {data.x.shape[1]} states "
-                f"and {data.u.shape[1]} inputs."
-            )
+            got = f"{data.x.shape[1]} states and {data.u.shape[1]} inputs"
+            raise ShapeError(f"the model has {n} states and {self.B.shape[1]} inputs, and its data have {got}.")
 
     @classmethod
     def fit(cls, data: Transitions, *, intercept: bool = True) -> Linear:
@@ -53,10 +49,9 @@ class Linear(ShortRepr):
         with single_threaded():
             weights, _, rank, _ = np.linalg.lstsq(regressors, data.x_next)
         if rank < regressors.shape[1]:
-            raise InputError(
-                f"the data do not determine a linear model: {len(data)} transitions of {n} states and {m} inputs "
-                f"have rank {rank}, and {regressors.shape[1]} is needed; excite every state and input."
-            )
+            have = f"{len(data)} transitions of {n} states and {m} inputs have rank {rank}"
+            needed = f"{regressors.shape[1]} is needed; excite every state and input"
+            raise InputError(f"the data do not determine a linear model: {have}, and {needed}.")
         # No regressor may nearly be a linear combination of the others, independently of units.
         with single_threaded():
             _, sizes, directions = np.linalg.svd(regressors / np.linalg.norm(regressors, axis=0), full_matrices=False)
@@ -65,8 +60,7 @@ class Linear(ShortRepr):
             together = [names[i] for i in np.flatnonzero(np.abs(directions[-1]) > 0.1)]
             raise InputError(
                 f"the data hardly determine a linear model: {' and '.join(together)} depend on each other in all "
-                f"transitions (condition {sizes[0] / sizes[-1]:.1e}, at most 1e+08); excite them independently, for "
-                "example without feedback."
+                f"transitions (condition {sizes[0] / sizes[-1]:.1e}, at most 1e+08); excite them independently."
             )
         return cls(weights[:n].T, weights[n : n + m].T, weights[n + m] if intercept else None, data)
 
@@ -74,10 +68,8 @@ class Linear(ShortRepr):
         try:
             return np.asarray(x @ self.A.T + u @ self.B.T + self.c)
         except ValueError as error:
-            raise ShapeError(
-                f"the model has {len(self.A)} states and {self.B.shape[1]} inputs, got states of shape {np.shape(x)} "
-                f"and inputs of shape {np.shape(u)}."
-            ) from error
+            got = f"states of shape {np.shape(x)} and inputs of shape {np.shape(u)}"
+            raise ShapeError(f"the model has {len(self.A)} states and {self.B.shape[1]} inputs, got {got}.") from error
 
     def jacobian(self, x: Array, u: Array) -> tuple[Array, Array]:
         """Return A and B, which are the same for all states and inputs."""
@@ -96,14 +88,14 @@ def state_space(system: Any, dt: Seconds) -> Linear:
     A, B = as_finite("A", system.A), as_finite("B", system.B)
     if A.ndim != 2 or A.shape[0] != A.shape[1] or B.ndim != 2 or len(B) != len(A):
         raise ShapeError(f"a state-space model needs A (n, n) and B (n, m), got {A.shape} and {B.shape}.")
-    own = getattr(system, "dt", None)
-    if not own:
+    step = getattr(system, "dt", None)
+    if not step:
         from scipy.linalg import expm
 
         # For an input that is held over dt: the exponential of [[A, B], [0, 0]] dt.
         n, m = B.shape
         whole = expm(np.block([[A, B], [np.zeros((m, n + m))]]) * dt)
         return Linear(whole[:n, :n], whole[:n, n:])
-    if own is not True and not np.isclose(own, dt, rtol=1e-9, atol=0):
-        raise InputError(f"dt must be that of the discrete system, {own:g} s, got {dt:g} s.")
+    if step is not True and not np.isclose(step, dt, rtol=1e-9, atol=0):
+        raise InputError(f"dt must be that of the discrete system, {step:g} s, got {dt:g} s.")
     return Linear(A, B)

@@ -57,10 +57,8 @@ class MuJoCo(ShortRepr):
     def step(self, x: Array, u: Array) -> Array:
         model, nq = self._model, self._model.nq
         if (x.shape[-1], u.shape[-1]) != (nq + model.nv, model.nu):
-            raise ShapeError(
-                f"the model has {nq} qpos, {model.nv} qvel and {model.nu} inputs, "
-                f"got {x.shape[-1]} states and {u.shape[-1]} inputs."
-            )
+            got = f"{x.shape[-1]} states and {u.shape[-1]} inputs"
+            raise ShapeError(f"the model has {nq} qpos, {model.nv} qvel and {model.nu} inputs, got {got}.")
         batch = np.broadcast_shapes(x.shape[:-1], u.shape[:-1])
         states, inputs = map(rows_of, paired(x, u))
         reached = np.full(states.shape, np.nan)
@@ -74,7 +72,6 @@ class MuJoCo(ShortRepr):
         return reached.reshape(*batch, -1)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Leave out the module, which another process imports itself."""
         return {name: value for name, value in vars(self).items() if name != "_mujoco"}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -86,7 +83,7 @@ def identified_in(path: Path) -> Path:
     if not path.is_dir():
         return path
     models = sorted(path.glob("*.xml"))
-    if not (path / _SYSID).is_file() or not models:
+    if not is_sysid_result(path) or not models:
         raise InputError(f"the folder {path} has no result of mujoco.sysid: {_SYSID} and an XML file are needed.")
     if len(models) > 1:
         names = ", ".join(file.name for file in models)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 import warnings
 from collections.abc import Sequence
@@ -9,16 +10,16 @@ from typing import Any
 
 import numpy as np
 
-from ctxval._util.arrays import Array, ArrayLike, as_finite, single_threaded
+from ctxval._util.arrays import ArrayLike, as_finite, single_threaded
 from ctxval._util.checked import NonNegativeInt, PositiveInt, checked
 from ctxval._util.extras import require_extra
-from ctxval._util.representation import ShortRepr
 from ctxval.core.trajectory import Transitions
 from ctxval.errors import InputError, ShapeError
-from ctxval.models.scaling import IncrementScaling
+from ctxval.models.scaling import IncrementModel, IncrementScaling
+from ctxval.models.smooth_maps import SmoothMap, network
 
 
-class FeedforwardReLU(ShortRepr):
+class FeedforwardReLU(IncrementModel):
     """A network with ReLU layers and a linear last layer that predicts the increment of the state.
 
     Layer i maps z to ``z @ weights[i] + biases[i]``, in the standardised units of the scaling.
@@ -45,9 +46,9 @@ class FeedforwardReLU(ShortRepr):
         widths = [pair, *[bias.size for bias in self.biases]]
         shapes = [weight.shape for weight in self.weights]
         if len(widths) < 2 or widths[-1] != states or shapes != list(itertools.pairwise(widths)):
+            what = f"a network from {pair} standardised states and inputs to {states} increments"
             raise ShapeError(
-                f"a network from {pair} standardised states and inputs to {states} increments must have layers that "
-                f"fit together, got weights {shapes} and biases {widths[1:]}."
+                f"{what} must have layers that fit together, got weights {shapes} and biases {widths[1:]}."
             )
 
     @classmethod
@@ -76,13 +77,13 @@ class FeedforwardReLU(ShortRepr):
         """
         scaling = IncrementScaling.of(data)
         seeds = np.random.SeedSequence(seed).generate_state(restarts)
-        network = require_extra("sklearn.neural_network", "cases", "learned networks").MLPRegressor
+        perceptron = require_extra("sklearn.neural_network", "cases", "learned networks").MLPRegressor
         ignored = require_extra("sklearn.exceptions", "cases", "learned networks").ConvergenceWarning
         trained = []
         with single_threaded(), warnings.catch_warnings():
             warnings.simplefilter("ignore", ignored)  # stopping at the limit of iterations is intended
             for start in seeds:
-                regressor = network(
+                regressor = perceptron(
                     hidden_layer_sizes=tuple(hidden),
                     solver="lbfgs",
                     alpha=1e-6,  # almost no penalty, because so few weights do not overfit thousands of transitions
@@ -93,18 +94,6 @@ class FeedforwardReLU(ShortRepr):
                 trained.append(regressor.fit(scaling.inputs(data.x, data.u), scaling.targets(data)))
         return cls.from_sklearn(min(trained, key=lambda regressor: regressor.loss_), scaling, data)
 
-    def step(self, x: Array, u: Array) -> Array:
-        z = self.scaling.inputs(x, u)
-        for weight, bias in zip(self.weights[:-1], self.biases[:-1], strict=True):
-            z = np.maximum(z @ weight + bias, 0.0)
-        return self.scaling.step(x, z @ self.weights[-1] + self.biases[-1])
-
-    def jacobian(self, x: Array, u: Array) -> tuple[Array, Array]:
-        """Return A ``(..., n, n)`` and B ``(..., n, m)``; at a kink the unit counts as inactive."""
-        z = self.scaling.inputs(x, u)
-        gradient = np.broadcast_to(np.eye(z.shape[-1]), (*z.shape, z.shape[-1]))
-        for weight, bias in zip(self.weights[:-1], self.biases[:-1], strict=True):
-            before = z @ weight + bias
-            gradient = (gradient @ weight) * (before > 0)[..., None, :]
-            z = np.maximum(before, 0.0)
-        return self.scaling.jacobian(np.swapaxes(gradient @ self.weights[-1], -1, -2))
+    @functools.cached_property
+    def _map(self) -> SmoothMap:
+        return network(self.weights, self.biases, "relu")

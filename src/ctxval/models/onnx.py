@@ -18,13 +18,11 @@ from ctxval.errors import InputError, ShapeError
 
 @part(files=("source",))
 class Onnx(ShortRepr):
-    """A network from an ONNX file as a model; any toolbox may have written the file.
+    """A network from an ONNX file as a model; any toolbox may have written the file, and nothing in it is run as code.
 
-    The network takes the state and the input as two inputs in this order, or as one input with the state first. It
-    runs with onnxruntime; nothing in the file is executed as code.
-
-    In single precision the rounding hides differences of 1e-5. The Jacobian is therefore taken by central differences
-    with wider steps, which give about three correct digits.
+    The network takes the state and the input as two inputs in this order, or as one input with the state first. Its
+    Jacobian is taken by central differences that suit its precision; in single precision about three digits are
+    correct.
 
     Args:
         source: the file, or its bytes.
@@ -35,25 +33,20 @@ class Onnx(ShortRepr):
     def __init__(
         self, source: str | Path | bytes, *, increments: bool = False, data: Transitions | None = None
     ) -> None:
-        self.network = OnnxNetwork(source)
-        self.data = data
-        self.increments = increments
+        self.network, self.increments, self.data = OnnxNetwork(source), increments, data
         if len(self.network.widths) not in (1, 2):
-            raise InputError(
-                f"a model must take (x, u) as one or two inputs, but the network has {', '.join(self.network.names)}."
-            )
+            names = ", ".join(self.network.names)
+            raise InputError(f"a model must take (x, u) as one or two inputs, but the network has {names}.")
 
     def step(self, x: Array, u: Array) -> Array:
         pair = (x, u) if len(self.network.widths) == 2 else (np.concatenate(paired(x, u), axis=-1),)
         output = self.network(*pair)
         if output.shape[-1] != x.shape[-1]:
-            raise ShapeError(
-                f"the network must return as many states as it takes, {x.shape[-1]}, got {output.shape[-1]}."
-            )
+            got = f"{x.shape[-1]}, got {output.shape[-1]}"
+            raise ShapeError(f"the network must return as many states as it takes, {got}.")
         return x + output if self.increments else output
 
     def jacobian(self, x: Array, u: Array) -> tuple[Array, Array]:
-        """Return A ``(..., n, n)`` and B ``(..., n, m)`` by central differences that suit the network's precision."""
         return central_differences(self.step, *paired(x, u), self.network.precision)
 
     def describe(self) -> dict[str, Any]:

@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
-from scipy.spatial.distance import cdist
 
 from ctxval._util.arrays import Array
 from ctxval.models import smooth_maps as maps
@@ -125,8 +124,6 @@ def _ridge_kernel(regressor: Any, features: int) -> Kernel | None:
             return _of_products(
                 lambda p: (gamma * p + shift) ** degree, lambda p: gamma * degree * (gamma * p + shift) ** (degree - 1)
             )
-        case "sigmoid":
-            return _of_products(lambda p: np.tanh(gamma * p + shift), lambda p: gamma / np.cosh(gamma * p + shift) ** 2)
     return None
 
 
@@ -142,26 +139,13 @@ def _covariance(kernel: Any) -> Kernel | None:
             return maps.matern(kernel.length_scale, np.inf)
         case "Matern" if kernel.nu in (0.5, 1.5, 2.5, np.inf):
             return maps.matern(kernel.length_scale, kernel.nu)
-        case "RationalQuadratic":
-            return _rational_quadratic(kernel.length_scale, kernel.alpha)
         case "DotProduct":
             offset = float(kernel.sigma_0) ** 2
             return _of_products(lambda p: p + offset, lambda p: 1.0)
         case "Sum" | "Product" as name:
             first, second = _covariance(kernel.k1), _covariance(kernel.k2)
             return first and second and _joined(first, second, is_sum=name == "Sum")
-        case "Exponentiation":
-            base = _covariance(kernel.kernel)
-            return base and _power(base, kernel.exponent)
     return None
-
-
-def _rational_quadratic(length_scale: float, alpha: float) -> Kernel:
-    def kernel(Z: Array, X: Array) -> tuple[Array, Slopes]:
-        base = 1 + cdist(Z / length_scale, X / length_scale, "sqeuclidean") / (2 * alpha)
-        return base**-alpha, lambda: [(base ** (-alpha - 1), 1.0, length_scale**-2.0)]
-
-    return kernel
 
 
 def _of_products(function: Callable[[Array], Array], slope: Callable[[Array], Any]) -> Kernel:
@@ -180,17 +164,9 @@ def _times(slopes: list[Slope], other: Array | float) -> list[Slope]:
 
 def _joined(first: Kernel, second: Kernel, *, is_sum: bool) -> Kernel:
     def kernel(Z: Array, X: Array) -> tuple[Array | float, Slopes]:
-        (one, one_slopes), (two, two_slopes) = first(Z, X), second(Z, X)
+        (K, slopes), (L, other_slopes) = first(Z, X), second(Z, X)
         if is_sum:
-            return one + two, lambda: [*one_slopes(), *two_slopes()]
-        return one * two, lambda: [*_times(one_slopes(), two), *_times(two_slopes(), one)]
-
-    return kernel
-
-
-def _power(base: Kernel, exponent: float) -> Kernel:
-    def kernel(Z: Array, X: Array) -> tuple[Array | float, Slopes]:
-        K, slopes = base(Z, X)
-        return K**exponent, lambda: _times(slopes(), exponent * K ** (exponent - 1))
+            return K + L, lambda: [*slopes(), *other_slopes()]
+        return K * L, lambda: [*_times(slopes(), L), *_times(other_slopes(), K)]
 
     return kernel

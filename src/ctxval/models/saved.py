@@ -135,15 +135,12 @@ def read_refined(source: str | Path, before: Model | None) -> SavedModel:
         correction = Correction(*(arrays.numbers(field.name) for field in fields(Correction)))
         return Corrected(corrected, correction, linearised=linearised, data=data)
     except (InputError, ValueError, TypeError, IndexError) as error:
-        raise InputError(
-            f"{source} cannot be read as a model (an NPZ file of ctxval, or one with the matrices A (n, n) and B "
-            f"(n, m)): {str(error).removesuffix('.')}."
-        ) from error
+        known = "an NPZ file of ctxval, or one with the matrices A (n, n) and B (n, m)"
+        reason = str(error).removesuffix(".")
+        raise InputError(f"{source} cannot be read as a model ({known}): {reason}.") from error
 
 
 def _plain_model(arrays: Archive, kind: str, data: Transitions | None, prefix: str = "") -> SavedModel:
-    """Return a model whose arrays have a prefix before their names."""
-
     def numbers(name: str) -> Array:
         return arrays.numbers(prefix + name)
 
@@ -162,9 +159,8 @@ def _arrays(model: Model) -> dict[str, Any]:
     if isinstance(model, Linear):
         return {"A": model.A, "B": model.B, "c": model.c}
     if not isinstance(model, FeedforwardReLU | GaussianProcessModel):
-        raise InputError(
-            f"only linear models, networks, Gaussian processes and corrections can be written, got {model!r}."
-        )
+        known = "linear models, networks, Gaussian processes and corrections"
+        raise InputError(f"only {known} can be written, got {model!r}.")
     scaling = {name: getattr(model.scaling, name) for name in _SCALING}
     if isinstance(model, FeedforwardReLU):
         layers = {f"weights_{i}": weight for i, weight in enumerate(model.weights)}

@@ -1,15 +1,18 @@
-"""Standardised inputs and increments of learned regressors of the dynamics."""
+"""Models of the increment of the state: a learned map between standardised pairs and standardised increments."""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-from ctxval._util.arrays import Array
+from ctxval._util.arrays import Array, rows_of
 from ctxval._util.representation import ShortRepr
 from ctxval.core.trajectory import Transitions
 from ctxval.errors import InputError, ShapeError
+from ctxval.models.smooth_maps import SmoothMap
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,8 +32,7 @@ class IncrementScaling(ShortRepr):
     @classmethod
     def of(cls, data: Transitions) -> IncrementScaling:
         """Return the scaling that gives recorded transitions zero mean and unit variance."""
-        if not len(data) or not all(np.isfinite(part).all() for part in (data.x, data.u, data.x_next)):
-            raise InputError("a model needs finite transitions to be learned from, got none, NaN or infinity.")
+        require_finite(data)
         pairs, increments = np.concatenate([data.x, data.u], axis=1), data.x_next - data.x
         shift_in, shift_out = pairs.mean(axis=0), increments.mean(axis=0)
         return cls(shift_in, standard_deviations(pairs), shift_out, standard_deviations(increments))
@@ -43,16 +45,38 @@ class IncrementScaling(ShortRepr):
         """Return the target outputs of f for recorded transitions, shape ``(N, n)``."""
         return (data.x_next - data.x - self.shift_out) / self.scale_out
 
-    def step(self, x: Array, output: Array) -> Array:
-        """Return the next states ``(..., n)`` for outputs ``(..., n)`` of f."""
-        return x + self.shift_out + self.scale_out * output
 
-    def jacobian(self, gradient: Array) -> tuple[Array, Array]:
-        """Return A ``(..., n, n)`` and B ``(..., n, m)`` for the Jacobian ``(..., n, n + m)`` of f."""
-        n = len(self.shift_out)
-        whole = self.scale_out[:, None] * gradient / self.scale_in
+class IncrementModel(ShortRepr, ABC):
+    """A model with a Jacobian, from a scaling and a differentiable map of standardised pairs."""
+
+    scaling: IncrementScaling
+
+    @property
+    @abstractmethod
+    def _map(self) -> SmoothMap:
+        """The map from standardised pairs ``(N, n + m)`` to standardised increments ``(N, n)``."""
+
+    def step(self, x: Array, u: Array) -> Array:
+        z = self.scaling.inputs(x, u)
+        outputs = self._map.value(rows_of(z)).reshape(*z.shape[:-1], len(self.scaling.shift_out))
+        return x + self.scaling.shift_out + self.scaling.scale_out * outputs
+
+    def jacobian(self, x: Array, u: Array) -> tuple[Array, Array]:
+        z, n = self.scaling.inputs(x, u), len(self.scaling.shift_out)
+        gradient = self._map.expanded(rows_of(z))[1].reshape(*z.shape[:-1], n, z.shape[-1])
+        whole = self.scaling.scale_out[:, None] * gradient / self.scaling.scale_in
         whole[..., :n] += np.eye(n)
         return whole[..., :n], whole[..., n:]
+
+    def __getstate__(self) -> dict[str, Any]:
+        # The map has functions that cannot be pickled; another process makes its own.
+        return {name: value for name, value in vars(self).items() if name != "_map"}
+
+
+def require_finite(data: Transitions) -> None:
+    """Refuse transitions from which nothing can be learned."""
+    if not len(data) or not all(np.isfinite(part).all() for part in (data.x, data.u, data.x_next)):
+        raise InputError("a model needs finite transitions to be learned from, got none, NaN or infinity.")
 
 
 def standardised_pairs(x: Array, u: Array, shift: Array, scale: Array) -> Array:
@@ -62,9 +86,8 @@ def standardised_pairs(x: Array, u: Array, shift: Array, scale: Array) -> Array:
     z = np.empty((*batch, n + u.shape[-1]))
     z[..., :n], z[..., n:] = x, u
     if z.shape[-1:] != shift.shape:
-        raise ShapeError(
-            f"the model has {len(shift)} states and inputs together, got {n} states and {u.shape[-1]} inputs."
-        )
+        got = f"{n} states and {u.shape[-1]} inputs"
+        raise ShapeError(f"the model has {len(shift)} states and inputs together, got {got}.")
     z -= shift
     z /= scale
     return z

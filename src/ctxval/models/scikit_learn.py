@@ -14,6 +14,7 @@ from ctxval.core.model import central_differences, paired
 from ctxval.core.trajectory import Transitions
 from ctxval.errors import InputError, ShapeError
 from ctxval.models.regressors import smooth_map
+from ctxval.models.scaling import require_finite
 from ctxval.models.smooth_maps import SmoothMap
 
 
@@ -22,9 +23,9 @@ class ScikitLearn(ShortRepr):
     """A fitted scikit-learn regressor as a model: a pipeline, a forest, ridge regression, a Gaussian process.
 
     Its features are the state, then the input. Networks, Gaussian processes, kernel ridge regression, linear models,
-    and pipelines of these with scalers and polynomial features, have an exact Jacobian from their formula. All others
-    are differentiated by central differences. The regressor must be smooth for LQR and iLQR: a forest or nearest
-    neighbours are piecewise constant, and their Jacobian is zero.
+    and pipelines of these with scalers and polynomial features, have an exact Jacobian from their formula; all others
+    are differentiated by central differences. A forest or nearest neighbours are piecewise constant: their Jacobian is
+    zero, with which LQR and iLQR cannot design.
 
     Args:
         regressor: the fitted regressor, whose ``predict`` maps features ``(N, n + m)`` to ``(N, n)``.
@@ -45,8 +46,7 @@ class ScikitLearn(ShortRepr):
     @classmethod
     def fit(cls, regressor: Any, data: Transitions, *, increments: bool = True) -> ScikitLearn:
         """Fit a regressor on recorded transitions. The regressor itself is fitted, not a copy."""
-        if not len(data) or not all(np.isfinite(part).all() for part in (data.x, data.u, data.x_next)):
-            raise InputError("a model needs finite transitions to be learned from, got none, NaN or infinity.")
+        require_finite(data)
         if not callable(getattr(regressor, "fit", None)):
             raise InputError(f"the regressor must have fit and predict, got {regressor!r}.")
         targets = data.x_next - data.x if increments else data.x_next
@@ -55,19 +55,15 @@ class ScikitLearn(ShortRepr):
         return cls(regressor, increments=increments, data=data)
 
     def step(self, x: Array, u: Array) -> Array:
-        """Return the next state; shapes ``(..., n), (..., m) -> (..., n)``.
+        """Return the next states ``(..., n)``, NaN for a pair that is not finite.
 
         The formula gives what ``predict`` gives, without its checks, which take longer than the formula on few rows.
-        A pair that is not finite leads to NaN.
         """
         rows, batch = self._rows(x, u)
         finite: Mask = np.asarray(np.isfinite(rows).all(axis=-1, keepdims=True))
         complete = rows if finite.all() else np.where(finite, rows, 0.0)
         formula = self._formula()
-        if formula is None:
-            outputs = _as_columns(self.regressor.predict(complete))
-        else:
-            outputs = np.concatenate([formula.value(block) for block in _blocks(complete)])
+        outputs = formula.value(complete) if formula else _as_columns(self.regressor.predict(complete))
         _require_states(outputs, x.shape[-1])
         outputs = (outputs if finite.all() else np.where(finite, outputs, np.nan)).reshape(*batch, -1)
         return x + outputs if self.increments else outputs
@@ -80,14 +76,13 @@ class ScikitLearn(ShortRepr):
             return central_differences(self.step, x, u)
         if formula.constant:
             rows, batch = np.zeros((1, self.features)), ()
-        whole = np.concatenate([formula.jacobian(block) for block in _blocks(rows)])
+        whole = formula.expanded(rows)[1]
         _require_states(whole, n)
         whole = whole.reshape(*batch, *whole.shape[1:])
         A, B = whole[..., :n], whole[..., n:]
         return (A + np.eye(n) if self.increments else A), B
 
     def _rows(self, x: Array, u: Array) -> tuple[Array, tuple[int, ...]]:
-        """Return states and inputs side by side, shape ``(N, n + m)``, and the shape of their batch."""
         n, m = x.shape[-1], u.shape[-1]
         if n + m != self.features:
             raise ShapeError(f"the regressor was fitted on {self.features} features, got {n} states and {m} inputs.")
@@ -102,11 +97,6 @@ class ScikitLearn(ShortRepr):
 def _require_states(outputs: Array, n: int) -> None:
     if outputs.shape[1] != n:
         raise ShapeError(f"the regressor must predict as many states as it takes, {n}, got shape {outputs.shape}.")
-
-
-def _blocks(rows: Array) -> list[Array]:
-    """Return blocks of 1024 rows: enough to be fast, few enough for the cache."""
-    return [rows[first : first + 1024] for first in range(0, max(1, len(rows)), 1024)]
 
 
 def _as_columns(output: Any) -> Array:

@@ -1,10 +1,11 @@
-"""Differentiable functions of rows, from which the formulas of fitted regressors are composed.
+"""Differentiable functions of rows: the one way from a learned map to a model with a Jacobian.
 
 Derivatives are pulled back from the outputs to the inputs (reverse mode): a model has fewer outputs than inputs.
 """
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -25,20 +26,30 @@ class SmoothMap:
     Attributes:
         linearised: returns the values at rows, and what pulls derivatives back to the rows.
         constant: whether the derivative is the same everywhere.
+        block: number of rows that are evaluated together: enough to be fast, few enough for the cache.
     """
 
     linearised: Callable[[Array], tuple[Array, PullBack]]
     constant: bool = False
+    block: int = 1024
 
     def value(self, Z: Array) -> Array:
         """Return the values ``(N, o)`` at rows ``(N, k)``."""
-        return self.linearised(Z)[0]
+        if len(Z) <= self.block:
+            return self.linearised(Z)[0]
+        return np.concatenate([self.linearised(rows)[0] for rows in self._blocks(Z)])
 
-    def jacobian(self, Z: Array) -> Array:
-        """Return the derivatives ``(N, o, k)`` at rows ``(N, k)``."""
+    def expanded(self, Z: Array) -> tuple[Array, Array]:
+        """Return the values ``(N, o)`` and the derivatives ``(N, o, k)`` at rows ``(N, k)``."""
+        if len(Z) > self.block:
+            values, derivatives = map(np.concatenate, zip(*map(self.expanded, self._blocks(Z)), strict=True))
+            return values, derivatives
         values, pull_back = self.linearised(Z)
-        count, outputs = values.shape
-        return pull_back(np.broadcast_to(np.eye(outputs), (count, outputs, outputs)))
+        outputs = values.shape[1]
+        return values, pull_back(np.broadcast_to(np.eye(outputs), (len(values), outputs, outputs)))
+
+    def _blocks(self, Z: Array) -> list[Array]:
+        return [Z[first : first + self.block] for first in range(0, len(Z), self.block)]
 
 
 def affine(W: Array, b: Array) -> SmoothMap:
@@ -85,7 +96,7 @@ ACTIVATIONS: dict[str, tuple[Callable[[Array], Array], Callable[[Array], Array]]
     "identity": (lambda z: z, np.ones_like),
     "logistic": (expit, lambda a: a * (1 - a)),
     "tanh": (np.tanh, lambda a: 1 - a * a),
-    "relu": (lambda z: np.maximum(z, 0), lambda a: (a > 0).astype(np.float64)),
+    "relu": (lambda z: np.maximum(z, 0.0), lambda a: (a > 0).astype(np.float64)),
 }
 """The functions of units by scikit-learn's names, and their derivatives as functions of their own values.
 
@@ -135,6 +146,16 @@ def chain(parts: Sequence[SmoothMap]) -> SmoothMap:
     return SmoothMap(linearised, constant=all(part.constant for part in parts))
 
 
+def total(first: SmoothMap, second: SmoothMap) -> SmoothMap:
+    """Return the sum of two maps of the same rows, evaluated in the blocks of the first."""
+
+    def linearised(Z: Array) -> tuple[Array, PullBack]:
+        (values, pull), (others, other_pull) = first.linearised(Z), second.linearised(Z)
+        return values + others, lambda G: pull(G) + other_pull(G)
+
+    return SmoothMap(linearised, first.constant and second.constant, first.block)
+
+
 def side_by_side(parts: Sequence[SmoothMap]) -> SmoothMap:
     """Return several maps of the same rows, whose values are joined."""
 
@@ -164,27 +185,32 @@ Kernel = Callable[[Array, Array], tuple[Array | float, Slopes]]
 """Maps points ``(N, k)`` and centres ``(M, k)`` to ``k(z, x)``, ``(N, M)`` or a number, and the terms of its slope."""
 
 
-def kernel_sum(kernel: Kernel, centres: Array, weights: Array) -> SmoothMap:
+def kernel_sum(kernel: Kernel, centres: Array, weights: Array, block: int = 1024) -> SmoothMap:
     """Return the map ``sum_i k(z, x_i) w_i`` of centres x_i ``(M, k)`` and weights w_i ``(M, o)``."""
+
+    @functools.cache
+    def columns() -> Array:
+        """Return w and w x of the centres: sums over the centres of a factor times these are all that a slope takes."""
+        moments = (weights[:, :, None] * centres[:, None, :]).reshape(len(centres), -1)
+        return np.concatenate([weights, moments], axis=1)
 
     def linearised(Z: Array) -> tuple[Array, PullBack]:
         covariances, slopes = kernel(Z, centres)
         (count, k), outputs, shape = Z.shape, weights.shape[1], (len(Z), len(centres))
 
         def pull_back(G: Array) -> Array:
-            # Sums over the centres of factor w and of factor w x.
-            moments = (weights[:, :, None] * centres[:, None, :]).reshape(len(centres), -1)
-            columns = np.concatenate([weights, moments], axis=1)
-            derivatives = np.zeros((count, outputs, k))
+            derivatives: Array | float = 0.0
             for factor, pull, weight in slopes():
-                sums = np.broadcast_to(factor, shape) @ columns
+                sums = np.broadcast_to(factor, shape) @ columns()
                 drawn = sums[:, outputs:].reshape(count, outputs, k)
-                derivatives += (drawn - pull * sums[:, :outputs, None] * Z[:, None, :]) * weight
-            return np.asarray(G @ derivatives)
+                if pull:
+                    drawn = drawn - pull * sums[:, :outputs, None] * Z[:, None, :]
+                derivatives = derivatives + drawn * weight
+            return np.asarray(G @ np.broadcast_to(derivatives, (count, outputs, k)))
 
         return np.broadcast_to(covariances, shape) @ weights, pull_back
 
-    return SmoothMap(linearised)
+    return SmoothMap(linearised, block=block)
 
 
 def matern(length_scale: Array | float, nu: float) -> Kernel:

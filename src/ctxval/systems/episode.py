@@ -28,9 +28,8 @@ def run_episode(advance: Advance, controller: Controller, task: Task, inputs: in
     for t in range(task.horizon):
         u = np.asarray(controller(t, x), dtype=np.float64)
         if u.shape != (inputs,):
-            raise ShapeError(
-                f"the controller must return the system's {inputs} inputs, shape ({inputs},), got {u.shape}."
-            )
+            wanted = f"the system's {inputs} inputs, shape ({inputs},)"
+            raise ShapeError(f"the controller must return {wanted}, got {u.shape}.")
         applied[t] = u
         x, reason = advance(u) if np.isfinite(u).all() else (np.full_like(x, np.nan), "an input is not finite")
         states[t + 1] = x

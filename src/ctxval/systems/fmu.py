@@ -43,11 +43,9 @@ class FMU(ShortRepr):
     Args:
         path: the ``.fmu`` file.
         states, inputs: names of the variables that make up the state, and of the inputs; all are real numbers.
-        start: the variable whose start value sets a state, by the name of the state; by default the state's own
-            variable.
+        start: the variable whose start value sets a state, by the name of the state; by default its own variable.
         parameters: values of other variables, set before the initialisation.
-        step: the communication step size in seconds, of which a task's dt must be a whole multiple; by default it is
-            the task's dt.
+        step: the communication step size in seconds, of which a task's dt must be a whole multiple; by default the dt.
     """
 
     def __init__(
@@ -123,19 +121,17 @@ class FMU(ShortRepr):
 
     @contextlib.contextmanager
     def _process(self) -> Iterator[_Process]:
-        """Yield an idle or a new process; it is not used again after an error."""
         idle = self._idle.setdefault(os.getpid(), [])
         try:
             process = idle.pop()
         except IndexError:
             process = _Process(self._setup)
+        ended = False
         try:
             yield process
-        except BaseException:
-            process.sound = False
-            raise
+            ended = True
         finally:
-            if process.sound:
+            if ended and process.sound:
                 idle.append(process)
             else:
                 process.end()

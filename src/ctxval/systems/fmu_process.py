@@ -12,7 +12,7 @@ import os
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import IO, Any
 
 
@@ -24,6 +24,15 @@ class Refused(Exception):  # noqa: N818
         self.input_is_wrong = input_is_wrong
 
 
+@contextlib.contextmanager
+def refused(sentence: str, *, input_is_wrong: bool = False) -> Iterator[None]:
+    """Turn an exception, of which FMPy raises the most general kind, into a refusal."""
+    try:
+        yield
+    except Exception as error:
+        raise Refused(f"{sentence}: {error}", input_is_wrong=input_is_wrong) from error
+
+
 class Unit:
     """An unpacked FMU with one instance at a time; it hides the different names of FMI 2 and 3.
 
@@ -31,13 +40,7 @@ class Unit:
     """
 
     def __init__(
-        self,
-        folder: str,
-        name: str,
-        states: list[int],
-        inputs: list[int],
-        start: list[str],
-        parameters: dict[str, Any],
+        self, folder: str, name: str, states: list[int], inputs: list[int], start: list[str], parameters: dict[str, Any]
     ) -> None:
         import fmpy
 
@@ -55,21 +58,17 @@ class Unit:
         from fmpy.simulation import instantiate_fmu
 
         self.steps, self.step, self.substeps = 0, step, substeps
-        try:
+        with refused(f"the FMU {self.name} cannot be instantiated"):
             self.fmu = instantiate_fmu(self.folder, self.description, fmi_type="CoSimulation")
-        except Exception as error:  # FMPy raises Exception itself
-            raise Refused(f"the FMU {self.name} cannot be instantiated: {error}") from error
         self._set, self._get = (
             (self.fmu.setFloat64, self.fmu.getFloat64) if self.is_fmi3 else (self.fmu.setReal, self.fmu.getReal)
         )
         # The campaign's process reports a wrong number of states.
         if x is not None and len(x) == len(self.start):
-            try:
+            what = f"the FMU does not let the start values of {', '.join(self.start)} be set"
+            with refused(what, input_is_wrong=True):
                 self._set(self.start_references, x)
-            except Exception as error:
-                sentence = f"the FMU does not let the start values of {', '.join(self.start)} be set: {error}"
-                raise Refused(sentence, input_is_wrong=True) from error
-        try:
+        with refused(f"the FMU {self.name} cannot be initialised"):
             enumeration = "Int64" if hasattr(self.fmu, "setInt64") else "Integer"
             for variable, value in self.parameters:
                 kind = enumeration if variable.type == "Enumeration" else variable.type
@@ -78,8 +77,6 @@ class Unit:
                 self.fmu.setupExperiment(startTime=0.0)
             self.fmu.enterInitializationMode()
             self.fmu.exitInitializationMode()
-        except Exception as error:
-            raise Refused(f"the FMU {self.name} cannot be initialised: {error}") from error
         self.initialised = True
         return self._state()
 
@@ -122,8 +119,8 @@ def serve(requests: IO[str], answers: IO[str]) -> None:
         act, *arguments = json.loads(line)
         try:
             answer: dict[str, Any] = {"value": acts[act](*arguments)}
-        except Refused as refused:
-            answer = {"refused": str(refused), "input": refused.input_is_wrong}
+        except Refused as error:
+            answer = {"refused": str(error), "input": error.input_is_wrong}
         answers.write(json.dumps(answer) + "\n")
         answers.flush()
 

@@ -37,7 +37,5 @@ class Function(ShortRepr):
             states, inputs = (as_floats(name, part) for name, part in zip(("states", "inputs"), returned, strict=True))
             return Trajectory(task.times, states, inputs)
         except (InputError, TypeError, ValueError) as error:
-            raise ExecutionError(
-                f"the system's function must return a Trajectory, or states (H + 1, n) and inputs (H, m) with "
-                f"H = {task.horizon}: {error}"
-            ) from error
+            wanted = f"a Trajectory, or states (H + 1, n) and inputs (H, m) with H = {task.horizon}"
+            raise ExecutionError(f"the system's function must return {wanted}: {error}") from error

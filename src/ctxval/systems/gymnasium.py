@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import copy
 import os
 from collections.abc import Callable
 from typing import Any
@@ -12,6 +13,7 @@ import numpy as np
 from ctxval._util.arrays import Array, as_floats
 from ctxval._util.checked import NonNegativeInt, Seconds
 from ctxval._util.extras import require_extra
+from ctxval._util.mjcf import warning_of
 from ctxval._util.registry import part
 from ctxval._util.representation import ShortRepr
 from ctxval.core.controller import Controller
@@ -28,20 +30,19 @@ StateSetter = Callable[[Any, Array], None]
 class Gymnasium(ShortRepr):
     """A gymnasium environment with continuous actions as the true system.
 
-    An execution resets the environment with its seed, sets the task's initial state and runs the closed loop. MuJoCo
-    environments need no further arguments: their state is ``(qpos, qvel)``. Other environments need ``get_state`` and
-    ``set_state``.
+    An execution resets the environment with its seed, sets the task's initial state and runs the closed loop. The state
+    of MuJoCo environments is ``(qpos, qvel)``; others need ``get_state`` and ``set_state``. Actions go to the
+    environment unchanged, in the type of its action space; the environment clips them, and the trajectory keeps the
+    unclipped inputs.
 
-    The actions of the controller go to the environment unchanged, in the type of its action space. The environment
-    clips them, as MuJoCo does to the control range; the trajectory keeps the unclipped inputs.
-
-    If the environment terminates or truncates the episode, the trajectory ends: its remaining values are NaN and
-    ``ended`` gives the reason, so that a campaign records a failed trial. A warning of MuJoCo, such as an unstable
-    state, ends the trajectory too, although MuJoCo silently resets the simulation and continues.
+    If the environment terminates or truncates the episode, or MuJoCo warns, for instance of an unstable state, the
+    trajectory ends: its remaining values are NaN and ``ended`` gives the reason, so that a campaign records a failed
+    trial.
 
     Args:
-        environment: an id such as ``"Reacher-v5"``, or a function that makes an environment.
-        get_state: function ``environment -> x`` of the environment without wrappers; ``(qpos, qvel)`` by default.
+        environment: an id such as ``"Reacher-v5"``, a function that makes an environment, or an environment, which is
+            copied for executions at the same time. Of a vector environment, give the one that it repeats.
+        get_state: function ``environment -> x`` of the environment without wrappers.
         set_state: function ``(environment, x)`` of the environment without wrappers; by default the first components
             of x go to MuJoCo's ``set_state``.
         dt: length of a step, seconds; by default that of the environment.
@@ -52,7 +53,7 @@ class Gymnasium(ShortRepr):
 
     def __init__(
         self,
-        environment: str | Callable[..., Any],
+        environment: Any,
         *,
         get_state: StateGetter | None = None,
         set_state: StateSetter | None = None,
@@ -72,32 +73,38 @@ class Gymnasium(ShortRepr):
         self.get_state, self.set_state = get_state, set_state
         self.seed = seed
         self.ignore_termination = ignore_termination
+        self._given = hasattr(environment, "reset") and not isinstance(environment, type)
+        if self._given and options:
+            given = f"{', '.join(options)} for {environment}"
+            raise InputError(f"options are for environments that are made, got {given}.")
         first = self._made()
+        if hasattr(first, "num_envs"):
+            raise InputError(f"the environment must be a single one, got {first}; give the one that it repeats.")
         self._idle = [first]  # each execution takes its own, so that threads do not share one
         space = first.action_space
         if not np.issubdtype(space.dtype or object, np.floating) or not space.shape:
             raise InputError(f"the environment must have continuous actions, a Box, got {space}.")
         self.inputs = int(np.prod(space.shape))
         bare = first.unwrapped
-        own = getattr(bare, "dt", None)
-        step = own if dt is None else dt
+        stated = getattr(bare, "dt", None)
+        step = stated if dt is None else dt
         if not isinstance(step, int | float | np.number) or not (np.isfinite(step) and step > 0):
             raise InputError(f"dt must be the positive number of seconds in one step of the environment, got {step!r}.")
-        if own is not None and not np.isclose(own, step, rtol=1e-9, atol=0):
-            raise InputError(f"dt must be that of the environment, {own:g} s, got {step:g} s.")
+        if stated is not None and not np.isclose(stated, step, rtol=1e-9, atol=0):
+            raise InputError(f"dt must be that of the environment, {stated:g} s, got {step:g} s.")
         self.dt = float(step)
-        is_mujoco = (
-            hasattr(bare, "set_state") and hasattr(bare, "model") and hasattr(getattr(bare, "data", None), "qpos")
-        )
+        is_mujoco = hasattr(bare, "set_state") and hasattr(getattr(bare, "data", None), "qpos")
         if (get_state is None or set_state is None) and not is_mujoco:
-            raise InputError(
-                f"{bare} has no MuJoCo state; give the functions get_state(environment) -> x and "
-                "set_state(environment, x)."
-            )
+            functions = "get_state(environment) -> x and set_state(environment, x)"
+            raise InputError(f"{bare} has no MuJoCo state; give the functions {functions}.")
 
     def describe(self) -> dict[str, Any]:
         fields = ("environment", "options", "get_state", "set_state", "seed", "ignore_termination", "dt")
-        return {name: getattr(self, name) for name in fields}
+        described = {name: getattr(self, name) for name in fields}
+        if self._given:
+            bare = self.environment.unwrapped
+            described["environment"] = {"class": type(bare), "id": getattr(bare.spec, "id", None)}
+        return described
 
     def state(self) -> Array:
         """Return the state ``(n,)`` after a reset, to see the number of states and their magnitudes."""
@@ -129,6 +136,8 @@ class Gymnasium(ShortRepr):
 
     def _made(self) -> Any:
         gymnasium = require_extra("gymnasium", "mujoco", "environments")
+        if self._given:
+            return self.environment if not hasattr(self, "_idle") else copy.deepcopy(self.environment)
         if not isinstance(self.environment, str):
             return self.environment(**{**self.options, **self._files})
         try:
@@ -146,9 +155,8 @@ class Gymnasium(ShortRepr):
         else:
             nq, nv = len(bare.data.qpos), len(bare.data.qvel)
             if len(x) < nq + nv:
-                raise ShapeError(
-                    f"the task must have at least {nq + nv} states, {nq} qpos and {nv} qvel, got {len(x)}."
-                )
+                wanted = f"{nq + nv} states, {nq} qpos and {nv} qvel"
+                raise ShapeError(f"the task must have at least {wanted}, got {len(x)}.")
             bare.set_state(x[:nq], x[nq : nq + nv])
         require_started(task, self._read(bare))
 
@@ -164,10 +172,7 @@ class Gymnasium(ShortRepr):
         state = self._read(environment.unwrapped)
         counts = getattr(getattr(getattr(environment.unwrapped, "data", None), "warning", None), "number", None)
         if counts is not None and np.any(counts):
-            from mujoco import mjtWarning
-
-            kind = mjtWarning(int(np.argmax(np.asarray(counts) > 0))).name.removeprefix("mjWARN_")
-            return np.full_like(state, np.nan), f"MuJoCo warned of {kind}"
+            return np.full_like(state, np.nan), f"MuJoCo warned of {warning_of(counts)}"
         if self.ignore_termination or not (terminated or truncated):
             return state, ""
         return state, f"the environment {'terminated' if terminated else 'truncated'} the episode"

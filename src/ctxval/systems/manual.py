@@ -26,15 +26,12 @@ class Manual(ShortRepr):
 
     def __init__(self, *, states: Mapping[str, str], inputs: Mapping[str, str], dt: Seconds) -> None:
         self.states, self.inputs = dict(states), dict(inputs)
-        if not self.states or not all(
-            isinstance(t, str) for d in (self.states, self.inputs) for t in (*d, *d.values())
-        ):
+        texts = [*self.states.items(), *self.inputs.items()]
+        if not self.states or not all(isinstance(text, str) for pair in texts for text in pair):
             raise InputError(f"states and inputs must be names with units, got {self.states} and {self.inputs}.")
         require_names(self.states, self.inputs)
         self.dt = float(dt)
 
     def execute(self, controller: Controller, task: Task) -> NoReturn:
-        raise ExecutionError(
-            "a manual system is executed by people; get a task with campaign.ask() and report its result with "
-            "campaign.tell() instead of campaign.run()."
-        )
+        advice = "get a task with campaign.ask() and report its result with campaign.tell() instead of campaign.run()"
+        raise ExecutionError(f"a manual system is executed by people; {advice}.")

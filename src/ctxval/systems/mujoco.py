@@ -10,7 +10,7 @@ import numpy as np
 
 from ctxval._util.arrays import Array, ArrayLike, Mask, Rows, as_finite, require_shape
 from ctxval._util.checked import PositiveInt
-from ctxval._util.mjcf import compile_mjcf
+from ctxval._util.mjcf import compile_mjcf, warning_of
 from ctxval._util.registry import part
 from ctxval._util.representation import ShortRepr
 from ctxval.core.controller import Controller
@@ -28,9 +28,9 @@ class MuJoCo(ShortRepr):
     the model's defaults (activations, mocap bodies, ...) at the task's qpos and qvel. Inputs are MuJoCo's ``ctrl``,
     held over a step. MuJoCo clamps them to a ``ctrlrange``; the trajectory keeps the unclamped inputs.
 
-    A warning of MuJoCo (unstable state or acceleration, full contact buffer) means that the simulation has failed,
-    although MuJoCo silently resets it and continues: its states are NaN from that step on, and the trajectory's
-    ``ended`` names the warning.
+    If MuJoCo warns (unstable state or acceleration, full contact buffer), it silently resets the simulation and
+    continues. Such a simulation has failed: its states are NaN from that step on, and the trajectory's ``ended`` names
+    the warning.
 
     Args:
         mjcf: the model as XML text, or the path of its file.
@@ -80,10 +80,8 @@ class MuJoCo(ShortRepr):
 
     def execute(self, controller: Controller, task: Task) -> Trajectory:
         if not np.isclose(task.dt, self.dt, rtol=1e-9, atol=0):
-            raise InputError(
-                f"the task's dt must be the model's timestep times substeps, "
-                f"{self._model.opt.timestep:g} s x {self.substeps} = {self.dt:g} s, got {task.dt:g} s."
-            )
+            wanted = f"{self._model.opt.timestep:g} s x {self.substeps} = {self.dt:g} s"
+            raise InputError(f"the task's dt must be the model's timestep times substeps, {wanted}, got {task.dt:g} s.")
         execution = _Execution(self, self._started(task))
         trajectory = rollout(execution.step, controller, task)
         ended = execution.failure or trajectory.ended
@@ -93,10 +91,8 @@ class MuJoCo(ShortRepr):
         nq, nv, sites = self._model.nq, self._model.nv, self._coordinates[0].size * self._coordinates[1].size
         states = task.initial_state.reshape(-1, task.initial_state.shape[-1])
         if states.shape[1] != nq + nv + sites:
-            raise ShapeError(
-                f"the task must have {nq + nv + sites} states, {nq} qpos, {nv} qvel and {sites} coordinates of sites, "
-                f"got {states.shape[1]}."
-            )
+            wanted = f"{nq + nv + sites} states, {nq} qpos, {nv} qvel and {sites} coordinates of sites"
+            raise ShapeError(f"the task must have {wanted}, got {states.shape[1]}.")
         simulations = _Batch(self._model, len(states), self.threads)
         simulations.qpos[:], simulations.qvel[:] = states[:, :nq], states[:, nq : nq + nv]
         if sites:
@@ -104,11 +100,9 @@ class MuJoCo(ShortRepr):
             given, actual = states[:, nq + nv :], self._observed(simulations)[:, nq + nv :]
             misses = np.abs(given - actual).max(axis=1)
             if misses.max() > 1e-6:  # metres
-                worst = int(misses.argmax())
-                raise InputError(
-                    f"the initial state must end with the sites' positions at its qpos, {actual[worst].tolist()}, "
-                    f"got {given[worst].tolist()}; state(qpos, qvel) returns the whole state."
-                )
+                wanted, got = (part[misses.argmax()].tolist() for part in (actual, given))
+                sentence = f"the initial state must end with the sites' positions at its qpos, {wanted}, got {got}"
+                raise InputError(f"{sentence}; state(qpos, qvel) returns the whole state.")
         return simulations
 
     def _observed(self, simulations: _Batch) -> Array:
@@ -137,10 +131,7 @@ class _Execution:
         self.simulations.advance(self.system.substeps, self.healthy, locate=bool(self.system.sites))
         warned: Mask = np.asarray(self.simulations.warnings > 0)
         if warned.any():
-            from mujoco import mjtWarning
-
-            kind = mjtWarning(int(warned.any(axis=0).argmax())).name.removeprefix("mjWARN_")
-            self._mark(np.asarray(warned.any(axis=1)), f"MuJoCo warned of {kind}")
+            self._mark(np.asarray(warned.any(axis=1)), f"MuJoCo warned of {warning_of(warned.any(axis=0))}")
         states = self.system._observed(self.simulations)
         states[~self.healthy] = np.nan
         return states.reshape(x.shape)
@@ -152,10 +143,7 @@ class _Execution:
 
 
 class _Batch:
-    """Simulations of one model, one in each row: qpos ``(N, nq)``, qvel ``(N, nv)`` and ctrl ``(N, nu)``.
-
-    The positions of sites, ``(N, nsite, 3)``, are computed if they are wanted.
-    """
+    """Simulations of one model: qpos ``(N, nq)``, qvel ``(N, nv)``, ctrl ``(N, nu)``, sites ``(N, nsite, 3)``."""
 
     def __init__(self, model: Any, count: int, threads: int) -> None:
         from mujoco import mjtStage
@@ -168,7 +156,6 @@ class _Batch:
 
     @property
     def warnings(self) -> Rows:
-        """The numbers of warnings by simulation and by kind."""
         counts: Rows = self.batch.warning[:, :, 1]
         return counts
 

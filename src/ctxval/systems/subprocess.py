@@ -12,8 +12,6 @@ import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
-import numpy as np
-
 from ctxval._util.checked import TimeLimit
 from ctxval._util.registry import part
 from ctxval._util.representation import ShortRepr
@@ -22,7 +20,7 @@ from ctxval.core.controller import Controller
 from ctxval.core.exchange import write_controller, write_task
 from ctxval.core.labels import require_names
 from ctxval.core.task import Task
-from ctxval.core.trajectory import COMPLETE, Trajectory
+from ctxval.core.trajectory import COMPLETE, Trajectory, require_times
 from ctxval.errors import ExecutionError, InputError
 from ctxval.systems.episode import require_one
 from ctxval.systems.supervised import run_supervised
@@ -47,8 +45,7 @@ class Subprocess(ShortRepr):
         timeout: seconds after which the command and all processes that it started are killed.
         states, inputs: names of the states and inputs with their units, for the files.
         keep: a folder in which the folders of all executions are kept, to examine failures.
-        folder: folder in which the files that the command names are searched first; by default, and if they are not
-            there, the current folder is used.
+        folder: folder in which the files that the command names are searched before the current one.
     """
 
     def __init__(
@@ -80,10 +77,7 @@ class Subprocess(ShortRepr):
         self._home = Path.cwd()
 
     def describe(self) -> dict[str, object]:
-        """Return what identifies this system in a store: its program, and digests of the files that the command names.
-
-        Other arguments are left out, because they may be secrets.
-        """
+        """Return its program, and digests of the files that the command names; other arguments may be secrets."""
         named = [*self._located[1:], *(self._located[:1] if not os.path.isabs(self.command[0]) else [])]
         files = {Path(name).name: Path(name).read_bytes() for name in named if os.path.isfile(name)}
         digests = {name: hashlib.sha256(content).hexdigest()[:16] for name, content in files.items()}
@@ -124,7 +118,7 @@ class Subprocess(ShortRepr):
 
 
 def signal_name(number: int) -> str:
-    """Return the name of a signal."""
+    """Return the name of a signal, also of one that Python does not know."""
     try:
         return signal.Signals(number).name
     except ValueError:
@@ -132,7 +126,6 @@ def signal_name(number: int) -> str:
 
 
 def _trajectory(folder: Path, task: Task) -> Trajectory:
-    """Return the trajectory that the command wrote, if it has the shape and the times of the task."""
     shape = task.horizon + 1, task.initial_state.size
     try:
         if os.path.lexists(folder / "trajectory.npz"):
@@ -141,19 +134,10 @@ def _trajectory(folder: Path, task: Task) -> Trajectory:
             trajectory = Trajectory.from_csv(folder / "trajectory.csv", most_rows=shape[0])
         else:
             raise ExecutionError("the command ended well but wrote neither trajectory.npz nor trajectory.csv")
+        if trajectory.ended == COMPLETE:
+            if trajectory.states.shape != shape:
+                raise InputError(f"it must have states of shape {shape}, got {trajectory.states.shape}")
+            require_times(trajectory, task.times)
     except (InputError, OSError, MemoryError) as error:
         raise ExecutionError(f"the command's trajectory cannot be used: {error}") from error
-    if trajectory.ended != COMPLETE:
-        return trajectory
-    if trajectory.states.shape != shape:
-        raise ExecutionError(
-            f"the command's trajectory must have states of shape {shape}, got {trajectory.states.shape}"
-        )
-    misses = np.abs(trajectory.times - trajectory.times[0] - task.times)
-    if not (misses <= 0.01 * task.dt).all():
-        worst = int(np.argmax(np.where(np.isnan(misses), np.inf, misses)))
-        raise ExecutionError(
-            f"the command's trajectory must have steps of {task.dt:g} s: time {worst} must be {task.times[worst]:g} s "
-            f"after the first, got {trajectory.times[worst] - trajectory.times[0]:g} s"
-        )
     return trajectory
