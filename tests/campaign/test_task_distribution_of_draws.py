@@ -80,7 +80,7 @@ def test_every_text_says_that_a_volume_is_a_probability_under_it(kind: Certifica
     assert accepted.answer == "validated"
     assert accepted.certificate is not None
     for text in (accepted.reason, refused.reason, accepted.certificate.statement):
-        assert "of the probability under the stated distribution of tasks" in text
+        assert "of the tasks under the stated distribution" in text
         assert "of the task space" not in text
     stated = " ".join(accepted.certificate.assumptions)
     assert "follow the stated distribution of tasks (goal normal (mean 1.0, deviation 0.05), all else" in stated

@@ -78,7 +78,7 @@ def test_what_a_kind_needs_and_is_not_given_is_asked_for() -> None:
 def test_a_confidence_below_1_is_not_printed_as_1() -> None:
     draws = Sample(np.zeros((9, 1)), np.arange(9.0), ["iid"] * 9, ["completed"] * 9)
     certificate = Scenario().certify(draws, 0.9999999)
-    assert "confidence 0.9999999," in certificate.statement
+    assert "99.99999 % confidence," in certificate.statement
 
 
 def test_the_kinds_of_this_package_are_listed_by_name() -> None:

@@ -37,7 +37,7 @@ def test_a_good_prediction_narrows_the_interval_around_the_true_mean() -> None:
 def test_it_says_whether_it_is_asymptotic() -> None:
     asymptotic, finite = certify_mean(sample()), certify_mean(sample(), options=Mean(largest_possible=1.5))
     assert asymptotic.statement.startswith(
-        "With confidence 0.95, as far as a normal approximation for 60 draws holds, the"
+        "With 95 % confidence, as far as a normal approximation for 60 draws holds, the"
     )
     assert "the interval is asymptotic and no bound in finite samples" in " ".join(asymptotic.assumptions)
     assert finite.statement.startswith(

@@ -79,7 +79,7 @@ def test_the_new_kind_is_found_by_name_and_judges(recipe: ModuleType) -> None:
     assert kind == recipe.Lipschitz(2.0)
     verdict = campaign.verdict(1e3, certificate=CertificateOptions(kind))
     assert verdict.answer == "validated"
-    assert verdict.reason.startswith("by its assumptions, the lipschitz bound of 8 trials is ")
+    assert "the lipschitz bound is " in verdict.reason
     assert verdict.rests_on is not None
     assert verdict.rests_on.startswith("It rests on the slope that you stated; on this campaign")
     missing = campaign.verdict(1e3, certificate=CertificateOptions(recipe.Lipschitz()))

@@ -3,8 +3,6 @@
 from typing import TYPE_CHECKING, Any
 
 from ctxval.certificates.anytime import AnytimeAudit, certify_anytime
-from ctxval.certificates.assessment import Assessment, assess
-from ctxval.certificates.audit import Audit, certify_audit
 from ctxval.certificates.automatic import Automatic
 from ctxval.certificates.base import Certificate, CertificateKind
 from ctxval.certificates.convergence import is_validated, rate
@@ -15,16 +13,17 @@ from ctxval.certificates.covering import (
     farthest_task,
     most_contested,
 )
+from ctxval.certificates.draws import Audit, certify_audit
 from ctxval.certificates.dynamics import Dynamics, certify_dynamics
 from ctxval.certificates.dynamics_evidence import (
     CheckedPrediction,
     DynamicsEvidence,
+    LearnedDistance,
     StateInputCoverage,
     StateInputGap,
     UntriedParameter,
 )
 from ctxval.certificates.forecast import Forecast, forecast
-from ctxval.certificates.learned import LearnedDistance, require_learned
 from ctxval.certificates.maxima import Maxima, draw_maxima, settle_maxima
 from ctxval.certificates.mean import Mean, certify_mean
 from ctxval.certificates.options import CertificateOptions
@@ -33,7 +32,7 @@ from ctxval.certificates.posterior_diagnostics import Diagnosis, diagnose
 from ctxval.certificates.provenance import Provenance
 from ctxval.certificates.region import Region, certify_region
 from ctxval.certificates.registry import KINDS, require_use
-from ctxval.certificates.sample import PLANNED, MadeGood, Sample
+from ctxval.certificates.sample import PLANNED, MadeGood, Sample, require_learned
 from ctxval.certificates.scenario import (
     SamplingDiscarding,
     Scenario,
@@ -43,7 +42,7 @@ from ctxval.certificates.scenario import (
     volume_bound,
 )
 from ctxval.certificates.stopping import StoppingDecision, StoppingRule
-from ctxval.certificates.verdict import Verdict, judge, judge_by
+from ctxval.certificates.verdict import Assessment, Verdict, assess, judge, judge_by
 
 if TYPE_CHECKING:
     USES: dict[str, tuple[str, ...]]

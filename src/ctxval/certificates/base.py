@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 from ctxval._util.representation import ShortRepr, Shown, call, line, lines, table
 from ctxval._util.version import VERSION
+from ctxval.certificates import verdict_sentences as sentences
 from ctxval.certificates.bounds import ERRORS, as_text, at_most, with_error
 from ctxval.certificates.sample import Sample
 from ctxval.core.space import TaskSpace
@@ -16,18 +17,6 @@ from ctxval.core.trial import Origin
 
 if TYPE_CHECKING:
     from ctxval.certificates.forecast import Forecast
-
-ONE_CAMPAIGN = (
-    "this campaign was fixed beforehand and not chosen among several: the best of several is wrong more often than "
-    "stated"
-)
-"""The assumption that all certificates share."""
-
-_NOT_PRINTED = ("failures", "checked")
-"""Details that are only in JSON."""
-
-_INDENT = "\n  "
-"""Line break within a text: its further lines are indented, so that none looks like a line of the certificate."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -82,12 +71,13 @@ class Certificate:
 
     @property
     def numbers(self) -> dict[str, Any]:
-        """The numbers that are printed; failures, which the assumptions list, and long lists are left out."""
-        shown = {name: value for name, value in self.details.items() if name not in _NOT_PRINTED}
+        """The numbers that are printed; failures, which the assumptions list, and long lists are only in JSON."""
+        shown = {name: value for name, value in self.details.items() if name not in ("failures", "checked")}
         return {**shown, "trials": self.trials, "version": self.version}
 
     def __str__(self) -> str:
-        return "\n".join(one.replace("\r\n", "\n").replace("\n", _INDENT) for one in self._lines())
+        # Further lines of a text are indented, so that none looks like a line of the certificate.
+        return "\n".join(text.replace("\r\n", "\n").replace("\n", "\n  ") for text in self._lines())
 
     def _lines(self) -> Iterator[str]:
         yield f"{self.kind}: {self.statement}"
@@ -125,10 +115,9 @@ class Certificate:
 class CertificateKind(ShortRepr, ABC):
     """A kind of certificate. Its fields are its options: its inputs besides the trials and the confidence.
 
-    A kind is a frozen dataclass with a name and a method that computes a certificate from trials. The other methods
-    state what a verdict by it rests on, and refuse a useless audit before its draws are executed.
-    Their defaults suit a bound on d* that is computed from the distances alone. If a kind uses what the experiment's
-    model predicts, it sets ``needs_model`` and reads :attr:`Sample.learned`.
+    A kind is a frozen dataclass with a name and a method that computes a certificate from trials. The defaults of all
+    else suit a bound on d* that is computed from the distances alone. If a kind uses what the experiment's model
+    predicts, it sets ``needs_model`` and reads :attr:`Sample.learned`.
     """
 
     name: ClassVar[str]
@@ -136,9 +125,6 @@ class CertificateKind(ShortRepr, ABC):
 
     bounds_maximum: ClassVar[bool] = True
     """Whether it bounds d* itself. If not, it leaves out a share of the task space, which the user must accept."""
-
-    evidence: ClassVar[str] = "by its assumptions"
-    """What a validation by it rests on, in the sentence of the verdict, if it bounds d*."""
 
     needs_threshold: ClassVar[bool] = False
     """Whether its statement is about a threshold, so that there is none without one."""
@@ -149,27 +135,28 @@ class CertificateKind(ShortRepr, ABC):
     needs_model: ClassVar[bool] = False
     """Whether it uses what the experiment's model predicts, so that the experiment must be loaded."""
 
+    sorts_draws: ClassVar[bool] = False
+    """Whether it sorts out independent draws whose number depended on results; else these are no draws in its sample.
+    """
+
     never_validates: ClassVar[str] = ""
     """Why it validates no threshold, whatever its numbers are: a sentence without its full stop; empty if it can."""
 
     @classmethod
     def options(cls) -> tuple[str, ...]:
         """Return the names of its options: its fields, and ``volume`` if it validates but for a share of the tasks."""
-        own = tuple(one.name for one in fields(cls))
-        return own if cls.bounds_maximum or cls.never_validates else (*own, "volume")
+        names = tuple(option.name for option in fields(cls))
+        return names if cls.bounds_maximum or cls.never_validates else (*names, "volume")
 
     @classmethod
     def of(cls, stated: Mapping[str, Any]) -> Self:
         """Return an instance from those of the options that are its own; an option that is None keeps its default."""
-        return cls(**{one.name: stated[one.name] for one in fields(cls) if stated.get(one.name) is not None})
+        names = [option.name for option in fields(cls)]
+        return cls(**{name: stated[name] for name in names if stated.get(name) is not None})
 
     @abstractmethod
     def certify(self, sample: Sample, confidence: float = 0.95) -> Certificate:
-        """Return the certificate of trials.
-
-        Args:
-            sample: the trials.
-            confidence: the probability with which the statement must hold.
+        """Return the certificate of trials, whose statement must hold with the confidence.
 
         Raises:
             CertificateError: if its theory does not allow these trials, or an option that it needs is missing.
@@ -181,28 +168,18 @@ class CertificateKind(ShortRepr, ABC):
         """Return a certificate that is precise enough for a threshold, and a forecast of further executions.
 
         The forecast is None if the certificate keeps the threshold, or if nothing can be predicted.
-
-        Raises:
-            CertificateError: under the conditions of :meth:`certify`.
         """
         return self.certify(sample, confidence), None
 
     def require_audit_helps(self, origins: Iterable[Origin]) -> None:
-        """Check that this certificate can use independent draws, before they are executed.
-
-        Args:
-            origins: the origins of the trials so far.
+        """Check that this certificate can use independent draws beside trials so far, before they are executed.
 
         Raises:
             CertificateError: if the certificate would be refused whatever the distances of the draws are.
         """
 
     def require_usable(self, confidence: float, executions: int) -> None:
-        """Check that this certificate can be computed, before the executions are paid for.
-
-        Args:
-            confidence: the probability with which the statement must hold.
-            executions: the planned number of trials.
+        """Check that this certificate can be computed from so many trials, before the executions are paid for.
 
         Raises:
             CertificateError: if it would be refused whatever the distances are.
@@ -212,23 +189,6 @@ class CertificateKind(ShortRepr, ABC):
     def rests_on(cls, certificate: Certificate, space: TaskSpace | None = None) -> list[str]:
         """Return what a validation by a certificate rests on: each entry completes a sentence "It rests on ...".
 
-        Args:
-            certificate: a certificate of this kind.
-            space: the task space, to state lengths in its units; None if it is not known.
+        The task space states lengths in its units; it is None if it is not known.
         """
-        return ["what its certificate assumes"]
-
-    @classmethod
-    def qualification(cls, certificate: Certificate, space: TaskSpace | None = None) -> str:
-        """Return the end of a sentence that names options other than the defaults; empty if all are defaults."""
-        return ""
-
-    @classmethod
-    def support(cls, certificate: Certificate, threshold: float) -> str:
-        """Return what speaks for a threshold although the certificate is withdrawn; empty if nothing does."""
-        return ""
-
-    @classmethod
-    def shortfall(cls, certificate: Certificate) -> str:
-        """Return the end of a sentence on why the bound or the volume left out is not smaller; empty if unknown."""
-        return ""
+        return sentences.conditions(certificate, space)

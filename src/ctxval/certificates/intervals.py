@@ -52,13 +52,8 @@ class Interval:
 def asymptotic_interval(values: Array, predicted: Array, elsewhere: Array, beta: float) -> Interval:
     """Return the prediction-powered interval of the mean, with the weight that has the least variance (PPI++).
 
-    It uses Student's t distribution with N - 2 degrees of freedom, and is valid for many draws only.
-
-    Args:
-        values: values of N >= 3 independent draws, shape ``(N,)``.
-        predicted: what was predicted for them, ``(N,)``.
-        elsewhere: predictions at M independent points, ``(M,)``.
-        beta: the probability with which the mean may lie outside.
+    It uses Student's t distribution with N - 2 degrees of freedom, and is valid for many draws only. Values and
+    predictions of draws have shape ``(N,)``, predictions elsewhere ``(M,)``.
     """
     n, m = len(values), len(elsewhere)
     weight = _best_weight(values, predicted, m)
@@ -72,12 +67,8 @@ def asymptotic_interval(values: Array, predicted: Array, elsewhere: Array, beta:
 def betting_interval(values: Array, predicted: Array, elsewhere: Array, most: float, beta: float) -> Interval:
     """Return an interval of the mean that is valid for every number of draws.
 
-    Args:
-        values: values of N independent draws in their order, all in [0, most], shape ``(N,)``.
-        predicted: what was predicted for them, ``(N,)``, all in [0, most].
-        elsewhere: predictions at M >= 2 independent points, ``(M,)``, all in [0, most].
-        most: the largest possible value.
-        beta: the probability with which the mean may lie outside.
+    Values of draws in their order and their predictions have shape ``(N,)``, predictions elsewhere ``(M,)`` with M >= 2;
+    all lie in [0, most].
     """
     centre, slack = mean_of_predictions(elsewhere, most, _OF_PREDICTIONS * beta)
     target = (1 - _OF_PREDICTIONS) * beta
@@ -117,8 +108,7 @@ def log_wealth_against(
     """Return the logarithm of the wealth after each draw, of bets that the mean is not the given one, ``(..., N)``.
 
     Args:
-        values: values of the draws, shape ``(..., N)``; leading axes are independent campaigns.
-        predicted: what was predicted for them, same shape.
+        values, predicted: values of the draws and their predictions, shape ``(..., N)``; leading axes are campaigns.
         centre: the estimated mean of the predictions over all points, and its largest error.
         most: the largest possible value.
         mean: the mean that is bet against.
@@ -146,15 +136,10 @@ def _log_wealth(
 
 
 def quantile_ranks(n: int, level: float, beta: float) -> tuple[int | None, int | None]:
-    """Return the ranks, from 1 to n, of the ordered values between which a quantile lies.
+    """Return the ranks, from 1 to n, of the ordered values between which the quantile of this level lies.
 
     Each side is wrong with probability at most beta / 2, for any distribution: the number of values below the quantile
     is binomial. A rank is None if there are too few values for a limit on its side.
-
-    Args:
-        n: number of independent draws.
-        level: the level of the quantile, strictly between 0 and 1.
-        beta: the probability with which the quantile may lie outside.
     """
     at_most = bdtr(np.arange(n), n, level)  # Pr(Bin(n, level) <= j) for j = 0, ..., n - 1
     low = int((at_most <= beta / 2).sum())

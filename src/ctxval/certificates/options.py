@@ -58,11 +58,7 @@ class CertificateOptions(ShortRepr):
     def or_automatic(
         cls, certificate: CertificateOptions | None, confidence: float, stochastic: bool, resolution: float
     ) -> CertificateOptions:
-        """Return a certificate that is given; otherwise ``auto`` with these options.
-
-        Raises:
-            InputError: if it is not a CertificateOptions, or if options are given beside it, which it has itself.
-        """
+        """Return a certificate that is given, beside which no options may stand; otherwise ``auto`` with the options."""
         if certificate is None:
             return cls(Automatic(stochastic, resolution), confidence)
         if (confidence, stochastic, resolution) != (CONFIDENCE, False, RESOLUTION):

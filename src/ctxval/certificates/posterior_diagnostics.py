@@ -26,9 +26,6 @@ from ctxval.gp.hyperposterior import Conditioned
 LEVEL = 0.01
 """Significance level: a surprise that is less probable than this withdraws the bound."""
 
-_MOST = 100
-"""Largest number of missing executions that a message states exactly."""
-
 
 @dataclass(frozen=True)
 class Diagnosis(ShortRepr):
@@ -69,8 +66,7 @@ def diagnose(
     Args:
         conditioned: processes conditioned on the values in the order of the trials, one for each draw of the
             hyperparameters.
-        X: the trials' points ``(n, d)``.
-        numbers: numbers of the trials; 0, 1, ... by default.
+        X: the trials' points ``(n, d)``, with ``numbers``; 0, 1, ... by default.
         unordered: which trials have an order without meaning, shape ``(n,)``; none by default.
         level: a surprise that is less probable than this withdraws the bound.
         resolution: a task that is farther than this from every trial withdraws the bound, in diagonals.
@@ -81,9 +77,9 @@ def diagnose(
     trial = worst if numbers is None else numbers[worst]
     tested = int(np.isfinite(exceed).sum())
     surprise = float(-np.expm1(tested * np.log1p(-min(exceed[worst], 1 - 1e-16))))
-    left_out = float(np.sqrt(np.mean([_left_out(one) for one in conditioned])))
+    left_out = float(np.sqrt(np.mean([_left_out(process) for process in conditioned])))
     covering_points = X if covered is None else covered
-    farthest, doubt = farthest_task(covering_points), None
+    farthest, d, doubt = farthest_task(covering_points), X.shape[1], None
     if surprise < level:
         doubt = (
             f"trial {trial} came out {-ndtri(max(exceed[worst], 1e-300)):.1f} standard deviations above what the "
@@ -91,29 +87,29 @@ def diagnose(
             "bound assumes, so the bound is withdrawn"
         )
     elif farthest > resolution:
-        doubt = _uncovered(covering_points, farthest, resolution)
-    elif len(bare := bare_corners(covering_points, resolution)):
-        doubt = _bare(bare, len(X[0]))
+        missing = covering(covering_points, resolution, 100)
+        many = "more than 100" if missing is None else f"{len(missing)}"
+        doubt = (
+            f"some task is {farthest:.2g} of the task space's diagonal away from every trial, more than the resolution "
+            f"of {resolution:g}, so the bound is withdrawn; {many} more executions would come near to every task "
+            "(`ctxval run` makes them), or an audit bounds how many tasks are worse"
+        )
+    elif bare := len(bare_corners(covering_points, resolution)):
+        where = "ends of the task parameter's range" if d == 1 else "corners of the task space"
+        doubt = (
+            f"no trial is at or next to {bare} of the {2**d} {where}, towards which the distance may rise unseen, so "
+            f"the bound is withdrawn; {bare} more executions would be there (`ctxval run` makes them)"
+        )
     return Diagnosis(surprise, trial, left_out, farthest, doubt)
-
-
-def _uncovered(X: Array, farthest: float, resolution: float) -> str:
-    missing = covering(X, resolution, _MOST)
-    many = f"more than {_MOST}" if missing is None else f"{len(missing)}"
-    return (
-        f"some task is {farthest:.2g} of the task space's diagonal away from every trial, more than the resolution of "
-        f"{resolution:g}, so the bound is withdrawn; {many} more executions would come near to every task "
-        "(`ctxval run` makes them), or an audit bounds how many tasks are worse"
-    )
 
 
 def _surprises(conditioned: list[Conditioned], unordered: Mask) -> tuple[Array, Mask]:
     """Return upper tail probabilities ``(n,)``, NaN if not tested, and which trials are predicted from earlier ones."""
     exceed = np.full(len(unordered), np.nan)
     before = ~unordered
-    exceed[2:] = np.mean([_exceedances(one) for one in conditioned], axis=0)
+    exceed[2:] = np.mean([_exceedances(process) for process in conditioned], axis=0)
     if unordered.any():
-        exceed[unordered] = np.mean([_left_out_exceedances(one) for one in conditioned], axis=0)[unordered]
+        exceed[unordered] = np.mean([_left_out_exceedances(process) for process in conditioned], axis=0)[unordered]
     return exceed, before
 
 
@@ -123,18 +119,10 @@ def _left_out_exceedances(conditioned: Conditioned) -> Array:
     inverse = conditioned.factor.solve(np.eye(n))
     ones = inverse.sum(axis=1)
     inverse = inverse - np.outer(ones, ones) / ones.sum()  # the unknown mean is projected out
-    pull, own = inverse @ y, np.maximum(np.diag(inverse), np.finfo(np.float64).tiny)
+    pull, diagonal = inverse @ y, np.maximum(np.diag(inverse), np.finfo(np.float64).tiny)
     freedom = n - 2
-    scale2 = np.maximum(y @ pull - pull**2 / own, np.finfo(np.float64).tiny) / freedom
-    return np.asarray(stdtr(freedom, -pull / np.sqrt(own * scale2)))
-
-
-def _bare(bare: Array, d: int) -> str:
-    where = "ends of the task parameter's range" if d == 1 else "corners of the task space"
-    return (
-        f"no trial is at or next to {len(bare)} of the {2**d} {where}, towards which the distance may rise unseen, so "
-        f"the bound is withdrawn; {len(bare)} more executions would be there (`ctxval run` makes them)"
-    )
+    scale2 = np.maximum(y @ pull - pull**2 / diagonal, np.finfo(np.float64).tiny) / freedom
+    return np.asarray(stdtr(freedom, -pull / np.sqrt(diagonal * scale2)))
 
 
 def _exceedances(conditioned: Conditioned) -> Array:

@@ -29,12 +29,9 @@ WIDEST = 0.12
 
 
 def fewest_missing_tests(points: Array, drawn: int, tests: int) -> int:
-    """Return the fewest executions that complete the tests; 0 if they are complete.
+    """Return the fewest executions that complete the tests; 0 if they are complete, or no tests are asked for.
 
-    Args:
-        points: tasks that were predicted beforehand and executed, points of the unit cube ``(n, d)``.
-        drawn: how many of them were drawn as tests.
-        tests: the number of tests; with 0 none are needed.
+    The points ``(n, d)`` are tasks that were predicted beforehand and executed; some of them were drawn as tests.
     """
     return max(tests - drawn, fewest_spread_tests(points)) if tests else 0
 
@@ -67,8 +64,7 @@ def _value_in_a_gap(values: Array, rng: np.random.Generator) -> float:
 
 def _gaps(values: Array) -> Iterator[tuple[float, float]]:
     """Yield the intervals between neighbouring values and the bounds 0 and 1."""
-    ordered = [0.0, *np.sort(values).tolist(), 1.0]
-    return pairwise(ordered)
+    return pairwise([0.0, *np.sort(values).tolist(), 1.0])
 
 
 def _needed(low: float, high: float) -> int:

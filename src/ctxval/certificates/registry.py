@@ -76,12 +76,7 @@ KINDS = KindRegistry()
 
 
 def require_use(kind: str, given: Iterable[str]) -> None:
-    """Refuse options that a kind would ignore: a user who gives one expects it to have an effect.
-
-    Raises:
-        CertificateError: if an option belongs to other kinds.
-        UnknownNameError: if no kind has that name, or no kind has such an option.
-    """
+    """Refuse options that a kind would ignore: a user who gives one expects it to have an effect."""
     own = KINDS.find(kind).options()
     for option in given:
         if option in own:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -11,12 +11,14 @@ import numpy as np
 from ctxval._util.arrays import Array
 from ctxval._util.representation import ShortRepr
 from ctxval._util.texts import enumerated
-from ctxval.certificates.learned import LearnedDistance
+from ctxval.certificates.dynamics_evidence import LearnedDistance
 from ctxval.core.trial import TOLD_ALONE, Origin, State, Trial
 from ctxval.errors import CertificateError
 
 PLANNED = "draws"
 """Key of the planned number of draws in the note of an independent draw."""
+
+_OF_EACH = ("origins", "states", "numbers", "planned")
 
 _SAME_TASK = 1e-9
 """Largest difference, in each coordinate, of unit-cube points that count as one task: scaling rounds them."""
@@ -95,50 +97,52 @@ class Sample(ShortRepr):
         A failure is left out if the same task was executed with success later, unless it is an independent draw. The
         order of trials that people chose or imported has no meaning, so they are sorted by their tasks.
 
-        Args:
-            trials: all trials of a campaign.
-            search: the type of the search that chose their tasks, if it is known.
-            learned: what the experiment's model predicts, if the experiment is loaded.
-
         Raises:
             CertificateError: if there is no trial, or one is still open.
         """
         if not trials:
             raise CertificateError("nothing was executed yet, so nothing can be certified.")
-        good = _made_good(trials)
-        left_out = {one.trial for one in good} | _measured_later(trials)
-        count = _in_order([trial for trial in trials if trial.number not in left_out])
+        made_good = _made_good(trials)
+        left_out = {failure.trial for failure in made_good} | _measured_later(trials)
+        counted = _in_order([trial for trial in trials if trial.number not in left_out])
         return cls(
-            np.array([trial.unit_point for trial in count]),
-            np.array([np.nan if trial.distance is None else trial.distance for trial in count]),
-            [trial.origin for trial in count],
-            [trial.state for trial in count],
-            [trial.number for trial in count],
-            [_planned(trial) for trial in count],
-            good,
+            np.array([trial.unit_point for trial in counted]),
+            np.array([np.nan if trial.distance is None else trial.distance for trial in counted]),
+            [trial.origin for trial in counted],
+            [trial.state for trial in counted],
+            [trial.number for trial in counted],
+            [_planned(trial) for trial in counted],
+            made_good,
             search,
             learned,
         )
 
     def only(self, origin: Origin) -> Sample:
         """Return the trials of one origin."""
-        return self.rows([row for row, own in enumerate(self.origins) if own == origin])
+        return self.rows([row for row, each in enumerate(self.origins) if each == origin])
 
     def rows(self, rows: Sequence[int]) -> Sample:
         """Return some of the trials."""
         chosen = list(rows)
-        return Sample(
-            self.points[chosen],
-            self.distances[chosen],
-            [self.origins[row] for row in chosen],
-            [self.states[row] for row in chosen],
-            [self.numbers[row] for row in chosen],
-            [self.planned[row] for row in chosen],
-            self.made_good,
-            self.search,
-            self.learned,
-            self.distribution,
-        )
+        parts = {name: [getattr(self, name)[row] for row in chosen] for name in _OF_EACH}
+        return replace(self, points=self.points[chosen], distances=self.distances[chosen], **parts)
+
+    @property
+    def countable(self) -> list[int]:
+        """Rows of the independent draws whose number was chosen before they were executed.
+
+        If the number was raised after some were known, these are the draws of the last decision.
+        """
+        rows = [row for row, origin in enumerate(self.origins) if origin == "iid"]
+        plans = [self.planned[row] for row in rows if self.planned[row] != 0]  # 0: the draws end with the verdict
+        return [row for row in rows if plans and self.planned[row] == plans[-1]]
+
+    def with_countable_draws(self) -> Sample:
+        """Return the sample in which only the countable draws are independent draws, and the others like a search's."""
+        kept = self.countable
+        others = [origin == "iid" and row not in kept for row, origin in enumerate(self.origins)]
+        origins = ["acquisition" if is_other else each for each, is_other in zip(self.origins, others, strict=True)]
+        return replace(self, origins=origins) if any(others) else self
 
     @property
     def best(self) -> float:
@@ -152,7 +156,7 @@ class Sample(ShortRepr):
 
     def numbers_of(self, state: State) -> list[int]:
         """Return the numbers of the trials in a state."""
-        return [number for number, own in zip(self.numbers, self.states, strict=True) if own == state]
+        return [number for number, each in zip(self.numbers, self.states, strict=True) if each == state]
 
     @property
     def failures(self) -> dict[str, list[Any]]:
@@ -160,49 +164,55 @@ class Sample(ShortRepr):
         return {
             "failed": self.numbers_of("failed"),
             "unmeasured": self.numbers_of("unmeasured"),
-            "made_good": [asdict(one) for one in self.made_good],
+            "made_good": [asdict(failure) for failure in self.made_good],
         }
 
     @property
     def remarks(self) -> tuple[str, ...]:
         """Sentences on the trials that failed, that could not be measured and that were made good."""
         failed, unmeasured = self.numbers_of("failed"), self.numbers_of("unmeasured")
-        found = [f"{listed(failed)} failed, and no distance is known there"] if failed else []
+        remarks = [f"{listed(failed)} failed, and no distance is known there"] if failed else []
         if unmeasured:
-            found.append(f"{listed(unmeasured)} {_was(unmeasured)} executed, but the distance could not be measured")
-        causes = dict.fromkeys((one.by, one.because) for one in self.made_good)
+            remarks.append(_unmeasured(unmeasured))
+        causes = dict.fromkeys((failure.by, failure.because) for failure in self.made_good)
         for by, because in causes:
-            which = listed([one.trial for one in self.made_good if one.by == by])
+            which = listed([failure.trial for failure in self.made_good if failure.by == by])
             why = "nobody stated why" if because is None else f"you state why: {because!r}"
-            found.append(f"{which} failed, and trial {by} executed the same task with success; {why}")
-        return tuple(found)
+            remarks.append(f"{which} failed, and trial {by} executed the same task with success; {why}")
+        return tuple(remarks)
 
 
-_LISTED = 5
-"""Largest number of trials that a message lists."""
+def require_learned(sample: Sample, kind: str) -> LearnedDistance:
+    """Return the predictions that come with a sample, which this kind of certificate needs."""
+    if sample.learned is None:
+        raise CertificateError(
+            f"the {kind} certificate uses what the experiment's model predicts, but the experiment is not loaded: use "
+            "`ctxval certify`, Campaign.verdict, or Provenance(learned=...)."
+        )
+    return sample.learned
 
 
 def listed(numbers: Sequence[int]) -> str:
-    """Return numbers of trials as text; if there are many, only the first few."""
-    first = enumerated(numbers, _LISTED)
+    """Return numbers of trials as text; if there are many, only the first five."""
+    first = enumerated(numbers, 5)
     return f"trial {first}" if len(numbers) == 1 else f"{len(numbers)} trials ({first})"
+
+
+def _unmeasured(numbers: Sequence[int]) -> str:
+    was = "was" if len(numbers) == 1 else "were"
+    return f"{listed(numbers)} {was} executed, but the distance could not be measured"
 
 
 def advice_to_remeasure(sample: Sample) -> str:
     """Return a sentence on what to do about trials that were executed but not measured; empty if there are none."""
-    unmeasured = sample.numbers_of("unmeasured")
-    if not unmeasured:
+    numbers = sample.numbers_of("unmeasured")
+    if not numbers:
         return ""
-    what = listed(unmeasured)
+    what = _unmeasured(numbers)
     return (
-        f" {what[0].upper()}{what[1:]} {_was(unmeasured)} executed, but the distance could not be measured: correct "
-        "the distance, then measure the recorded executions with `ctxval remeasure STORE`; if an execution was not "
-        "recorded, execute its task again."
+        f" {what[0].upper()}{what[1:]}: correct the distance, then measure the recorded executions with `ctxval "
+        "remeasure STORE`; if an execution was not recorded, execute its task again."
     )
-
-
-def _was(numbers: Sequence[int]) -> str:
-    return "was" if len(numbers) == 1 else "were"
 
 
 def _planned(trial: Trial) -> int | None:
@@ -218,10 +228,10 @@ def _in_order(trials: list[Trial]) -> list[Trial]:
         (trials[place] for place in places),
         key=lambda trial: (trial.unit_point.tolist(), np.inf if trial.distance is None else trial.distance),
     )
-    found = list(trials)
+    in_order = list(trials)
     for place, trial in zip(places, ordered, strict=True):
-        found[place] = trial
-    return found
+        in_order[place] = trial
+    return in_order
 
 
 def _measured_later(trials: Sequence[Trial]) -> set[int]:
@@ -244,11 +254,11 @@ def _made_good(trials: Sequence[Trial]) -> tuple[MadeGood, ...]:
     if not known or not failed:
         return ()
     points, numbers = np.array([trial.unit_point for trial in known]), np.array([trial.number for trial in known])
-    found = []
+    made_good = []
     for trial in failed:
         same = (np.abs(points - trial.unit_point).max(axis=1) <= _SAME_TASK) & (numbers > trial.number)
         later = [known[row] for row in np.flatnonzero(same)]
         if later:
-            by = next((one for one in later if one.because), later[0])
-            found.append(MadeGood(trial.number, by.number, by.because))
-    return tuple(found)
+            by = next((success for success in later if success.because), later[0])
+            made_good.append(MadeGood(trial.number, by.number, by.because))
+    return tuple(made_good)

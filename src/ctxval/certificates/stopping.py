@@ -43,9 +43,7 @@ class StoppingDecision(ShortRepr):
 class Screening:
     """A cheap test whether the bound is clearly above the threshold.
 
-    Attributes:
-        draws: number of draws of the hyperparameters.
-        margin: allowance for the error of so few draws, in the probability that d* keeps the threshold.
+    The margin allows for the error of so few draws, in the probability that d* keeps the threshold.
     """
 
     draws: int
@@ -65,8 +63,6 @@ class StoppingRule(ShortRepr):
             after them. They are executed where the largest draws of d* lie, and mostly correct a bound that is too
             low.
 
-    Raises:
-        InputError: if the certificate is not the posterior bound.
     """
 
     threshold: PositiveFloat
@@ -79,14 +75,10 @@ class StoppingRule(ShortRepr):
             raise InputError(f"this rule is for the posterior bound, got {self.options.kind.name!r}.")
 
     def decide(self, trials: Sequence[Trial], left: int) -> StoppingDecision:
-        """Return whether a campaign stops and, if not, which task must be executed next.
+        """Return whether a campaign with so many executions left stops and, if not, which task must be executed next.
 
-        While the bound is far above the threshold, this costs much less than the verdict.
-
-        Args:
-            trials: all trials of the campaign. Open trials count for the coverage of the task space, but their
-                distances are not waited for.
-            left: number of executions that are left.
+        While the bound is far above the threshold, this costs much less than the verdict. Open trials count for the
+        coverage of the task space, but their distances are not waited for.
         """
         if counterexample(trials, self.threshold) is not None:
             return StoppingDecision(decided=True)
