@@ -82,26 +82,23 @@ def test_a_confidence_below_1_is_not_printed_as_1() -> None:
 
 
 def test_the_kinds_of_this_package_are_listed_by_name() -> None:
-    own = ["anytime", "audit", "auto", "dynamics", "mean", "posterior", "region"]
+    own = ["anytime", "audit", "auto", "dynamics", "posterior", "region"]
     assert list(KINDS) == [*own, "sampling-discarding", "scenario"]
-    assert len(KINDS) == 9
+    assert len(KINDS) == 8
     assert "posteriour" not in KINDS
     assert KINDS["posterior"] is Posterior
 
 
 def test_which_kinds_have_a_use_for_an_option_follows_from_their_fields() -> None:
-    assert certificates.USES == {
+    uses = {
         "stochastic": ("auto", "dynamics", "posterior"),
         "tests": ("auto", "dynamics"),
         "resolution": ("auto", "posterior"),
         "volume": ("anytime", "audit", "region", "sampling-discarding", "scenario"),
         "discard": ("region", "sampling-discarding"),
-        "predictions": ("mean", "region"),
-        "quantile": ("mean",),
-        "largest_possible": ("mean",),
+        "predictions": ("region",),
     }
-    with pytest.raises(AttributeError, match="no attribute 'USED'"):
-        _ = certificates.USED
+    assert {option: KINDS.with_option(option) for option in uses} == uses
     with pytest.raises(UnknownNameError, match="did you mean 'resolution'"):
         require_use("posterior", ["resolutoin"])
     with pytest.raises(CertificateError, match="of the kind region or sampling-discarding; the kind here is posterior"):

@@ -99,20 +99,9 @@ def test_options_are_given_by_name_and_checked(store: str) -> None:
     assert one["details"]["discarded"] == 2
     few = json.loads(invoke("certify", store, "--kind", "region", "--option", "predictions=50", "--json").stdout)
     assert few["details"]["predictions"] == 50
-    refused = invoke("certify", store, "--kind", "region", "--option", "quantile=0.9")
+    refused = invoke("certify", store, "--kind", "region", "--option", "tests=3")
     assert refused.exit_code == 2
-    assert "quantile is for certificates of the kind mean" in refused.stderr
-
-
-def test_the_mean_and_its_quantile(store: str) -> None:
-    named = ("--option", "quantile=0.8", "--option", "largest_possible=1")
-    report = json.loads(invoke("certify", store, "--kind", "mean", *named, "--json").stdout)
-    assert 0 < report["details"]["lower_limit"] < report["details"]["upper_limit"] < 1
-    assert report["details"]["quantile_low"] < report["details"]["quantile_high"]
-    assert report["volume"] == 1
-    text = " ".join(invoke("certify", store, "--kind", "mean", "--threshold", "9").stdout.split())
-    assert "UNDECIDED against 9: the mean certificate is about the expected distance" in text
-    assert "as far as a normal approximation for 30 draws holds, the expected distance of a task" in text
+    assert "tests is for certificates of the kind auto or dynamics" in refused.stderr
 
 
 FILE = """

@@ -139,14 +139,11 @@ class CertificateKind(ShortRepr, ABC):
     """Whether it sorts out independent draws whose number depended on results; else these are no draws in its sample.
     """
 
-    never_validates: ClassVar[str] = ""
-    """Why it validates no threshold, whatever its numbers are: a sentence without its full stop; empty if it can."""
-
     @classmethod
     def options(cls) -> tuple[str, ...]:
         """Return the names of its options: its fields, and ``volume`` if it validates but for a share of the tasks."""
         names = tuple(option.name for option in fields(cls))
-        return names if cls.bounds_maximum or cls.never_validates else (*names, "volume")
+        return names if cls.bounds_maximum else (*names, "volume")
 
     @classmethod
     def of(cls, stated: Mapping[str, Any]) -> Self:

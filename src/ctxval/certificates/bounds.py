@@ -35,12 +35,6 @@ def at_most(value: float, digits: int = 4) -> str:
     return f"{value + 10.0 ** (np.floor(np.log10(abs(value))) - digits + 1):.{digits}g}"
 
 
-def at_least(value: float, digits: int = 4) -> str:
-    """Return a lower limit as text, rounded down."""
-    rounded = at_most(-value, digits)
-    return rounded.removeprefix("-") if rounded.startswith("-") else ("0" if value == 0 else f"-{rounded}")
-
-
 def percent(probability: float) -> str:
     """Return a probability such as 0.95 as ``95 %``."""
     return f"{100 * probability:.9g} %"

@@ -30,7 +30,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from ctxval._util.arrays import Array, Mask
-from ctxval.certificates.bets import log_wealth_of_bets, weights_so_far
 
 _LARGEST = 0.9  # gain or loss of one bet on unbounded differences, as a share of the wealth
 _FEW = 4  # with fewer earlier tasks, all of them count as recent
@@ -60,7 +59,7 @@ class PairedDifferences:
     @property
     def _weights(self) -> Array:
         """The slope of differences against predictions among the recent earlier tasks, from 0 to 1, ``(N,)``."""
-        return weights_so_far(self.values, self.predicted, _recent_sum)
+        return _weights_so_far(self.values, self.predicted)
 
     def log_wealth(self, mean: Array, *, above: bool) -> Array:
         """Return the logarithm of the largest wealth so far, of bets that the mean is not the given one ``(...)``.
@@ -168,6 +167,17 @@ def _recent_sum(values: Array) -> Array:
     return np.asarray(sums[..., ends] - sums[..., starts])
 
 
+def _weights_so_far(values: Array, predicted: Array) -> Array:
+    """Return for each task the slope of values against predictions among the recent earlier ones, from 0 to 1."""
+    count = _recent_sum(np.ones(values.shape[-1]))
+    of_values, of_predicted, of_products, of_squares = map(
+        _recent_sum, (values, predicted, values * predicted, predicted**2)
+    )
+    with np.errstate(invalid="ignore", divide="ignore"):
+        slope = (of_products - of_values * of_predicted / count) / (of_squares - of_predicted**2 / count)
+    return np.asarray(np.where(np.isfinite(slope) & (count >= 3), np.clip(slope, 0.0, 1.0), 1.0))
+
+
 def _recent_size(values: Array) -> Array:
     """Return for each task the root mean square of the recent earlier values, ``(..., N)``; NaN for the first task."""
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -181,7 +191,17 @@ def _by_bound(values: Array, mean: Array, lowest: Array, most: float) -> Array:
     deviations = (values - np.cumsum(values) / (count + 1)) ** 2
     spread = (most**2 / 16 + np.cumsum(deviations) - deviations) / count
     wanted = np.sqrt(2 * np.log(20.0) / (spread * count * np.log1p(count)))
-    return log_wealth_of_bets(values - mean, wanted, mean - lowest)
+    return _log_wealth_of_bets(values - mean, wanted, mean - lowest)
+
+
+def _log_wealth_of_bets(gains: Array, wanted: Array, room: Array) -> Array:
+    """Return the logarithm of the wealth after each draw, of bets on values that are bounded on one side, ``(..., N)``.
+
+    A bet of 1 gains ``gains`` with each draw and can lose ``room`` at most, which limits the bets that are wanted.
+    """
+    # A bet is at most 3/4 of that with which one draw could lose everything; without room no draw can lose.
+    won = np.minimum(wanted, 0.75 / np.maximum(room, 1e-300)) * gains
+    return np.asarray(np.cumsum(np.log1p(np.maximum(won, -0.75)), axis=-1))
 
 
 def _end(differences: PairedDifferences, centre: float, level: float, *, above: bool) -> float:

@@ -94,7 +94,7 @@ class Dynamics(CertificateKind):
 
     def _evidence(self, sample: Sample, confidence: float) -> DynamicsEvidence:
         learned = require_learned(sample, self.name)
-        require_executions(sample)
+        _require_distances(sample)
         evidence = learned.dynamics(confidence)
         if evidence is None:
             raise CertificateError(
@@ -109,14 +109,12 @@ def draws_for(confidence: float) -> int:
     return min(MOST_DRAWS, int(np.ceil(confidence / (1 - confidence))))
 
 
-def require_executions(sample: Sample) -> None:
-    """Check that the trials allow a bound from learned dynamics."""
+def _require_distances(sample: Sample) -> None:
     unknown = [number for number, distance in zip(sample.numbers, sample.distances, strict=True) if np.isnan(distance)]
     if unknown:
         raise CertificateError(
             f"{listed(unknown)} failed or has no distance, so d* is not bounded there; execute the task again, or "
-            "audit."
-            f"{advice_to_remeasure(sample)}"
+            f"audit.{advice_to_remeasure(sample)}"
         )
     if not sample.best > 0:
         raise CertificateError(
@@ -127,9 +125,7 @@ def require_executions(sample: Sample) -> None:
 
 @checked
 def certify_dynamics(sample: Sample, evidence: DynamicsEvidence, confidence: Probability = 0.95) -> Certificate:
-    """Return the bound that d* stays below with the confidence, under the prior on the dynamics.
-
-    The evidence must be from the same trials.
+    """Return the bound that d* stays below with the confidence, from evidence of the same trials.
 
     Raises:
         CertificateError: if the confidence is too high for the number of draws, or draws diverge.

@@ -70,7 +70,7 @@ class Maxima(ShortRepr):
 
         A block bootstrap over the chain of hyperparameters is used, because successive draws are correlated, and so are
         draws that share hyperparameters. If the confidence is high, few draws are above the bound and their spread may
-        be too small, so the error of the bound with fewer draws below it is computed, too, and the larger one is returned.
+        be too small; the error of the bound with fewer draws below it is then returned, if it is larger.
         """
         blocks = min(32, len(self.conditioned))
         if blocks < 2:

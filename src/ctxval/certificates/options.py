@@ -58,7 +58,7 @@ class CertificateOptions(ShortRepr):
     def or_automatic(
         cls, certificate: CertificateOptions | None, confidence: float, stochastic: bool, resolution: float
     ) -> CertificateOptions:
-        """Return a certificate that is given, beside which no options may stand; otherwise ``auto`` with the options."""
+        """Return a certificate that is given, beside which no options may stand; else ``auto`` with the options."""
         if certificate is None:
             return cls(Automatic(stochastic, resolution), confidence)
         if (confidence, stochastic, resolution) != (CONFIDENCE, False, RESOLUTION):

@@ -12,7 +12,7 @@ not chosen by the distances.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -48,7 +48,7 @@ class Diagnosis(ShortRepr):
 
     def to_json(self) -> dict[str, Any]:
         """Return the numbers, ready for JSON."""
-        return {"surprise": self.surprise, "trial": self.trial, "left_out": self.left_out, "farthest": self.farthest}
+        return {name: value for name, value in asdict(self).items() if name != "doubt"}
 
 
 def diagnose(

@@ -1,4 +1,4 @@
-"""The origin of trials: the task space, the search, and changes of their store."""
+"""What is known of trials besides their numbers: the task space, units, and changes of their store."""
 
 from __future__ import annotations
 
@@ -22,7 +22,6 @@ class Provenance(ShortRepr):
 
     Attributes:
         space: the task space, to state lengths in its units; None if it is not known.
-        search: the type of the search that chose the tasks; None if it is not known.
         remarks: sentences that a certificate lists among its assumptions, such as what was changed on the system.
         learned: what the experiment's model predicts, for kinds that need it; None if the experiment is not loaded.
         distribution: the distribution of tasks as a text; None if it is uniform.
@@ -32,7 +31,6 @@ class Provenance(ShortRepr):
     """
 
     space: TaskSpace | None = None
-    search: str | None = None
     remarks: tuple[str, ...] = ()
     learned: LearnedDistance | None = None
     distribution: str | None = None
@@ -42,12 +40,11 @@ class Provenance(ShortRepr):
     @classmethod
     def of(cls, description: Mapping[str, Any], changes: Iterable[Change] = ()) -> Provenance:
         """Return the provenance from a store's description of its experiment and its list of changes."""
-        search, validation = _table(description, "search"), _table(description, "validation")
+        validation = _table(description, "validation")
         described, refined = _table(validation, "space"), _table(validation, "model").get("type") == "Refined"
         distribution = described.get(DISTRIBUTION)
         return cls(
             space=_space_of(described),
-            search=search.get("type"),
             remarks=(*([REFINED] if refined else []), *remarks_on(changes)),
             distribution=None if distribution is None else distribution_text(distribution),
         )
@@ -71,7 +68,7 @@ class Provenance(ShortRepr):
 
     def sample(self, trials: Sequence[Trial]) -> Sample:
         """Return trials as a certificate sees them, with what is known here."""
-        return replace(Sample.of(trials, self.search, self.learned), distribution=self.distribution)
+        return replace(Sample.of(trials, self.learned), distribution=self.distribution)
 
 
 def remarks_on(changes: Iterable[Change]) -> tuple[str, ...]:

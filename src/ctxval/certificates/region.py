@@ -26,11 +26,9 @@ from ctxval._util.checked import NonNegativeInt, PositiveFloat, PositiveInt, Pro
 from ctxval._util.registry import part
 from ctxval.certificates.base import Certificate, CertificateKind
 from ctxval.certificates.bounds import at_most, of_tasks
-from ctxval.certificates.draws import countable_draws, not_counted
-from ctxval.certificates.dynamics_evidence import LearnedDistance
 from ctxval.certificates.forecast import Forecast
 from ctxval.certificates.sample import Sample, advice_to_remeasure, require_learned
-from ctxval.certificates.scenario import volume_bound
+from ctxval.certificates.scenario import countable_draws, not_counted, volume_bound
 from ctxval.certificates.sentences import ABOUT_DRAWS, FROZEN, ONE_CAMPAIGN, how_drawn, margin_and_map
 from ctxval.errors import CertificateError
 
@@ -72,55 +70,6 @@ class Region(CertificateKind):
         _require_fewer(self.discard, executions)
 
 
-@dataclass(frozen=True, eq=False)
-class _Margin:
-    """The margin q, the (k+1)-th largest excess d - d_hat of independent draws, in the distance's units.
-
-    The prediction is learned from the trials before the first of the draws.
-    """
-
-    drawn: Sample
-    before: int
-    value: float
-    unpredicted: int
-
-
-@dataclass(frozen=True, eq=False)
-class _Map:
-    """Predicted bounds d_hat + q of M independent tasks, against a limit.
-
-    Outside are the tasks whose bound exceeds the limit or cannot be predicted. A limit that is not fixed is the largest
-    of these bounds.
-    """
-
-    limit: float
-    count: int
-    outside: int
-    unpredicted: int
-    fixed: bool
-
-    @property
-    def share(self) -> float:
-        """The estimated share of the tasks inside."""
-        return 1 - self.outside / self.count
-
-    @property
-    def error(self) -> float:
-        """The standard error of the share, with one more task on either side, so that it is never zero."""
-        smoothed = (self.outside + 1) / (self.count + 2)
-        return float(np.sqrt(smoothed * (1 - smoothed) / self.count))
-
-    def volume_outside(self, beta: float) -> float:
-        """Return an upper bound on the share outside, which is wrong with probability at most beta."""
-        if self.outside == self.count:
-            return 1.0
-        if self.fixed:
-            return volume_bound(self.count, self.outside, beta)
-        # The tasks without a prediction, and those above the largest of the others, which the draws did not fix.
-        known = self.count - self.unpredicted
-        return volume_bound(self.count, self.unpredicted, beta / 2) + volume_bound(known, 0, beta / 2)
-
-
 @checked
 def certify_region(
     sample: Sample,
@@ -138,24 +87,38 @@ def certify_region(
             draws lack a distance or a prediction than are discarded.
     """
     chosen, beta = options or Region(), 1 - confidence
-    learned = require_learned(sample, "region")
-    margin = _margin_of(sample, learned, chosen.discard)
-    volume = volume_bound(len(margin.drawn), chosen.discard, (1 - _OF_MAP) * beta)
-    tasks = learned.tasks(chosen.predictions, margin.before)
-    mapped = _map_of(learned.expected(tasks, margin.before) + margin.value, threshold)
-    total = min(1.0, volume + mapped.volume_outside(_OF_MAP * beta))
+    learned, drawn = require_learned(sample, "region"), countable_draws(sample, "a region bound")
+    before = min(drawn.numbers)  # the prediction is learned from the trials before the draws
+    margin, unpredicted = _margin(drawn, learned.expected(drawn.points, before), before, chosen.discard)
+    volume = volume_bound(len(drawn), chosen.discard, (1 - _OF_MAP) * beta)
+    bounds = learned.expected(learned.tasks(chosen.predictions, before), before) + margin
+    count, unknown = len(bounds), int(np.isnan(bounds).sum())
+    limit = float(bounds[~np.isnan(bounds)].max(initial=-np.inf)) if threshold is None else float(threshold)
+    outside = int((~(bounds <= limit)).sum())
+    if outside == count:
+        outside_volume = 1.0
+    elif threshold is not None:
+        outside_volume = volume_bound(count, outside, _OF_MAP * beta)
+    else:
+        # The tasks without a prediction, and those above the largest of the others, which the draws did not fix.
+        half = _OF_MAP * beta / 2
+        outside_volume = volume_bound(count, unknown, half) + volume_bound(count - unknown, 0, half)
+    total, share = min(1.0, volume + outside_volume), 1 - outside / count
+    smoothed = (outside + 1) / (count + 2)  # one more task on either side, so that the error is never zero
+    error = float(np.sqrt(smoothed * (1 - smoothed) / count))
+    kept = f"this prediction is at most {at_most(limit)} on each of {count} predicted tasks that it covers"
+    if threshold is not None:
+        tasks = f"{100 * share:.4g} ± {at_most(100 * error, 2)} % {of_tasks(sample.distribution)}"
+        kept = f"this prediction keeps {limit:.6g} on {tasks} (an estimate from {count} predicted tasks)"
     return Certificate(
         kind="region",
-        statement=margin_and_map(
-            *(sample, margin.value, volume, total, confidence, at_most(mapped.limit)),
-            kept=_kept(mapped, of_tasks(sample.distribution)),
-        ),
-        upper_bound=mapped.limit,
+        statement=margin_and_map(sample, margin, volume, total, confidence, at_most(limit), kept),
+        upper_bound=limit,
         confidence=confidence,
         volume=total,
-        trials=len(margin.drawn),
+        trials=len(drawn),
         assumptions=(
-            *how_drawn(sample, margin.drawn),
+            *how_drawn(sample, drawn),
             "the number discarded was chosen before the draws were known",
             FROZEN,
             *ABOUT_DRAWS,
@@ -163,16 +126,16 @@ def certify_region(
             ONE_CAMPAIGN,
         ),
         details={
-            "margin": margin.value,
+            "margin": margin,
             "discarded": chosen.discard,
             "volume_of_draws": volume,
-            "learned_before": margin.before,
-            "predictions": mapped.count,
-            "share_kept": mapped.share,
-            "share_error": mapped.error,
-            "unpredicted_draws": margin.unpredicted,
-            "unpredicted_tasks": mapped.unpredicted,
-            "largest_drawn": margin.drawn.best if np.isfinite(margin.drawn.best) else None,
+            "learned_before": before,
+            "predictions": count,
+            "share_kept": share,
+            "share_error": error,
+            "unpredicted_draws": unpredicted,
+            "unpredicted_tasks": unknown,
+            "largest_drawn": drawn.best if np.isfinite(drawn.best) else None,
             "not_counted": not_counted(sample),
             "failed": sample.failed,
             "failures": sample.failures,
@@ -181,16 +144,8 @@ def certify_region(
     )
 
 
-def _require_fewer(discard: int, draws: int) -> None:
-    if discard >= draws:
-        raise CertificateError(f"of {draws} draws, from 0 to {draws - 1} can be discarded, not {discard}.")
-
-
-def _margin_of(sample: Sample, learned: LearnedDistance, discard: int) -> _Margin:
-    """Return the margin of the prediction from the trials before the draws that count."""
-    drawn = countable_draws(sample, "a region bound")
-    before = min(drawn.numbers)
-    predicted = learned.expected(drawn.points, before)
+def _margin(drawn: Sample, predicted: Array, before: int, discard: int) -> tuple[float, int]:
+    """Return q, the (k+1)-th largest excess d - d_hat of draws, and how many of them cannot be predicted."""
     if np.isnan(predicted).all():
         raise CertificateError(
             f"nothing can be predicted from the trials before trial {before}, the first of these draws: execute tasks "
@@ -204,19 +159,9 @@ def _margin_of(sample: Sample, learned: LearnedDistance, discard: int) -> _Margi
             f"{drawn.failed} of {len(drawn)} draws have no distance and {unpredicted} have no prediction, more than "
             f"the {discard} discarded; nothing bounds the distance there.{advice_to_remeasure(drawn)}"
         )
-    return _Margin(drawn, before, float(excess[-1 - discard]), unpredicted)
+    return float(excess[-1 - discard]), unpredicted
 
 
-def _map_of(bounds: Array, threshold: float | None) -> _Map:
-    """Return the map of predicted bounds ``(M,)``, which are NaN if a task cannot be predicted."""
-    known = bounds[~np.isnan(bounds)]
-    limit = float(known.max(initial=-np.inf)) if threshold is None else float(threshold)
-    return _Map(limit, len(bounds), int((~(bounds <= limit)).sum()), len(bounds) - len(known), threshold is not None)
-
-
-def _kept(mapped: _Map, tasks: str) -> str:
-    if not mapped.fixed:
-        limit = at_most(mapped.limit)
-        return f"this prediction is at most {limit} on each of {mapped.count} predicted tasks that it covers"
-    share = f"{100 * mapped.share:.4g} ± {at_most(100 * mapped.error, 2)} % {tasks}"
-    return f"this prediction keeps {mapped.limit:.6g} on {share} (an estimate from {mapped.count} predicted tasks)"
+def _require_fewer(discard: int, draws: int) -> None:
+    if discard >= draws:
+        raise CertificateError(f"of {draws} draws, from 0 to {draws - 1} can be discarded, not {discard}.")

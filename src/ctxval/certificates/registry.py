@@ -26,8 +26,7 @@ class KindRegistry(Registry[CertificateKind]):
         """Add a kind; it is used as a decorator of the class."""
         name = _required(kind).name
         known = self.find(name) if name in self.built_in else self._registered.get(name, kind)
-        again = (known.__module__, known.__qualname__) == (kind.__module__, kind.__qualname__)
-        if not again:
+        if (known.__module__, known.__qualname__) != (kind.__module__, kind.__qualname__):
             raise InputError(f"there is a kind of certificate called {name!r} already: {known.__qualname__}.")
         if name not in self.built_in:
             self._registered[name] = kind  # a cell that is run again replaces its own class
@@ -35,12 +34,10 @@ class KindRegistry(Registry[CertificateKind]):
 
     def find(self, name: str) -> type[CertificateKind]:
         """Return the kind of a name."""
-        if name in self._registered:
-            return self._registered[name]
-        found = _required(super().find(name))
-        if found.name != name:
-            raise InputError(f"the certificate {name!r} calls itself {found.name!r}.")
-        return found
+        kind = self._registered.get(name) or _required(super().find(name))
+        if kind.name != name:
+            raise InputError(f"the certificate {name!r} calls itself {kind.name!r}.")
+        return kind
 
     @property
     def imported(self) -> tuple[str, ...]:
@@ -65,10 +62,10 @@ class KindRegistry(Registry[CertificateKind]):
         return len(list(iter(self)))
 
 
-def _required(found: Any) -> type[CertificateKind]:
-    if isinstance(found, type) and issubclass(found, CertificateKind) and isinstance(getattr(found, "name", None), str):
-        return found
-    raise InputError(f"a kind of certificate must be a subclass of CertificateKind with a name, got {found!r}.")
+def _required(kind: Any) -> type[CertificateKind]:
+    if isinstance(kind, type) and issubclass(kind, CertificateKind) and isinstance(getattr(kind, "name", None), str):
+        return kind
+    raise InputError(f"a kind of certificate must be a subclass of CertificateKind with a name, got {kind!r}.")
 
 
 KINDS = KindRegistry()
@@ -77,11 +74,10 @@ KINDS = KindRegistry()
 
 def require_use(kind: str, given: Iterable[str]) -> None:
     """Refuse options that a kind would ignore: a user who gives one expects it to have an effect."""
-    own = KINDS.find(kind).options()
+    options = KINDS.find(kind).options()
     for option in given:
-        if option in own:
-            continue
         kinds = " or ".join(KINDS.with_option(option))
-        if not kinds:
-            raise UnknownNameError.among(f"option of the certificate {kind!r}", option, own)
-        raise CertificateError(f"{option} is for certificates of the kind {kinds}; the kind here is {kind}.")
+        if option not in options and not kinds:
+            raise UnknownNameError.among(f"option of the certificate {kind!r}", option, options)
+        if option not in options:
+            raise CertificateError(f"{option} is for certificates of the kind {kinds}; the kind here is {kind}.")

@@ -18,10 +18,7 @@ from ctxval.errors import CertificateError
 PLANNED = "draws"
 """Key of the planned number of draws in the note of an independent draw."""
 
-_OF_EACH = ("origins", "states", "numbers", "planned")
-
-_SAME_TASK = 1e-9
-"""Largest difference, in each coordinate, of unit-cube points that count as one task: scaling rounds them."""
+_SAME_TASK = 1e-9  # largest difference of coordinates that count as one task: scaling rounds them
 
 
 @dataclass(frozen=True)
@@ -52,7 +49,6 @@ class Sample(ShortRepr):
         planned: for each trial, the total number of independent draws that was planned when it was drawn; 0 if they
             were to end with the verdict, None if that is not known.
         made_good: failures that are left out, because their tasks were executed with success later.
-        search: the type of the search that chose the tasks; None if it is not known.
         learned: what the experiment's model predicts; None if the experiment is not loaded.
         distribution: the distribution of tasks as a text; None if it is uniform.
 
@@ -67,7 +63,6 @@ class Sample(ShortRepr):
     numbers: Sequence[int] = ()
     planned: Sequence[int | None] = ()
     made_good: tuple[MadeGood, ...] = ()
-    search: str | None = None
     learned: LearnedDistance | None = None
     distribution: str | None = None
 
@@ -77,11 +72,10 @@ class Sample(ShortRepr):
         if not len(self.planned):
             object.__setattr__(self, "planned", [None] * len(self.points))
         parts = (self.points, self.distances, self.origins, self.states, self.numbers, self.planned)
-        lengths = {len(part) for part in parts}
-        if len(lengths) != 1:
+        if len({len(part) for part in parts}) != 1:
             raise CertificateError(
                 "points, distances, origins, states, numbers and planned must be equally many, got lengths "
-                f"{sorted(lengths)}."
+                f"{sorted({len(part) for part in parts})}."
             )
         if "open" in self.states:
             waiting = [str(n) for n, state in zip(self.numbers, self.states, strict=True) if state == "open"]
@@ -91,7 +85,7 @@ class Sample(ShortRepr):
         return len(self.distances)
 
     @classmethod
-    def of(cls, trials: Sequence[Trial], search: str | None = None, learned: LearnedDistance | None = None) -> Sample:
+    def of(cls, trials: Sequence[Trial], learned: LearnedDistance | None = None) -> Sample:
         """Return the sample of a campaign's trials; a task that failed before its execution has failed as well.
 
         A failure is left out if the same task was executed with success later, unless it is an independent draw. The
@@ -113,7 +107,6 @@ class Sample(ShortRepr):
             [trial.number for trial in counted],
             [_planned(trial) for trial in counted],
             made_good,
-            search,
             learned,
         )
 
@@ -124,7 +117,9 @@ class Sample(ShortRepr):
     def rows(self, rows: Sequence[int]) -> Sample:
         """Return some of the trials."""
         chosen = list(rows)
-        parts = {name: [getattr(self, name)[row] for row in chosen] for name in _OF_EACH}
+        parts = {
+            name: [getattr(self, name)[row] for row in chosen] for name in ("origins", "states", "numbers", "planned")
+        }
         return replace(self, points=self.points[chosen], distances=self.distances[chosen], **parts)
 
     @property

@@ -1,12 +1,13 @@
 """What certificates state and assume, in sentences: numbers in, text out.
 
-The sentences of verdicts are in :mod:`ctxval.certificates.verdict_sentences`. Why a bound is withdrawn stands beside the test that withdraws it, in the diagnostics.
+The sentences of verdicts are in :mod:`ctxval.certificates.verdict_sentences`. Why a bound is withdrawn
+stands beside the test that withdraws it, in the diagnostics.
 """
 
 from __future__ import annotations
 
 from ctxval._util.representation import counted
-from ctxval.certificates.bounds import at_least, at_most, of_tasks, percent, with_error, with_units
+from ctxval.certificates.bounds import at_most, of_tasks, percent, with_error, with_units
 from ctxval.certificates.dynamics_evidence import DynamicsEvidence
 from ctxval.certificates.sample import Sample, listed
 
@@ -104,28 +105,6 @@ def margin_and_map(
         f"{of_tasks(sample.distribution)}; {kept}, so that the distance exceeds {limit} on at most "
         f"{at_most(100 * total, 3)} % in all."
     )
-
-
-def expected_distance(
-    sample: Sample, interval: tuple[float, float, float], draws: int, confidence: float, most: float | None, failed: int
-) -> str:
-    """Return the statement on the expected distance, from an estimate and the ends of its interval, without its end."""
-    over = "uniform over the task space" if sample.distribution is None else "from the stated distribution of tasks"
-    how = f", as far as a normal approximation for {draws} draws holds" if most is None else ""
-    what = f"distance, with failures as {most:g}," if failed else "distance"
-    estimate, low, high = interval
-    return (
-        f"With {percent(confidence)} confidence{how}, the expected {what} of a task {over} is between {at_least(low)} "
-        f"and {at_most(high)} (estimate {estimate:.4g})"
-    )
-
-
-def between(low: float | None, high: float | None) -> str:
-    """Return between which limits a quantile lies, as the end of a sentence; None if the draws are too few for one."""
-    above = "" if low is None else f"is at least {at_least(low)}"
-    if high is None:
-        return f"{above}, and has no upper limit from so few draws".removeprefix(", and ")
-    return f"{above} and at most {at_most(high)}" if above else f"is at most {at_most(high)}"
 
 
 # The posterior of the distance

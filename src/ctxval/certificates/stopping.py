@@ -39,15 +39,9 @@ class StoppingDecision(ShortRepr):
     next_point: Array | None = None
 
 
-@dataclass(frozen=True)
-class Screening:
-    """A cheap test whether the bound is clearly above the threshold.
-
-    The margin allows for the error of so few draws, in the probability that d* keeps the threshold.
-    """
-
-    draws: int
-    margin: float
+_SCREENINGS = ((8, 0.3), (32, 0.05))
+"""Cheap tests whether the bound is clearly above the threshold: how many draws of the hyperparameters, and a margin
+that allows for the error of so few draws, in the probability that d* keeps the threshold."""
 
 
 @checked
@@ -58,7 +52,6 @@ class StoppingRule(ShortRepr):
     Attributes:
         threshold: tau, in the distance's units.
         options: the certificate of the verdict; it must be the posterior bound.
-        screenings: cheap tests; while one shows that the bound is clearly above the threshold, it is not computed.
         confirmations: number of trials after the bound first keeps the threshold; it must still keep the threshold
             after them. They are executed where the largest draws of d* lie, and mostly correct a bound that is too
             low.
@@ -67,7 +60,6 @@ class StoppingRule(ShortRepr):
 
     threshold: PositiveFloat
     options: CertificateOptions = field(default_factory=CertificateOptions.posterior)
-    screenings: tuple[Screening, ...] = (Screening(8, 0.3), Screening(32, 0.05))
     confirmations: NonNegativeInt = 2
 
     def __post_init__(self) -> None:
@@ -131,9 +123,9 @@ class StoppingRule(ShortRepr):
         if instantaneous is not None and instantaneous["max_ucb"] > self.threshold:
             return True
         return any(
-            draw_maxima(sample, draws=one.draws, stochastic=stochastic).probability(self.threshold)
-            < self.options.confidence - one.margin
-            for one in self.screenings
+            draw_maxima(sample, draws=draws, stochastic=stochastic).probability(self.threshold)
+            < self.options.confidence - margin
+            for draws, margin in _SCREENINGS
         )
 
 

@@ -128,7 +128,7 @@ def judge_by(
     if falsified is not None:
         return replace(falsified, certificate=certificate)
     if not certificate.covers(tau, require_volume(volume)):
-        why_not = sentences.undecided(certificate, tau, volume, kind.never_validates, quantities)
+        why_not = sentences.undecided(certificate, tau, volume, quantities)
         return Verdict("undecided", tau, why_not, certificate=certificate)
     conditions = kind.rests_on(certificate, known.space)
     rests_on = sentences.rests_on(conditions, certificate, tau, quantities, known.stated)

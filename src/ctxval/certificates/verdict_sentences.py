@@ -260,16 +260,14 @@ def _without_assumptions(certificate: Certificate, tau: float, quantities: Quant
 # Undecided
 
 
-def undecided(certificate: Certificate, tau: float, volume: float, never: str, quantities: Quantities) -> str:
+def undecided(certificate: Certificate, tau: float, volume: float, quantities: Quantities) -> str:
     """Return why a certificate does not validate a threshold, and what speaks for the threshold nevertheless.
 
-    ``volume`` is the share of the tasks that may exceed it; ``never`` says why its kind validates nothing, if so.
+    ``volume`` is the share of the tasks that may exceed it.
     """
     if certificate.doubt is not None:
         support = supported(certificate, tau, quantities)
         return f"{support}; but {certificate.doubt}." if support else f"{certificate.doubt}."
-    if never:
-        return f"{never}."
     upper, limit = _bound_and_limit(certificate, tau, quantities)
     if certificate.upper_bound > tau:
         return f"no distance above {limit} was executed, but d* may be up to {upper}{_shortfall(certificate)}."
