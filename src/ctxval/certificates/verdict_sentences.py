@@ -121,37 +121,38 @@ def validated(certificate: Certificate, tau: float, quantities: Quantities) -> s
     level, tests = percent(certificate.confidence), certificate.details.get("tests")
     untested = "" if tests is None or tests["drawn"] else f"{_UNTESTED}; "
     if certificate.volume:
-        volume = f"{at_most(100 * certificate.volume, 3)} % {of_tasks(certificate.distribution)}"
         return (
-            f"{untested}every task{quantities.ranges} stays at or below {limit}, but for {volume}: the "
-            f"{certificate.kind} bound is {upper}, with {level} confidence. It is audited by "
-            f"{counted(certificate.trials, 'independent draw')}."
+            f"{untested}with {level} confidence, at most {at_most(100 * certificate.volume, 3)} % "
+            f"{of_tasks(certificate.distribution)}{quantities.ranges} exceed {limit}: the {certificate.kind} bound is "
+            f"{upper}, from {counted(certificate.trials, 'independent draw')}."
         )
-    given, condition = _condition(certificate, quantities)
+    best = certificate.details.get("best")
+    largest = "" if best is None else f", the largest distance {quantities.of(f'{best:.4g}')}"
     return (
         f"{untested}every task{quantities.ranges} stays at or below {limit}: the {certificate.kind} bound is {upper}, "
-        f"{level} {given}, if {condition}. {counted(certificate.trials, 'trial')}{_tested(certificate, tau)}."
+        f"with {level} {_condition(certificate, quantities)}. {counted(certificate.trials, 'execution')}{largest}"
+        f"{_tested(certificate, tau)}."
     )
 
 
 _UNTESTED = "no prediction was tested where nobody chose to look (tests = 0)"
 
 
-def _condition(certificate: Certificate, quantities: Quantities) -> tuple[str, str]:
+def _condition(certificate: Certificate, quantities: Quantities) -> str:
     """Return what the confidence of a bound on d* is, and the condition under which it holds."""
     if certificate.kind == "dynamics":
         missed = "the system" if certificate.details["without_model"] else "what M misses"
         return (
-            f"probability under a Gaussian process of {missed}",
-            f"{missed} is one smooth function of recorded state and input, the same in every task and over time",
+            f"probability under a Gaussian process, if {missed} is one smooth function of recorded state and input, "
+            "the same in every task and over time"
         )
     if certificate.kind == "posterior":
         what = "expected distance" if certificate.details.get("stochastic") else "distance"
         return (
-            f"probability under a Gaussian process of the {what}",
-            f"the {what} is as smooth between the trials as at them{_unusual(certificate, quantities)}",
+            f"probability under a Gaussian process, if the {what} is as smooth between the trials as at "
+            f"them{_unusual(certificate, quantities)}"
         )
-    return "confidence", "its assumptions hold"
+    return "confidence, if its assumptions hold"
 
 
 def _unusual(certificate: Certificate, quantities: Quantities) -> str:
@@ -324,10 +325,9 @@ def outlook(forecast: Forecast, horizon: int) -> str:
     many = f"about {forecast.executions}" if forecast.executions is not None else f"more than {horizon}"
     plural = "execution is" if forecast.executions == 1 else "executions are"
     if forecast.fewest:
-        return (
-            f"at least {forecast.executions} more {plural} needed to decide: {100 * forecast.validated:.0f} % of the "
-            "posterior samples of the dynamics would validate the threshold, and the others would falsify it"
-        )
+        shares = f"{100 * forecast.validated:.0f} % of the posterior samples of the dynamics validate the threshold"
+        others = ", and the others falsify it" if forecast.falsified else ""
+        return f"at least {forecast.executions} more {plural} needed to decide: {shares}{others}"
     shares = {"validated": forecast.validated, "falsified": forecast.falsified}
     answer = max(shares, key=lambda name: shares[name])
     outcome = f" ({answer} in {100 * shares[answer]:.0f} % of the simulated futures)" if shares[answer] else ""
