@@ -23,7 +23,7 @@ from ctxval.certificates import (
     Scenario,
     require_use,
 )
-from ctxval.certificates.registry import KindRegistry
+from ctxval.certificates.base import KindRegistry
 from ctxval.errors import CertificateError, InputError, UnknownNameError
 
 confidences = st.floats(0.01, 0.999)

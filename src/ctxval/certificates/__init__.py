@@ -2,7 +2,7 @@
 
 from ctxval.certificates.anytime import AnytimeAudit, certify_anytime
 from ctxval.certificates.automatic import Automatic
-from ctxval.certificates.base import Certificate, CertificateKind
+from ctxval.certificates.base import KINDS, Certificate, CertificateKind, require_use
 from ctxval.certificates.convergence import is_validated, rate
 from ctxval.certificates.covering import (
     RESOLUTION,
@@ -23,11 +23,9 @@ from ctxval.certificates.dynamics_evidence import (
 from ctxval.certificates.forecast import Forecast, forecast
 from ctxval.certificates.maxima import Maxima, draw_maxima, settle_maxima
 from ctxval.certificates.options import CertificateOptions
-from ctxval.certificates.posterior import Posterior, certify_posterior, instantaneous_bound
-from ctxval.certificates.posterior_diagnostics import Diagnosis, diagnose
+from ctxval.certificates.posterior import Diagnosis, Posterior, certify_posterior, diagnose, instantaneous_bound
 from ctxval.certificates.provenance import Provenance
 from ctxval.certificates.region import Region, certify_region
-from ctxval.certificates.registry import KINDS, require_use
 from ctxval.certificates.sample import PLANNED, MadeGood, Sample, require_learned
 from ctxval.certificates.scenario import (
     Audit,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
@@ -69,16 +70,18 @@ class Automatic(CertificateKind):
     def _first(self, sample: Sample, threshold: float | None, confidence: float) -> _Outcome:
         by_dynamics = None
         if self.uses_dynamics(sample):
-            by_dynamics = _tried(Dynamics(tests=self.tests), sample, threshold, confidence)
-        if isinstance(by_dynamics, tuple) and _decides(by_dynamics[0], threshold):
+            with suppress(CertificateError):
+                by_dynamics = _certified(Dynamics(tests=self.tests), sample, threshold, confidence)
+        if by_dynamics is not None and _decides(by_dynamics[0], threshold):
             return by_dynamics
-        by_distance = self._tested(_tried(self.posterior, sample, threshold, confidence), sample)
-        if not isinstance(by_dynamics, tuple):
-            if isinstance(by_distance, CertificateError):
-                raise by_distance
+        try:
+            by_distance = self._tested(_certified(self.posterior, sample, threshold, confidence), sample)
+        except CertificateError:
+            if by_dynamics is None:
+                raise
+            return by_dynamics
+        if by_dynamics is None or _decides(by_distance[0], threshold):
             return by_distance
-        if not isinstance(by_distance, tuple) or _decides(by_distance[0], threshold):
-            return by_dynamics if not isinstance(by_distance, tuple) else by_distance
         supported = threshold is not None and supported_by(by_dynamics[0], threshold)
         return by_dynamics if _is_sound(by_dynamics[0]) or supported else by_distance
 
@@ -88,10 +91,8 @@ class Automatic(CertificateKind):
         drawn = sum(origin in DRAWN for origin, is_known in zip(sample.origins, known, strict=True) if is_known)
         return fewest_missing_tests(sample.points[known], drawn, self.tests)
 
-    def _tested(self, outcome: _Outcome | CertificateError, sample: Sample) -> _Outcome | CertificateError:
+    def _tested(self, outcome: _Outcome, sample: Sample) -> _Outcome:
         """Return the posterior bound, withdrawn if tasks of the whole space have not been executed."""
-        if isinstance(outcome, CertificateError):
-            return outcome
         certificate, expected = outcome
         origins = [origin for origin in sample.origins if self.tests and origin in DRAWN]
         tests = {"drawn": len(origins), "independent": origins.count("iid"), "largest_error": None}
@@ -104,15 +105,10 @@ class Automatic(CertificateKind):
         return replace(certificate, details={**certificate.details, "tests": tests}, doubt=doubt), expected
 
 
-def _tried(
-    kind: CertificateKind, sample: Sample, threshold: float | None, confidence: float
-) -> _Outcome | CertificateError:
-    try:
-        if threshold is None:
-            return kind.certify(sample, confidence), None
-        return kind.certify_against(sample, threshold, confidence)
-    except CertificateError as error:
-        return error
+def _certified(kind: CertificateKind, sample: Sample, threshold: float | None, confidence: float) -> _Outcome:
+    if threshold is None:
+        return kind.certify(sample, confidence), None
+    return kind.certify_against(sample, threshold, confidence)
 
 
 def _decides(certificate: Certificate, threshold: float | None) -> bool:

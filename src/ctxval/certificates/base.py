@@ -1,12 +1,13 @@
-"""The certificate, and the base class of all kinds of certificates."""
+"""The certificate, the base class of all kinds of certificates, and kinds by name."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
-from typing import TYPE_CHECKING, Any, ClassVar, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeVar
 
+from ctxval._util.registry import Registry
 from ctxval._util.representation import ShortRepr, Shown, call, line, lines, table
 from ctxval._util.version import VERSION
 from ctxval.certificates import verdict_sentences as sentences
@@ -14,6 +15,7 @@ from ctxval.certificates.bounds import ERRORS, as_text, at_most, with_error
 from ctxval.certificates.sample import Sample
 from ctxval.core.space import TaskSpace
 from ctxval.core.trial import Origin
+from ctxval.errors import CertificateError, InputError, UnknownNameError
 
 if TYPE_CHECKING:
     from ctxval.certificates.forecast import Forecast
@@ -169,18 +171,10 @@ class CertificateKind(ShortRepr, ABC):
         return self.certify(sample, confidence), None
 
     def require_audit_helps(self, origins: Iterable[Origin]) -> None:
-        """Check that this certificate can use independent draws beside trials so far, before they are executed.
-
-        Raises:
-            CertificateError: if the certificate would be refused whatever the distances of the draws are.
-        """
+        """Raise a CertificateError if independent draws beside trials of these origins could never be certified."""
 
     def require_usable(self, confidence: float, executions: int) -> None:
-        """Check that this certificate can be computed from so many trials, before the executions are paid for.
-
-        Raises:
-            CertificateError: if it would be refused whatever the distances are.
-        """
+        """Raise a CertificateError if so many trials could never be certified, before they are paid for."""
 
     @classmethod
     def rests_on(cls, certificate: Certificate, space: TaskSpace | None = None) -> list[str]:
@@ -189,3 +183,77 @@ class CertificateKind(ShortRepr, ABC):
         The task space states lengths in its units; it is None if it is not known.
         """
         return sentences.conditions(certificate, space)
+
+
+Kind = TypeVar("Kind", bound=type[CertificateKind])
+
+
+class KindRegistry(Registry[CertificateKind]):
+    """Kinds of certificates by name: built-in ones, those of installed packages, and those registered by a decorator.
+
+    A registered kind is the user's own code, so :meth:`is_data` returns False for it.
+    """
+
+    def __init__(self) -> None:
+        super().__init__("certificate", "ctxval.certificates", method="certify")
+        self._registered: dict[str, type[CertificateKind]] = {}
+
+    def register(self, kind: Kind) -> Kind:
+        """Add a kind; it is used as a decorator of the class."""
+        name = _required(kind).name
+        known = self.find(name) if name in self.built_in else self._registered.get(name, kind)
+        if (known.__module__, known.__qualname__) != (kind.__module__, kind.__qualname__):
+            raise InputError(f"there is a kind of certificate called {name!r} already: {known.__qualname__}.")
+        if name not in self.built_in:
+            self._registered[name] = kind  # a cell that is run again replaces its own class
+        return kind
+
+    def find(self, name: str) -> type[CertificateKind]:
+        """Return the kind of a name."""
+        kind = self._registered.get(name) or _required(super().find(name))
+        if kind.name != name:
+            raise InputError(f"the certificate {name!r} calls itself {kind.name!r}.")
+        return kind
+
+    @property
+    def imported(self) -> tuple[str, ...]:
+        """The names of the kinds that are imported: built-in and registered ones."""
+        return (*self.built_in, *self._registered)
+
+    def of(self, certificate: Certificate) -> type[CertificateKind]:
+        """Return the kind of a certificate; the base class :class:`CertificateKind` if the kind is not known."""
+        return self.find(certificate.kind) if certificate.kind in self else CertificateKind
+
+    def with_option(self, option: str) -> tuple[str, ...]:
+        """Return the names of the imported kinds that have an option."""
+        return tuple(name for name in self.imported if option in self.find(name).options())
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._registered or super().__contains__(name)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(dict.fromkeys((*self.imported, *self.installed)))
+
+    def __len__(self) -> int:
+        return len(list(iter(self)))
+
+
+def _required(kind: Any) -> type[CertificateKind]:
+    if isinstance(kind, type) and issubclass(kind, CertificateKind) and isinstance(getattr(kind, "name", None), str):
+        return kind
+    raise InputError(f"a kind of certificate must be a subclass of CertificateKind with a name, got {kind!r}.")
+
+
+KINDS = KindRegistry()
+"""Kinds of certificates by name."""
+
+
+def require_use(kind: str, given: Iterable[str]) -> None:
+    """Refuse options that a kind would ignore: a user who gives one expects it to have an effect."""
+    options = KINDS.find(kind).options()
+    for option in given:
+        kinds = " or ".join(KINDS.with_option(option))
+        if option not in options and not kinds:
+            raise UnknownNameError.among(f"option of the certificate {kind!r}", option, options)
+        if option not in options:
+            raise CertificateError(f"{option} is for certificates of the kind {kinds}; the kind here is {kind}.")

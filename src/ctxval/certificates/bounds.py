@@ -6,6 +6,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from ctxval._util.texts import parted
+
 ERRORS = 2.0
 """Number of its standard errors by which a bound from random draws must stay below a threshold."""
 
@@ -47,8 +49,8 @@ def of_tasks(distribution: str | None) -> str:
 
 def with_units(values: Mapping[str, float], digits: int = 2) -> str:
     """Return numbers with their names; the unit of a label ``name [unit]`` follows its number."""
-    parts = ((*name.partition(" [")[::2], value) for name, value in values.items())
-    return ", ".join(f"{name} {value:.{digits}g} {unit.removesuffix(']')}".rstrip() for name, unit, value in parts)
+    parts = ((*parted(label), value) for label, value in values.items())
+    return ", ".join(f"{name} {value:.{digits}g} {unit}".rstrip() for name, unit, value in parts)
 
 
 def as_text(value: object) -> str:

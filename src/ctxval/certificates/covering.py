@@ -15,9 +15,9 @@ RESOLUTION = 0.125
 """Default of the largest distance from a task to its nearest trial, in diagonals of the task space. Farther away the
 distance d may behave in ways that no trial has shown (docs/calibration.md)."""
 
+# Largest distance from a corner to its nearest trial, as a share of what is allowed for other tasks. A trial merely
+# near a corner tells little about it: no trial lies beyond, and d often rises steeply towards the worst corner.
 _NEXT_TO = 0.125
-"""Largest distance from a corner to its nearest trial, as a share of what is allowed for other tasks. A trial merely
-near a corner tells little about it: no trial lies beyond, and d often rises steeply towards the worst corner."""
 
 
 def resolved_volume(resolution: float, dimension: int) -> float:

@@ -29,7 +29,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ctxval._util.arrays import Array, Mask
+from ctxval._util.arrays import Array
 
 _LARGEST = 0.9  # gain or loss of one bet on unbounded differences, as a share of the wealth
 _FEW = 4  # with fewer earlier tasks, all of them count as recent
@@ -114,7 +114,8 @@ def mean_difference(differences: PairedDifferences, beta: float) -> MeanDifferen
     if not count:
         return MeanDifference(None, -np.inf, np.inf, 0, None, 0, None)
     level, corrected = float(np.log(2 / beta)), differences.corrected
-    crossed = [_first(differences.log_wealth(np.array(0.0), above=above) >= level) for above in (True, False)]
+    reached = [np.flatnonzero(differences.log_wealth(np.array(0.0), above=side) >= level) for side in (True, False)]
+    crossed = [int(rows[0]) + 1 if len(rows) else None for rows in reached]
     after = min((count for count in crossed if count is not None), default=None)
     sign = 0 if after is None else -1 if crossed[1] == after else 1
     centre = _centre(corrected)
@@ -133,12 +134,6 @@ def _centre(corrected: Array) -> float:
     weights = np.where(np.isfinite(size) & (size > 0), 1 / np.where(size > 0, size, 1.0), 0.0)
     weights[:2] = 0.0  # nothing is known of the deviations yet
     return float(np.average(corrected, weights=weights) if weights.any() else corrected.mean())
-
-
-def _first(reached: Mask) -> int | None:
-    """Return how many tasks there were when a condition was first true; None if it never was."""
-    found = np.flatnonzero(reached)
-    return int(found[0]) + 1 if len(found) else None
 
 
 def _by_symmetry(centred: Array, *, recent: bool) -> Array:

@@ -15,7 +15,7 @@ predictions, and by far more if one of these predictions failed.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
@@ -138,6 +138,9 @@ def certify_dynamics(sample: Sample, evidence: DynamicsEvidence, confidence: Pro
             "the dynamics give no bound: the closed loops of some posterior samples diverge, or an execution could not "
             "be predicted. More executions narrow them."
         )
+    finite, last = evidence.maxima[np.isfinite(evidence.maxima)], counted(evidence, bound)[-PREDICTIONS:]
+    drawn = [test for test in tested(evidence.predictions, evidence.tests) if test.origin in DRAWN]
+    coverage, worst = evidence.coverage, failed(evidence, bound)
     return Certificate(
         kind="dynamics",
         statement=dynamics_statement(upper, error, confidence),
@@ -146,7 +149,43 @@ def certify_dynamics(sample: Sample, evidence: DynamicsEvidence, confidence: Pro
         volume=0.0,
         trials=len(sample),
         assumptions=(*dynamics_assumptions(evidence), *sample.remarks, ONE_CAMPAIGN),
-        details=_details(sample, evidence, bound, error),
+        details={
+            "best": sample.best,
+            "gap": upper - sample.best,
+            "raised_from": None if worst is None else bound,
+            "raised_by_trial": None if worst is None else worst.trial,
+            "error": error,
+            "executions": evidence.executions,
+            "draws": len(evidence.maxima),
+            "largest_draw": float(finite.max()) if len(finite) == len(evidence.maxima) else None,
+            "median_draw": float(np.median(finite)) if len(finite) else None,
+            "evaluations": evidence.evaluations,
+            "predictions": {
+                "made": len(evidence.predictions),
+                "stored_beforehand": sum(prediction.stored for prediction in evidence.predictions),
+                "last_ones": len(last),
+                "held": sum(held(prediction, bound) for prediction in last),
+            },
+            "tests": {
+                "drawn": len(drawn),
+                "independent": sum(test.origin == "iid" for test in drawn),
+                "largest_error": max((test.error for test in drawn), default=None),
+            },
+            "checked": [{**each.to_json(), "held": bool(held(each, bound))} for each in evidence.predictions],
+            "coverage_gap": coverage.marginal.size,
+            "beyond_the_records": coverage.beyond.size,
+            "coverage_gap_of_pairs": None if coverage.pair is None else coverage.pair.size,
+            "largest_gap_at": coverage.marginal.place,
+            "resolution": coverage.resolution,
+            "noise": evidence.noise,
+            "without_model": evidence.without_model,
+            "sharpness": evidence.sharpness,
+            "jump": evidence.jump,
+            "missed": evidence.missed,
+            "disagreement": evidence.disagreement,
+            "variance_left_out": evidence.left_out,
+            "failures": sample.failures,
+        },
         doubt=both_outcomes(sample, stochastic=False) or doubt_of(evidence, sample.best, bound),
         error=error,
     )
@@ -166,46 +205,3 @@ def bound_of(evidence: DynamicsEvidence, best: float, confidence: float) -> floa
     """
     excess = max((prediction.excess for prediction in evidence.predictions[-PREDICTIONS:]), default=0.0)
     return max(evidence.upper(confidence) * evidence.missed, best) + 0.5 * excess
-
-
-def _details(sample: Sample, evidence: DynamicsEvidence, bound: float, error: float) -> dict[str, Any]:
-    finite, last = evidence.maxima[np.isfinite(evidence.maxima)], counted(evidence, bound)[-PREDICTIONS:]
-    drawn = [test for test in tested(evidence.predictions, evidence.tests) if test.origin in DRAWN]
-    coverage, worst, upper = evidence.coverage, failed(evidence, bound), raised(evidence, bound)
-    return {
-        "best": sample.best,
-        "gap": upper - sample.best,
-        "raised_from": None if worst is None else bound,
-        "raised_by_trial": None if worst is None else worst.trial,
-        "error": error,
-        "executions": evidence.executions,
-        "draws": len(evidence.maxima),
-        "largest_draw": float(finite.max()) if len(finite) == len(evidence.maxima) else None,
-        "median_draw": float(np.median(finite)) if len(finite) else None,
-        "evaluations": evidence.evaluations,
-        "predictions": {
-            "made": len(evidence.predictions),
-            "stored_beforehand": sum(prediction.stored for prediction in evidence.predictions),
-            "last_ones": len(last),
-            "held": sum(held(prediction, bound) for prediction in last),
-        },
-        "tests": {
-            "drawn": len(drawn),
-            "independent": sum(test.origin == "iid" for test in drawn),
-            "largest_error": max((test.error for test in drawn), default=None),
-        },
-        "checked": [{**each.to_json(), "held": bool(held(each, bound))} for each in evidence.predictions],
-        "coverage_gap": coverage.marginal.size,
-        "beyond_the_records": coverage.beyond.size,
-        "coverage_gap_of_pairs": None if coverage.pair is None else coverage.pair.size,
-        "largest_gap_at": coverage.marginal.place,
-        "resolution": coverage.resolution,
-        "noise": evidence.noise,
-        "without_model": evidence.without_model,
-        "sharpness": evidence.sharpness,
-        "jump": evidence.jump,
-        "missed": evidence.missed,
-        "disagreement": evidence.disagreement,
-        "variance_left_out": evidence.left_out,
-        "failures": sample.failures,
-    }

@@ -2,7 +2,7 @@
 
 Each diagnostic yields a sentence, which says what is wrong and what would help; the first one withdraws the bound. The
 limits were chosen on development systems. Those of the posterior bound are in
-:mod:`ctxval.certificates.posterior_diagnostics`.
+:func:`ctxval.certificates.posterior.diagnose`.
 """
 
 from __future__ import annotations
@@ -16,56 +16,27 @@ from ctxval.certificates.bounds import with_units
 from ctxval.certificates.dynamics_evidence import CheckedPrediction, DynamicsEvidence, StateInputGap
 from ctxval.certificates.prediction_tests import DRAWN, fewest_missing_tests
 
-FEWEST = 3
-"""The fewest executions for a bound: the data that M was made from are no executions."""
+# Limits; docs/theory.md has the reason for each.
 
-PREDICTIONS = 3
-"""Number of the last predictions that must have held."""
-
+FEWEST = 3  # executions for a bound: the data that M was made from are no executions
+PREDICTIONS = 3  # last predictions that must have held
 ACCURATE = 0.05
 """Largest difference between a distance and its prediction that held, as a share of the bound or, if a prediction
 failed, of the margin that is left above the bound; see :func:`raised`."""
-
-NOISE = 0.01
-"""Largest learned variance of noise, as a share of the mean square of the residual: with more, the next state does not
-follow from the recorded state and input."""
-
-LEFT_OUT = 0.5
-"""Largest share of the posterior variance that the draws may leave out between their pivots: with more, they vary too
-little there."""
-
-GAP = 0.25
-"""Largest gap of the records in a state or an input, as a share of the range that closed loops visit: what happens in a
-gap is a guess of the prior."""
-
+NOISE = 0.01  # learned variance of noise, as a share of the mean square of the residual
+LEFT_OUT = 0.5  # share of the posterior variance that posterior samples leave out between their pivots
+GAP = 0.25  # gap of the records in a state or an input, as a share of the range that closed loops visit
+PAIR_GAP = 0.5  # the same for two of them together
 BEYOND = 0.02
 """Largest excess of a state or an input over its largest record, or below its smallest one, as a share of that range.
 Contacts, end stops and saturation lie beyond what is recorded more often than between records. With too many
-coordinates for a comparison of pairs, it is the same as ``GAP``: each extreme would take an execution of its own."""
-
-PAIR_GAP = 0.5
-"""The same as ``GAP`` for two of them together."""
-
-TESTED = 0.8
-"""Least share of the largest distance on the posterior mean that must have been executed: the bound is tested there."""
-
-MATTERS = 0.3
-"""Least distance, as a share of the bound, at which a prediction must have held: small distances hardly test it."""
-
-SHARP = 0.05
-"""Largest share by which a large predicted distance may exceed the median of those of nearly the same tasks: if large
-distances are narrow, a search finds the largest one by chance."""
-
-JUMP = 0.01
-"""Largest jump of the predicted distance between nearly equal tasks, as a share of the bound: larger distances can hide
-between jumps."""
-
-DENSE = 2
-"""Largest number of task parameters in which deeper searches may find the largest distance in spite of jumps."""
-
-AGREE = 0.05
-"""Largest share by which the results of two deeper searches may differ, and by which they may exceed the usual one:
-otherwise an even deeper one may find a larger distance."""
+coordinates for a comparison of pairs, ``GAP`` takes its place: each extreme would take an execution of its own."""
+TESTED = 0.8  # least share of the largest predicted distance that must have been executed
+MATTERS = 0.3  # least distance, as a share of the bound, at which a prediction must have held
+SHARP = 0.05  # share by which a large predicted distance may exceed the median of those of nearly the same tasks
+JUMP = 0.01  # jump of the predicted distance between nearly equal tasks, as a share of the bound
+DENSE = 2  # task parameters in which deeper searches may find the largest distance in spite of jumps
+AGREE = 0.05  # share by which two deeper searches may differ, and by which they may exceed the usual one
 
 
 def doubt_of(evidence: DynamicsEvidence, best: float, bound: float) -> str | None:

@@ -15,8 +15,7 @@ from ctxval.gp.hyperposterior import Conditioned
 HORIZON = 200
 """Largest number of executions in a simulated future."""
 
-_JITTER = 1e-9
-"""Added to variances, relative to the distance's variance, so that the covariance of near tasks can be factorised."""
+_JITTER = 1e-9  # added to variances, relative to the distance's, so that the covariance of near tasks can be factorised
 
 
 @dataclass(frozen=True)

@@ -22,20 +22,11 @@ from ctxval.gp.hyperposterior import EXACT, Conditioned, Prior, draw_hyperparame
 from ctxval.gp.sample_paths import draw_paths, maxima
 from ctxval.gp.subset import kept_rows
 
-FEWEST = 4
-"""The fewest trials for a bound."""
-
-MOST = 160
-"""The largest number of trials that a process is conditioned on; the effort of a draw grows with its cube."""
-
-STOCHASTIC = (1e-6, 1.0)
-"""Bounds of the noise variance of a stochastic system, relative to the variance of the distance."""
-
-_EXTREME = 1e100
-"""The largest allowed distance, and the inverse of the smallest allowed difference: their squares must be finite."""
-
-_MOST = 4
-"""Largest number of chains for a bound near a threshold; one chain is usual."""
+FEWEST = 4  # trials for a bound
+MOST = 160  # trials that a process is conditioned on; the effort of a draw grows with its cube
+STOCHASTIC = (1e-6, 1.0)  # bounds of the noise variance of a stochastic system, relative to that of the distance
+_EXTREME = 1e100  # largest distance, and inverse of the smallest difference: their squares must be finite
+_MOST = 4  # chains for a bound near a threshold; one chain is usual
 
 
 @dataclass(frozen=True, eq=False)
@@ -202,12 +193,12 @@ def _required_data(sample: Sample) -> tuple[Array, Array]:
 def _require_one_distance_each(sample: Sample) -> None:
     """Refuse trials of a stochastic system."""
     y, numbers = sample.distances, sample.numbers
-    _, tasks = np.unique(sample.points, axis=0, return_inverse=True)
-    for row, task in enumerate(tasks.ravel()):
-        first = int(np.argmax(tasks.ravel() == task))
-        if abs(y[row] - y[first]) > 1e-6 * np.ptp(y):
-            raise CertificateError(
-                f"trials {numbers[first]} and {numbers[row]} executed one task, and their distances are {y[first]:g} "
-                f"and {y[row]:g}: the system is not deterministic; say --stochastic to bound the largest expected "
-                "distance."
-            )
+    _, firsts, tasks = np.unique(sample.points, axis=0, return_index=True, return_inverse=True)
+    first_of = firsts[tasks.ravel()]
+    different = np.flatnonzero(np.abs(y - y[first_of]) > 1e-6 * np.ptp(y))
+    if len(different):
+        row, first = different[0], first_of[different[0]]
+        raise CertificateError(
+            f"trials {numbers[first]} and {numbers[row]} executed one task, and their distances are {y[first]:g} and "
+            f"{y[row]:g}: the system is not deterministic; say --stochastic to bound the largest expected distance."
+        )

@@ -18,11 +18,8 @@ CONFIDENCE = 0.95
 WITHIN = 0.05
 """Default share by which a bound may exceed the largest executed distance where a search without a threshold ends."""
 
-LEAST_CONFIDENCE = 0.5
-"""Least confidence of a verdict: below it, a statement is wrong more often than right."""
-
-MOST_VOLUME = 0.5
-"""Largest acceptable volume of a verdict: above it, a statement leaves out most of the task space."""
+LEAST_CONFIDENCE = 0.5  # below it, a statement is wrong more often than right
+MOST_VOLUME = 0.5  # above it, a statement leaves out most of the task space
 
 
 @checked

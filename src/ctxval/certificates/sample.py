@@ -18,8 +18,6 @@ from ctxval.errors import CertificateError
 PLANNED = "draws"
 """Key of the planned number of draws in the note of an independent draw."""
 
-_SAME_TASK = 1e-9  # largest difference of coordinates that count as one task: scaling rounds them
-
 
 @dataclass(frozen=True)
 class MadeGood(ShortRepr):
@@ -229,14 +227,17 @@ def _in_order(trials: list[Trial]) -> list[Trial]:
     return in_order
 
 
+def executions_of(trial: Trial, trials: Sequence[Trial]) -> list[Trial]:
+    """Return the trials with a distance that executed the task of a trial; scaling rounds their unit-cube points."""
+    known = [other for other in trials if other.distance is not None]
+    gaps = (np.abs(other.unit_point - trial.unit_point).max() for other in known)
+    return [other for other, gap in zip(known, gaps, strict=True) if gap <= 1e-9]
+
+
 def _measured_later(trials: Sequence[Trial]) -> set[int]:
     """Return the trials that were executed again since, and whose distance was told alone under another definition."""
-    known = [trial.unit_point for trial in trials if trial.distance is not None]
     waiting = [trial for trial in trials if trial.failure == TOLD_ALONE and trial.origin != "iid"]
-    if not known or not waiting:
-        return set()
-    gaps = (np.abs(np.array(known) - trial.unit_point).max(axis=1).min() for trial in waiting)
-    return {trial.number for trial, gap in zip(waiting, gaps, strict=True) if gap <= _SAME_TASK}
+    return {trial.number for trial in waiting if executions_of(trial, trials)}
 
 
 def _made_good(trials: Sequence[Trial]) -> tuple[MadeGood, ...]:
@@ -244,16 +245,11 @@ def _made_good(trials: Sequence[Trial]) -> tuple[MadeGood, ...]:
 
     If there are several successes, the first one with a stated reason counts, or else the first one.
     """
-    known = [trial for trial in trials if trial.distance is not None]
-    failed = [trial for trial in trials if trial.state == "failed" and trial.origin != "iid"]
-    if not known or not failed:
-        return ()
-    points, numbers = np.array([trial.unit_point for trial in known]), np.array([trial.number for trial in known])
     made_good = []
-    for trial in failed:
-        same = (np.abs(points - trial.unit_point).max(axis=1) <= _SAME_TASK) & (numbers > trial.number)
-        later = [known[row] for row in np.flatnonzero(same)]
-        if later:
-            by = next((success for success in later if success.because), later[0])
-            made_good.append(MadeGood(trial.number, by.number, by.because))
+    for trial in trials:
+        if trial.state == "failed" and trial.origin != "iid":
+            later = [success for success in executions_of(trial, trials) if success.number > trial.number]
+            by = next((success for success in later if success.because), later[0] if later else None)
+            if by is not None:
+                made_good.append(MadeGood(trial.number, by.number, by.because))
     return tuple(made_good)

@@ -55,7 +55,6 @@ class StoppingRule(ShortRepr):
         confirmations: number of trials after the bound first keeps the threshold; it must still keep the threshold
             after them. They are executed where the largest draws of d* lie, and mostly correct a bound that is too
             low.
-
     """
 
     threshold: PositiveFloat
@@ -80,7 +79,7 @@ class StoppingRule(ShortRepr):
             return StoppingDecision()
 
     def _by_the_bound(self, trials: Sequence[Trial], left: int) -> StoppingDecision:
-        sample, points = _ended(trials), _points(trials)
+        sample, points = _ended(trials), np.array([trial.unit_point for trial in trials])
         missing = covering(points, self._posterior.resolution, left)
         if missing is None or self._is_surely_too_high(sample):
             return StoppingDecision()
@@ -102,7 +101,8 @@ class StoppingRule(ShortRepr):
 
     def _has_stood(self, trials: Sequence[Trial]) -> bool:
         """Return whether the earlier trials already covered the task space with a bound that kept the threshold."""
-        if not trials or covering(_points(trials), self._posterior.resolution, 0) is None:
+        points = np.array([trial.unit_point for trial in trials])
+        if not trials or covering(points, self._posterior.resolution, 0) is None:
             return False
         try:
             return self._is_kept(_ended(trials))[1]
@@ -131,7 +131,3 @@ class StoppingRule(ShortRepr):
 
 def _ended(trials: Sequence[Trial]) -> Sample:
     return Sample.of([trial for trial in trials if trial.state != "open"])
-
-
-def _points(trials: Sequence[Trial]) -> Array:
-    return np.array([trial.unit_point for trial in trials])

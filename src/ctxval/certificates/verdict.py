@@ -11,12 +11,10 @@ import numpy as np
 from ctxval._util.checked import PositiveFloat, checked
 from ctxval._util.representation import ShortRepr, call, line, lines, shown, table
 from ctxval.certificates import verdict_sentences as sentences
-from ctxval.certificates.base import Certificate
+from ctxval.certificates.base import KINDS, Certificate
 from ctxval.certificates.forecast import Forecast
 from ctxval.certificates.options import CertificateOptions, require_confidence, require_volume
 from ctxval.certificates.provenance import Provenance
-from ctxval.certificates.registry import KINDS
-from ctxval.certificates.sample import Sample
 from ctxval.certificates.verdict_sentences import Quantities
 from ctxval.core.trial import Trial, designs_sentence
 from ctxval.errors import CertificateError
@@ -163,18 +161,24 @@ def _judged(trials: Sequence[Trial], threshold: float, options: CertificateOptio
     if falsified is not None:
         return falsified
     try:
-        sample = _sample(trials, options, known)
-        certificate, expected = options.kind.certify_against(sample, threshold, options.confidence)
+        certificate, expected = _certified(trials, options, known, threshold)
     except CertificateError as error:
         return Verdict("undecided", float(threshold), str(error))
-    certificate = certificate.with_remarks(known.remarks)
-    return replace(judge_by(certificate, trials, threshold, volume=options.volume, provenance=known), expected=expected)
+    verdict = judge_by(certificate, trials, threshold, volume=options.volume, provenance=known)
+    return replace(verdict, expected=expected)
 
 
-def _sample(trials: Sequence[Trial], options: CertificateOptions, known: Provenance) -> Sample:
-    """Return the trials as a kind sees them: most kinds are handed countable draws only."""
-    sample = known.sample(trials)
-    return sample if options.kind.sorts_draws else sample.with_countable_draws()
+def _certified(
+    trials: Sequence[Trial], options: CertificateOptions, known: Provenance, threshold: float | None
+) -> tuple[Certificate, Forecast | None]:
+    """Return a certificate, for a threshold if there is one, and a forecast. Most kinds see countable draws only."""
+    kind, sample = options.kind, known.sample(trials)
+    sample = sample if kind.sorts_draws else sample.with_countable_draws()
+    if threshold is None:
+        certificate, expected = kind.certify(sample, options.confidence), None
+    else:
+        certificate, expected = kind.certify_against(sample, threshold, options.confidence)
+    return certificate.with_remarks(known.remarks), expected
 
 
 @dataclass(frozen=True, eq=False)
@@ -227,15 +231,11 @@ def assess(
         if verdict.certificate is None:
             raise CertificateError(verdict.reason)
         return Assessment(kind.name, verdict.certificate, verdict)
+    limit = threshold if kind.needs_threshold or kind.uses_threshold else None
     try:
-        sample = _sample(trials, options, known)
-        if threshold is not None and (kind.needs_threshold or kind.uses_threshold):
-            certificate, _ = kind.certify_against(sample, threshold, options.confidence)
-        else:
-            certificate = kind.certify(sample, options.confidence)
+        certificate, _ = _certified(trials, options, known, limit)
     except CertificateError as error:
         if falsified is None:
             raise
         return Assessment(kind.name, None, falsified, str(error))
-    certificate = certificate.with_remarks(known.remarks)
     return Assessment(kind.name, certificate, falsified and replace(falsified, certificate=certificate))

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import islice
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ctxval._util.representation import counted
+from ctxval._util.representation import counted, shown
+from ctxval._util.texts import parted
 from ctxval.certificates.bounds import at_most, of_tasks, percent, with_error, with_units
 from ctxval.certificates.covering import RESOLUTION
+from ctxval.certificates.sample import executions_of
 from ctxval.core.space import TaskSpace
 from ctxval.core.trial import Trial
 
@@ -42,32 +45,26 @@ class Quantities:
         """The tasks, such as `` (start 0 to 0.4 m, goal 0.2 to 1.2 m)``; empty if they are not known or too many."""
         if self.space is None or self.space.dimension > _NAMED:
             return ""
-        low, high = self.space.low, self.space.high
-        return f" ({', '.join(map(_range, self.space.labels, low.tolist(), high.tolist()))})"
+        ends = zip(self.space.labels, self.space.low.tolist(), self.space.high.tolist(), strict=True)
+        ranges = ((*parted(label), low, high) for label, low, high in ends)
+        return f" ({', '.join(f'{name} {low:.4g} to {high:.4g} {unit}'.rstrip() for name, unit, low, high in ranges)})"
 
     def task(self, trial: Trial) -> str:
-        """Return the task of a trial by its parameters."""
-        space = self.space
-        if space is None or set(space.units) != set(trial.parameters):
-            return ", ".join(f"{name} {value}" for name, value in trial.parameters.items())
-        return with_units(dict(zip(space.labels, space.point(trial.parameters).tolist(), strict=True)), digits=4)
+        """Return the task of a trial by its parameters, at most six of them."""
+        space, at = self.space, trial.unit_point
+        if space is None or at.shape != (space.dimension,):
+            return shown(trial.parameters)
+        values = dict(islice(zip(space.labels, space.from_unit(at).tolist(), strict=True), 6))
+        return with_units(values, digits=4) + (", ..." if len(at) > 6 else "")
 
-    def lengths(self, resolution: Mapping[str, float]) -> str:
-        """Return a resolution in the units of the task parameters, if they are few and known."""
-        share, space = resolution["of_each_range"], self.space
+    def lengths(self, share: float) -> str:
+        """Return a share of each range in the units of the task parameters, if they are few and known."""
+        space = self.space
         if space is None or space.dimension > _NAMED:
             return f"{share:.2g} of each parameter's range"
-        parted = [label.partition(" [")[::2] for label in space.labels]
-        widths = (space.high - space.low).tolist()
-        return " and ".join(
-            f"{share * width:.2g} {unit.removesuffix(']')}".rstrip() + f" in {name}"
-            for (name, unit), width in zip(parted, widths, strict=True)
-        )
-
-
-def _range(label: str, low: float, high: float) -> str:
-    name, _, unit = label.partition(" [")
-    return f"{name} {low:.4g} to {high:.4g} {unit.removesuffix(']')}".rstrip()
+        widths = zip(space.labels, (space.high - space.low).tolist(), strict=True)
+        lengths = {label: f"{share * width:.2g} {parted(label)[1]}".rstrip() for label, width in widths}
+        return " and ".join(f"{length} in {parted(label)[0]}" for label, length in lengths.items())
 
 
 # Falsified
@@ -76,13 +73,7 @@ def _range(label: str, low: float, high: float) -> str:
 def falsified(worst: Trial, trials: Sequence[Trial], tau: float, quantities: Quantities) -> str:
     """Return which executed task exceeds a threshold, and how often an execution of the same task reproduced it."""
     distance, limit = distinguishable(worst.distance or 0.0, tau)
-    again = [
-        trial.distance > tau
-        for trial in trials
-        if trial is not worst
-        and trial.distance is not None
-        and np.abs(trial.unit_point - worst.unit_point).max() <= 1e-9
-    ]
+    again = [(trial.distance or 0.0) > tau for trial in executions_of(worst, trials) if trial is not worst]
     reproduced = ""
     if again:
         times = {1: "once", 2: "twice"}.get(sum(again), f"{sum(again)} times")
@@ -161,14 +152,16 @@ def _unusual(certificate: Certificate, quantities: Quantities) -> str:
     if resolution is None or resolution["diagonals"] == RESOLUTION:
         return ""
     diagonals = f"{resolution['diagonals']:g} diagonals; usual: {RESOLUTION:g}"
-    if resolution["of_each_range"] >= 1:
-        return f", also in whole regions without a trial ({diagonals})"
-    return f", in gaps of up to {quantities.lengths(resolution)}, {_share(resolution)} of the task space ({diagonals})"
+    return f"{_gaps(resolution, quantities)} ({diagonals})"
 
 
-def _share(resolution: Mapping[str, float]) -> str:
+def _gaps(resolution: Mapping[str, float], quantities: Quantities) -> str:
+    """Return how large the gaps between trials may be, in the units of the tasks and as a share of the task space."""
     share = 100 * resolution["of_the_space"]
-    return f"{share:.0f} %" if share >= 10 else f"{share:.2g} %"
+    if resolution["of_each_range"] >= 1:
+        return ", also in whole regions without a trial"
+    volume = f"{share:.0f}" if share >= 10 else f"{share:.2g}"
+    return f", in gaps of up to {quantities.lengths(resolution['of_each_range'])}, {volume} % of the task space"
 
 
 def _tested(certificate: Certificate, tau: float) -> str:
@@ -213,12 +206,7 @@ def conditions(certificate: Certificate, space: TaskSpace | None) -> list[str]:
 
 def _posterior_conditions(details: Mapping[str, Any], quantities: Quantities) -> list[str]:
     resolution = details.get("resolution")
-    where = ", also in regions without any trial"
-    if resolution is not None and resolution["of_each_range"] < 1:
-        where = (
-            f", in gaps of up to {quantities.lengths(resolution)} (a peak inside such a gap, {_share(resolution)} of "
-            "the task space, may be missed)"
-        )
+    where = "" if resolution is None else f"{_gaps(resolution, quantities)} (a peak inside one may be missed)"
     smooth = f"the distance being as smooth between the trials as at them{where}"
     if details.get("stochastic"):
         return [
