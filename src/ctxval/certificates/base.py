@@ -97,20 +97,18 @@ class Certificate:
         return lines(head, *withdrawn, line(self.statement), f"assumptions: {len(self.assumptions)}")
 
     def _repr_html_(self) -> str:
-        return table(
-            f"Certificate: {self.kind}",
-            [
-                ("withdrawn", self.doubt),
-                ("statement", self.statement),
-                ("upper bound", with_error(self.upper_bound, self.error)),
-                ("confidence", Shown(f"{self.confidence:.6g}")),
-                ("volume left out", at_most(self.volume, 3)),
-                ("trials", self.trials),
-                *(("assumes", assumption) for assumption in self.assumptions),
-                ("distribution of tasks", self.distribution),
-                ("version", self.version),
-            ],
-        )
+        rows = [
+            ("withdrawn", self.doubt),
+            ("statement", self.statement),
+            ("upper bound", with_error(self.upper_bound, self.error)),
+            ("confidence", Shown(f"{self.confidence:.6g}")),
+            ("volume left out", at_most(self.volume, 3)),
+            ("trials", self.trials),
+            *(("assumes", assumption) for assumption in self.assumptions),
+            ("distribution of tasks", self.distribution),
+            ("version", self.version),
+        ]
+        return table(f"Certificate: {self.kind}", rows)
 
 
 @dataclass(frozen=True)

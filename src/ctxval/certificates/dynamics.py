@@ -40,8 +40,7 @@ from ctxval.certificates.sample import Sample, advice_to_remeasure, listed, requ
 from ctxval.certificates.sentences import ONE_CAMPAIGN, both_outcomes, dynamics_assumptions, dynamics_statement
 from ctxval.errors import CertificateError
 
-MOST_DRAWS = 400
-"""The largest number of draws of the dynamics, which limits the confidence."""
+MOST_DRAWS = 400  # posterior samples of the dynamics, which limit the confidence
 
 
 @part("dynamics")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import asdict, dataclass
 from typing import Any, Protocol, Self, runtime_checkable
 
@@ -176,7 +177,7 @@ class DynamicsEvidence(ShortRepr):
 
     def to_json(self) -> dict[str, Any]:
         """Return all attributes in types that JSON has; numbers may be infinite."""
-        plain: dict[str, Any] = _plain(asdict(self))
+        plain: dict[str, Any] = json.loads(json.dumps(asdict(self), default=lambda value: value.tolist()))
         return plain
 
     @classmethod
@@ -196,17 +197,6 @@ class DynamicsEvidence(ShortRepr):
             return cls(**{**values, **arrays, **parts})
         except (KeyError, TypeError, ValueError):
             return None
-
-
-def _plain(value: Any) -> Any:
-    match value:
-        case np.ndarray() | np.generic():
-            return value.tolist()
-        case dict():
-            return {name: _plain(item) for name, item in value.items()}
-        case tuple() | list():
-            return [_plain(item) for item in value]
-    return value
 
 
 def _gap(values: Any) -> Any:

@@ -78,17 +78,13 @@ class _Future:
         L = np.linalg.cholesky(self.covariance + _JITTER * conditioned.scale2 * np.eye(len(candidates)))
         self.truth = self.mean + L @ rng.normal(size=len(candidates))
         tops = (self.mean[:, None] + L @ rng.normal(size=(len(candidates), 256))).max(axis=0)
-        self.width = self._width(max(float(np.quantile(tops, confidence)), self.best))
-        # The first bound is that of all draws together: one draw must not decide what all together leave undecided.
-        self.bound = max(float(self.warp.forward(found.upper(confidence))), self.best)
-
-    def _width(self, bound: float) -> float:
-        """Return the z at which ``max (mean + z deviation)`` is the bound."""
-        low, high = 0.0, 20.0
+        bound, low, high = max(float(np.quantile(tops, confidence)), self.best), 0.0, 20.0
         for _ in range(40):
             middle = 0.5 * (low + high)
             low, high = (middle, high) if self._upper(middle) < bound else (low, middle)
-        return high
+        self.width = high  # the z at which max (mean + z deviation) is the bound
+        # The first bound is that of all draws together: one draw must not decide what all together leave undecided.
+        self.bound = max(float(self.warp.forward(found.upper(confidence))), self.best)
 
     def _deviation(self) -> Array:
         return np.sqrt(np.maximum(np.diag(self.covariance), 0.0))

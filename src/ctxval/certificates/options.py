@@ -12,12 +12,8 @@ from ctxval.certificates.covering import RESOLUTION
 from ctxval.certificates.posterior import Posterior
 from ctxval.errors import InputError
 
-CONFIDENCE = 0.95
-"""Default confidence of a verdict."""
-
-WITHIN = 0.05
-"""Default share by which a bound may exceed the largest executed distance where a search without a threshold ends."""
-
+CONFIDENCE = 0.95  # default of a verdict
+WITHIN = 0.05  # default share by which the bound exceeds the largest distance where a search without a threshold ends
 LEAST_CONFIDENCE = 0.5  # below it, a statement is wrong more often than right
 MOST_VOLUME = 0.5  # above it, a statement leaves out most of the task space
 

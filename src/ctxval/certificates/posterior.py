@@ -200,7 +200,6 @@ def diagnose(
     numbers: Sequence[int] | None = None,
     *,
     unordered: Mask | None = None,
-    level: float = LEVEL,
     resolution: float = RESOLUTION,
     covered: Array | None = None,
 ) -> Diagnosis:
@@ -211,23 +210,25 @@ def diagnose(
             hyperparameters.
         X: the trials' points ``(n, d)``, with ``numbers``; 0, 1, ... by default.
         unordered: which trials have an order without meaning, shape ``(n,)``; none by default.
-        level: a surprise that is less probable than this withdraws the bound.
         resolution: a task that is farther than this from every trial withdraws the bound, in diagonals.
         covered: points that cover tasks, if there are more than X.
     """
-    exceed, before = _surprises(conditioned, np.zeros(len(X), dtype=bool) if unordered is None else unordered)
+    exceed = np.full(len(X), np.nan)  # upper tail probabilities; NaN if not tested
+    exceed[2:] = np.mean([_exceedances(process) for process in conditioned], axis=0)
+    if unordered is not None and unordered.any():
+        exceed[unordered] = np.mean([_left_out_exceedances(process) for process in conditioned], axis=0)[unordered]
     worst = int(np.nanargmin(exceed))
+    others = "other trials" if unordered is not None and unordered[worst] else "trials before it"
     trial = worst if numbers is None else numbers[worst]
     tested = int(np.isfinite(exceed).sum())
     surprise = float(-np.expm1(tested * np.log1p(-min(exceed[worst], 1 - 1e-16))))
     left_out = float(np.sqrt(np.mean([_left_out(process) for process in conditioned])))
     covering_points = X if covered is None else covered
     farthest, d, doubt = farthest_task(covering_points), X.shape[1], None
-    if surprise < level:
+    if surprise < LEVEL:
         doubt = (
             f"trial {trial} came out {-ndtri(max(exceed[worst], 1e-300)):.1f} standard deviations above what the "
-            f"{'trials before it' if before[worst] else 'other trials'} predict: the distance is not as smooth as the "
-            "bound assumes, so the bound is withdrawn"
+            f"{others} predict: the distance is not as smooth as the bound assumes, so the bound is withdrawn"
         )
     elif farthest > resolution:
         missing = covering(covering_points, resolution, 100)
@@ -244,16 +245,6 @@ def diagnose(
             f"the bound is withdrawn; {bare} more executions would be there (`ctxval run` makes them)"
         )
     return Diagnosis(surprise, trial, left_out, farthest, doubt)
-
-
-def _surprises(conditioned: list[Conditioned], unordered: Mask) -> tuple[Array, Mask]:
-    """Return upper tail probabilities ``(n,)``, NaN if not tested, and which trials are predicted from earlier ones."""
-    exceed = np.full(len(unordered), np.nan)
-    before = ~unordered
-    exceed[2:] = np.mean([_exceedances(process) for process in conditioned], axis=0)
-    if unordered.any():
-        exceed[unordered] = np.mean([_left_out_exceedances(process) for process in conditioned], axis=0)[unordered]
-    return exceed, before
 
 
 def _left_out_exceedances(conditioned: Conditioned) -> Array:

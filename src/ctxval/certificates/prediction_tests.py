@@ -2,7 +2,7 @@
 
 A search looks where distances are large, so it may never see that the dynamics are other in some tasks. Before a bound
 is believed, executions must have been predicted at a number of tasks that are drawn for this: tasks that leave no
-interval of a task parameter without a test if it is wider than :data:`WIDEST`, and independent draws from the
+interval of a task parameter without a test if it is wider than ``WIDEST``, and independent draws from the
 distribution of tasks. What is other in one of eight equal parts of a parameter's range is met with certainty by the
 former; eight independent draws meet it with a probability of 66 %. Other executions fill intervals too, if they were
 predicted beforehand.
@@ -18,14 +18,9 @@ import numpy as np
 from ctxval._util.arrays import Array
 from ctxval.core.trial import Origin
 
-TESTS = 8
-"""Default number of tests."""
-
-DRAWN: tuple[Origin, ...] = ("iid", "spread")
-"""Origins of the tasks that are drawn."""
-
-WIDEST = 0.12
-"""Widest interval of a task parameter without a test, as a share of its range."""
+TESTS = 8  # default number
+WIDEST = 0.12  # widest interval of a task parameter without a test, as a share of its range
+DRAWN: tuple[Origin, ...] = ("iid", "spread")  # origins of the tasks that are drawn
 
 
 def fewest_missing_tests(points: Array, drawn: int, tests: int) -> int:

@@ -28,7 +28,7 @@ from ctxval.certificates.base import Certificate, CertificateKind
 from ctxval.certificates.bounds import at_most, of_tasks
 from ctxval.certificates.forecast import Forecast
 from ctxval.certificates.sample import Sample, advice_to_remeasure, require_learned
-from ctxval.certificates.scenario import countable_draws, not_counted, volume_bound
+from ctxval.certificates.scenario import countable_draws, volume_bound
 from ctxval.certificates.sentences import ABOUT_DRAWS, FROZEN, ONE_CAMPAIGN, how_drawn, margin_and_map
 from ctxval.errors import CertificateError
 
@@ -136,7 +136,7 @@ def certify_region(
             "unpredicted_draws": unpredicted,
             "unpredicted_tasks": unknown,
             "largest_drawn": drawn.best if np.isfinite(drawn.best) else None,
-            "not_counted": not_counted(sample),
+            "not_counted": len(sample.only("iid")) - len(drawn),
             "failed": sample.failed,
             "failures": sample.failures,
         },

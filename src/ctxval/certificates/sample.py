@@ -114,11 +114,15 @@ class Sample(ShortRepr):
 
     def rows(self, rows: Sequence[int]) -> Sample:
         """Return some of the trials."""
-        chosen = list(rows)
-        parts = {
-            name: [getattr(self, name)[row] for row in chosen] for name in ("origins", "states", "numbers", "planned")
-        }
-        return replace(self, points=self.points[chosen], distances=self.distances[chosen], **parts)
+        return replace(
+            self,
+            points=self.points[list(rows)],
+            distances=self.distances[list(rows)],
+            origins=[self.origins[row] for row in rows],
+            states=[self.states[row] for row in rows],
+            numbers=[self.numbers[row] for row in rows],
+            planned=[self.planned[row] for row in rows],
+        )
 
     @property
     def countable(self) -> list[int]:

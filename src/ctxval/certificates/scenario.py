@@ -216,11 +216,6 @@ def countable_draws(sample: Sample, kind: str) -> Sample:
     return drawn
 
 
-def not_counted(sample: Sample) -> int:
-    """Return the number of independent draws that do not count."""
-    return len(sample.only("iid")) - len(sample.countable)
-
-
 @part("audit")
 @dataclass(frozen=True, repr=False)
 class Audit(CertificateKind):
@@ -268,7 +263,7 @@ def certify_audit(sample: Sample, confidence: Probability = 0.95) -> Certificate
             "largest_drawn": drawn.best,
             "largest_chosen": largest,
             "exceeding": None if largest is None else int((drawn.distances > largest).sum()),
-            "not_counted": not_counted(sample),
+            "not_counted": len(sample.only("iid")) - len(drawn),
             "failed": sample.failed,
             "failures": sample.failures,
         },

@@ -92,7 +92,7 @@ def usable_bound(certificate: Certificate | None) -> float | None:
 
 @checked
 def counterexample(
-    trials: Sequence[Trial], threshold: PositiveFloat, quantities: Quantities | None = None
+    trials: Sequence[Trial], threshold: PositiveFloat, quantities: Quantities = sentences.NO_UNITS
 ) -> Verdict | None:
     """Return the verdict "falsified" by the largest distance above the threshold; None if no distance is above it."""
     tau = float(threshold)
@@ -100,7 +100,7 @@ def counterexample(
     if not above:
         return None
     worst = max(above, key=lambda trial: trial.distance or 0.0)
-    return Verdict("falsified", tau, sentences.falsified(worst, trials, tau, quantities or Quantities()), worst)
+    return Verdict("falsified", tau, sentences.falsified(worst, trials, tau, quantities), worst)
 
 
 @checked

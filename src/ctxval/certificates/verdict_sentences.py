@@ -67,6 +67,8 @@ class Quantities:
         return " and ".join(f"{length} in {parted(label)[0]}" for label, length in lengths.items())
 
 
+NO_UNITS = Quantities()
+
 # Falsified
 
 
@@ -250,10 +252,7 @@ def _without_assumptions(certificate: Certificate, tau: float, quantities: Quant
 
 
 def undecided(certificate: Certificate, tau: float, volume: float, quantities: Quantities) -> str:
-    """Return why a certificate does not validate a threshold, and what speaks for the threshold nevertheless.
-
-    ``volume`` is the share of the tasks that may exceed it.
-    """
+    """Return why a certificate does not validate a threshold that a share of the tasks may exceed."""
     if certificate.doubt is not None:
         support = supported(certificate, tau, quantities)
         return f"{support}; but {certificate.doubt}." if support else f"{certificate.doubt}."
@@ -266,13 +265,13 @@ def undecided(certificate: Certificate, tau: float, volume: float, quantities: Q
             "computed from; more executions tighten it."
         )
     return (
-        f"the {certificate.kind} bound of {certificate.trials} trials leaves out "
+        f"the {certificate.kind} bound of {counted(certificate.trials, 'trial')} leaves out "
         f"{at_most(100 * certificate.volume, 3)} % {of_tasks(certificate.distribution)}, more than the "
         f"{100 * volume:.3g} % that are acceptable{_shortfall(certificate)}; it is no bound on d*."
     )
 
 
-def supported(certificate: Certificate, tau: float, quantities: Quantities | None = None) -> str:
+def supported(certificate: Certificate, tau: float, quantities: Quantities = NO_UNITS) -> str:
     """Return what speaks for a threshold although a bound from dynamics is withdrawn; empty if nothing does."""
     if certificate.kind != "dynamics":
         return ""
@@ -282,7 +281,7 @@ def supported(certificate: Certificate, tau: float, quantities: Quantities | Non
         return ""
     return (
         f"supported by the model: no posterior sample of the dynamics exceeds "
-        f"{(quantities or Quantities()).of(f'{tau:.6g}')} in a search of {details['evaluations']} closed loops; "
+        f"{quantities.of(f'{tau:.6g}')} in a search of {details['evaluations']} closed loops; "
         f"{predictions['held']} of the last {predictions['last_ones']} predictions held"
     )
 
@@ -313,9 +312,9 @@ def outlook(forecast: Forecast, horizon: int) -> str:
     many = f"about {forecast.executions}" if forecast.executions is not None else f"more than {horizon}"
     plural = "execution is" if forecast.executions == 1 else "executions are"
     if forecast.fewest:
-        shares = f"{100 * forecast.validated:.0f} % of the posterior samples of the dynamics validate the threshold"
+        validate = f"{100 * forecast.validated:.0f} % of the posterior samples of the dynamics validate the threshold"
         others = ", and the others falsify it" if forecast.falsified else ""
-        return f"at least {forecast.executions} more {plural} needed to decide: {shares}{others}"
+        return f"at least {forecast.executions} more {plural} needed to decide: {validate}{others}"
     shares = {"validated": forecast.validated, "falsified": forecast.falsified}
     answer = max(shares, key=lambda name: shares[name])
     outcome = f" ({answer} in {100 * shares[answer]:.0f} % of the simulated futures)" if shares[answer] else ""
