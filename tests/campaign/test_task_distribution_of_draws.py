@@ -115,7 +115,7 @@ def test_an_experiment_file_states_it(tmp_path: Path, monkeypatch: pytest.Monkey
     shown = invoke(app, ["certify", "p.sqlite", "--kind", "scenario"])
     assert shown.exit_code == 0, shown.output
     text = " ".join(shown.output.split())
-    assert "of the probability under the stated distribution of tasks has a distance above" in text
+    assert "of the tasks under the stated distribution have a distance above" in text
     assert "(goal normal (mean 0.5, deviation 0.1), all else uniform)" in text
     space = read_settings("p.toml", {}).load().validation.space
     assert np.abs(space.iid(200, np.random.default_rng(0)) - 0.5).max() < 0.6

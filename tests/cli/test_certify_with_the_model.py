@@ -78,7 +78,7 @@ def test_a_region_speaks_to_a_person_and_executes_nothing(store: str) -> None:
     text = " ".join(invoke("certify", store, "--kind", "region", "--threshold", "0.38").stdout.split())
     assert "UNDECIDED against 0.38: the region bound of 30 trials leaves out" in text
     assert "because of the number of draws, and the rest because the prediction plus its margin exceeds" in text
-    assert "region: With confidence 0.95, the distance exceeds the predicted one by at most" in text
+    assert "region: With 95 % confidence, the distance exceeds the predicted one by at most" in text
     assert "of the tasks (an estimate from 1000 predicted tasks), so that the distance exceeds 0.38 on at" in text
     assert "It assumes that - the audited tasks are independent and uniform" in text
     assert "the prediction was learned only from the model's own data and from trials before the first" in text

@@ -515,7 +515,7 @@ def test_a_certificate_tells_its_resolution_in_the_units_of_the_stored_task_spac
         campaign.tell(opened, wider.execute(opened.plan))
     result = invoke("certify", "own.sqlite", "--threshold", "1e6", "--resolution", "0.5766")
     text = " ".join(result.stdout.split())
-    assert "to a resolution of 6 rad in goal and 1 kg in load[0] and 2 kg in load[1]" in text
+    assert "gaps of up to 6 rad in goal and 1 kg in load[0] and 2 kg in load[1]" in text
 
 
 @pytest.mark.parametrize("value", ["0.1", "0.4999"])

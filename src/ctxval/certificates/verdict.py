@@ -19,8 +19,6 @@ from ctxval.certificates.verdict_sentences import Quantities
 from ctxval.core.trial import Trial, designs_sentence
 from ctxval.errors import CertificateError
 
-_SENTENCE = 350  # characters of a sentence in a representation; the text of a verdict has it whole
-
 Answer = Literal["validated", "falsified", "undecided"]
 """The answer of a verdict to the question whether d* <= tau."""
 
@@ -63,7 +61,8 @@ class Verdict:
     def __repr__(self) -> str:
         head = call(self, self.answer, threshold=self.threshold)
         if self.rests_on:
-            return "\n  ".join([head, f"reason: {line(self.reason, _SENTENCE)}", line(self.rests_on, _SENTENCE)])
+            # The text of a verdict has both sentences whole.
+            return "\n  ".join([head, f"reason: {line(self.reason, 180)}", line(self.rests_on, 330)])
         parts = {"witness": self.witness, "certificate": self.certificate, "expected": self.expected}
         known = (f"{name}: {shown(part)}" for name, part in parts.items() if part is not None)
         return lines(head, f"reason: {line(self.reason)}", *known)
