@@ -30,7 +30,7 @@ from calibrate import (
 from calibration_dynamics_part import by_dynamics
 from calibration_verdicts_part import interval, table, until_decided
 from ctxval.certificates import RESOLUTION
-from ctxval.certificates.posterior_diagnostics import LEVEL
+from ctxval.certificates.posterior import LEVEL
 
 PAGE = ROOT / "docs" / "calibration.md"
 PICTURES = ROOT / "docs" / "calibration"

@@ -13,7 +13,7 @@ PRINTED = {
     "1_first_verdict": [
         "11 executions of the cart",
         "falsified: trial",
-        "validated: by a prior on the dynamics",
+        "validated: every task",
     ],
     "2_resume_and_inspect": ["Tuesday: 6 executions are stored.", "Tuesday: 15 executions", "The worst task"],
     "3_hardware_by_hand": [

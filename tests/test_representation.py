@@ -377,7 +377,6 @@ EXAMPLES: dict[str, Callable[[], object]] = {
     "certificates.StoppingRule": lambda: certificates.StoppingRule(0.5, BY_POSTERIOR),
     "certificates.Diagnosis": diagnosis,
     "certificates.Forecast": lambda: certificates.Forecast(12, 0.75, 0.25),
-    "certificates.Mean": lambda: certificates.Mean(quantile=0.9),
     "certificates.MadeGood": lambda: certificates.MadeGood(3, 7, "fuse replaced"),
     "certificates.Maxima": lambda: certificates.draw_maxima(sample(), draws=12, paths=4),
     "certificates.Region": certificates.Region,

@@ -7,12 +7,14 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
 
 from ctxval._util.arrays import Array, Mask
 from ctxval._util.representation import ShortRepr
+from ctxval.certificates import Certificate, CertificateKind, Sample
 from ctxval.core.controller import Controller, Synthesizer, converged_of
 from ctxval.core.distance import Distance
 from ctxval.core.model import Model, central_differences, linearize
@@ -20,7 +22,8 @@ from ctxval.core.rollout import rollout
 from ctxval.core.system import System
 from ctxval.core.task import Task
 from ctxval.core.trajectory import COMPLETE, Trajectory
-from ctxval.errors import ConformanceError, InputError
+from ctxval.core.trial import Origin
+from ctxval.errors import CertificateError, ConformanceError, InputError
 from ctxval.searches import Search
 
 _TOLERANCE = 1e-10
@@ -195,3 +198,33 @@ def _require_close(name: str, value: Array, other_name: str, other: Array, toler
     _require(value.shape == other.shape, f"{name} has shape {value.shape}, {other_name} {other.shape}")
     gap = float((np.abs(value - other) / np.maximum(1.0, np.abs(other))).max(initial=0.0))
     _require(gap <= tolerance, f"{name} differs from {other_name} by {gap:.2g}, more than {tolerance:g}")
+
+
+def check_certificate(kind: CertificateKind, sample: Sample, threshold: float = 1.0, confidence: float = 0.9) -> None:
+    """Check that a kind of certificate does not count independent draws whose number depended on their distances.
+
+    The same trials are certified as trials of a search, and as independent draws of two decisions: the first half was
+    to end with the verdict. The statement on the latter must not be stronger than with the second half of the draws
+    alone. Only a kind that is valid whenever its draws end, such as ``anytime``, may fail this check.
+    """
+    half = len(sample) // 2
+    origins: list[Origin] = ["iid"] * len(sample)
+    drawn = replace(sample, origins=origins, planned=[0] * half + [len(sample)] * (len(sample) - half))
+    _require(len(drawn.countable) < len(drawn) and half > 0, "the check needs at least two trials")
+    allowed = _volume(kind, drawn.with_countable_draws(), threshold, confidence)
+    claimed = _volume(kind, drawn, threshold, confidence)
+    sentence = (
+        f"the kind {kind.name} leaves out {claimed:.3g} of the tasks by draws that ended with the verdict, and "
+        f"{allowed:.3g} without them: count those of Sample.countable alone"
+    )
+    _require(claimed >= allowed - _TOLERANCE, sentence)
+
+
+def _volume(kind: CertificateKind, sample: Sample, threshold: float, confidence: float) -> float:
+    try:
+        certificate, _ = kind.certify_against(sample, threshold, confidence)
+    except CertificateError:
+        return 1.0  # a refusal claims nothing
+    _require(isinstance(certificate, Certificate), f"certify must return a Certificate, got {certificate!r}")
+    _require(certificate.kind == kind.name, f"the certificate is of the kind {certificate.kind!r}, not {kind.name!r}")
+    return 1.0 if certificate.doubt is not None else certificate.volume

@@ -10,7 +10,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from ctxval.certificates.difference import MeanDifference, PairedDifferences, _by_symmetry, mean_difference
+from ctxval.certificates.difference import (
+    MeanDifference,
+    PairedDifferences,
+    _by_symmetry,
+    _log_wealth_of_bets,
+    _weights_so_far,
+    mean_difference,
+)
 
 NUMBERS = st.floats(-1e3, 1e3, allow_nan=False)
 
@@ -116,3 +123,30 @@ def test_with_a_largest_distance_the_interval_is_within_it() -> None:
     many = mean_difference(paired(np.full(200, 0.5), most=1.0), 0.05)
     assert many.sign == 1
     assert 0 < many.low < 0.5 < many.high < 1
+
+
+SEEDS = st.integers(0, 10**6)
+
+
+@given(SEEDS)
+def test_the_wealth_is_the_product_of_limited_bets(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    gains, wanted, room = rng.uniform(-1, 1, 20), rng.uniform(0, 3, 20), rng.uniform(0, 1, 20)
+    factors = [
+        1 + max(-0.75, min(bet, 0.75 / most) * gain) for gain, bet, most in zip(gains, wanted, room, strict=True)
+    ]
+    np.testing.assert_allclose(_log_wealth_of_bets(gains, wanted, room), np.log(np.cumprod(factors)), atol=1e-12)
+    at_worst = _log_wealth_of_bets(-room * rng.random(20), np.full(20, 1e9), room)
+    assert np.diff(at_worst, prepend=0.0).min() >= np.log(0.25) - 1e-9
+
+
+@given(SEEDS)
+def test_a_weight_is_the_slope_among_recent_earlier_tasks(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    predicted = rng.random(12)
+    values = 0.6 * predicted + 0.1 * rng.normal(size=12)
+    weights = _weights_so_far(values, predicted)
+    assert (weights[:3] == 1).all()
+    slopes = [np.polyfit(predicted[k // 2 : k], values[k // 2 : k], 1)[0] for k in range(6, 12)]
+    np.testing.assert_allclose(weights[6:], np.clip(slopes, 0, 1), atol=1e-6)
+    np.testing.assert_allclose(_weights_so_far(np.append(values[:-1], 9.0), predicted), weights, atol=1e-9)

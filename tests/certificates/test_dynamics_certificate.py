@@ -118,7 +118,7 @@ def test_an_undecided_verdict_says_how_many_executions_are_needed_and_what_the_s
     certificate, expected = Dynamics(tests=0).certify_against(fewer, 1.2)
     assert certificate.doubt is not None
     assert expected == Forecast(2, 1.0, 0.0, fewest=True)
-    assert "at least 2 more executions are needed, and 100 % of the posterior samples" in str(expected)
+    assert "at least 2 more executions are needed to decide: 100 % of the posterior samples" in str(expected)
     assert Dynamics(tests=0).certify_against(sample(), 1.2)[1] is None
 
 
@@ -169,11 +169,13 @@ def test_it_needs_the_model_and_executions_that_did_not_fail() -> None:
 def test_the_verdict_names_its_evidence() -> None:
     known = Provenance(learned=Learned(GOOD))
     verdict = judge(trials(), 1.1, CertificateOptions(Dynamics(tests=0)), known)
-    assert str(verdict).startswith(
-        "validated: no prediction was tested where nobody chose to look (tests = 0); by a prior on the dynamics, the "
-        "dynamics bound of 4 trials is "
+    untested = (
+        "validated: no prediction was tested where nobody chose to look (tests = 0); every task stays at or below"
     )
+    assert str(verdict).startswith(untested)
+    assert "if what M misses is one smooth function of recorded state and input" in verdict.reason
     assert verdict.rests_on is not None
+    assert "changing neither with time nor with the task" in verdict.rests_on
     assert "the recorded state being complete" in verdict.rests_on
 
 
@@ -212,7 +214,7 @@ def test_the_kinds_are_found_by_name() -> None:
 
 def test_the_text_is_complete_and_json_has_every_prediction() -> None:
     found = certify_dynamics(sample(), GOOD)
-    assert "With probability 0.95 under the prior on the residual dynamics, d* is at most" in str(found)
+    assert "With 95 % probability under a Gaussian process of the residual dynamics, d* is at most" in str(found)
     assert "x[0] 0.1, u[0] 0.2" in str(found)
     stored = json.loads(json.dumps(found.to_json(), allow_nan=False))["details"]
     assert [one["trial"] for one in stored["checked"]] == [1, 2, 3]

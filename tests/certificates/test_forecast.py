@@ -71,5 +71,5 @@ def test_a_forecast_speaks_in_words() -> None:
     assert str(Forecast(7, 0.8, 0.2)) == likely
     assert "falsified in 90 %" in str(Forecast(1, 0.0, 0.9))
     fewest = Forecast(1, 0.95, 0.05, fewest=True)
-    share = "95 % of the posterior samples of the dynamics stay below the threshold"
-    assert str(fewest) == f"at least 1 more execution is needed, and {share}"
+    assert str(fewest).startswith("at least 1 more execution is needed to decide: 95 % of the posterior samples")
+    assert str(fewest).endswith("validate the threshold, and the others falsify it")

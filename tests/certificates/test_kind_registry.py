@@ -23,7 +23,7 @@ from ctxval.certificates import (
     Scenario,
     require_use,
 )
-from ctxval.certificates.registry import KindRegistry
+from ctxval.certificates.base import KindRegistry
 from ctxval.errors import CertificateError, InputError, UnknownNameError
 
 confidences = st.floats(0.01, 0.999)
@@ -78,30 +78,27 @@ def test_what_a_kind_needs_and_is_not_given_is_asked_for() -> None:
 def test_a_confidence_below_1_is_not_printed_as_1() -> None:
     draws = Sample(np.zeros((9, 1)), np.arange(9.0), ["iid"] * 9, ["completed"] * 9)
     certificate = Scenario().certify(draws, 0.9999999)
-    assert "confidence 0.9999999," in certificate.statement
+    assert "99.99999 % confidence," in certificate.statement
 
 
 def test_the_kinds_of_this_package_are_listed_by_name() -> None:
-    own = ["anytime", "audit", "auto", "dynamics", "mean", "posterior", "region"]
+    own = ["anytime", "audit", "auto", "dynamics", "posterior", "region"]
     assert list(KINDS) == [*own, "sampling-discarding", "scenario"]
-    assert len(KINDS) == 9
+    assert len(KINDS) == 8
     assert "posteriour" not in KINDS
     assert KINDS["posterior"] is Posterior
 
 
 def test_which_kinds_have_a_use_for_an_option_follows_from_their_fields() -> None:
-    assert certificates.USES == {
+    uses = {
         "stochastic": ("auto", "dynamics", "posterior"),
         "tests": ("auto", "dynamics"),
         "resolution": ("auto", "posterior"),
         "volume": ("anytime", "audit", "region", "sampling-discarding", "scenario"),
         "discard": ("region", "sampling-discarding"),
-        "predictions": ("mean", "region"),
-        "quantile": ("mean",),
-        "largest_possible": ("mean",),
+        "predictions": ("region",),
     }
-    with pytest.raises(AttributeError, match="no attribute 'USED'"):
-        _ = certificates.USED
+    assert {option: KINDS.with_option(option) for option in uses} == uses
     with pytest.raises(UnknownNameError, match="did you mean 'resolution'"):
         require_use("posterior", ["resolutoin"])
     with pytest.raises(CertificateError, match="of the kind region or sampling-discarding; the kind here is posterior"):

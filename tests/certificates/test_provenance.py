@@ -22,8 +22,7 @@ def test_what_was_changed_in_a_store_is_remarked() -> None:
 
 def test_what_a_store_describes_is_read() -> None:
     space = {"type": "TaskSpace", "goal": [-1.0, 1.0, "rad"], "load[0]": [0.0, 1.0, "kg"], "load[1]": [0.0, 2.0, "kg"]}
-    known = Provenance.of({"search": {"type": "GPUCB"}, "validation": {"space": space}})
-    assert known.search == "GPUCB"
+    known = Provenance.of({"validation": {"space": space}})
     assert isinstance(known.space, TaskSpace)
     assert known.space.names == ("goal", "load[0]", "load[1]")
     assert known.space.units == {"goal": "rad", "load": "kg"}
@@ -31,6 +30,6 @@ def test_what_a_store_describes_is_read() -> None:
 
 
 def test_what_a_store_does_not_describe_is_not_known() -> None:
-    for description in ({}, {"search": None, "validation": {"space": {"goal": "anything"}}}):
+    for description in ({}, {"validation": {"space": {"goal": "anything"}}}):
         known = Provenance.of(description)
-        assert (known.space, known.search, known.remarks) == (None, None, ())
+        assert (known.space, known.remarks) == (None, ())

@@ -206,7 +206,7 @@ def test_a_margin_below_zero_is_said_in_words() -> None:
     assert "the distance is below the predicted one by at least 0.4, except on at most" in text
     over = certify_region(draws([0.7] * 30), 0.65).statement
     assert "the distance exceeds the predicted one by at most 0.2, except on" in over
-    assert "keeps 0.65 on 0 ± 0.1 % of the task space (an estimate from 1000 predicted tasks)" in over
+    assert "keeps 0.65 on 0 ± 0.1 % of the tasks (an estimate from 1000 predicted tasks)" in over
 
 
 @pytest.mark.slow

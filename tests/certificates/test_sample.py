@@ -96,8 +96,3 @@ def test_a_draw_knows_how_many_there_were_to_be() -> None:
     ]
     assert list(Sample.of(trials).planned) == [59, None, None]
     assert list(Sample.of(trials).only("iid").planned) == [59, None]
-
-
-def test_the_search_that_chose_the_tasks_is_known_to_every_part() -> None:
-    sample = Sample.of([trial(0, 0.1, 0.3), trial(1, 0.2, 0.3, origin="iid")], "GPUCB")
-    assert (sample.search, sample.only("iid").search, sample.rows([0]).search) == ("GPUCB",) * 3

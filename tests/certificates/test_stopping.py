@@ -7,7 +7,7 @@ import pytest
 
 from ctxval import Trial
 from ctxval.certificates import Audit, CertificateOptions
-from ctxval.certificates.stopping import Screening, StoppingRule
+from ctxval.certificates.stopping import StoppingRule
 from ctxval.certificates.verdict import judge
 from ctxval.errors import InputError
 
@@ -73,9 +73,10 @@ def test_a_study_can_vary_how_often_a_bound_is_put_to_the_test() -> None:
     assert StoppingRule(50.0, confirmations=0).decide(known, left=5).decided
 
 
-def test_screening_alone_keeps_a_bound_from_being_asked_for() -> None:
+def test_screening_alone_keeps_a_bound_from_being_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
     known = [trial(k, x, 0.5 + 0.3 * np.sin(9 * x)) for k, x in enumerate([0.0, 0.2, 0.42, 0.6, 0.8, 1.0])]
-    never = StoppingRule(50.0, screenings=(Screening(8, -1.0),), confirmations=0)
+    monkeypatch.setattr("ctxval.certificates.stopping._SCREENINGS", ((8, -1.0),))
+    never = StoppingRule(50.0, confirmations=0)
     assert not never.decide(known, left=5).decided
 
 

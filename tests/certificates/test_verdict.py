@@ -1,13 +1,17 @@
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 import pytest
 
 from ctxval import TaskSpace, Trial
 from ctxval.certificates import (
+    AnytimeAudit,
+    Audit,
     Certificate,
+    CertificateKind,
     CertificateOptions,
     Provenance,
     Sample,
@@ -16,6 +20,7 @@ from ctxval.certificates import (
     certify_scenario,
 )
 from ctxval.certificates.covering import resolved_volume
+from ctxval.certificates.provenance import REFINED
 from ctxval.certificates.stopping import StoppingRule
 from ctxval.certificates.verdict import counterexample, judge, judge_by
 from ctxval.core.trial import Origin, State, designs_sentence
@@ -114,7 +119,7 @@ def test_a_bound_at_most_the_threshold_validates() -> None:
     verdict = judge_by(certificate(1.2), trials(), 1.2)
     assert verdict.answer == "validated"
     assert verdict.certificate is not None
-    assert "with confidence 0.95" in verdict.reason
+    assert "95 % probability under a Gaussian process" in verdict.reason
 
 
 def test_a_counterexample_wins_over_any_bound() -> None:
@@ -140,11 +145,11 @@ def test_a_volume_is_left_out_only_where_that_is_accepted() -> None:
     partial = certificate(1.1, volume=0.05)
     refused = judge_by(partial, trials(), 1.2)
     assert refused.answer == "undecided"
-    assert "leaves out 5 % of the task space" in refused.reason
+    assert "leaves out 5 % of the tasks" in refused.reason
     assert judge_by(partial, trials(), 1.2, volume=0.04).answer == "undecided"
     accepted = judge_by(partial, trials(), 1.2, volume=0.05)
     assert accepted.answer == "validated"
-    assert "but for 5 % of the task space" in accepted.reason
+    assert "at most 5 % of the tasks exceed 1.2" in accepted.reason
 
 
 def test_scenario_and_audit_bounds_judge_too() -> None:
@@ -257,8 +262,9 @@ def test_what_nothing_came_near_to_is_missing_where_the_bound_keeps_the_threshol
 def test_a_reason_does_not_round_its_comparison_away() -> None:
     falsified = counterexample([trial(0, 0, 0.50000001)], 0.5)
     assert falsified is not None
-    assert "its distance 0.50000001 exceeds 0.5." in falsified.reason
-    assert "is 1.234561, at most 1.234569" in judge_by(certificate(1.234561), trials(), 1.234569).reason
+    assert "its distance 0.50000001 exceeds 0.5, at" in falsified.reason
+    near = judge_by(certificate(1.234561), trials(), 1.234569).reason
+    assert "stays at or below 1.234569: the posterior bound is 1.234561," in near
     assert (
         "above 1.23456 was executed, but d* may be up to 1.235"
         in judge_by(certificate(1.23457), trials(), 1.23456).reason
@@ -324,15 +330,12 @@ IN_SPACE = Provenance(TaskSpace(goal=(0.0, 2.0, "rad")))
 
 def test_a_resolution_other_than_the_usual_one_stands_in_the_verdict_in_the_units_of_the_task() -> None:
     usual = judge(trials(), 50.0, provenance=IN_SPACE)
-    assert "resolution" not in usual.reason
+    assert "diagonals" not in usual.reason
     coarse = judge(trials(), 50.0, posterior(resolution=0.25), IN_SPACE)
-    assert "to a resolution of 0.5 rad in goal, 50 % of the task space (0.25 diagonals; usual: 0.125)" in coarse.reason
-    assert (
-        "to a resolution of 0.25 of each parameter's range, 50 %"
-        in judge(trials(), 50.0, posterior(resolution=0.25)).reason
-    )
+    assert "gaps of up to 0.5 rad in goal, 50 % of the task space (0.25 diagonals; usual: 0.125)" in coarse.reason
+    assert "0.25 of each parameter's range, 50 %" in judge(trials(), 50.0, posterior(resolution=0.25)).reason
     none = judge(trials(), 50.0, posterior(resolution=1), IN_SPACE)
-    assert "whole regions without a trial taken to be like the rest (1 diagonals; usual: 0.125)" in none.reason
+    assert "whole regions without a trial (1 diagonals; usual: 0.125)" in none.reason
 
 
 def test_a_quarter_of_the_diagonal_is_39_percent_of_a_plane() -> None:
@@ -345,10 +348,13 @@ def test_a_quarter_of_the_diagonal_is_39_percent_of_a_plane() -> None:
 def test_a_validation_names_what_it_rests_on() -> None:
     verdict = judge(trials(), 50.0, posterior(), IN_SPACE)
     assert verdict.rests_on == (
-        "It rests on the distance being as smooth between the trials as at them, to a resolution of 0.25 rad in goal "
-        "(a peak inside a gap of that radius, 25 % of the task space, may be missed); on each task having one "
-        "distance, however often it is executed; on this campaign not being chosen among several."
+        "It rests on the distance being as smooth between the trials as at them, in gaps of up to 0.25 rad in goal, "
+        "25 % of the task space (a peak inside one may be missed); on each task having one distance, however often it "
+        "is executed; on this campaign not being chosen among several."
     )
+    assert verdict.rests_on in str(verdict)
+    assert "It rests on" in repr(verdict)
+    assert "It rests on" in verdict._repr_html_()
     noisy = judge(trials(), 50.0, posterior(stochastic=True), IN_SPACE)
     assert noisy.rests_on is not None
     assert "single executions may exceed it" in noisy.rests_on
@@ -368,7 +374,7 @@ def test_a_threshold_within_the_error_of_the_bound_is_undecided() -> None:
         assert "too near to it for the random draws" in verdict.reason
     assert "more executions tighten it" in judge_by(near, trials(), 1.09).reason
     assert judge_by(near, trials(), 1.11).answer == "validated"
-    assert "is 1 ± 0.05, at most 1.11" in judge_by(near, trials(), 1.11).reason
+    assert "at or below 1.11: the posterior bound is 1 ± 0.05" in judge_by(near, trials(), 1.11).reason
 
 
 def test_the_error_is_in_the_verdict_of_the_posterior() -> None:
@@ -376,6 +382,51 @@ def test_the_error_is_in_the_verdict_of_the_posterior() -> None:
     assert verdict.certificate is not None
     assert verdict.certificate.error > 0
     assert "±" in verdict.reason
+
+
+def test_sentences_have_units_and_tasks() -> None:
+    known = replace(IN_SPACE, units="m")
+    validated = judge(trials(), 50.0, posterior(), known)
+    assert validated.reason.startswith("every task (goal 0 to 2 rad) stays at or below 50 m: the posterior bound is ")
+    assert "8 executions, the largest distance 0.9897 m" in validated.reason
+    executed = trials()
+    falsified = judge(executed, 0.5, posterior(), known)
+    assert falsified.reason.endswith(" m exceeds 0.5 m, at goal 1.143 rad.")
+    close = replace(executed[0], number=9, unit_point=executed[4].unit_point, distance=executed[4].distance)
+    for more, said in (
+        ([close], "rad, reproduced once."),
+        ([close, replace(close, number=10)], "rad, reproduced twice."),
+        ([replace(close, distance=0.1)], "rad (1 of 1 repetitions of the task did not exceed it)."),
+    ):
+        assert judge([*executed, *more], 0.5, posterior(), known).reason.endswith(said)
+
+
+def test_a_validation_rests_on_what_the_user_states() -> None:
+    known = Provenance(remarks=("what was changed after 7 trials makes no difference to them", REFINED))
+    verdict = judge(trials(), 50.0, posterior(), known)
+    assert verdict.rests_on is not None
+    assert "your word that what was changed after 7 trials makes no difference to them" in verdict.rests_on
+    assert REFINED not in verdict.rests_on
+
+
+def test_most_kinds_are_handed_countable_draws_only() -> None:
+    drawn = [replace(trial(k, k / 5, 0.1, "iid"), note={"draws": 3 if k < 3 else 6}) for k in range(6)]
+    for kind, count in ((Share(), 3), (Audit(), 3), (AnytimeAudit(), 6)):
+        verdict = judge(drawn, 0.5, CertificateOptions(kind, 0.5, 0.5))
+        assert verdict.certificate is not None
+        assert verdict.certificate.trials == count
+
+
+@dataclass(frozen=True)
+class Share(CertificateKind):
+    """Count all independent draws that it is given."""
+
+    name: ClassVar[str] = "share"
+
+    def certify(self, sample: Sample, confidence: float = 0.95) -> Certificate:
+        """Return a certificate of the draws."""
+        draws = len(sample.only("iid"))
+        return Certificate(self.name, "", sample.best, confidence, 1 / draws, draws, ())
 
 
 def test_remarks_are_among_the_assumptions() -> None:

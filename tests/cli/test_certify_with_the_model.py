@@ -78,8 +78,8 @@ def test_a_region_speaks_to_a_person_and_executes_nothing(store: str) -> None:
     text = " ".join(invoke("certify", store, "--kind", "region", "--threshold", "0.38").stdout.split())
     assert "UNDECIDED against 0.38: the region bound of 30 trials leaves out" in text
     assert "because of the number of draws, and the rest because the prediction plus its margin exceeds" in text
-    assert "region: With confidence 0.95, the distance exceeds the predicted one by at most" in text
-    assert "of the task space (an estimate from 1000 predicted tasks), so that the distance exceeds 0.38 on at" in text
+    assert "region: With 95 % confidence, the distance exceeds the predicted one by at most" in text
+    assert "of the tasks (an estimate from 1000 predicted tasks), so that the distance exceeds 0.38 on at" in text
     assert "It assumes that - the audited tasks are independent and uniform" in text
     assert "the prediction was learned only from the model's own data and from trials before the first" in text
     assert len(Store.existing(Path(store)).trials()) == len(before) == 36
@@ -99,20 +99,9 @@ def test_options_are_given_by_name_and_checked(store: str) -> None:
     assert one["details"]["discarded"] == 2
     few = json.loads(invoke("certify", store, "--kind", "region", "--option", "predictions=50", "--json").stdout)
     assert few["details"]["predictions"] == 50
-    refused = invoke("certify", store, "--kind", "region", "--option", "quantile=0.9")
+    refused = invoke("certify", store, "--kind", "region", "--option", "tests=3")
     assert refused.exit_code == 2
-    assert "quantile is for certificates of the kind mean" in refused.stderr
-
-
-def test_the_mean_and_its_quantile(store: str) -> None:
-    named = ("--option", "quantile=0.8", "--option", "largest_possible=1")
-    report = json.loads(invoke("certify", store, "--kind", "mean", *named, "--json").stdout)
-    assert 0 < report["details"]["lower_limit"] < report["details"]["upper_limit"] < 1
-    assert report["details"]["quantile_low"] < report["details"]["quantile_high"]
-    assert report["volume"] == 1
-    text = " ".join(invoke("certify", store, "--kind", "mean", "--threshold", "9").stdout.split())
-    assert "UNDECIDED against 9: the mean certificate is about the expected distance" in text
-    assert "as far as a normal approximation for 30 draws holds, the expected distance of a task" in text
+    assert "tests is for certificates of the kind auto or dynamics" in refused.stderr
 
 
 FILE = """

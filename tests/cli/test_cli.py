@@ -137,7 +137,7 @@ def test_the_human_report_names_the_worst_task_and_the_verdict(invoke) -> None: 
     assert result.exit_code == 0
     assert "goal =" in result.stdout
     assert "VALIDATED against 5" in result.stdout
-    assert "with confidence 0.95" in " ".join(result.stdout.split())
+    assert "95 % probability" in " ".join(result.stdout.split())
 
 
 @pytest.mark.parametrize("search", ["random", "sampling-discarding"])
@@ -490,7 +490,7 @@ def test_a_run_names_what_its_verdict_rests_on_and_the_other_campaigns(invoke) -
     alone = invoke(*arguments)
     text = " ".join(alone.stdout.split())
     assert "VALIDATED against 90" in text
-    assert "to a resolution of 3.6 rad in goal, 100 % of the task space (0.6 diagonals; usual: 0.125)" in text
+    assert "gaps of up to 3.6 rad in goal, 100 % of the task space (0.6 diagonals; usual: 0.125)" in text
     assert "It rests on the distance being as smooth between the trials as at them" in text
     assert "other store" not in text
     again = invoke(*arguments, "--seed", "1")
@@ -518,7 +518,7 @@ def test_a_certificate_tells_its_resolution_in_the_units_of_the_stored_task_spac
         campaign.tell(opened, wider.execute(opened.plan))
     result = invoke("certify", "own.sqlite", "--threshold", "1e6", "--resolution", "0.5766")
     text = " ".join(result.stdout.split())
-    assert "to a resolution of 6 rad in goal and 1 kg in load[0] and 2 kg in load[1]" in text
+    assert "gaps of up to 6 rad in goal and 1 kg in load[0] and 2 kg in load[1]" in text
 
 
 @pytest.mark.parametrize("value", ["0.1", "0.4999"])

@@ -116,7 +116,7 @@ def test_a_whole_campaign_by_hand(browser: Any, folder: Path, address: str) -> N
         assert re.search(rf"Trial {number} has the distance 0\.\d+ m\.", one.message())
         one.page.locator("#verdict .work").wait_for(state="detached", timeout=WAIT)
     assert one.page.locator(".answer").inner_text() == "validated against 2 m"
-    assert "with confidence 0.95" in one.page.locator("#verdict").inner_text()
+    assert "95 % probability" in one.page.locator("#verdict").inner_text()
     assert one.page.locator("#choosing .done").inner_text().startswith("The verdict is reached: validated.")
     assert one.page.locator("#choosing .problem").count() == 0
     assert one.page.locator("#verdict img").evaluate_all("all => all.map((one) => one.naturalWidth > 0)") == [True] * 2

@@ -26,6 +26,7 @@ from ctxval.certificates.covering import RESOLUTION, covering
 from ctxval.certificates.dynamics import Dynamics, bound_of, certify_dynamics
 from ctxval.certificates.dynamics_diagnostics import (
     FEWEST,
+    GAP,
     doubt_of,
     held,
     missing_tests,
@@ -34,7 +35,6 @@ from ctxval.certificates.dynamics_diagnostics import (
     tested,
     uncovered,
     untested,
-    untried_parameter,
 )
 from ctxval.certificates.options import WITHIN
 from ctxval.certificates.posterior import Posterior
@@ -331,9 +331,9 @@ def next_task(
         candidates = [largest, highest, farthest]
     elif exceeds:
         candidates = [highest, farthest]
-    elif uncovered(evidence, best, limit) is not None:
+    elif uncovered(evidence) is not None:
         candidates = [farthest, highest, largest]
-        if evidence.untried is not None and untried_parameter(evidence, best, limit) is not None:
+        if evidence.untried is not None and evidence.untried.gap > GAP:
             candidates = [evidence.untried.task[None], *candidates]
     elif evidence.missed > 1 or untested(evidence, best, limit) is not None:
         candidates = [largest, highest, farthest]

@@ -19,7 +19,7 @@ from ctxval.campaign.plot import overview
 from ctxval.campaign.storage.store import Store
 from ctxval.campaign.trials import TrialRecorder
 from ctxval.certificates import RESOLUTION, Certificate, CertificateOptions, Provenance, Verdict, assess, judge
-from ctxval.certificates.dynamics_evidence import with_units
+from ctxval.certificates.bounds import with_units
 from ctxval.certificates.options import CONFIDENCE
 from ctxval.core.preflight import StartOffset, start_offset
 from ctxval.core.trajectory import Trajectory
@@ -193,7 +193,7 @@ class CampaignResults:
             for trial, executed in executed_trials(self.store, self.trials)
         ]
         start = max(((offset.size, f"{offset.text} (trial {number})") for offset, number in offsets), default=None)
-        return replace(known, space=space, learned=learned, start=start)
+        return replace(known, space=space, learned=learned, start=start, units=self.validation.labels.units)
 
     def surrogate(self) -> Surrogate:
         """Return the Gaussian process of the distance over the task space, for every search.

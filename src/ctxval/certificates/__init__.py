@@ -1,12 +1,8 @@
 """Certificates: statements about d* with their assumptions, and the verdicts that rest on them."""
 
-from typing import TYPE_CHECKING, Any
-
 from ctxval.certificates.anytime import AnytimeAudit, certify_anytime
-from ctxval.certificates.assessment import Assessment, assess
-from ctxval.certificates.audit import Audit, certify_audit
 from ctxval.certificates.automatic import Automatic
-from ctxval.certificates.base import Certificate, CertificateKind
+from ctxval.certificates.base import KINDS, Certificate, CertificateKind, require_use
 from ctxval.certificates.convergence import is_validated, rate
 from ctxval.certificates.covering import (
     RESOLUTION,
@@ -19,41 +15,35 @@ from ctxval.certificates.dynamics import Dynamics, certify_dynamics
 from ctxval.certificates.dynamics_evidence import (
     CheckedPrediction,
     DynamicsEvidence,
+    LearnedDistance,
     StateInputCoverage,
     StateInputGap,
     UntriedParameter,
 )
 from ctxval.certificates.forecast import Forecast, forecast
-from ctxval.certificates.learned import LearnedDistance, require_learned
 from ctxval.certificates.maxima import Maxima, draw_maxima, settle_maxima
-from ctxval.certificates.mean import Mean, certify_mean
 from ctxval.certificates.options import CertificateOptions
-from ctxval.certificates.posterior import Posterior, certify_posterior, instantaneous_bound
-from ctxval.certificates.posterior_diagnostics import Diagnosis, diagnose
+from ctxval.certificates.posterior import Diagnosis, Posterior, certify_posterior, diagnose, instantaneous_bound
 from ctxval.certificates.provenance import Provenance
 from ctxval.certificates.region import Region, certify_region
-from ctxval.certificates.registry import KINDS, require_use
-from ctxval.certificates.sample import PLANNED, MadeGood, Sample
+from ctxval.certificates.sample import PLANNED, MadeGood, Sample, require_learned
 from ctxval.certificates.scenario import (
+    Audit,
     SamplingDiscarding,
     Scenario,
+    certify_audit,
     certify_scenario,
     samples_needed,
     tail,
     volume_bound,
 )
 from ctxval.certificates.stopping import StoppingDecision, StoppingRule
-from ctxval.certificates.verdict import Verdict, judge, judge_by
-
-if TYPE_CHECKING:
-    USES: dict[str, tuple[str, ...]]
-    """For each option of certificates, the kinds that use it."""
+from ctxval.certificates.verdict import Assessment, Verdict, assess, judge, judge_by
 
 __all__ = [
     "KINDS",
     "PLANNED",
     "RESOLUTION",
-    "USES",
     "AnytimeAudit",
     "Assessment",
     "Audit",
@@ -69,7 +59,6 @@ __all__ = [
     "LearnedDistance",
     "MadeGood",
     "Maxima",
-    "Mean",
     "Posterior",
     "Provenance",
     "Region",
@@ -87,7 +76,6 @@ __all__ = [
     "certify_anytime",
     "certify_audit",
     "certify_dynamics",
-    "certify_mean",
     "certify_posterior",
     "certify_region",
     "certify_scenario",
@@ -111,11 +99,3 @@ __all__ = [
 ]
 
 KINDS.collect()
-
-
-def __getattr__(name: str) -> Any:
-    """Return ``USES``: for each option, the kinds that use it. It is computed on request, as it imports all kinds."""
-    if name != "USES":
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    options = [option for name in KINDS.imported for option in KINDS.find(name).options()]
-    return {option: KINDS.with_option(option) for option in options}

@@ -27,19 +27,14 @@ from scipy.special import betainc, betaln
 from ctxval._util.arrays import Array, Mask
 from ctxval._util.checked import PositiveFloat, Probability, checked
 from ctxval._util.registry import part
-from ctxval.certificates.base import ONE_CAMPAIGN, Certificate, CertificateKind
-from ctxval.certificates.bounds import at_most, drawn_from, of_tasks
+from ctxval.certificates.base import Certificate, CertificateKind
 from ctxval.certificates.forecast import Forecast
 from ctxval.certificates.sample import Sample
-from ctxval.certificates.scenario import ABOUT_DRAWS, rests_on_draws
-from ctxval.core.space import TaskSpace
+from ctxval.certificates.sentences import ABOUT_DRAWS, ONE_CAMPAIGN, distributed, share_above
 from ctxval.errors import CertificateError
 
 _NO_VIOLATION = 0.75
 """Weight w of q = 0. Without a violation, at most a share log(1/w) / log(1/beta) more draws are needed."""
-
-_LEAST_VOLUME = 1e-12
-"""Volumes below it are not told apart."""
 
 
 @part("anytime")
@@ -50,13 +45,10 @@ class AnytimeAudit(CertificateKind):
     name: ClassVar[str] = "anytime"
     bounds_maximum: ClassVar[bool] = False
     needs_threshold: ClassVar[bool] = True
+    sorts_draws: ClassVar[bool] = True  # all of them count, whenever they end
 
     def certify(self, sample: Sample, confidence: float = 0.95) -> Certificate:
-        """Refuse: the bound is on the volume above a threshold, and none is given.
-
-        Raises:
-            CertificateError: always.
-        """
+        """Refuse: the bound is on the volume above a threshold, and none is given."""
         raise CertificateError("an anytime audit bounds the volume above a threshold, so it needs one (--threshold).")
 
     def certify_against(
@@ -65,45 +57,34 @@ class AnytimeAudit(CertificateKind):
         """Return :func:`certify_anytime` of the trials; nothing is forecast."""
         return certify_anytime(sample, threshold, confidence), None
 
-    @classmethod
-    def rests_on(cls, certificate: Certificate, space: TaskSpace | None = None) -> list[str]:
-        """Return what it needs of the draws."""
-        return rests_on_draws(certificate)
-
 
 @checked
 def certify_anytime(sample: Sample, threshold: PositiveFloat, confidence: Probability = 0.95) -> Certificate:
-    """Bound the volume of the tasks above a threshold, by the independent draws among the trials.
+    """Bound the volume of the tasks above a threshold that was fixed before the draws were known.
 
-    A draw without a distance counts as a violation, so that failures cannot help.
-
-    Args:
-        sample: trials of any origin; only independent draws count, in their order.
-        threshold: tau, in the distance's units, fixed before the draws were known.
-        confidence: 1 - beta.
+    Only independent draws count, in their order. One without a distance counts as a violation, so that failures cannot
+    help.
 
     Raises:
-        CertificateError: there is no independent draw, or the confidence is not a probability.
+        CertificateError: if there is no independent draw.
     """
-    beta = 1 - confidence
     drawn = sample.only("iid")
     if not len(drawn):
         raise CertificateError("an anytime audit needs independent draws of tasks, and there is none; use --audit N.")
     violating = ~(drawn.distances <= threshold)  # also where no distance is known
-    volume = anytime_volume(violating, beta)
+    volume = anytime_volume(violating, 1 - confidence)
     return Certificate(
         kind="anytime",
-        statement=(
-            f"With confidence {confidence}, at most {at_most(100 * volume, 3)} % "
-            f"{of_tasks(sample.distribution)} has a distance above {threshold:.6g} or fails, however often this "
-            "was looked at and continued."
+        statement=share_above(
+            *(sample, volume, confidence, f"{threshold:.6g}", len(drawn)),
+            " or fail, however often this was looked at and continued",
         ),
         upper_bound=float(threshold),
         confidence=confidence,
         volume=volume,
         trials=len(drawn),
         assumptions=(
-            f"the audited tasks are independent and {drawn_from(sample.distribution)}",
+            f"the audited tasks are independent and {distributed(sample)}",
             f"the threshold {threshold:.6g} was fixed before any of them was known",
             *ABOUT_DRAWS,
             *sample.remarks,
@@ -120,11 +101,9 @@ def certify_anytime(sample: Sample, threshold: PositiveFloat, confidence: Probab
 
 
 def anytime_volume(violating: Mask, beta: float) -> float:
-    """Return the least volume that draws reject at one of the times that there were, 1 if they reject none.
+    """Return the least volume that draws ``(n,)`` reject at one of the times that there were, 1 if they reject none.
 
-    Args:
-        violating: which of n independent draws violate the threshold, in their order, shape ``(n,)``.
-        beta: the probability with which the true volume may be rejected, at any time.
+    The true volume is rejected at any time with probability at most beta.
     """
     counts = np.cumsum(violating)
     # Between violations more draws only lower the volume, so that the last moment before each of them is enough.
@@ -139,11 +118,11 @@ def _rejected_from(n: int, violations: int, beta: float) -> float:
     def excess(volume: float) -> float:
         return float(log_e_value(n, violations, np.array(volume)) - target)
 
-    low, high = max(violations / n, _LEAST_VOLUME), 1 - 1e-9
+    low, high = max(violations / n, 1e-12), 1 - 1e-9
     if violations == n or excess(high) < 0:
         return 1.0
-    found: float = brentq(excess, low, high, xtol=1e-12)
-    return min(1.0, found * (1 + 1e-9))
+    root: float = brentq(excess, low, high, xtol=1e-12)
+    return min(1.0, root * (1 + 1e-9))
 
 
 def log_e_value(n: int, violations: int, volume: Array) -> Array:

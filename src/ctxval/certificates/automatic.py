@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
@@ -17,9 +18,10 @@ from ctxval.certificates.forecast import Forecast
 from ctxval.certificates.posterior import Posterior
 from ctxval.certificates.prediction_tests import DRAWN, TESTS, fewest_missing_tests
 from ctxval.certificates.sample import Sample
+from ctxval.certificates.verdict_sentences import supported as supported_by
 from ctxval.errors import CertificateError
 
-Found = tuple[Certificate, Forecast | None]
+_Outcome = tuple[Certificate, Forecast | None]
 
 
 @part("auto")
@@ -39,6 +41,7 @@ class Automatic(CertificateKind):
 
     name: ClassVar[str] = "auto"
     needs_model: ClassVar[bool] = True
+    sorts_draws: ClassVar[bool] = True  # its draws are tests, and count at any time
 
     stochastic: bool = False
     resolution: PositiveFloat = RESOLUTION
@@ -55,35 +58,31 @@ class Automatic(CertificateKind):
         return usual and sample.learned is not None and len(sample) >= FEWEST and not sample.failed
 
     def certify(self, sample: Sample, confidence: float = 0.95) -> Certificate:
-        """Return the dynamics bound or, if it is withdrawn or refused, the posterior bound.
-
-        Raises:
-            CertificateError: if both are refused.
-        """
+        """Return the dynamics bound or, if it is withdrawn or refused, the posterior bound."""
         return self._first(sample, None, confidence)[0]
 
     def certify_against(
         self, sample: Sample, threshold: float, confidence: float = 0.95
     ) -> tuple[Certificate, Forecast | None]:
-        """Return the first certificate that keeps the threshold, or else the one that is nearer to a decision.
-
-        Raises:
-            CertificateError: if both are refused.
-        """
+        """Return the first certificate that keeps the threshold, or else the one that is nearer to a decision."""
         return self._first(sample, threshold, confidence)
 
-    def _first(self, sample: Sample, threshold: float | None, confidence: float) -> Found:
+    def _first(self, sample: Sample, threshold: float | None, confidence: float) -> _Outcome:
         by_dynamics = None
         if self.uses_dynamics(sample):
-            by_dynamics = _tried(Dynamics(tests=self.tests), sample, threshold, confidence)
-        if isinstance(by_dynamics, tuple) and _decides(by_dynamics[0], threshold):
+            with suppress(CertificateError):
+                by_dynamics = _certified(Dynamics(tests=self.tests), sample, threshold, confidence)
+        if by_dynamics is not None and _decides(by_dynamics[0], threshold):
             return by_dynamics
-        by_distance = self._tested(_tried(self.posterior, sample, threshold, confidence), sample)
-        if not isinstance(by_dynamics, tuple):
-            return _required(by_distance)
-        if not isinstance(by_distance, tuple) or _decides(by_distance[0], threshold):
-            return by_dynamics if not isinstance(by_distance, tuple) else by_distance
-        supported = threshold is not None and Dynamics.support(by_dynamics[0], threshold)
+        try:
+            by_distance = self._tested(_certified(self.posterior, sample, threshold, confidence), sample)
+        except CertificateError:
+            if by_dynamics is None:
+                raise
+            return by_dynamics
+        if by_dynamics is None or _decides(by_distance[0], threshold):
+            return by_distance
+        supported = threshold is not None and supported_by(by_dynamics[0], threshold)
         return by_dynamics if _is_sound(by_dynamics[0]) or supported else by_distance
 
     def missing_tests(self, sample: Sample) -> int:
@@ -92,32 +91,24 @@ class Automatic(CertificateKind):
         drawn = sum(origin in DRAWN for origin, is_known in zip(sample.origins, known, strict=True) if is_known)
         return fewest_missing_tests(sample.points[known], drawn, self.tests)
 
-    def _tested(self, found: Found | CertificateError, sample: Sample) -> Found | CertificateError:
+    def _tested(self, outcome: _Outcome, sample: Sample) -> _Outcome:
         """Return the posterior bound, withdrawn if tasks of the whole space have not been executed."""
-        if isinstance(found, CertificateError):
-            return found
+        certificate, expected = outcome
         origins = [origin for origin in sample.origins if self.tests and origin in DRAWN]
         tests = {"drawn": len(origins), "independent": origins.count("iid"), "largest_error": None}
-        found = replace(found[0], details={**found[0].details, "tests": tests}), found[1]
-        missing = self.missing_tests(sample)
-        if found[0].doubt is not None or not missing:
-            return found
-        doubt = (
-            f"at least {missing} more {'task' if missing == 1 else 'tasks'} drawn over the whole task space must be "
-            "executed (`ctxval run` executes them; --tests 0 leaves them out)"
-        )
-        return replace(found[0], doubt=doubt), found[1]
+        doubt, missing = certificate.doubt, self.missing_tests(sample)
+        if doubt is None and missing:
+            doubt = (
+                f"at least {missing} more {'task' if missing == 1 else 'tasks'} drawn over the whole task space must "
+                "be executed (`ctxval run` executes them; --tests 0 leaves them out)"
+            )
+        return replace(certificate, details={**certificate.details, "tests": tests}, doubt=doubt), expected
 
 
-def _tried(
-    kind: CertificateKind, sample: Sample, threshold: float | None, confidence: float
-) -> Found | CertificateError:
-    try:
-        if threshold is None:
-            return kind.certify(sample, confidence), None
-        return kind.certify_against(sample, threshold, confidence)
-    except CertificateError as error:
-        return error
+def _certified(kind: CertificateKind, sample: Sample, threshold: float | None, confidence: float) -> _Outcome:
+    if threshold is None:
+        return kind.certify(sample, confidence), None
+    return kind.certify_against(sample, threshold, confidence)
 
 
 def _decides(certificate: Certificate, threshold: float | None) -> bool:
@@ -128,9 +119,3 @@ def _decides(certificate: Certificate, threshold: float | None) -> bool:
 def _is_sound(certificate: Certificate) -> bool:
     """Return whether a certificate is not withdrawn, and no prediction failed that raises its bound."""
     return certificate.doubt is None and certificate.details.get("raised_from") is None
-
-
-def _required(found: Found | CertificateError) -> Found:
-    if isinstance(found, CertificateError):
-        raise found
-    return found

@@ -1,33 +1,24 @@
-"""The certificate, and the base class of all kinds of certificates."""
+"""The certificate, the base class of all kinds of certificates, and kinds by name."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
-from typing import TYPE_CHECKING, Any, ClassVar, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeVar
 
+from ctxval._util.registry import Registry
 from ctxval._util.representation import ShortRepr, Shown, call, line, lines, table
 from ctxval._util.version import VERSION
+from ctxval.certificates import verdict_sentences as sentences
 from ctxval.certificates.bounds import ERRORS, as_text, at_most, with_error
 from ctxval.certificates.sample import Sample
 from ctxval.core.space import TaskSpace
 from ctxval.core.trial import Origin
+from ctxval.errors import CertificateError, InputError, UnknownNameError
 
 if TYPE_CHECKING:
     from ctxval.certificates.forecast import Forecast
-
-ONE_CAMPAIGN = (
-    "this campaign was fixed beforehand and not chosen among several: the best of several is wrong more often than "
-    "stated"
-)
-"""The assumption that all certificates share."""
-
-_NOT_PRINTED = ("failures", "checked")
-"""Details that are only in JSON."""
-
-_INDENT = "\n  "
-"""Line break within a text: its further lines are indented, so that none looks like a line of the certificate."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -82,12 +73,13 @@ class Certificate:
 
     @property
     def numbers(self) -> dict[str, Any]:
-        """The numbers that are printed; failures, which the assumptions list, and long lists are left out."""
-        shown = {name: value for name, value in self.details.items() if name not in _NOT_PRINTED}
+        """The numbers that are printed; failures, which the assumptions list, and long lists are only in JSON."""
+        shown = {name: value for name, value in self.details.items() if name not in ("failures", "checked")}
         return {**shown, "trials": self.trials, "version": self.version}
 
     def __str__(self) -> str:
-        return "\n".join(one.replace("\r\n", "\n").replace("\n", _INDENT) for one in self._lines())
+        # Further lines of a text are indented, so that none looks like a line of the certificate.
+        return "\n".join(text.replace("\r\n", "\n").replace("\n", "\n  ") for text in self._lines())
 
     def _lines(self) -> Iterator[str]:
         yield f"{self.kind}: {self.statement}"
@@ -105,30 +97,27 @@ class Certificate:
         return lines(head, *withdrawn, line(self.statement), f"assumptions: {len(self.assumptions)}")
 
     def _repr_html_(self) -> str:
-        return table(
-            f"Certificate: {self.kind}",
-            [
-                ("withdrawn", self.doubt),
-                ("statement", self.statement),
-                ("upper bound", with_error(self.upper_bound, self.error)),
-                ("confidence", Shown(f"{self.confidence:.6g}")),
-                ("volume left out", at_most(self.volume, 3)),
-                ("trials", self.trials),
-                *(("assumes", assumption) for assumption in self.assumptions),
-                ("distribution of tasks", self.distribution),
-                ("version", self.version),
-            ],
-        )
+        rows = [
+            ("withdrawn", self.doubt),
+            ("statement", self.statement),
+            ("upper bound", with_error(self.upper_bound, self.error)),
+            ("confidence", Shown(f"{self.confidence:.6g}")),
+            ("volume left out", at_most(self.volume, 3)),
+            ("trials", self.trials),
+            *(("assumes", assumption) for assumption in self.assumptions),
+            ("distribution of tasks", self.distribution),
+            ("version", self.version),
+        ]
+        return table(f"Certificate: {self.kind}", rows)
 
 
 @dataclass(frozen=True)
 class CertificateKind(ShortRepr, ABC):
     """A kind of certificate. Its fields are its options: its inputs besides the trials and the confidence.
 
-    A kind is a frozen dataclass with a name and a method that computes a certificate from trials. The other methods
-    state what a verdict by it rests on, and refuse a useless audit before its draws are executed.
-    Their defaults suit a bound on d* that is computed from the distances alone. If a kind uses what the experiment's
-    model predicts, it sets ``needs_model`` and reads :attr:`Sample.learned`.
+    A kind is a frozen dataclass with a name and a method that computes a certificate from trials. The defaults of all
+    else suit a bound on d* that is computed from the distances alone. If a kind uses what the experiment's model
+    predicts, it sets ``needs_model`` and reads :attr:`Sample.learned`.
     """
 
     name: ClassVar[str]
@@ -136,9 +125,6 @@ class CertificateKind(ShortRepr, ABC):
 
     bounds_maximum: ClassVar[bool] = True
     """Whether it bounds d* itself. If not, it leaves out a share of the task space, which the user must accept."""
-
-    evidence: ClassVar[str] = "by its assumptions"
-    """What a validation by it rests on, in the sentence of the verdict, if it bounds d*."""
 
     needs_threshold: ClassVar[bool] = False
     """Whether its statement is about a threshold, so that there is none without one."""
@@ -149,27 +135,25 @@ class CertificateKind(ShortRepr, ABC):
     needs_model: ClassVar[bool] = False
     """Whether it uses what the experiment's model predicts, so that the experiment must be loaded."""
 
-    never_validates: ClassVar[str] = ""
-    """Why it validates no threshold, whatever its numbers are: a sentence without its full stop; empty if it can."""
+    sorts_draws: ClassVar[bool] = False
+    """Whether it sorts out independent draws whose number depended on results; else these are no draws in its sample.
+    """
 
     @classmethod
     def options(cls) -> tuple[str, ...]:
         """Return the names of its options: its fields, and ``volume`` if it validates but for a share of the tasks."""
-        own = tuple(one.name for one in fields(cls))
-        return own if cls.bounds_maximum or cls.never_validates else (*own, "volume")
+        names = tuple(option.name for option in fields(cls))
+        return names if cls.bounds_maximum else (*names, "volume")
 
     @classmethod
     def of(cls, stated: Mapping[str, Any]) -> Self:
         """Return an instance from those of the options that are its own; an option that is None keeps its default."""
-        return cls(**{one.name: stated[one.name] for one in fields(cls) if stated.get(one.name) is not None})
+        names = [option.name for option in fields(cls)]
+        return cls(**{name: stated[name] for name in names if stated.get(name) is not None})
 
     @abstractmethod
     def certify(self, sample: Sample, confidence: float = 0.95) -> Certificate:
-        """Return the certificate of trials.
-
-        Args:
-            sample: the trials.
-            confidence: the probability with which the statement must hold.
+        """Return the certificate of trials, whose statement must hold with the confidence.
 
         Raises:
             CertificateError: if its theory does not allow these trials, or an option that it needs is missing.
@@ -181,54 +165,93 @@ class CertificateKind(ShortRepr, ABC):
         """Return a certificate that is precise enough for a threshold, and a forecast of further executions.
 
         The forecast is None if the certificate keeps the threshold, or if nothing can be predicted.
-
-        Raises:
-            CertificateError: under the conditions of :meth:`certify`.
         """
         return self.certify(sample, confidence), None
 
     def require_audit_helps(self, origins: Iterable[Origin]) -> None:
-        """Check that this certificate can use independent draws, before they are executed.
-
-        Args:
-            origins: the origins of the trials so far.
-
-        Raises:
-            CertificateError: if the certificate would be refused whatever the distances of the draws are.
-        """
+        """Raise a CertificateError if independent draws beside trials of these origins could never be certified."""
 
     def require_usable(self, confidence: float, executions: int) -> None:
-        """Check that this certificate can be computed, before the executions are paid for.
-
-        Args:
-            confidence: the probability with which the statement must hold.
-            executions: the planned number of trials.
-
-        Raises:
-            CertificateError: if it would be refused whatever the distances are.
-        """
+        """Raise a CertificateError if so many trials could never be certified, before they are paid for."""
 
     @classmethod
     def rests_on(cls, certificate: Certificate, space: TaskSpace | None = None) -> list[str]:
         """Return what a validation by a certificate rests on: each entry completes a sentence "It rests on ...".
 
-        Args:
-            certificate: a certificate of this kind.
-            space: the task space, to state lengths in its units; None if it is not known.
+        The task space states lengths in its units; it is None if it is not known.
         """
-        return ["what its certificate assumes"]
+        return sentences.conditions(certificate, space)
 
-    @classmethod
-    def qualification(cls, certificate: Certificate, space: TaskSpace | None = None) -> str:
-        """Return the end of a sentence that names options other than the defaults; empty if all are defaults."""
-        return ""
 
-    @classmethod
-    def support(cls, certificate: Certificate, threshold: float) -> str:
-        """Return what speaks for a threshold although the certificate is withdrawn; empty if nothing does."""
-        return ""
+Kind = TypeVar("Kind", bound=type[CertificateKind])
 
-    @classmethod
-    def shortfall(cls, certificate: Certificate) -> str:
-        """Return the end of a sentence on why the bound or the volume left out is not smaller; empty if unknown."""
-        return ""
+
+class KindRegistry(Registry[CertificateKind]):
+    """Kinds of certificates by name: built-in ones, those of installed packages, and those registered by a decorator.
+
+    A registered kind is the user's own code, so :meth:`is_data` returns False for it.
+    """
+
+    def __init__(self) -> None:
+        super().__init__("certificate", "ctxval.certificates", method="certify")
+        self._registered: dict[str, type[CertificateKind]] = {}
+
+    def register(self, kind: Kind) -> Kind:
+        """Add a kind; it is used as a decorator of the class."""
+        name = _required(kind).name
+        known = self.find(name) if name in self.built_in else self._registered.get(name, kind)
+        if (known.__module__, known.__qualname__) != (kind.__module__, kind.__qualname__):
+            raise InputError(f"there is a kind of certificate called {name!r} already: {known.__qualname__}.")
+        if name not in self.built_in:
+            self._registered[name] = kind  # a cell that is run again replaces its own class
+        return kind
+
+    def find(self, name: str) -> type[CertificateKind]:
+        """Return the kind of a name."""
+        kind = self._registered.get(name) or _required(super().find(name))
+        if kind.name != name:
+            raise InputError(f"the certificate {name!r} calls itself {kind.name!r}.")
+        return kind
+
+    @property
+    def imported(self) -> tuple[str, ...]:
+        """The names of the kinds that are imported: built-in and registered ones."""
+        return (*self.built_in, *self._registered)
+
+    def of(self, certificate: Certificate) -> type[CertificateKind]:
+        """Return the kind of a certificate; the base class :class:`CertificateKind` if the kind is not known."""
+        return self.find(certificate.kind) if certificate.kind in self else CertificateKind
+
+    def with_option(self, option: str) -> tuple[str, ...]:
+        """Return the names of the imported kinds that have an option."""
+        return tuple(name for name in self.imported if option in self.find(name).options())
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._registered or super().__contains__(name)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(dict.fromkeys((*self.imported, *self.installed)))
+
+    def __len__(self) -> int:
+        return len(list(iter(self)))
+
+
+def _required(kind: Any) -> type[CertificateKind]:
+    if isinstance(kind, type) and issubclass(kind, CertificateKind) and isinstance(getattr(kind, "name", None), str):
+        return kind
+    raise InputError(f"a kind of certificate must be a subclass of CertificateKind with a name, got {kind!r}.")
+
+
+KINDS = KindRegistry()
+"""Kinds of certificates by name."""
+
+
+def require_use(kind: str, given: Iterable[str]) -> None:
+    """Refuse options that a kind would ignore: a user who gives one expects it to have an effect."""
+    options = KINDS.find(kind).options()
+    for option in given:
+        kinds = " or ".join(KINDS.with_option(option))
+        if option not in options and not kinds:
+            raise UnknownNameError.among(f"option of the certificate {kind!r}", option, options)
+        if option not in options:
+            raise CertificateError(f"{option} is for certificates of the kind {kinds}; the kind here is {kind}.")

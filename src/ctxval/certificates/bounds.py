@@ -1,8 +1,12 @@
-"""Numbers of certificates: checks of probabilities, and bounds as text, which are always rounded up."""
+"""Numbers of certificates as text; bounds are always rounded up."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
+
+from ctxval._util.texts import parted
 
 ERRORS = 2.0
 """Number of its standard errors by which a bound from random draws must stay below a threshold."""
@@ -33,26 +37,20 @@ def at_most(value: float, digits: int = 4) -> str:
     return f"{value + 10.0 ** (np.floor(np.log10(abs(value))) - digits + 1):.{digits}g}"
 
 
-def at_least(value: float, digits: int = 4) -> str:
-    """Return a lower limit as text, rounded down."""
-    rounded = at_most(-value, digits)
-    return rounded.removeprefix("-") if rounded.startswith("-") else ("0" if value == 0 else f"-{rounded}")
+def percent(probability: float) -> str:
+    """Return a probability such as 0.95 as ``95 %``."""
+    return f"{100 * probability:.9g} %"
 
 
 def of_tasks(distribution: str | None) -> str:
-    """Return of what a share is a share: of the task space, or of the probability under a distribution of tasks.
-
-    Args:
-        distribution: the distribution of tasks as a text; None if it is uniform.
-    """
-    return "of the task space" if distribution is None else "of the probability under the stated distribution of tasks"
+    """Return of what a share is a share; the distribution of tasks is a text, None if it is uniform."""
+    return "of the tasks" if distribution is None else "of the tasks under the stated distribution"
 
 
-def drawn_from(distribution: str | None) -> str:
-    """Return how independent draws are distributed, as the end of a clause "the tasks are independent and ..."."""
-    if distribution is None:
-        return "uniform over the task space"
-    return f"follow the stated distribution of tasks ({distribution})"
+def with_units(values: Mapping[str, float], digits: int = 2) -> str:
+    """Return numbers with their names; the unit of a label ``name [unit]`` follows its number."""
+    parts = ((*parted(label), value) for label, value in values.items())
+    return ", ".join(f"{name} {value:.{digits}g} {unit}".rstrip() for name, unit, value in parts)
 
 
 def as_text(value: object) -> str:

@@ -43,12 +43,6 @@ def is_validated(
 ) -> bool:
     """Return whether Corollary 1 validates the model: ``best_n < tau - r_n``.
 
-    Args:
-        best: the largest distance that GP-UCB has found.
-        threshold: tau, in the distance's units.
-        constant: C, in the distance's units.
-        n: number of tasks that the acquisition function chose.
-        dimension: number of task parameters.
-        kernel: the kernel of the prior.
+    n tasks were chosen by the acquisition function. The largest distance found, tau and the constant C have one unit.
     """
     return best < threshold - constant * rate(n, dimension, kernel)

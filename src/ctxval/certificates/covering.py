@@ -15,15 +15,9 @@ RESOLUTION = 0.125
 """Default of the largest distance from a task to its nearest trial, in diagonals of the task space. Farther away the
 distance d may behave in ways that no trial has shown (docs/calibration.md)."""
 
-_PROBES = 8192
-"""Number of random tasks, and of random corners, from which the coverage is computed."""
-
+# Largest distance from a corner to its nearest trial, as a share of what is allowed for other tasks. A trial merely
+# near a corner tells little about it: no trial lies beyond, and d often rises steeply towards the worst corner.
 _NEXT_TO = 0.125
-"""Largest distance from a corner to its nearest trial, as a share of what is allowed for other tasks. A trial merely
-near a corner tells little about it: no trial lies beyond, and d often rises steeply towards the worst corner."""
-
-_MOST_PARAMETERS = 4
-"""Largest number of parameters for which corners must be executed, since there are 2^d of them."""
 
 
 def resolved_volume(resolution: float, dimension: int) -> float:
@@ -42,15 +36,12 @@ def farthest_task(X: Array) -> float:
 
 
 def bare_corners(X: Array, resolution: float) -> Array:
-    """Return the corners ``(k, d)`` of the cube that no trial is at or next to; none if d is larger than 4.
+    """Return the corners ``(k, d)`` of the cube that no trial is at or next to; none if d > 4, as there are 2^d.
 
-    Args:
-        X: the trials' points ``(n, d)``.
-        resolution: largest distance from a task to its nearest trial, in diagonals; for a corner it is an eighth of
-            that. If it is 1 or more, no corner is returned.
+    "Next to" is an eighth of the resolution, in diagonals; if that is 1 or more, no corner is returned.
     """
     d = X.shape[1]
-    if d > _MOST_PARAMETERS or resolution >= 1:
+    if d > 4 or resolution >= 1:
         return np.empty((0, d))
     corners = np.array(list(product((0.0, 1.0), repeat=d)))
     return np.asarray(corners[_gaps(X, corners) > _NEXT_TO * resolution])
@@ -59,13 +50,8 @@ def bare_corners(X: Array, resolution: float) -> Array:
 def covering(X: Array, resolution: float, most: int) -> Array | None:
     """Return points ``(k, d)`` whose execution would cover the task space; None if more than ``most`` are needed.
 
-    The corners without a trial come first. Each further point is the task that is farthest from the trials and from
-    the points before it.
-
-    Args:
-        X: the trials' points ``(n, d)``.
-        resolution: largest distance from a task to its nearest trial, in diagonals.
-        most: the largest number of points.
+    The corners without a trial come first. Each further point is the task that is farthest from the trials ``(n, d)``
+    and the points before it, until all tasks are within the resolution, in diagonals.
     """
     probes = _probes(X.shape[1])
     points: list[Array] = list(bare_corners(X, resolution))
@@ -83,10 +69,7 @@ def covering(X: Array, resolution: float, most: int) -> Array | None:
 def most_contested(points: Array, X: Array, resolution: float) -> Array | None:
     """Return the point that is near many others and far from every trial; None if each of them is next to a trial.
 
-    Args:
-        points: maximisers of the largest draws of d*, shape ``(k, d)``.
-        X: the trials' points ``(n, d)``.
-        resolution: largest distance from a task to its nearest trial, in diagonals.
+    The points ``(k, d)`` are maximisers of the largest draws of d*; the resolution is in diagonals.
     """
     gaps = _gaps(X, points)
     near = (cdist(points, points) / np.sqrt(X.shape[1]) <= resolution / 2).sum(axis=1)
@@ -96,8 +79,8 @@ def most_contested(points: Array, X: Array, resolution: float) -> Array | None:
 
 def _probes(d: int) -> Array:
     rng = np.random.default_rng(0)
-    corners = rng.integers(0, 2, (_PROBES, d)).astype(np.float64)
-    return np.concatenate([rng.random((_PROBES, d)), corners])
+    corners = rng.integers(0, 2, (8192, d)).astype(np.float64)
+    return np.concatenate([rng.random((8192, d)), corners])
 
 
 def _gaps(X: Array, probes: Array) -> Array:

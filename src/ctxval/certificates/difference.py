@@ -29,20 +29,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ctxval._util.arrays import Array, Mask
-from ctxval.certificates.bets import log_wealth_of_bets, weights_so_far
+from ctxval._util.arrays import Array
 
-_LARGEST = 0.9
-"""Largest gain or loss of one bet on unbounded differences, as a share of the wealth."""
-
-_REFINED = 60
-"""Number of bisections of the end of an interval."""
-
-_FEW = 4
-"""If there are fewer earlier tasks, all of them count as recent."""
-
-_FARTHEST = 1e6
-"""The ends of an interval are searched within this many standard deviations of the estimate."""
+_LARGEST = 0.9  # gain or loss of one bet on unbounded differences, as a share of the wealth
+_FEW = 4  # with fewer earlier tasks, all of them count as recent
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,17 +59,13 @@ class PairedDifferences:
     @property
     def _weights(self) -> Array:
         """The slope of differences against predictions among the recent earlier tasks, from 0 to 1, ``(N,)``."""
-        return weights_so_far(self.values, self.predicted, _recent_sum)
+        return _weights_so_far(self.values, self.predicted)
 
     def log_wealth(self, mean: Array, *, above: bool) -> Array:
-        """Return the logarithm of the largest wealth so far, of bets that the mean is not the given one.
+        """Return the logarithm of the largest wealth so far, of bets that the mean is not the given one ``(...)``.
 
-        Args:
-            mean: means that are bet against, shape ``(...)``.
-            above: bet that the true mean is above; else below.
-
-        Returns:
-            shape ``(..., N)``; it never decreases along the last axis.
+        The bets are that the true mean is above, or else below. The shape is ``(..., N)``; it never decreases along
+        the last axis.
         """
         sign = 1.0 if above else -1.0
         against = sign * np.asarray(mean, dtype=np.float64)[..., None]
@@ -122,16 +108,16 @@ class MeanDifference:
 def mean_difference(differences: PairedDifferences, beta: float) -> MeanDifference:
     """Return the expected difference, with an interval and a decision that hold together at all numbers of tasks.
 
-    Args:
-        differences: the differences.
-        beta: the probability with which the interval may ever be wrong.
+    They are ever wrong with probability beta.
     """
     count = len(differences.values)
     if not count:
         return MeanDifference(None, -np.inf, np.inf, 0, None, 0, None)
     level, corrected = float(np.log(2 / beta)), differences.corrected
-    crossed = [_first(differences.log_wealth(np.array(0.0), above=above) >= level) for above in (True, False)]
-    sign, after = _decision(*crossed)
+    reached = [np.flatnonzero(differences.log_wealth(np.array(0.0), above=side) >= level) for side in (True, False)]
+    crossed = [int(rows[0]) + 1 if len(rows) else None for rows in reached]
+    after = min((count for count in crossed if count is not None), default=None)
+    sign = 0 if after is None else -1 if crossed[1] == after else 1
     centre = _centre(corrected)
     low, high = (_end(differences, centre, level, above=above) for above in (True, False))
     spread = float(differences.values.var())
@@ -148,21 +134,6 @@ def _centre(corrected: Array) -> float:
     weights = np.where(np.isfinite(size) & (size > 0), 1 / np.where(size > 0, size, 1.0), 0.0)
     weights[:2] = 0.0  # nothing is known of the deviations yet
     return float(np.average(corrected, weights=weights) if weights.any() else corrected.mean())
-
-
-def _decision(above: int | None, below: int | None) -> tuple[int, int | None]:
-    """Return the sign that was decided first, and after how many tasks."""
-    if above is None and below is None:
-        return 0, None
-    if below is None or (above is not None and above < below):
-        return 1, above
-    return -1, below
-
-
-def _first(reached: Mask) -> int | None:
-    """Return how many tasks there were when a condition was first true; None if it never was."""
-    found = np.flatnonzero(reached)
-    return int(found[0]) + 1 if len(found) else None
 
 
 def _by_symmetry(centred: Array, *, recent: bool) -> Array:
@@ -191,6 +162,17 @@ def _recent_sum(values: Array) -> Array:
     return np.asarray(sums[..., ends] - sums[..., starts])
 
 
+def _weights_so_far(values: Array, predicted: Array) -> Array:
+    """Return for each task the slope of values against predictions among the recent earlier ones, from 0 to 1."""
+    count = _recent_sum(np.ones(values.shape[-1]))
+    of_values, of_predicted, of_products, of_squares = map(
+        _recent_sum, (values, predicted, values * predicted, predicted**2)
+    )
+    with np.errstate(invalid="ignore", divide="ignore"):
+        slope = (of_products - of_values * of_predicted / count) / (of_squares - of_predicted**2 / count)
+    return np.asarray(np.where(np.isfinite(slope) & (count >= 3), np.clip(slope, 0.0, 1.0), 1.0))
+
+
 def _recent_size(values: Array) -> Array:
     """Return for each task the root mean square of the recent earlier values, ``(..., N)``; NaN for the first task."""
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -204,14 +186,24 @@ def _by_bound(values: Array, mean: Array, lowest: Array, most: float) -> Array:
     deviations = (values - np.cumsum(values) / (count + 1)) ** 2
     spread = (most**2 / 16 + np.cumsum(deviations) - deviations) / count
     wanted = np.sqrt(2 * np.log(20.0) / (spread * count * np.log1p(count)))
-    return log_wealth_of_bets(values - mean, wanted, mean - lowest)
+    return _log_wealth_of_bets(values - mean, wanted, mean - lowest)
+
+
+def _log_wealth_of_bets(gains: Array, wanted: Array, room: Array) -> Array:
+    """Return the logarithm of the wealth after each draw, of bets on values that are bounded on one side, ``(..., N)``.
+
+    A bet of 1 gains ``gains`` with each draw and can lose ``room`` at most, which limits the bets that are wanted.
+    """
+    # A bet is at most 3/4 of that with which one draw could lose everything; without room no draw can lose.
+    won = np.minimum(wanted, 0.75 / np.maximum(room, 1e-300)) * gains
+    return np.asarray(np.cumsum(np.log1p(np.maximum(won, -0.75)), axis=-1))
 
 
 def _end(differences: PairedDifferences, centre: float, level: float, *, above: bool) -> float:
     """Return the lower end (bets above) or the upper end of the interval: the outermost mean that is not rejected."""
     sign = 1.0 if above else -1.0
     size = float(np.abs(differences.corrected - centre).mean()) or abs(centre) or 1.0
-    outermost = _FARTHEST * size if differences.most is None else differences.most + sign * centre
+    outermost = 1e6 * size if differences.most is None else differences.most + sign * centre
     steps = outermost * np.concatenate([np.geomspace(1, 1e-9, 400), [0.0]])
 
     def kept(means: Array) -> Array:
@@ -223,7 +215,7 @@ def _end(differences: PairedDifferences, centre: float, level: float, *, above: 
     if not inside[0]:
         return -sign * np.inf if differences.most is None else -sign * differences.most
     outer, inner = centre - sign * steps[inside[0] - 1], centre - sign * steps[inside[0]]
-    for _ in range(_REFINED):
+    for _ in range(60):
         middle = 0.5 * (outer + inner)
         outer, inner = (outer, middle) if kept(np.array(middle)) else (middle, inner)
     return float(outer)

@@ -15,14 +15,13 @@ predictions, and by far more if one of these predictions failed.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
 from ctxval._util.checked import NonNegativeInt, Probability, checked
 from ctxval._util.registry import part
-from ctxval.certificates.base import ONE_CAMPAIGN, Certificate, CertificateKind
-from ctxval.certificates.bounds import with_error
+from ctxval.certificates.base import Certificate, CertificateKind
 from ctxval.certificates.dynamics_diagnostics import (
     PREDICTIONS,
     counted,
@@ -34,20 +33,14 @@ from ctxval.certificates.dynamics_diagnostics import (
     tested,
     tests_missing,
 )
-from ctxval.certificates.dynamics_evidence import DynamicsEvidence, with_units
+from ctxval.certificates.dynamics_evidence import DynamicsEvidence
 from ctxval.certificates.forecast import Forecast
-from ctxval.certificates.learned import require_learned
-from ctxval.certificates.posterior import both_outcomes
 from ctxval.certificates.prediction_tests import DRAWN, TESTS
-from ctxval.certificates.sample import Sample, advice_to_remeasure, listed
-from ctxval.core.space import TaskSpace
+from ctxval.certificates.sample import Sample, advice_to_remeasure, listed, require_learned
+from ctxval.certificates.sentences import ONE_CAMPAIGN, both_outcomes, dynamics_assumptions, dynamics_statement
 from ctxval.errors import CertificateError
 
-MOST_DRAWS = 400
-"""The largest number of draws of the dynamics, which limits the confidence."""
-
-_RAISE = 0.5
-"""Share of the largest excess over predictions by which the bound is raised."""
+MOST_DRAWS = 400  # posterior samples of the dynamics, which limit the confidence
 
 
 @part("dynamics")
@@ -65,7 +58,6 @@ class Dynamics(CertificateKind):
 
     name: ClassVar[str] = "dynamics"
     needs_model: ClassVar[bool] = True
-    evidence: ClassVar[str] = "by a prior on the dynamics"
 
     stochastic: bool = False
     tests: NonNegativeInt = TESTS
@@ -78,19 +70,11 @@ class Dynamics(CertificateKind):
             )
 
     def require_usable(self, confidence: float, executions: int) -> None:
-        """Refuse a confidence that needs too many draws of the dynamics.
-
-        Raises:
-            CertificateError: if it does.
-        """
+        """Refuse a confidence that needs too many draws of the dynamics."""
         _require_draws(MOST_DRAWS, confidence)
 
     def certify(self, sample: Sample, confidence: float = 0.95) -> Certificate:
-        """Return :func:`certify_dynamics` of the trials and of what is learned from their trajectories.
-
-        Raises:
-            CertificateError: if the experiment is not loaded, an execution failed, or no dynamics can be learned.
-        """
+        """Return :func:`certify_dynamics` of the trials and of what is learned from their trajectories."""
         return certify_dynamics(sample, self._evidence(sample, confidence), confidence)
 
     def certify_against(
@@ -102,14 +86,14 @@ class Dynamics(CertificateKind):
         certificate = certify_dynamics(sample, evidence, confidence)
         if certificate.covers(threshold):
             return certificate, None
-        if raised(evidence, bound) > threshold and certificate.doubt == tests_missing(evidence, sample.best, bound):
+        if raised(evidence, bound) > threshold and certificate.doubt == tests_missing(evidence):
             certificate = replace(certificate, doubt=None)  # missing tests matter only to a bound that suffices
         kept = float((evidence.maxima <= threshold).mean())
         return certificate, Forecast(fewest_missing(evidence, sample.best, bound), kept, 1 - kept, fewest=True)
 
     def _evidence(self, sample: Sample, confidence: float) -> DynamicsEvidence:
         learned = require_learned(sample, self.name)
-        require_executions(sample)
+        _require_distances(sample)
         evidence = learned.dynamics(confidence)
         if evidence is None:
             raise CertificateError(
@@ -118,57 +102,18 @@ class Dynamics(CertificateKind):
             )
         return replace(evidence, tests=self.tests)
 
-    @classmethod
-    def rests_on(cls, certificate: Certificate, space: TaskSpace | None = None) -> list[str]:
-        """Return what it assumes about the system."""
-        resolution = with_units(certificate.details["resolution"])
-        return [
-            "the recorded state being complete",
-            "the system being deterministic, and its dynamics not changing with time nor with the task",
-            f"its dynamics being, in gaps of the records of up to {resolution}, like what was seen",
-        ]
-
-    @classmethod
-    def support(cls, certificate: Certificate, threshold: float) -> str:
-        """Return what speaks for a threshold although the certificate is withdrawn; empty if nothing does."""
-        details = certificate.details
-        largest = details["largest_draw"]
-        predictions = details["predictions"]
-        if largest is None or largest > threshold or not predictions["held"]:
-            return ""
-        return (
-            f"supported by the model: no posterior sample of the dynamics exceeds {threshold:.6g} in a search of "
-            f"{details['evaluations']} closed loops; {predictions['held']} of the last {predictions['last_ones']} "
-            "predictions held"
-        )
-
-    @classmethod
-    def shortfall(cls, certificate: Certificate) -> str:
-        """Return which failed prediction raises the bound; empty if all held."""
-        details = certificate.details
-        if details["raised_from"] is None:
-            return ""
-        worst = next(one for one in details["checked"] if one["trial"] == details["raised_by_trial"])
-        return (
-            f": trial {worst['trial']} came out at {worst['distance']:.4g} where {worst['median']:.4g} was predicted, "
-            f"which raises the bound from {details['raised_from']:.4g} until {PREDICTIONS} predictions in a row hold. "
-            "If predictions go on failing, a state that is not recorded, a jump such as a contact or dry friction, or "
-            "noise is the likely cause: record more states, or use --kind posterior or an audit"
-        )
-
 
 def draws_for(confidence: float) -> int:
     """Return the number of draws of the dynamics that a bound with this confidence needs."""
     return min(MOST_DRAWS, int(np.ceil(confidence / (1 - confidence))))
 
 
-def require_executions(sample: Sample) -> None:
-    """Check that the trials allow a bound from learned dynamics."""
-    failed = [number for number, distance in zip(sample.numbers, sample.distances, strict=True) if np.isnan(distance)]
-    if failed:
+def _require_distances(sample: Sample) -> None:
+    unknown = [number for number, distance in zip(sample.numbers, sample.distances, strict=True) if np.isnan(distance)]
+    if unknown:
         raise CertificateError(
-            f"{listed(failed)} failed or has no distance, so d* is not bounded there; execute the task again, or audit."
-            f"{advice_to_remeasure(sample)}"
+            f"{listed(unknown)} failed or has no distance, so d* is not bounded there; execute the task again, or "
+            f"audit.{advice_to_remeasure(sample)}"
         )
     if not sample.best > 0:
         raise CertificateError(
@@ -179,12 +124,7 @@ def require_executions(sample: Sample) -> None:
 
 @checked
 def certify_dynamics(sample: Sample, evidence: DynamicsEvidence, confidence: Probability = 0.95) -> Certificate:
-    """Return the bound that d* stays below with the confidence, under the prior on the dynamics.
-
-    Args:
-        sample: trials of any origin.
-        evidence: what the learned dynamics say, from the same trials.
-        confidence: the probability with which the bound holds.
+    """Return the bound that d* stays below with the confidence, from evidence of the same trials.
 
     Raises:
         CertificateError: if the confidence is too high for the number of draws, or draws diverge.
@@ -197,18 +137,54 @@ def certify_dynamics(sample: Sample, evidence: DynamicsEvidence, confidence: Pro
             "the dynamics give no bound: the closed loops of some posterior samples diverge, or an execution could not "
             "be predicted. More executions narrow them."
         )
+    finite, last = evidence.maxima[np.isfinite(evidence.maxima)], counted(evidence, bound)[-PREDICTIONS:]
+    drawn = [test for test in tested(evidence.predictions, evidence.tests) if test.origin in DRAWN]
+    coverage, worst = evidence.coverage, failed(evidence, bound)
     return Certificate(
         kind="dynamics",
-        statement=(
-            f"With probability {confidence} under the prior on the residual dynamics, d* is at most "
-            f"{with_error(upper, error)}."
-        ),
+        statement=dynamics_statement(upper, error, confidence),
         upper_bound=upper,
         confidence=confidence,
         volume=0.0,
         trials=len(sample),
-        assumptions=(*_assumptions(evidence), *sample.remarks, ONE_CAMPAIGN),
-        details=_details(sample, evidence, bound, error),
+        assumptions=(*dynamics_assumptions(evidence), *sample.remarks, ONE_CAMPAIGN),
+        details={
+            "best": sample.best,
+            "gap": upper - sample.best,
+            "raised_from": None if worst is None else bound,
+            "raised_by_trial": None if worst is None else worst.trial,
+            "error": error,
+            "executions": evidence.executions,
+            "draws": len(evidence.maxima),
+            "largest_draw": float(finite.max()) if len(finite) == len(evidence.maxima) else None,
+            "median_draw": float(np.median(finite)) if len(finite) else None,
+            "evaluations": evidence.evaluations,
+            "predictions": {
+                "made": len(evidence.predictions),
+                "stored_beforehand": sum(prediction.stored for prediction in evidence.predictions),
+                "last_ones": len(last),
+                "held": sum(held(prediction, bound) for prediction in last),
+            },
+            "tests": {
+                "drawn": len(drawn),
+                "independent": sum(test.origin == "iid" for test in drawn),
+                "largest_error": max((test.error for test in drawn), default=None),
+            },
+            "checked": [{**each.to_json(), "held": bool(held(each, bound))} for each in evidence.predictions],
+            "coverage_gap": coverage.marginal.size,
+            "beyond_the_records": coverage.beyond.size,
+            "coverage_gap_of_pairs": None if coverage.pair is None else coverage.pair.size,
+            "largest_gap_at": coverage.marginal.place,
+            "resolution": coverage.resolution,
+            "noise": evidence.noise,
+            "without_model": evidence.without_model,
+            "sharpness": evidence.sharpness,
+            "jump": evidence.jump,
+            "missed": evidence.missed,
+            "disagreement": evidence.disagreement,
+            "variance_left_out": evidence.left_out,
+            "failures": sample.failures,
+        },
         doubt=both_outcomes(sample, stochastic=False) or doubt_of(evidence, sample.best, bound),
         error=error,
     )
@@ -225,93 +201,6 @@ def bound_of(evidence: DynamicsEvidence, best: float, confidence: float) -> floa
     """Return the order statistic of the maxima, raised by what searches and predictions have missed.
 
     If predictions failed, the bound is much higher: see :func:`~ctxval.certificates.dynamics_diagnostics.raised`.
-
-    Args:
-        evidence: what the learned dynamics say.
-        best: the largest executed distance.
-        confidence: the probability with which the bound holds.
     """
-    excess = max((one.excess for one in evidence.predictions[-PREDICTIONS:]), default=0.0)
-    return max(evidence.upper(confidence) * evidence.missed, best) + _RAISE * excess
-
-
-def _prior(evidence: DynamicsEvidence) -> str:
-    if evidence.without_model:
-        return (
-            "a smooth function and a linear model explain the records far better than one and M, so the system is "
-            "learned without M: its difference from the linear model that fits best is a draw from a Gaussian process, "
-            "a Matern kernel of smoothness 3/2, 5/2 or 9/2 that may grow with the inputs, plus a linear function"
-        )
-    return (
-        "the residual x' - M(x, u) is a draw from a Gaussian process: a Matern kernel of smoothness 3/2 or 5/2 that "
-        "may grow with the inputs, plus a linear function"
-    )
-
-
-def _assumptions(evidence: DynamicsEvidence) -> tuple[str, ...]:
-    coordinates = len(evidence.coverage.resolution)
-    joint = (
-        f"with {coordinates} coordinates of state and input, the records cover each one alone and not all "
-        "combinations: what happens only at a combination that was never visited, such as a contact in a corner, is "
-        "not covered"
-        if evidence.coverage.pair is None
-        else "what happens only at a combination of three or more coordinates that was never visited is not covered"
-    )
-    return (
-        "the recorded state is complete: the next state depends on it and on the input alone",
-        "the system is deterministic, and its dynamics do not change with time or with the task",
-        f"{_prior(evidence)}; its hyperparameters are unknown and integrated over",
-        "the residual is like what was seen, to a resolution in state and input of "
-        f"{with_units(evidence.coverage.resolution)} (in the units of the system)",
-        joint,
-        f"the search of {evidence.evaluations} closed loops on the learned dynamics found the largest distance of each "
-        "draw",
-        "how the tasks were chosen and when the campaign stopped does not matter",
-    )
-
-
-def _tests(evidence: DynamicsEvidence) -> dict[str, Any]:
-    drawn = [one for one in tested(evidence.predictions, evidence.tests) if one.origin in DRAWN]
-    return {
-        "drawn": len(drawn),
-        "independent": sum(one.origin == "iid" for one in drawn),
-        "largest_error": max((one.error for one in drawn), default=None),
-    }
-
-
-def _details(sample: Sample, evidence: DynamicsEvidence, bound: float, error: float) -> dict[str, Any]:
-    finite, last = evidence.maxima[np.isfinite(evidence.maxima)], counted(evidence, bound)[-PREDICTIONS:]
-    coverage, worst, upper = evidence.coverage, failed(evidence, bound), raised(evidence, bound)
-    return {
-        "best": sample.best,
-        "gap": upper - sample.best,
-        "raised_from": None if worst is None else bound,
-        "raised_by_trial": None if worst is None else worst.trial,
-        "error": error,
-        "executions": evidence.executions,
-        "draws": len(evidence.maxima),
-        "largest_draw": float(finite.max()) if len(finite) == len(evidence.maxima) else None,
-        "median_draw": float(np.median(finite)) if len(finite) else None,
-        "evaluations": evidence.evaluations,
-        "predictions": {
-            "made": len(evidence.predictions),
-            "stored_beforehand": sum(one.stored for one in evidence.predictions),
-            "last_ones": len(last),
-            "held": sum(held(one, bound) for one in last),
-        },
-        "tests": _tests(evidence),
-        "checked": [{**one.to_json(), "held": bool(held(one, bound))} for one in evidence.predictions],
-        "coverage_gap": coverage.marginal.size,
-        "beyond_the_records": coverage.beyond.size,
-        "coverage_gap_of_pairs": None if coverage.pair is None else coverage.pair.size,
-        "largest_gap_at": coverage.marginal.place,
-        "resolution": coverage.resolution,
-        "noise": evidence.noise,
-        "without_model": evidence.without_model,
-        "sharpness": evidence.sharpness,
-        "jump": evidence.jump,
-        "missed": evidence.missed,
-        "disagreement": evidence.disagreement,
-        "variance_left_out": evidence.left_out,
-        "failures": sample.failures,
-    }
+    excess = max((prediction.excess for prediction in evidence.predictions[-PREDICTIONS:]), default=0.0)
+    return max(evidence.upper(confidence) * evidence.missed, best) + 0.5 * excess

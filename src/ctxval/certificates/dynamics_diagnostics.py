@@ -1,120 +1,88 @@
 """Diagnostics that withdraw the bound from learned dynamics: they do not believe the prior on the dynamics.
 
-Each diagnostic is a function of the evidence, the largest executed distance and the bound. It returns a sentence, which
-says what is wrong and what would help, or None. The first sentence of :data:`DIAGNOSTICS` withdraws the bound. The
+Each diagnostic yields a sentence, which says what is wrong and what would help; the first one withdraws the bound. The
 limits were chosen on development systems. Those of the posterior bound are in
-:mod:`ctxval.certificates.posterior_diagnostics`.
+:func:`ctxval.certificates.posterior.diagnose`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterator, Sequence
+from itertools import chain
 
 import numpy as np
 
-from ctxval.certificates.dynamics_evidence import CheckedPrediction, DynamicsEvidence, StateInputGap, with_units
+from ctxval.certificates.bounds import with_units
+from ctxval.certificates.dynamics_evidence import CheckedPrediction, DynamicsEvidence, StateInputGap
 from ctxval.certificates.prediction_tests import DRAWN, fewest_missing_tests
 
-Diagnostic = Callable[[DynamicsEvidence, float, float], str | None]
-"""Returns why a bound is withdrawn, from the evidence, the largest executed distance and the bound; None if it is not.
-"""
+# Limits; docs/theory.md has the reason for each.
+
+FEWEST = 3  # executions for a bound: the data that M was made from are no executions
+PREDICTIONS = 3  # last predictions that must have held
+ACCURATE = 0.05
+"""Largest difference between a distance and its prediction that held, as a share of the bound or, if a prediction
+failed, of the margin that is left above the bound; see :func:`raised`."""
+NOISE = 0.01  # learned variance of noise, as a share of the mean square of the residual
+LEFT_OUT = 0.5  # share of the posterior variance that posterior samples leave out between their pivots
+GAP = 0.25  # gap of the records in a state or an input, as a share of the range that closed loops visit
+PAIR_GAP = 0.5  # the same for two of them together
+BEYOND = 0.02
+"""Largest excess of a state or an input over its largest record, or below its smallest one, as a share of that range.
+Contacts, end stops and saturation lie beyond what is recorded more often than between records. With too many
+coordinates for a comparison of pairs, ``GAP`` takes its place: each extreme would take an execution of its own."""
+TESTED = 0.8  # least share of the largest predicted distance that must have been executed
+MATTERS = 0.3  # least distance, as a share of the bound, at which a prediction must have held
+SHARP = 0.05  # share by which a large predicted distance may exceed the median of those of nearly the same tasks
+JUMP = 0.01  # jump of the predicted distance between nearly equal tasks, as a share of the bound
+DENSE = 2  # task parameters in which deeper searches may find the largest distance in spite of jumps
+AGREE = 0.05  # share by which two deeper searches may differ, and by which they may exceed the usual one
 
 
 def doubt_of(evidence: DynamicsEvidence, best: float, bound: float) -> str | None:
     """Return why the bound is withdrawn, and what would help; None if it is not.
 
-    Args:
-        evidence: what the learned dynamics say.
-        best: the largest executed distance.
-        bound: the bound before failed predictions raise it.
+    ``best`` is the largest executed distance, ``bound`` the bound before failed predictions raise it.
     """
-    return _first(DIAGNOSTICS, evidence, best, bound)
+    reasons = chain(
+        _unlearned(evidence, bound),
+        _uncovered(evidence),
+        _untested(evidence, best, bound, raised(evidence, bound)),
+        _missing(evidence),
+        _unsearched(evidence, bound),
+    )
+    return next(reasons, None)
 
 
-def uncovered(evidence: DynamicsEvidence, best: float, bound: float) -> str | None:
-    """Return what the records and executions do not cover; None if nothing.
-
-    Args:
-        evidence: what the learned dynamics say.
-        best: the largest executed distance.
-        bound: the bound.
-    """
-    return _first(COVERAGE, evidence, best, bound)
+def uncovered(evidence: DynamicsEvidence) -> str | None:
+    """Return what the records and executions do not cover; None if nothing."""
+    return next(_uncovered(evidence), None)
 
 
 def untested(evidence: DynamicsEvidence, best: float, bound: float) -> str | None:
-    """Return that the bound is not tested where distances are large; None if it is.
-
-    Args:
-        evidence: what the learned dynamics say.
-        best: the largest executed distance.
-        bound: the bound.
-    """
+    """Return that the bound is not tested where distances are large; None if it is."""
     # Executions are chosen for predictions that hold, not for a bound that their errors raise.
-    return _largest_untested(evidence, best, bound) or _no_large_one_tested(evidence, best, bound)
+    return next(_untested(evidence, best, bound, bound), None)
 
 
 def only_tests_missing(evidence: DynamicsEvidence, best: float, bound: float) -> bool:
-    """Return whether tests are missing, and executions of other tasks would not help.
+    """Return whether tests are missing, and executions of other tasks would not help."""
+    needed = evidence.executions >= FEWEST and tests_missing(evidence) is not None
+    return needed and uncovered(evidence) is None and untested(evidence, best, bound) is None
 
-    Args:
-        evidence: what the learned dynamics say.
-        best: the largest executed distance.
-        bound: the bound before failed predictions raise it.
-    """
-    others = (*COVERAGE, _largest_untested, _no_large_one_tested)
-    needed = evidence.executions >= FEWEST and tests_missing(evidence, best, bound) is not None
-    return needed and _first(others, evidence, best, bound) is None
+
+def tests_missing(evidence: DynamicsEvidence) -> str | None:
+    """Return that predictions must be tested at drawn tasks; None if they were."""
+    return next(_missing(evidence), None)
 
 
 def fewest_missing(evidence: DynamicsEvidence, best: float, bound: float) -> int:
-    """Return the fewest executions after which nothing could withdraw or raise the bound any more, at least 1.
-
-    Args:
-        evidence: what the learned dynamics say.
-        best: the largest executed distance.
-        bound: the bound before failed predictions raise it.
-    """
+    """Return the fewest executions after which nothing could withdraw or raise the bound any more, at least 1."""
     checked = counted(evidence, bound)
-    in_a_row = next((k for k, one in enumerate(reversed(checked)) if not held(one, bound)), len(checked))
-    gaps = sum(one(evidence, best, bound) is not None for one in (*COVERAGE, _largest_untested, _only_small_distances))
+    in_a_row = next((k for k, last in enumerate(reversed(checked)) if not held(last, bound)), len(checked))
+    each_takes_one = chain(_uncovered(evidence), _untested(evidence, best, bound, raised(evidence, bound)))
     tests = missing_tests(evidence.predictions, evidence.tests)
-    return max(FEWEST - evidence.executions, PREDICTIONS - in_a_row, gaps, tests, 1)
-
-
-def _first(diagnostics: Iterable[Diagnostic], evidence: DynamicsEvidence, best: float, bound: float) -> str | None:
-    found = (one(evidence, best, bound) for one in diagnostics)
-    return next((sentence for sentence in found if sentence is not None), None)
-
-
-FEWEST = 3
-"""The fewest executions for a bound: the data that M was made from are no executions."""
-
-
-def _few_executions(evidence: DynamicsEvidence, best: float, bound: float) -> str | None:
-    if evidence.executions < FEWEST:
-        return (
-            f"the dynamics are learned from {evidence.executions} executed trajectories, and the bound needs at least "
-            f"{FEWEST}; execute more tasks"
-        )
-    return None
-
-
-def _unplanned(evidence: DynamicsEvidence, best: float, bound: float) -> str | None:
-    if evidence.unplanned:
-        return (
-            f"for {100 * evidence.unplanned:.2g} % of the tasks no controller can be designed, or the model diverges: "
-            "nothing is known there; make the task space smaller, so that every task can be executed"
-        )
-    return None
-
-
-PREDICTIONS = 3
-"""Number of the last predictions that must have held."""
-
-ACCURATE = 0.05
-"""Largest difference between a distance and its prediction that held, as a share of the bound or, if a prediction
-failed, of the margin that is left above the bound; see :func:`raised`."""
+    return max(FEWEST - evidence.executions, PREDICTIONS - in_a_row, len(list(each_takes_one)), tests, 1)
 
 
 def agrees(distance: float, predicted: float, bound: float) -> bool:
@@ -137,9 +105,9 @@ def counted(evidence: DynamicsEvidence, bound: float) -> list[CheckedPrediction]
     was made afterwards.
     """
     return [
-        one
-        for one in evidence.predictions
-        if not held(one, bound) or (one.new and (one.stored or one.origin != "manual"))
+        prediction
+        for prediction in evidence.predictions
+        if not held(prediction, bound) or (prediction.new and (prediction.stored or prediction.origin != "manual"))
     ]
 
 
@@ -148,23 +116,24 @@ def tested(predictions: Sequence[CheckedPrediction], tests: int) -> list[Checked
 
     So a test that failed matters until later tests are complete without it.
     """
-    stored = [one for one in predictions if one.stored and one.point]
+    stored = [prediction for prediction in predictions if prediction.stored and prediction.point]
     first = range(len(stored) - 1, -1, -1) if tests else ()
     return next((stored[k:] for k in first if not missing_tests(stored[k:], tests)), stored if tests else [])
 
 
 def missing_tests(predictions: Sequence[CheckedPrediction], tests: int) -> int:
     """Return the fewest executions that complete the tests; those that were stored beforehand count."""
-    stored = [one for one in predictions if one.stored and one.point]
-    points = np.array([one.point for one in stored]) if stored else np.empty((0, 1))
-    return fewest_missing_tests(points, sum(one.origin in DRAWN for one in stored), tests)
+    stored = [prediction for prediction in predictions if prediction.stored and prediction.point]
+    points = np.array([prediction.point for prediction in stored]) if stored else np.empty((0, 1))
+    return fewest_missing_tests(points, sum(prediction.origin in DRAWN for prediction in stored), tests)
 
 
 def failed(evidence: DynamicsEvidence, bound: float) -> CheckedPrediction | None:
     """Return the one that failed most of the tests and of the last predictions that count; None if all of them held."""
-    tests = [one for one in tested(evidence.predictions, evidence.tests) if one.origin in DRAWN]
-    last = [one for one in (*tests, *counted(evidence, bound)[-PREDICTIONS:]) if not held(one, bound)]
-    return max(last, key=lambda one: one.error, default=None)
+    tests = [test for test in tested(evidence.predictions, evidence.tests) if test.origin in DRAWN]
+    last = [*tests, *counted(evidence, bound)[-PREDICTIONS:]]
+    wrong = (prediction for prediction in last if not held(prediction, bound))
+    return max(wrong, key=lambda prediction: prediction.error, default=None)
 
 
 def raised(evidence: DynamicsEvidence, bound: float) -> float:
@@ -177,79 +146,62 @@ def raised(evidence: DynamicsEvidence, bound: float) -> float:
     return bound if worst is None else bound + worst.error / ACCURATE
 
 
-def _few_predictions(evidence: DynamicsEvidence, best: float, bound: float) -> str | None:
-    checked = counted(evidence, bound)
-    if len(checked) < PREDICTIONS:
-        return (
-            f"{len(checked)} executions of different tasks were predicted from earlier ones, and the bound needs "
+def jumps(evidence: DynamicsEvidence, bound: float) -> bool:
+    """Return whether the distance is no smooth function of the task, so that a search may miss the largest one."""
+    return evidence.sharpness > SHARP or evidence.jump > JUMP * bound
+
+
+# Reasons to withdraw the bound, each beside its test
+
+
+def _unlearned(evidence: DynamicsEvidence, bound: float) -> Iterator[str]:
+    """Yield why too little is known of the dynamics."""
+    if evidence.executions < FEWEST:
+        yield (
+            f"the dynamics are learned from {evidence.executions} executed trajectories, and the bound needs at least "
+            f"{FEWEST}; execute more tasks"
+        )
+    if evidence.unplanned:
+        yield (
+            f"for {100 * evidence.unplanned:.2g} % of the tasks no controller can be designed, or the model diverges: "
+            "nothing is known there; make the task space smaller, so that every task can be executed"
+        )
+    checked = len(counted(evidence, bound))
+    if checked < PREDICTIONS:
+        yield (
+            f"{checked} executions of different tasks were predicted from earlier ones, and the bound needs "
             f"{PREDICTIONS} predictions that hold; execute more tasks"
         )
-    return None
-
-
-NOISE = 0.01
-"""Largest learned variance of noise, as a share of the mean square of the residual: with more, the next state does not
-follow from the recorded state and input."""
-
-
-def _noisy(evidence: DynamicsEvidence, best: float, bound: float) -> str | None:
     if evidence.noise > NOISE:
-        return (
+        yield (
             f"noise is learned with {100 * evidence.noise:.2g} % of the variance of the residual, and at most "
             f"{100 * NOISE:g} % is allowed: the system is not deterministic in the recorded state and input; record "
             "more states or reduce the noise, or use --kind posterior with --stochastic"
         )
-    return None
-
-
-LEFT_OUT = 0.5
-"""Largest share of the posterior variance that the draws may leave out between their pivots: with more, they vary too
-little there."""
-
-
-def _variance_left_out(evidence: DynamicsEvidence, best: float, bound: float) -> str | None:
     if evidence.left_out > LEFT_OUT:
-        return (
+        yield (
             f"the posterior samples of the dynamics leave out {100 * evidence.left_out:.0f} % of the largest variance, "
             f"more than {100 * LEFT_OUT:g} %; more executions reduce this variance"
         )
-    return None
 
 
-GAP = 0.25
-"""Largest gap of the records in a state or an input, as a share of the range that closed loops visit: what happens in a
-gap is a guess of the prior."""
-
-BEYOND = 0.02
-"""Largest excess of a state or an input over its largest record, or below its smallest one, as a share of that range.
-Contacts, end stops and saturation lie beyond what is recorded more often than between records. With too many
-coordinates for a comparison of pairs, it is the same as ``GAP``: each extreme would take an execution of its own."""
-
-PAIR_GAP = 0.5
-"""The same as ``GAP`` for two of them together."""
-
-
-def _beyond_the_records(evidence: DynamicsEvidence, best: float, bound: float) -> str | None:
-    beyond = evidence.coverage.beyond
-    if beyond.size <= (GAP if evidence.coverage.pair is None else BEYOND):
-        return None
-    return f"predicted runs leave the recorded range of {_at(beyond)}; `ctxval run` executes a task that goes there"
-
-
-def _coverage_gap(evidence: DynamicsEvidence, best: float, bound: float) -> str | None:
-    gap = evidence.coverage.marginal
-    if gap.size <= GAP:
-        return None
-    return f"predicted runs enter a gap in the records of {_at(gap)}; `ctxval run` executes a task that goes there"
-
-
-def _coverage_gap_of_pairs(evidence: DynamicsEvidence, best: float, bound: float) -> str | None:
-    gap = evidence.coverage.pair
-    if gap is None or gap.size <= PAIR_GAP:
-        return None
-    return (
-        f"predicted runs enter a gap in the joint records of {_at(gap)}; `ctxval run` executes a task that goes there"
-    )
+def _uncovered(evidence: DynamicsEvidence) -> Iterator[str]:
+    """Yield what the records and executions do not cover."""
+    coverage, pair, untried = evidence.coverage, evidence.coverage.pair, evidence.untried
+    goes_there = "`ctxval run` executes a task that goes there"
+    if coverage.beyond.size > (GAP if pair is None else BEYOND):
+        yield f"predicted runs leave the recorded range of {_at(coverage.beyond)}; {goes_there}"
+    if coverage.marginal.size > GAP:
+        yield f"predicted runs enter a gap in the records of {_at(coverage.marginal)}; {goes_there}"
+    if pair is not None and pair.size > PAIR_GAP:
+        yield f"predicted runs enter a gap in the joint records of {_at(pair)}; {goes_there}"
+    if untried is not None and untried.gap > GAP:
+        yield (
+            f"the parameter {untried.name} hardly changes the closed loops of the model, so what it changes in the "
+            "system cannot be learned from states and inputs, and some of its values are "
+            f"{100 * untried.gap:.0f} % of its range away from every executed one; an execution there helps "
+            "(`ctxval run` executes it)"
+        )
 
 
 def _at(gap: StateInputGap) -> str:
@@ -257,145 +209,47 @@ def _at(gap: StateInputGap) -> str:
     return f"{' and '.join(gap.coordinates)} by {100 * gap.size:.2g} % (at {with_units(gap.place)})"
 
 
-def untried_parameter(evidence: DynamicsEvidence, best: float, bound: float) -> str | None:
-    """Return which task parameter has values far from all executed ones, though M does not tell what it changes.
-
-    Args:
-        evidence: what the learned dynamics say.
-        best: the largest executed distance.
-        bound: the bound.
-    """
-    untried = evidence.untried
-    if untried is not None and untried.gap > GAP:
-        return (
-            f"the parameter {untried.name} hardly changes the closed loops of the model, so what it changes in the "
-            "system cannot be learned from states and inputs, and some of its values are "
-            f"{100 * untried.gap:.0f} % of its range away from every executed one; an execution there helps "
-            "(`ctxval run` executes it)"
-        )
-    return None
-
-
-TESTED = 0.8
-"""Least share of the largest distance on the posterior mean that must have been executed: the bound is tested there."""
-
-
-def _largest_untested(evidence: DynamicsEvidence, best: float, bound: float) -> str | None:
+def _untested(evidence: DynamicsEvidence, best: float, bound: float, allowed: float) -> Iterator[str]:
+    """Yield why predictions are not tested where they matter, with errors as a bound of ``allowed`` permits."""
     if best < TESTED * evidence.highest:
-        return (
+        yield (
             f"the largest distance is predicted to be {evidence.highest:.4g}, but the largest executed one is "
             f"{best:.4g}: the prediction is not tested where it matters; an execution of that task helps "
             "(`ctxval run` executes it)"
         )
-    return None
+    large = [prediction for prediction in counted(evidence, bound) if prediction.distance >= MATTERS * bound]
+    if not any(held(prediction, allowed) for prediction in large):
+        yield (
+            f"no prediction held at a distance of at least {100 * MATTERS:g} % of the bound: small distances hardly "
+            "test it; an execution of another task with a large distance helps (`ctxval run` executes it)"
+        )
 
 
-MATTERS = 0.3
-"""Least distance, as a share of the bound, at which a prediction must have held: small distances hardly test it."""
-
-
-def _only_small_distances(evidence: DynamicsEvidence, best: float, bound: float) -> str | None:
-    return _no_large_one_held(evidence, bound, raised(evidence, bound))
-
-
-def _no_large_one_tested(evidence: DynamicsEvidence, best: float, bound: float) -> str | None:
-    return _no_large_one_held(evidence, bound, bound)
-
-
-def _no_large_one_held(evidence: DynamicsEvidence, bound: float, allowed: float) -> str | None:
-    """Return that no prediction held at a large distance, with errors as a bound of ``allowed`` permits."""
-    if any(one.distance >= MATTERS * bound and held(one, allowed) for one in counted(evidence, bound)):
-        return None
-    return (
-        f"no prediction held at a distance of at least {100 * MATTERS:g} % of the bound: small distances hardly "
-        "test it; an execution of another task with a large distance helps (`ctxval run` executes it)"
-    )
-
-
-def tests_missing(evidence: DynamicsEvidence, best: float, bound: float) -> str | None:
-    """Return that predictions must be tested at drawn tasks; None if they were.
-
-    Args:
-        evidence: what the learned dynamics say.
-        best: the largest executed distance.
-        bound: the bound before failed predictions raise it.
-    """
+def _missing(evidence: DynamicsEvidence) -> Iterator[str]:
+    """Yield that predictions must be tested at drawn tasks."""
     missing = missing_tests(evidence.predictions, evidence.tests)
-    if not missing:
-        return None
-    return (
-        f"at least {missing} more {'execution' if missing == 1 else 'executions'} must be predicted beforehand, at "
-        "tasks drawn over the whole task space (`ctxval run` executes them; --tests 0 leaves them out)"
-    )
+    if missing:
+        yield (
+            f"at least {missing} more {'execution' if missing == 1 else 'executions'} must be predicted beforehand, at "
+            "tasks drawn over the whole task space (`ctxval run` executes them; --tests 0 leaves them out)"
+        )
 
 
-SHARP = 0.05
-"""Largest share by which a large predicted distance may exceed the median of those of nearly the same tasks: if large
-distances are narrow, a search finds the largest one by chance."""
-
-JUMP = 0.01
-"""Largest jump of the predicted distance between nearly equal tasks, as a share of the bound: larger distances can hide
-between jumps."""
-
-DENSE = 2
-"""Largest number of task parameters in which deeper searches may find the largest distance in spite of jumps."""
-
-
-def jumps(evidence: DynamicsEvidence, bound: float) -> bool:
-    """Return whether the distance is no smooth function of the task, so that a search may miss the largest one."""
-    return evidence.sharpness > SHARP or evidence.jump > JUMP * bound
-
-
-def _distance_jumps(evidence: DynamicsEvidence, best: float, bound: float) -> str | None:
-    if evidence.dense or not jumps(evidence, bound):
-        return None
-    if evidence.sharpness > SHARP:
-        what = f"one of the largest predicted distances falls by {100 * evidence.sharpness:.0f} %"
-    else:
+def _unsearched(evidence: DynamicsEvidence, bound: float) -> Iterator[str]:
+    """Yield why a search may miss the largest distance; many closed loops are run to know it, if all else is well."""
+    if not evidence.dense and jumps(evidence, bound):
         what = f"the predicted distance jumps by up to {100 * evidence.jump / bound:.2g} % of the bound"
-    return (
-        f"{what} if a task changes by a thousandth of its ranges, so a search may miss the largest distance: the "
-        "controllers change abruptly from task to task, as those of a model with kinks do, or the closed loop does; "
-        "use a smoother model, or an audit"
-    )
-
-
-AGREE = 0.05
-"""Largest share by which the results of two deeper searches may differ, and by which they may exceed the usual one:
-otherwise an even deeper one may find a larger distance."""
-
-
-def _searches_disagree(evidence: DynamicsEvidence, best: float, bound: float) -> str | None:
+        if evidence.sharpness > SHARP:
+            what = f"one of the largest predicted distances falls by {100 * evidence.sharpness:.0f} %"
+        yield (
+            f"{what} if a task changes by a thousandth of its ranges, so a search may miss the largest distance: the "
+            "controllers change abruptly from task to task, as those of a model with kinks do, or the closed loop "
+            "does; use a smoother model, or an audit"
+        )
     share = max(evidence.missed - 1, evidence.disagreement)
-    if not evidence.dense or share <= AGREE:
-        return None
-    return (
-        f"searches of the learned dynamics find largest distances that differ by {100 * share:.0f} %, because the "
-        "controllers or the closed loop change abruptly from task to task; an execution of the task of the largest one "
-        "helps (`ctxval run` executes it), or use a smoother model, or an audit"
-    )
-
-
-COVERAGE: tuple[Diagnostic, ...] = (
-    _beyond_the_records,
-    _coverage_gap,
-    _coverage_gap_of_pairs,
-    untried_parameter,
-)
-"""Diagnostics of what the records and executions do not cover."""
-
-DIAGNOSTICS: tuple[Diagnostic, ...] = (
-    _few_executions,
-    _unplanned,
-    _few_predictions,
-    _noisy,
-    _variance_left_out,
-    *COVERAGE,
-    _largest_untested,
-    _only_small_distances,
-    tests_missing,
-    _distance_jumps,
-    _searches_disagree,
-)
-"""All diagnostics, in the order of their sentences. Jumps come last: many closed loops are run to find them, but only
-if nothing else withdraws the bound."""
+    if evidence.dense and share > AGREE:
+        yield (
+            f"searches of the learned dynamics find largest distances that differ by {100 * share:.0f} %, because the "
+            "controllers or the closed loop change abruptly from task to task; an execution of the task of the largest "
+            "one helps (`ctxval run` executes it), or use a smoother model, or an audit"
+        )

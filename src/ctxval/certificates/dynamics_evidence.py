@@ -1,9 +1,10 @@
-"""What learned dynamics say about the largest distance, as numbers: the input of the certificate ``dynamics``."""
+"""What an experiment's model predicts, as numbers: the input of kinds that need more than trials."""
 
 from __future__ import annotations
 
+import json
 from dataclasses import asdict, dataclass
-from typing import Any, Self
+from typing import Any, Protocol, Self, runtime_checkable
 
 import numpy as np
 
@@ -11,9 +12,6 @@ from ctxval._util.arrays import Array
 from ctxval._util.representation import ShortRepr
 from ctxval.certificates.prediction_tests import TESTS
 from ctxval.core.trial import Origin
-
-_RESAMPLES = 200
-"""Number of bootstrap samples."""
 
 
 @dataclass(frozen=True)
@@ -173,14 +171,14 @@ class DynamicsEvidence(ShortRepr):
     def error(self, confidence: float) -> float:
         """Return the standard error of :meth:`upper` over draws of the hyperparameters, by a bootstrap over them."""
         blocks = self.maxima.reshape(-1, self.groups)
-        rows = np.random.default_rng(0).integers(len(blocks), size=(_RESAMPLES, len(blocks)))
-        resampled = np.sort(blocks[rows].reshape(_RESAMPLES, -1), axis=1)[:, self.rank(confidence)]
+        rows = np.random.default_rng(0).integers(len(blocks), size=(200, len(blocks)))
+        resampled = np.sort(blocks[rows].reshape(200, -1), axis=1)[:, self.rank(confidence)]
         return float(resampled.std(ddof=1)) if np.isfinite(resampled).all() else np.inf
 
     def to_json(self) -> dict[str, Any]:
         """Return all attributes in types that JSON has; numbers may be infinite."""
-        found: dict[str, Any] = _plain(asdict(self))
-        return found
+        plain: dict[str, Any] = json.loads(json.dumps(asdict(self), default=lambda value: value.tolist()))
+        return plain
 
     @classmethod
     def from_json(cls, values: Any) -> Self | None:
@@ -191,7 +189,7 @@ class DynamicsEvidence(ShortRepr):
             arrays = {name: np.array(values[name], dtype=np.float64) for name in ("maxima", "points", "elites")}
             parts = {
                 "predictions": tuple(
-                    CheckedPrediction(**{**one, "point": tuple(one["point"])}) for one in values["predictions"]
+                    CheckedPrediction(**{**each, "point": tuple(each["point"])}) for each in values["predictions"]
                 ),
                 "coverage": StateInputCoverage(**{**coverage, **gaps, "task": np.array(coverage["task"])}),
                 "untried": untried and UntriedParameter(**{**untried, "task": np.array(untried["task"])}),
@@ -201,22 +199,28 @@ class DynamicsEvidence(ShortRepr):
             return None
 
 
-def _plain(value: Any) -> Any:
-    match value:
-        case np.ndarray() | np.generic():
-            return value.tolist()
-        case dict():
-            return {name: _plain(item) for name, item in value.items()}
-        case tuple() | list():
-            return [_plain(item) for item in value]
-    return value
-
-
 def _gap(values: Any) -> Any:
     return values and StateInputGap(**{**values, "coordinates": tuple(values["coordinates"])})
 
 
-def with_units(values: dict[str, float]) -> str:
-    """Return numbers with their names; the unit of a label ``name [unit]`` follows its number."""
-    parts = ((*name.partition(" [")[::2], value) for name, value in values.items())
-    return ", ".join(f"{name} {value:.2g} {unit.removesuffix(']')}".rstrip() for name, unit, value in parts)
+@runtime_checkable
+class LearnedDistance(Protocol):
+    """Predictions of the distance that are learned from trials and from the data that the model was made from."""
+
+    def expected(self, points: Array, before: int) -> Array:
+        """Return predicted distances ``(m,)`` at points ``(m, d)`` of the unit cube; NaN if nothing can be predicted.
+
+        They are learned from trials with numbers below ``before`` only.
+        """
+
+    def dynamics(self, confidence: float) -> DynamicsEvidence | None:
+        """Return what the dynamics learned from all trials say about d*; None if nothing can be learned.
+
+        The confidence sets the least number of posterior samples. Users' code raises a CertificateError.
+        """
+
+    def tasks(self, count: int, seed: int) -> Array:
+        """Return independent draws from the distribution of tasks: points of the unit cube ``(count, d)``.
+
+        They have nothing to do with the draws of any trial.
+        """

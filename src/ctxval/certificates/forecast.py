@@ -9,19 +9,13 @@ import numpy as np
 from ctxval._util.arrays import Array, single_threaded
 from ctxval.certificates.maxima import Maxima
 from ctxval.certificates.sample import Sample
+from ctxval.certificates.verdict_sentences import outlook
 from ctxval.gp.hyperposterior import Conditioned
 
 HORIZON = 200
 """Largest number of executions in a simulated future."""
 
-_CANDIDATES = 400
-"""Number of random tasks in each future; maximisers of draws of d* come on top."""
-
-_BETA = 2.0
-"""Confidence parameter of GP-UCB in each future."""
-
-_JITTER = 1e-9
-"""Added to variances, relative to the distance's variance, so that the covariance of near tasks can be factorised."""
+_JITTER = 1e-9  # added to variances, relative to the distance's, so that the covariance of near tasks can be factorised
 
 
 @dataclass(frozen=True)
@@ -42,36 +36,18 @@ class Forecast:
     fewest: bool = False
 
     def __str__(self) -> str:
-        plural = "execution is" if self.executions == 1 else "executions are"
-        if self.fewest:
-            shares = f"{100 * self.validated:.0f} % of the posterior samples of the dynamics stay below the threshold"
-            return f"at least {self.executions} more {plural} needed, and {shares}"
-        many = f"about {self.executions}" if self.executions is not None else f"more than {HORIZON}"
-        answer, share = max(("validated", self.validated), ("falsified", self.falsified), key=lambda one: one[1])
-        outcome = f" ({answer} in {100 * share:.0f} % of the simulated futures)" if share else ""
-        return f"{many} more {plural} expected to decide{outcome}"
+        return outlook(self, HORIZON)
 
 
 def forecast(
     sample: Sample, found: Maxima, threshold: float, confidence: float, *, seed: int = 0, futures: int = 32
 ) -> Forecast:
-    """Return how many more executions of GP-UCB decide whether d* is at most the threshold.
+    """Return how many more executions of GP-UCB decide whether d* is at most the threshold, from draws of d*.
 
     Each future takes one draw of the hyperparameters, from those whose draws of d* exceed the threshold if there are
     any. It draws a true distance function from the posterior on a set of candidate tasks, and searches it with GP-UCB.
     It is decided when a distance above the threshold is executed, or when the upper bound falls to the threshold. The
     bound keeps the number of standard deviations above the mean that it has now.
-
-    Args:
-        sample: the trials.
-        found: draws of d* from the same trials.
-        threshold: tau, in the distance's units.
-        confidence: confidence level of the bound.
-        seed: seed of the futures.
-        futures: number of futures.
-
-    Raises:
-        CertificateError: if the confidence is too high for so few draws of d*.
     """
     rng = np.random.default_rng(seed)
     lengths, kept = [], 0
@@ -94,26 +70,21 @@ class _Future:
     def __init__(
         self, sample: Sample, found: Maxima, conditioned: Conditioned, confidence: float, rng: np.random.Generator
     ) -> None:
-        candidates = np.concatenate(
-            [found.points[:: max(1, len(found.points) // 100)], rng.random((_CANDIDATES, sample.points.shape[1]))]
-        )
+        highest = found.points[:: max(1, len(found.points) // 100)]
+        candidates = np.concatenate([highest, rng.random((400, sample.points.shape[1]))])
         self.warp = conditioned.warp  # from here on everything is on the process's scale
         self.best = float(self.warp.forward(sample.best))
         self.mean, self.covariance = _joint(conditioned, sample.points, candidates)
         L = np.linalg.cholesky(self.covariance + _JITTER * conditioned.scale2 * np.eye(len(candidates)))
         self.truth = self.mean + L @ rng.normal(size=len(candidates))
         tops = (self.mean[:, None] + L @ rng.normal(size=(len(candidates), 256))).max(axis=0)
-        self.width = self._width(max(float(np.quantile(tops, confidence)), self.best))
-        # The first bound is that of all draws together: one draw must not decide what all together leave undecided.
-        self.bound = max(float(self.warp.forward(found.upper(confidence))), self.best)
-
-    def _width(self, bound: float) -> float:
-        """Return the z at which ``max (mean + z deviation)`` is the bound."""
-        low, high = 0.0, 20.0
+        bound, low, high = max(float(np.quantile(tops, confidence)), self.best), 0.0, 20.0
         for _ in range(40):
             middle = 0.5 * (low + high)
             low, high = (middle, high) if self._upper(middle) < bound else (low, middle)
-        return high
+        self.width = high  # the z at which max (mean + z deviation) is the bound
+        # The first bound is that of all draws together: one draw must not decide what all together leave undecided.
+        self.bound = max(float(self.warp.forward(found.upper(confidence))), self.best)
 
     def _deviation(self) -> Array:
         return np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
@@ -135,7 +106,7 @@ class _Future:
 
     def _execute(self) -> None:
         deviation = self._deviation()
-        bound = self.mean + np.sqrt(_BETA) * deviation
+        bound = self.mean + np.sqrt(2.0) * deviation  # GP-UCB with beta = 2
         row = int(bound.argmax())
         if deviation[row] <= 1e-6 * max(deviation.max(), 1e-300):
             row = int(deviation.argmax())

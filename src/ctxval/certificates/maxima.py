@@ -22,38 +22,11 @@ from ctxval.gp.hyperposterior import EXACT, Conditioned, Prior, draw_hyperparame
 from ctxval.gp.sample_paths import draw_paths, maxima
 from ctxval.gp.subset import kept_rows
 
-FEWEST = 4
-"""The fewest trials for a bound."""
-
-MOST = 160
-"""The largest number of trials that a process is conditioned on; the effort of a draw grows with its cube."""
-
-STOCHASTIC = (1e-6, 1.0)
-"""Bounds of the noise variance of a stochastic system, relative to the variance of the distance."""
-
-_ROUNDING = 1e-14
-"""Distances that differ by less than this share of the largest one differ by rounding alone."""
-
-_EXTREME = 1e100
-"""The largest allowed distance, and the inverse of the smallest allowed difference: their squares must be finite."""
-
-_REPEATED = 1e-6
-"""Largest difference between two executions of a task on a deterministic system, as a share of the distances' range."""
-
-_BLOCKS = 32
-"""Number of blocks of the chain of hyperparameters in the bootstrap of a bound's standard error."""
-
-_RESAMPLES = 200
-"""Number of bootstrap samples."""
-
-_SEEDS = 1_000_003
-"""Distance between the seeds of chains whose draws are pooled."""
-
-_MOST = 4
-"""Largest number of chains for a bound near a threshold; one chain is usual."""
-
-_EXACTNESS = 3.0 * np.sqrt(EXACT)
-"""Tolerance with which a path passes through exact values, in standard deviations of the distance."""
+FEWEST = 4  # trials for a bound
+MOST = 160  # trials that a process is conditioned on; the effort of a draw grows with its cube
+STOCHASTIC = (1e-6, 1.0)  # bounds of the noise variance of a stochastic system, relative to that of the distance
+_EXTREME = 1e100  # largest distance, and inverse of the smallest difference: their squares must be finite
+_MOST = 4  # chains for a bound near a threshold; one chain is usual
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,11 +47,7 @@ class Maxima(ShortRepr):
 
     @checked
     def upper(self, confidence: Probability) -> float:
-        """Return the bound on d* that holds with this probability.
-
-        Raises:
-            CertificateError: if the confidence is too high for so few draws.
-        """
+        """Return the bound on d* that holds with this probability; a CertificateError if that needs more draws."""
         rank = max(1, int(np.ceil((len(self.draws) + 1) * confidence - 1e-9)))
         if rank > len(self.draws):
             raise CertificateError(
@@ -90,25 +59,23 @@ class Maxima(ShortRepr):
     def error(self, confidence: Probability) -> float:
         """Return the standard error of the bound: its standard deviation over seeds of the draws.
 
-        It is computed by a block bootstrap over the chain of hyperparameters, because successive draws are correlated,
-        and so are draws that share hyperparameters. If the confidence is high, few draws are above the bound and their
-        spread may be too small. The bound with fewer draws below it has an error too, and the larger of the two
-        is returned.
+        A block bootstrap over the chain of hyperparameters is used, because successive draws are correlated, and so are
+        draws that share hyperparameters. If the confidence is high, few draws are above the bound and their spread may
+        be too small; the error of the bound with fewer draws below it is then returned, if it is larger.
         """
-        share = confidence
-        blocks = min(_BLOCKS, len(self.conditioned))
+        blocks = min(32, len(self.conditioned))
         if blocks < 2:
             return 0.0
         block_of = self.owners * blocks // len(self.conditioned)
-        times = np.random.default_rng(0).multinomial(blocks, np.full(blocks, 1 / blocks), size=_RESAMPLES)
+        times = np.random.default_rng(0).multinomial(blocks, np.full(blocks, 1 / blocks), size=200)
         weights = np.cumsum(times[:, block_of], axis=1, dtype=np.float64)
         total = weights[:, -1:]
 
-        def spread(confidence: float) -> float:
-            rows = (weights < np.minimum(confidence * (total + 1), total)).sum(axis=1)
+        def spread(share: float) -> float:
+            rows = (weights < np.minimum(share * (total + 1), total)).sum(axis=1)
             return float(self.draws[np.minimum(rows, len(self.draws) - 1)].std(ddof=1))
 
-        return max(spread(share), spread(1 - (1 - share) / np.sqrt(2)))
+        return max(spread(confidence), spread(1 - (1 - confidence) / np.sqrt(2)))
 
     def probability(self, threshold: float) -> float:
         """Return a lower estimate of Pr(d* <= threshold): the number of draws that keep it, divided by S + 1."""
@@ -124,15 +91,9 @@ def draw_maxima(
     stochastic: bool = False,
     prior: Prior | None = None,
 ) -> Maxima:
-    """Return draws of d* given the trials.
+    """Return draws of d* given the trials: of hyperparameters, and of so many paths for each.
 
-    Args:
-        sample: trials of any origin.
-        draws: number of draws of hyperparameters.
-        paths: number of paths for each draw of hyperparameters.
-        seed: seed of the draws.
-        stochastic: whether two executions of one task may differ; then d* is the largest expected distance.
-        prior: prior of the hyperparameters; if None, the default for a deterministic or a stochastic system.
+    If the system is stochastic, d* is the largest expected distance. ``prior`` is that of the hyperparameters.
 
     Raises:
         CertificateError: if an execution failed, there are too few trials, their distances are all equal or too
@@ -144,26 +105,23 @@ def draw_maxima(
     rng = np.random.default_rng(seed)
     # No logarithm with noise: the exponential of an expected logarithm is not the expected distance.
     # No second chain on well-spread trials: only all trials together can separate noise from roughness.
-    usual = Prior(noise=STOCHASTIC, offset=None, spread_share=1.0) if stochastic else Prior()
-    believed = usual if prior is None else prior
+    believed = prior or (Prior(noise=STOCHASTIC, offset=None, spread_share=1.0) if stochastic else Prior())
     best_first = X[np.argsort(-y, kind="stable")]
     with single_threaded(), stage("drawing the largest distance", draws * paths, "draws"):
         conditioned = draw_hyperparameters(X, y, draws, rng, believed)
-        found = []
-        for one in conditioned:
-            found.append(maxima(draw_paths(one, X, paths, rng), best_first, rng))
+        tops, points = [], []
+        for process in conditioned:
+            top, where = maxima(draw_paths(process, X, paths, rng), best_first, rng)
+            # A path passes through exact values with this tolerance.
+            tops.append(process.warp.backward(top + 3.0 * np.sqrt(EXACT) * np.sqrt(process.scale2)))
+            points.append(where)
             advance(paths)
-    tops = np.concatenate(
-        [
-            one.warp.backward(top + _EXACTNESS * np.sqrt(one.scale2))
-            for (top, _), one in zip(found, conditioned, strict=True)
-        ]
-    )
+    draws_of_d = np.concatenate(tops)
     if not stochastic:
-        tops = np.maximum(tops, y.max())
-    order = np.argsort(tops, kind="stable")
+        draws_of_d = np.maximum(draws_of_d, y.max())
+    order = np.argsort(draws_of_d, kind="stable")
     owners = np.repeat(np.arange(len(conditioned)), paths)
-    return Maxima(tops[order], np.concatenate([where for _, where in found])[order], conditioned, owners[order])
+    return Maxima(draws_of_d[order], np.concatenate(points)[order], conditioned, owners[order])
 
 
 def representative(sample: Sample) -> Sample:
@@ -181,27 +139,24 @@ def settle_maxima(
 
     The draws of :func:`draw_maxima` are doubled while the threshold is within two standard errors of the bound, up to
     four times as many. The additional draws come from separate chains.
-
-    Raises:
-        CertificateError: under the conditions of :func:`draw_maxima`, or if the confidence is too high for so few
-            draws.
     """
-    found = draw_maxima(sample, seed=seed, stochastic=stochastic)
-    chains = [found]
-    while len(chains) < _MOST and abs(found.upper(confidence) - threshold) < ERRORS * found.error(confidence):
+    pooled = draw_maxima(sample, seed=seed, stochastic=stochastic)
+    chains = [pooled]
+    while len(chains) < _MOST and abs(pooled.upper(confidence) - threshold) < ERRORS * pooled.error(confidence):
         more = range(len(chains), 2 * len(chains))
-        chains += [draw_maxima(sample, seed=_SEEDS * chain + seed, stochastic=stochastic) for chain in more]
-        found = _pooled(chains)
-    return found
+        chains += [draw_maxima(sample, seed=1_000_003 * chain + seed, stochastic=stochastic) for chain in more]
+        pooled = _pooled(chains)
+    return pooled
 
 
 def _pooled(chains: list[Maxima]) -> Maxima:
     """Return the draws of all chains as one."""
-    draws, points = np.concatenate([one.draws for one in chains]), np.concatenate([one.points for one in chains])
-    before = np.cumsum([0, *(len(one.conditioned) for one in chains[:-1])])
-    owners = np.concatenate([one.owners + first for one, first in zip(chains, before, strict=True)])
+    draws, points = (np.concatenate([getattr(chain, name) for chain in chains]) for name in ("draws", "points"))
+    before = np.cumsum([0, *(len(chain.conditioned) for chain in chains[:-1])])
+    owners = np.concatenate([chain.owners + first for chain, first in zip(chains, before, strict=True)])
     order = np.argsort(draws, kind="stable")
-    return Maxima(draws[order], points[order], [each for one in chains for each in one.conditioned], owners[order])
+    conditioned = [process for chain in chains for process in chain.conditioned]
+    return Maxima(draws[order], points[order], conditioned, owners[order])
 
 
 def _required_data(sample: Sample) -> tuple[Array, Array]:
@@ -225,7 +180,7 @@ def _required_data(sample: Sample) -> tuple[Array, Array]:
             "compares what differs; an audit bounds how many tasks are worse."
         )
     spread, largest = float(np.ptp(sample.distances)), float(np.abs(sample.distances).max())
-    if spread < _ROUNDING * largest:
+    if spread < 1e-14 * largest:
         raise CertificateError(f"the distances differ from {largest:g} by rounding alone: they do not bound d*.")
     if spread < 1 / _EXTREME or largest > _EXTREME:
         raise CertificateError(
@@ -238,12 +193,12 @@ def _required_data(sample: Sample) -> tuple[Array, Array]:
 def _require_one_distance_each(sample: Sample) -> None:
     """Refuse trials of a stochastic system."""
     y, numbers = sample.distances, sample.numbers
-    _, tasks = np.unique(sample.points, axis=0, return_inverse=True)
-    for row, task in enumerate(tasks.ravel()):
-        first = int(np.argmax(tasks.ravel() == task))
-        if abs(y[row] - y[first]) > _REPEATED * np.ptp(y):
-            raise CertificateError(
-                f"trials {numbers[first]} and {numbers[row]} executed one task, and their distances are {y[first]:g} "
-                f"and {y[row]:g}: the system is not deterministic; say --stochastic to bound the largest expected "
-                "distance."
-            )
+    _, firsts, tasks = np.unique(sample.points, axis=0, return_index=True, return_inverse=True)
+    first_of = firsts[tasks.ravel()]
+    different = np.flatnonzero(np.abs(y - y[first_of]) > 1e-6 * np.ptp(y))
+    if len(different):
+        row, first = different[0], first_of[different[0]]
+        raise CertificateError(
+            f"trials {numbers[first]} and {numbers[row]} executed one task, and their distances are {y[first]:g} and "
+            f"{y[row]:g}: the system is not deterministic; say --stochastic to bound the largest expected distance."
+        )

@@ -12,17 +12,10 @@ from ctxval.certificates.covering import RESOLUTION
 from ctxval.certificates.posterior import Posterior
 from ctxval.errors import InputError
 
-CONFIDENCE = 0.95
-"""Default confidence of a verdict."""
-
-WITHIN = 0.05
-"""Default share by which a bound may exceed the largest executed distance where a search without a threshold ends."""
-
-LEAST_CONFIDENCE = 0.5
-"""Least confidence of a verdict: below it, a statement is wrong more often than right."""
-
-MOST_VOLUME = 0.5
-"""Largest acceptable volume of a verdict: above it, a statement leaves out most of the task space."""
+CONFIDENCE = 0.95  # default of a verdict
+WITHIN = 0.05  # default share by which the bound exceeds the largest distance where a search without a threshold ends
+LEAST_CONFIDENCE = 0.5  # below it, a statement is wrong more often than right
+MOST_VOLUME = 0.5  # above it, a statement leaves out most of the task space
 
 
 @checked
@@ -58,11 +51,7 @@ class CertificateOptions(ShortRepr):
     def or_automatic(
         cls, certificate: CertificateOptions | None, confidence: float, stochastic: bool, resolution: float
     ) -> CertificateOptions:
-        """Return a certificate that is given; otherwise ``auto`` with these options.
-
-        Raises:
-            InputError: if it is not a CertificateOptions, or if options are given beside it, which it has itself.
-        """
+        """Return a certificate that is given, beside which no options may stand; else ``auto`` with the options."""
         if certificate is None:
             return cls(Automatic(stochastic, resolution), confidence)
         if (confidence, stochastic, resolution) != (CONFIDENCE, False, RESOLUTION):

@@ -2,7 +2,7 @@
 
 A search looks where distances are large, so it may never see that the dynamics are other in some tasks. Before a bound
 is believed, executions must have been predicted at a number of tasks that are drawn for this: tasks that leave no
-interval of a task parameter without a test if it is wider than :data:`WIDEST`, and independent draws from the
+interval of a task parameter without a test if it is wider than ``WIDEST``, and independent draws from the
 distribution of tasks. What is other in one of eight equal parts of a parameter's range is met with certainty by the
 former; eight independent draws meet it with a probability of 66 %. Other executions fill intervals too, if they were
 predicted beforehand.
@@ -18,23 +18,15 @@ import numpy as np
 from ctxval._util.arrays import Array
 from ctxval.core.trial import Origin
 
-TESTS = 8
-"""Default number of tests."""
-
-DRAWN: tuple[Origin, ...] = ("iid", "spread")
-"""Origins of the tasks that are drawn."""
-
-WIDEST = 0.12
-"""Widest interval of a task parameter without a test, as a share of its range."""
+TESTS = 8  # default number
+WIDEST = 0.12  # widest interval of a task parameter without a test, as a share of its range
+DRAWN: tuple[Origin, ...] = ("iid", "spread")  # origins of the tasks that are drawn
 
 
 def fewest_missing_tests(points: Array, drawn: int, tests: int) -> int:
-    """Return the fewest executions that complete the tests; 0 if they are complete.
+    """Return the fewest executions that complete the tests; 0 if they are complete, or no tests are asked for.
 
-    Args:
-        points: tasks that were predicted beforehand and executed, points of the unit cube ``(n, d)``.
-        drawn: how many of them were drawn as tests.
-        tests: the number of tests; with 0 none are needed.
+    The points ``(n, d)`` are tasks that were predicted beforehand and executed; some of them were drawn as tests.
     """
     return max(tests - drawn, fewest_spread_tests(points)) if tests else 0
 
@@ -67,8 +59,7 @@ def _value_in_a_gap(values: Array, rng: np.random.Generator) -> float:
 
 def _gaps(values: Array) -> Iterator[tuple[float, float]]:
     """Yield the intervals between neighbouring values and the bounds 0 and 1."""
-    ordered = [0.0, *np.sort(values).tolist(), 1.0]
-    return pairwise(ordered)
+    return pairwise([0.0, *np.sort(values).tolist(), 1.0])
 
 
 def _needed(low: float, high: float) -> int:

@@ -1,4 +1,4 @@
-"""The origin of trials: the task space, the search, and changes of their store."""
+"""What is known of trials besides their numbers: the task space, units, and changes of their store."""
 
 from __future__ import annotations
 
@@ -7,8 +7,9 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from ctxval._util.representation import ShortRepr
-from ctxval.certificates.learned import LearnedDistance
+from ctxval.certificates.dynamics_evidence import LearnedDistance
 from ctxval.certificates.sample import Sample
+from ctxval.certificates.verdict_sentences import Quantities
 from ctxval.core.space import DISTRIBUTION, TaskSpace
 from ctxval.core.task_distribution import distribution_text
 from ctxval.core.trial import Change, Trial
@@ -21,72 +22,71 @@ class Provenance(ShortRepr):
 
     Attributes:
         space: the task space, to state lengths in its units; None if it is not known.
-        search: the type of the search that chose the tasks; None if it is not known.
         remarks: sentences that a certificate lists among its assumptions, such as what was changed on the system.
         learned: what the experiment's model predicts, for kinds that need it; None if the experiment is not loaded.
         distribution: the distribution of tasks as a text; None if it is uniform.
+        units: the units of the distance.
         start: the largest offset of the start of an execution, as the distance measures it, and as a text; None if
             executions were not recorded.
     """
 
     space: TaskSpace | None = None
-    search: str | None = None
     remarks: tuple[str, ...] = ()
     learned: LearnedDistance | None = None
     distribution: str | None = None
+    units: str = ""
     start: tuple[float, str] | None = None
 
     @classmethod
     def of(cls, description: Mapping[str, Any], changes: Iterable[Change] = ()) -> Provenance:
         """Return the provenance from a store's description of its experiment and its list of changes."""
-        search = description.get("search")
+        validation = _table(description, "validation")
+        described, refined = _table(validation, "space"), _table(validation, "model").get("type") == "Refined"
+        distribution = described.get(DISTRIBUTION)
         return cls(
-            space=_space_of(description),
-            search=search.get("type") if isinstance(search, dict) else None,
-            remarks=(*_remarks_on_model(description), *remarks_on(changes)),
-            distribution=_distribution_of(description),
+            space=_space_of(described),
+            remarks=(*([REFINED] if refined else []), *remarks_on(changes)),
+            distribution=None if distribution is None else distribution_text(distribution),
         )
 
     def caution(self, threshold: float) -> str:
         """Return a sentence if an execution started farther from its task than the threshold; empty if none did."""
         if self.start is None or self.start[0] <= threshold:
             return ""
-        return f" The start of an execution was off by {self.start[1]}; the threshold is {threshold:.6g}."
+        limit = self.quantities.of(f"{threshold:.6g}")
+        return f" The start of an execution was off by {self.start[1]}; the threshold is {limit}."
+
+    @property
+    def quantities(self) -> Quantities:
+        """The units and tasks of sentences."""
+        return Quantities(self.units, self.space)
+
+    @property
+    def stated(self) -> tuple[str, ...]:
+        """The remarks that are the user's word, on which a validation rests."""
+        return tuple(remark for remark in self.remarks if remark != REFINED)
 
     def sample(self, trials: Sequence[Trial]) -> Sample:
-        """Return trials as a certificate sees them, with what is known here.
-
-        Raises:
-            CertificateError: if there is no trial, or one is still open.
-        """
-        return replace(Sample.of(trials, self.search, self.learned), distribution=self.distribution)
+        """Return trials as a certificate sees them, with what is known here."""
+        return replace(Sample.of(trials, self.learned), distribution=self.distribution)
 
 
 def remarks_on(changes: Iterable[Change]) -> tuple[str, ...]:
     """Return sentences on later changes of a store, for a certificate's assumptions."""
-    found = []
+    remarks = []
     for change in changes:
         if change.what == "accepted":
             different = "; ".join(change.content.get("differences", [])[:1]) or "nothing that is described"
-            found.append(
+            remarks.append(
                 f"what was changed after {change.content.get('trials', 'some')} trials makes no difference to them, as "
                 f"you state: {change.why!r} ({different})"
             )
         elif change.what == "remeasured":
-            found.append(f"the distances are those measured anew: {change.why!r}")
+            remarks.append(f"the distances are those measured anew: {change.why!r}")
         elif change.what == "replaced":
             numbers = ", ".join(change.content.get("before", {}))
-            found.append(f"the result of trial {numbers} that was told first is wrong, as you state: {change.why!r}")
-    return tuple(found)
-
-
-def _remarks_on_model(description: Mapping[str, Any]) -> tuple[str, ...]:
-    """Return what a certificate says of a model that was refined."""
-    try:
-        refined = description["validation"]["model"]["type"] == "Refined"
-    except (KeyError, TypeError):
-        refined = False
-    return (REFINED,) if refined else ()
+            remarks.append(f"the result of trial {numbers} that was told first is wrong, as you state: {change.why!r}")
+    return tuple(remarks)
 
 
 REFINED = (
@@ -96,26 +96,23 @@ REFINED = (
 """What a certificate says of a model that was refined."""
 
 
-def _distribution_of(description: Mapping[str, Any]) -> str | None:
-    """Return the distribution of tasks in a description as a text; None if tasks are uniform."""
-    try:
-        described = description["validation"]["space"].get(DISTRIBUTION)
-    except (KeyError, TypeError, AttributeError):
-        return None
-    return None if described is None else distribution_text(described)
+def _table(description: Mapping[str, Any], name: str) -> Mapping[str, Any]:
+    """Return a part of a description; empty if it has none that can be read."""
+    part = description.get(name)
+    return part if isinstance(part, dict) else {}
 
 
-def _space_of(description: Mapping[str, Any]) -> TaskSpace | None:
-    """Return the task space of a description; None if it has none that can be read."""
+def _space_of(described: Mapping[str, Any]) -> TaskSpace | None:
+    """Return a task space that is described; None if it cannot be read, as only sentences depend on it."""
     try:
-        described = dict(description["validation"]["space"])
-        described.pop("type", None)
-        described.pop(DISTRIBUTION, None)
         bounds: dict[str, tuple[Any, ...]] = {}
-        for name, (low, high, *unit) in described.items():
+        for name, bound in described.items():
+            if name in ("type", DISTRIBUTION):
+                continue
+            low, high, *unit = bound
             vector = name.partition("[")[0]
             lows, highs, *_ = bounds.get(vector, ([], []))
             bounds[vector] = (low, high, *unit) if vector == name else ([*lows, low], [*highs, high], *unit)
         return TaskSpace(**bounds)
-    except (KeyError, TypeError, ValueError, InputError):
-        return None  # only the units in a sentence depend on it
+    except (TypeError, ValueError, InputError):
+        return None

@@ -17,31 +17,23 @@ of M, j and the confidence. The volume above tau is at most eps and this bound t
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
 from ctxval._util.arrays import Array
 from ctxval._util.checked import NonNegativeInt, PositiveFloat, PositiveInt, Probability, checked
 from ctxval._util.registry import part
-from ctxval.certificates.base import ONE_CAMPAIGN, Certificate, CertificateKind
+from ctxval.certificates.base import Certificate, CertificateKind
 from ctxval.certificates.bounds import at_most, of_tasks
-from ctxval.certificates.draws import countable_draws, draws_left_out, how_drawn, not_counted
 from ctxval.certificates.forecast import Forecast
-from ctxval.certificates.learned import LearnedDistance, require_learned
-from ctxval.certificates.sample import Sample, advice_to_remeasure
-from ctxval.certificates.scenario import ABOUT_DRAWS, rests_on_draws, volume_bound
-from ctxval.core.space import TaskSpace
+from ctxval.certificates.sample import Sample, advice_to_remeasure, require_learned
+from ctxval.certificates.scenario import countable_draws, volume_bound
+from ctxval.certificates.sentences import ABOUT_DRAWS, FROZEN, ONE_CAMPAIGN, how_drawn, margin_and_map
 from ctxval.errors import CertificateError
 
 _OF_MAP = 0.05
 """Share of beta for the volume of the map; the rest is for the draws. Predictions cost no execution, draws do."""
-
-FROZEN = (
-    "the prediction was learned only from the model's own data and from trials before the first of these draws, and M "
-    "and the way of predicting were not changed after the draws were known"
-)
-"""The assumption that the prediction was fixed before the draws."""
 
 
 @part("region")
@@ -58,6 +50,7 @@ class Region(CertificateKind):
     bounds_maximum: ClassVar[bool] = False
     uses_threshold: ClassVar[bool] = True
     needs_model: ClassVar[bool] = True
+    sorts_draws: ClassVar[bool] = True
 
     discard: NonNegativeInt = 0
     predictions: PositiveInt = 1000
@@ -73,79 +66,8 @@ class Region(CertificateKind):
         return certify_region(sample, threshold, confidence, self), None
 
     def require_usable(self, confidence: float, executions: int) -> None:
-        """Require more trials than are discarded.
-
-        Raises:
-            CertificateError: if there are not more.
-        """
+        """Require more trials than are discarded."""
         _require_fewer(self.discard, executions)
-
-    @classmethod
-    def rests_on(cls, certificate: Certificate, space: TaskSpace | None = None) -> list[str]:
-        """Return what it needs of the draws and of the prediction."""
-        return [*rests_on_draws(certificate), "a prediction that was fixed before these tasks were drawn"]
-
-    @classmethod
-    def shortfall(cls, certificate: Certificate) -> str:
-        """Return why the volume left out is not smaller: the map, and draws that do not count."""
-        return f"{_outside_the_map(certificate)}{draws_left_out(certificate)}"
-
-
-@dataclass(frozen=True, eq=False)
-class _Margin:
-    """The margin of a prediction, from independent draws.
-
-    Attributes:
-        drawn: the draws that count.
-        before: number of the first of them; the prediction is learned from the trials below it.
-        value: q, the (k+1)-th largest excess d - d_hat, in the distance's units.
-        unpredicted: number of draws whose distance cannot be predicted.
-    """
-
-    drawn: Sample
-    before: int
-    value: float
-    unpredicted: int
-
-
-@dataclass(frozen=True, eq=False)
-class _Map:
-    """Predicted bounds d_hat + q of independent tasks, against a limit.
-
-    Attributes:
-        limit: the limit; a threshold, or the largest bound that was predicted.
-        count: number M of tasks.
-        outside: number of the tasks whose bound exceeds the limit or cannot be predicted.
-        unpredicted: number of the tasks that cannot be predicted.
-        fixed: whether the limit was given; else it is the largest of these bounds.
-    """
-
-    limit: float
-    count: int
-    outside: int
-    unpredicted: int
-    fixed: bool
-
-    @property
-    def share(self) -> float:
-        """The estimated share of the tasks inside."""
-        return 1 - self.outside / self.count
-
-    @property
-    def error(self) -> float:
-        """The standard error of the share, with one more task on either side, so that it is never zero."""
-        smoothed = (self.outside + 1) / (self.count + 2)
-        return float(np.sqrt(smoothed * (1 - smoothed) / self.count))
-
-    def volume_outside(self, beta: float) -> float:
-        """Return an upper bound on the share outside, which is wrong with probability at most beta."""
-        if self.outside == self.count:
-            return 1.0
-        if self.fixed:
-            return volume_bound(self.count, self.outside, beta)
-        # The tasks without a prediction, and those above the largest of the others, which the draws did not fix.
-        known = self.count - self.unpredicted
-        return volume_bound(self.count, self.unpredicted, beta / 2) + volume_bound(known, 0, beta / 2)
 
 
 @checked
@@ -160,55 +82,70 @@ def certify_region(
     With a threshold, the bound is the threshold, and the volume left out is that of the draws plus that of the tasks at
     which the prediction plus the margin exceeds the threshold. Without one, the bound is the largest predicted one.
 
-    Args:
-        sample: trials of any origin, some of them independent draws, with what the experiment's model predicts.
-        threshold: tau, in the distance's units; None if there is none.
-        confidence: 1 - beta, the probability with which all of the statement holds.
-        options: the number of excesses to discard and the number of predicted tasks.
-
     Raises:
-        CertificateError: if the experiment is not loaded, nothing can be predicted, there is no independent draw, the
-            number of draws depended on their distances, or more draws lack a distance or a prediction than are
-            discarded.
+        CertificateError: if the experiment is not loaded, nothing can be predicted, there is no countable draw, or more
+            draws lack a distance or a prediction than are discarded.
     """
-    chosen = options or Region()
-    discard, beta = chosen.discard, 1 - confidence
-    learned = require_learned(sample, "region")
-    margin = _margin_of(sample, learned, discard)
-    volume = volume_bound(len(margin.drawn), discard, (1 - _OF_MAP) * beta)
-    tasks = learned.tasks(chosen.predictions, margin.before)
-    mapped = _map_of(learned.expected(tasks, margin.before) + margin.value, threshold)
-    total = min(1.0, volume + mapped.volume_outside(_OF_MAP * beta))
+    chosen, beta = options or Region(), 1 - confidence
+    learned, drawn = require_learned(sample, "region"), countable_draws(sample, "a region bound")
+    before = min(drawn.numbers)  # the prediction is learned from the trials before the draws
+    margin, unpredicted = _margin(drawn, learned.expected(drawn.points, before), before, chosen.discard)
+    volume = volume_bound(len(drawn), chosen.discard, (1 - _OF_MAP) * beta)
+    bounds = learned.expected(learned.tasks(chosen.predictions, before), before) + margin
+    count, unknown = len(bounds), int(np.isnan(bounds).sum())
+    limit = float(bounds[~np.isnan(bounds)].max(initial=-np.inf)) if threshold is None else float(threshold)
+    outside = int((~(bounds <= limit)).sum())
+    if outside == count:
+        outside_volume = 1.0
+    elif threshold is not None:
+        outside_volume = volume_bound(count, outside, _OF_MAP * beta)
+    else:
+        # The tasks without a prediction, and those above the largest of the others, which the draws did not fix.
+        half = _OF_MAP * beta / 2
+        outside_volume = volume_bound(count, unknown, half) + volume_bound(count - unknown, 0, half)
+    total, share = min(1.0, volume + outside_volume), 1 - outside / count
+    smoothed = (outside + 1) / (count + 2)  # one more task on either side, so that the error is never zero
+    error = float(np.sqrt(smoothed * (1 - smoothed) / count))
+    kept = f"this prediction is at most {at_most(limit)} on each of {count} predicted tasks that it covers"
+    if threshold is not None:
+        tasks = f"{100 * share:.4g} ± {at_most(100 * error, 2)} % {of_tasks(sample.distribution)}"
+        kept = f"this prediction keeps {limit:.6g} on {tasks} (an estimate from {count} predicted tasks)"
     return Certificate(
         kind="region",
-        statement=_statement(sample, margin, volume, mapped, total, confidence),
-        upper_bound=mapped.limit,
+        statement=margin_and_map(sample, margin, volume, total, confidence, at_most(limit), kept),
+        upper_bound=limit,
         confidence=confidence,
         volume=total,
-        trials=len(margin.drawn),
+        trials=len(drawn),
         assumptions=(
-            *how_drawn(sample, margin.drawn),
+            *how_drawn(sample, drawn),
             "the number discarded was chosen before the draws were known",
             FROZEN,
             *ABOUT_DRAWS,
             *sample.remarks,
             ONE_CAMPAIGN,
         ),
-        details=_details(sample, margin, volume, mapped, discard),
+        details={
+            "margin": margin,
+            "discarded": chosen.discard,
+            "volume_of_draws": volume,
+            "learned_before": before,
+            "predictions": count,
+            "share_kept": share,
+            "share_error": error,
+            "unpredicted_draws": unpredicted,
+            "unpredicted_tasks": unknown,
+            "largest_drawn": drawn.best if np.isfinite(drawn.best) else None,
+            "not_counted": len(sample.only("iid")) - len(drawn),
+            "failed": sample.failed,
+            "failures": sample.failures,
+        },
         distribution=sample.distribution,
     )
 
 
-def _require_fewer(discard: int, draws: int) -> None:
-    if discard >= draws:
-        raise CertificateError(f"of {draws} draws, from 0 to {draws - 1} can be discarded, not {discard}.")
-
-
-def _margin_of(sample: Sample, learned: LearnedDistance, discard: int) -> _Margin:
-    """Return the margin of the prediction from the trials before the draws that count."""
-    drawn = countable_draws(sample, "a region bound")
-    before = min(drawn.numbers)
-    predicted = learned.expected(drawn.points, before)
+def _margin(drawn: Sample, predicted: Array, before: int, discard: int) -> tuple[float, int]:
+    """Return q, the (k+1)-th largest excess d - d_hat of draws, and how many of them cannot be predicted."""
     if np.isnan(predicted).all():
         raise CertificateError(
             f"nothing can be predicted from the trials before trial {before}, the first of these draws: execute tasks "
@@ -222,60 +159,9 @@ def _margin_of(sample: Sample, learned: LearnedDistance, discard: int) -> _Margi
             f"{drawn.failed} of {len(drawn)} draws have no distance and {unpredicted} have no prediction, more than "
             f"the {discard} discarded; nothing bounds the distance there.{advice_to_remeasure(drawn)}"
         )
-    return _Margin(drawn, before, float(excess[-1 - discard]), unpredicted)
+    return float(excess[-1 - discard]), unpredicted
 
 
-def _map_of(bounds: Array, threshold: float | None) -> _Map:
-    """Return the map of predicted bounds ``(M,)``, which are NaN if a task cannot be predicted."""
-    known = bounds[~np.isnan(bounds)]
-    limit = float(known.max(initial=-np.inf)) if threshold is None else float(threshold)
-    return _Map(limit, len(bounds), int((~(bounds <= limit)).sum()), len(bounds) - len(known), threshold is not None)
-
-
-def _statement(sample: Sample, margin: _Margin, volume: float, mapped: _Map, total: float, confidence: float) -> str:
-    tasks, q = of_tasks(sample.distribution), margin.value
-    excess = (
-        f"exceeds the predicted one by at most {at_most(q)}"
-        if q >= 0
-        else (f"is below the predicted one by at least {at_most(q).removeprefix('-')}")
-    )
-    held = (
-        f"With confidence {confidence}, the distance {excess}, except on at most {at_most(100 * volume, 3)} % {tasks}; "
-    )
-    share, error = f"{100 * mapped.share:.4g} ± {at_most(100 * mapped.error, 2)} %", f"{mapped.count} predicted tasks"
-    if mapped.fixed:
-        kept = f"this prediction keeps {mapped.limit:.6g} on {share} {tasks} (an estimate from {error})"
-    else:
-        kept = f"this prediction is at most {at_most(mapped.limit)} on each of {error} that it covers"
-    return (
-        f"{held}{kept}, so that the distance exceeds {at_most(mapped.limit)} on at most {at_most(100 * total, 3)} % in "
-        "all."
-    )
-
-
-def _details(sample: Sample, margin: _Margin, volume: float, mapped: _Map, discard: int) -> dict[str, Any]:
-    return {
-        "margin": margin.value,
-        "discarded": discard,
-        "volume_of_draws": volume,
-        "learned_before": margin.before,
-        "predictions": mapped.count,
-        "share_kept": mapped.share,
-        "share_error": mapped.error,
-        "unpredicted_draws": margin.unpredicted,
-        "unpredicted_tasks": mapped.unpredicted,
-        "largest_drawn": margin.drawn.best if np.isfinite(margin.drawn.best) else None,
-        "not_counted": not_counted(sample, margin.drawn),
-        "failed": sample.failed,
-        "failures": sample.failures,
-    }
-
-
-def _outside_the_map(certificate: Certificate) -> str:
-    details = certificate.details
-    if "share_kept" not in details:
-        return ""
-    return (
-        f" ({at_most(100 * details['volume_of_draws'], 3)} % because of the number of draws, and the rest because the "
-        "prediction plus its margin exceeds the threshold there)"
-    )
+def _require_fewer(discard: int, draws: int) -> None:
+    if discard >= draws:
+        raise CertificateError(f"of {draws} draws, from 0 to {draws - 1} can be discarded, not {discard}.")

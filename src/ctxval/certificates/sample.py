@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -11,15 +11,12 @@ import numpy as np
 from ctxval._util.arrays import Array
 from ctxval._util.representation import ShortRepr
 from ctxval._util.texts import enumerated
-from ctxval.certificates.learned import LearnedDistance
+from ctxval.certificates.dynamics_evidence import LearnedDistance
 from ctxval.core.trial import TOLD_ALONE, Origin, State, Trial
 from ctxval.errors import CertificateError
 
 PLANNED = "draws"
 """Key of the planned number of draws in the note of an independent draw."""
-
-_SAME_TASK = 1e-9
-"""Largest difference, in each coordinate, of unit-cube points that count as one task: scaling rounds them."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +47,6 @@ class Sample(ShortRepr):
         planned: for each trial, the total number of independent draws that was planned when it was drawn; 0 if they
             were to end with the verdict, None if that is not known.
         made_good: failures that are left out, because their tasks were executed with success later.
-        search: the type of the search that chose the tasks; None if it is not known.
         learned: what the experiment's model predicts; None if the experiment is not loaded.
         distribution: the distribution of tasks as a text; None if it is uniform.
 
@@ -65,7 +61,6 @@ class Sample(ShortRepr):
     numbers: Sequence[int] = ()
     planned: Sequence[int | None] = ()
     made_good: tuple[MadeGood, ...] = ()
-    search: str | None = None
     learned: LearnedDistance | None = None
     distribution: str | None = None
 
@@ -75,11 +70,10 @@ class Sample(ShortRepr):
         if not len(self.planned):
             object.__setattr__(self, "planned", [None] * len(self.points))
         parts = (self.points, self.distances, self.origins, self.states, self.numbers, self.planned)
-        lengths = {len(part) for part in parts}
-        if len(lengths) != 1:
+        if len({len(part) for part in parts}) != 1:
             raise CertificateError(
                 "points, distances, origins, states, numbers and planned must be equally many, got lengths "
-                f"{sorted(lengths)}."
+                f"{sorted({len(part) for part in parts})}."
             )
         if "open" in self.states:
             waiting = [str(n) for n, state in zip(self.numbers, self.states, strict=True) if state == "open"]
@@ -89,56 +83,63 @@ class Sample(ShortRepr):
         return len(self.distances)
 
     @classmethod
-    def of(cls, trials: Sequence[Trial], search: str | None = None, learned: LearnedDistance | None = None) -> Sample:
+    def of(cls, trials: Sequence[Trial], learned: LearnedDistance | None = None) -> Sample:
         """Return the sample of a campaign's trials; a task that failed before its execution has failed as well.
 
         A failure is left out if the same task was executed with success later, unless it is an independent draw. The
         order of trials that people chose or imported has no meaning, so they are sorted by their tasks.
-
-        Args:
-            trials: all trials of a campaign.
-            search: the type of the search that chose their tasks, if it is known.
-            learned: what the experiment's model predicts, if the experiment is loaded.
 
         Raises:
             CertificateError: if there is no trial, or one is still open.
         """
         if not trials:
             raise CertificateError("nothing was executed yet, so nothing can be certified.")
-        good = _made_good(trials)
-        left_out = {one.trial for one in good} | _measured_later(trials)
-        count = _in_order([trial for trial in trials if trial.number not in left_out])
+        made_good = _made_good(trials)
+        left_out = {failure.trial for failure in made_good} | _measured_later(trials)
+        counted = _in_order([trial for trial in trials if trial.number not in left_out])
         return cls(
-            np.array([trial.unit_point for trial in count]),
-            np.array([np.nan if trial.distance is None else trial.distance for trial in count]),
-            [trial.origin for trial in count],
-            [trial.state for trial in count],
-            [trial.number for trial in count],
-            [_planned(trial) for trial in count],
-            good,
-            search,
+            np.array([trial.unit_point for trial in counted]),
+            np.array([np.nan if trial.distance is None else trial.distance for trial in counted]),
+            [trial.origin for trial in counted],
+            [trial.state for trial in counted],
+            [trial.number for trial in counted],
+            [_planned(trial) for trial in counted],
+            made_good,
             learned,
         )
 
     def only(self, origin: Origin) -> Sample:
         """Return the trials of one origin."""
-        return self.rows([row for row, own in enumerate(self.origins) if own == origin])
+        return self.rows([row for row, each in enumerate(self.origins) if each == origin])
 
     def rows(self, rows: Sequence[int]) -> Sample:
         """Return some of the trials."""
-        chosen = list(rows)
-        return Sample(
-            self.points[chosen],
-            self.distances[chosen],
-            [self.origins[row] for row in chosen],
-            [self.states[row] for row in chosen],
-            [self.numbers[row] for row in chosen],
-            [self.planned[row] for row in chosen],
-            self.made_good,
-            self.search,
-            self.learned,
-            self.distribution,
+        return replace(
+            self,
+            points=self.points[list(rows)],
+            distances=self.distances[list(rows)],
+            origins=[self.origins[row] for row in rows],
+            states=[self.states[row] for row in rows],
+            numbers=[self.numbers[row] for row in rows],
+            planned=[self.planned[row] for row in rows],
         )
+
+    @property
+    def countable(self) -> list[int]:
+        """Rows of the independent draws whose number was chosen before they were executed.
+
+        If the number was raised after some were known, these are the draws of the last decision.
+        """
+        rows = [row for row, origin in enumerate(self.origins) if origin == "iid"]
+        plans = [self.planned[row] for row in rows if self.planned[row] != 0]  # 0: the draws end with the verdict
+        return [row for row in rows if plans and self.planned[row] == plans[-1]]
+
+    def with_countable_draws(self) -> Sample:
+        """Return the sample in which only the countable draws are independent draws, and the others like a search's."""
+        kept = self.countable
+        others = [origin == "iid" and row not in kept for row, origin in enumerate(self.origins)]
+        origins = ["acquisition" if is_other else each for each, is_other in zip(self.origins, others, strict=True)]
+        return replace(self, origins=origins) if any(others) else self
 
     @property
     def best(self) -> float:
@@ -152,7 +153,7 @@ class Sample(ShortRepr):
 
     def numbers_of(self, state: State) -> list[int]:
         """Return the numbers of the trials in a state."""
-        return [number for number, own in zip(self.numbers, self.states, strict=True) if own == state]
+        return [number for number, each in zip(self.numbers, self.states, strict=True) if each == state]
 
     @property
     def failures(self) -> dict[str, list[Any]]:
@@ -160,49 +161,55 @@ class Sample(ShortRepr):
         return {
             "failed": self.numbers_of("failed"),
             "unmeasured": self.numbers_of("unmeasured"),
-            "made_good": [asdict(one) for one in self.made_good],
+            "made_good": [asdict(failure) for failure in self.made_good],
         }
 
     @property
     def remarks(self) -> tuple[str, ...]:
         """Sentences on the trials that failed, that could not be measured and that were made good."""
         failed, unmeasured = self.numbers_of("failed"), self.numbers_of("unmeasured")
-        found = [f"{listed(failed)} failed, and no distance is known there"] if failed else []
+        remarks = [f"{listed(failed)} failed, and no distance is known there"] if failed else []
         if unmeasured:
-            found.append(f"{listed(unmeasured)} {_was(unmeasured)} executed, but the distance could not be measured")
-        causes = dict.fromkeys((one.by, one.because) for one in self.made_good)
+            remarks.append(_unmeasured(unmeasured))
+        causes = dict.fromkeys((failure.by, failure.because) for failure in self.made_good)
         for by, because in causes:
-            which = listed([one.trial for one in self.made_good if one.by == by])
+            which = listed([failure.trial for failure in self.made_good if failure.by == by])
             why = "nobody stated why" if because is None else f"you state why: {because!r}"
-            found.append(f"{which} failed, and trial {by} executed the same task with success; {why}")
-        return tuple(found)
+            remarks.append(f"{which} failed, and trial {by} executed the same task with success; {why}")
+        return tuple(remarks)
 
 
-_LISTED = 5
-"""Largest number of trials that a message lists."""
+def require_learned(sample: Sample, kind: str) -> LearnedDistance:
+    """Return the predictions that come with a sample, which this kind of certificate needs."""
+    if sample.learned is None:
+        raise CertificateError(
+            f"the {kind} certificate uses what the experiment's model predicts, but the experiment is not loaded: use "
+            "`ctxval certify`, Campaign.verdict, or Provenance(learned=...)."
+        )
+    return sample.learned
 
 
 def listed(numbers: Sequence[int]) -> str:
-    """Return numbers of trials as text; if there are many, only the first few."""
-    first = enumerated(numbers, _LISTED)
+    """Return numbers of trials as text; if there are many, only the first five."""
+    first = enumerated(numbers, 5)
     return f"trial {first}" if len(numbers) == 1 else f"{len(numbers)} trials ({first})"
+
+
+def _unmeasured(numbers: Sequence[int]) -> str:
+    was = "was" if len(numbers) == 1 else "were"
+    return f"{listed(numbers)} {was} executed, but the distance could not be measured"
 
 
 def advice_to_remeasure(sample: Sample) -> str:
     """Return a sentence on what to do about trials that were executed but not measured; empty if there are none."""
-    unmeasured = sample.numbers_of("unmeasured")
-    if not unmeasured:
+    numbers = sample.numbers_of("unmeasured")
+    if not numbers:
         return ""
-    what = listed(unmeasured)
+    what = _unmeasured(numbers)
     return (
-        f" {what[0].upper()}{what[1:]} {_was(unmeasured)} executed, but the distance could not be measured: correct "
-        "the distance, then measure the recorded executions with `ctxval remeasure STORE`; if an execution was not "
-        "recorded, execute its task again."
+        f" {what[0].upper()}{what[1:]}: correct the distance, then measure the recorded executions with `ctxval "
+        "remeasure STORE`; if an execution was not recorded, execute its task again."
     )
-
-
-def _was(numbers: Sequence[int]) -> str:
-    return "was" if len(numbers) == 1 else "were"
 
 
 def _planned(trial: Trial) -> int | None:
@@ -218,20 +225,23 @@ def _in_order(trials: list[Trial]) -> list[Trial]:
         (trials[place] for place in places),
         key=lambda trial: (trial.unit_point.tolist(), np.inf if trial.distance is None else trial.distance),
     )
-    found = list(trials)
+    in_order = list(trials)
     for place, trial in zip(places, ordered, strict=True):
-        found[place] = trial
-    return found
+        in_order[place] = trial
+    return in_order
+
+
+def executions_of(trial: Trial, trials: Sequence[Trial]) -> list[Trial]:
+    """Return the trials with a distance that executed the task of a trial; scaling rounds their unit-cube points."""
+    known = [other for other in trials if other.distance is not None]
+    gaps = (np.abs(other.unit_point - trial.unit_point).max() for other in known)
+    return [other for other, gap in zip(known, gaps, strict=True) if gap <= 1e-9]
 
 
 def _measured_later(trials: Sequence[Trial]) -> set[int]:
     """Return the trials that were executed again since, and whose distance was told alone under another definition."""
-    known = [trial.unit_point for trial in trials if trial.distance is not None]
     waiting = [trial for trial in trials if trial.failure == TOLD_ALONE and trial.origin != "iid"]
-    if not known or not waiting:
-        return set()
-    gaps = (np.abs(np.array(known) - trial.unit_point).max(axis=1).min() for trial in waiting)
-    return {trial.number for trial, gap in zip(waiting, gaps, strict=True) if gap <= _SAME_TASK}
+    return {trial.number for trial in waiting if executions_of(trial, trials)}
 
 
 def _made_good(trials: Sequence[Trial]) -> tuple[MadeGood, ...]:
@@ -239,16 +249,11 @@ def _made_good(trials: Sequence[Trial]) -> tuple[MadeGood, ...]:
 
     If there are several successes, the first one with a stated reason counts, or else the first one.
     """
-    known = [trial for trial in trials if trial.distance is not None]
-    failed = [trial for trial in trials if trial.state == "failed" and trial.origin != "iid"]
-    if not known or not failed:
-        return ()
-    points, numbers = np.array([trial.unit_point for trial in known]), np.array([trial.number for trial in known])
-    found = []
-    for trial in failed:
-        same = (np.abs(points - trial.unit_point).max(axis=1) <= _SAME_TASK) & (numbers > trial.number)
-        later = [known[row] for row in np.flatnonzero(same)]
-        if later:
-            by = next((one for one in later if one.because), later[0])
-            found.append(MadeGood(trial.number, by.number, by.because))
-    return tuple(found)
+    made_good = []
+    for trial in trials:
+        if trial.state == "failed" and trial.origin != "iid":
+            later = [success for success in executions_of(trial, trials) if success.number > trial.number]
+            by = next((success for success in later if success.because), later[0] if later else None)
+            if by is not None:
+                made_good.append(MadeGood(trial.number, by.number, by.because))
+    return tuple(made_good)

@@ -8,6 +8,9 @@ Beta(k + 1, N - k), so that
 
 and for any distribution Pr(V > eps) is at most that. The paper's sum ends at k - 1, which is too small: for k = 0 it
 would be empty, so a single draw would bound d on the whole task space.
+
+An audit is the scenario bound of the independent draws among trials of any origin. It assumes nothing about how the
+distance depends on the task, or about how the worst known task was found.
 """
 
 from __future__ import annotations
@@ -21,35 +24,27 @@ from scipy.special import bdtr, betaincinv
 
 from ctxval._util.checked import NonNegativeInt, PositiveInt, Probability, checked
 from ctxval._util.registry import part
-from ctxval.certificates.base import ONE_CAMPAIGN, Certificate, CertificateKind
-from ctxval.certificates.bounds import at_most, drawn_from, of_tasks
-from ctxval.certificates.sample import Sample, advice_to_remeasure, listed
-from ctxval.core.space import TaskSpace
+from ctxval.certificates.base import Certificate, CertificateKind
+from ctxval.certificates.bounds import at_most
+from ctxval.certificates.sample import Sample, advice_to_remeasure
+from ctxval.certificates.sentences import (
+    ABOUT_DRAWS,
+    NO_BOUND,
+    ONE_CAMPAIGN,
+    UNSEEN,
+    how_drawn,
+    share_above,
+    violations,
+)
 from ctxval.core.trial import Origin
 from ctxval.errors import CertificateError
-
-_MOST_SAMPLES = 2**40
-"""Largest number of draws that :func:`samples_needed` returns."""
-
-UNSEEN = (
-    "M was not learned from these tasks, nor chosen after seeing them: a model that is retrained on them needs a new "
-    "store and fresh draws"
-)
-"""The assumption that all bounds from independent draws share."""
-
-ABOUT_DRAWS = (
-    UNSEEN,
-    "each task has one distance: the system is deterministic",
-    "nothing is assumed of how the distance depends on the task",
-    "nothing is said of how large the distance is in the volume left out: this is no bound on d*",
-)
-"""Assumptions and limits of the statements by independent draws among trials of any origin."""
 
 
 class _ByDraws(CertificateKind):
     """A bound from independent draws alone."""
 
     bounds_maximum: ClassVar[bool] = False
+    sorts_draws: ClassVar[bool] = True
 
     def require_audit_helps(self, origins: Iterable[Origin]) -> None:
         """Refuse trials that are no independent draws."""
@@ -57,11 +52,6 @@ class _ByDraws(CertificateKind):
             raise CertificateError(
                 f"a {self.name} bound takes independent draws alone, but there are others; say --kind audit."
             )
-
-    @classmethod
-    def rests_on(cls, certificate: Certificate, space: TaskSpace | None = None) -> list[str]:
-        """Return what it assumes about the draws."""
-        return rests_on_draws(certificate)
 
 
 @part("scenario")
@@ -94,20 +84,12 @@ class SamplingDiscarding(_ByDraws):
         return certify_scenario(sample, confidence, self._require_discard())
 
     def require_audit_helps(self, origins: Iterable[Origin]) -> None:
-        """Refuse trials that are no independent draws, and require the number to discard.
-
-        Raises:
-            CertificateError: if there is such a trial, or the number is missing.
-        """
+        """Refuse trials that are no independent draws, and require the number to discard."""
         self._require_discard()
         super().require_audit_helps(origins)
 
     def require_usable(self, confidence: float, executions: int) -> None:
-        """Require the number to discard, and more trials than that.
-
-        Raises:
-            CertificateError: if the number is missing, or not below that of the trials.
-        """
+        """Require the number to discard, and more trials than that."""
         _require_counts(executions, self._require_discard())
 
     def _require_discard(self) -> int:
@@ -116,48 +98,28 @@ class SamplingDiscarding(_ByDraws):
         return self.discard
 
 
-def rests_on_draws(certificate: Certificate) -> list[str]:
-    """Return what a validation by independent draws rests on."""
-    return [
-        "tasks that were drawn independently, and from which M was not learned (how large the distance is in the "
-        f"{at_most(100 * certificate.volume, 3)} % that are left out is not known)"
-    ]
-
-
 @checked
 def tail(n: int, discarded: int, volume: Probability) -> float:
-    """Return Pr(V > volume) after n draws of which the k largest are discarded.
-
-    Raises:
-        CertificateError: if k is negative or not below n.
-    """
+    """Return Pr(V > volume) after n draws of which the k largest are discarded."""
     _require_counts(n, discarded)
     return float(bdtr(discarded, n, volume))
 
 
 @checked
 def volume_bound(n: int, discarded: int, beta: Probability) -> float:
-    """Return the least eps with ``Pr(V > eps) <= beta``.
-
-    Raises:
-        CertificateError: if k is negative or not below n.
-    """
+    """Return the least eps with ``Pr(V > eps) <= beta``."""
     _require_counts(n, discarded)
     return float(betaincinv(discarded + 1, n - discarded, 1 - beta))
 
 
 @checked
 def samples_needed(volume: Probability, beta: Probability, discarded: NonNegativeInt = 0) -> int:
-    """Return the least N with ``Pr(V > volume) <= beta``; for k = 0 it is ``log(beta) / log(1 - volume)``, rounded up.
-
-    Raises:
-        CertificateError: if N would be above 2^40.
-    """
+    """Return the least N with ``Pr(V > volume) <= beta``; for k = 0, ``log(beta) / log(1 - volume)`` rounded up."""
     low, high = discarded, discarded + 1
     while tail(high, discarded, volume) > beta:
         low, high = high, 2 * high
-        if high > _MOST_SAMPLES:
-            raise CertificateError(f"a volume of {volume:g} needs more than {_MOST_SAMPLES:g} samples.")
+        if high > 2**40:
+            raise CertificateError(f"a volume of {volume:g} needs more than {2**40:g} samples.")
     while high - low > 1:
         middle = (low + high) // 2
         low, high = (middle, high) if tail(middle, discarded, volume) > beta else (low, middle)
@@ -166,29 +128,24 @@ def samples_needed(volume: Probability, beta: Probability, discarded: NonNegativ
 
 @checked
 def certify_scenario(sample: Sample, confidence: Probability = 0.95, discarded: NonNegativeInt = 0) -> Certificate:
-    """Return a bound on the volume of the tasks whose distance exceeds the largest one left after discarding.
+    """Return a bound on the volume of the tasks whose distance exceeds the largest one left after discarding k.
 
-    A failed execution counts as a violation, larger than any distance, so it must be among the discarded ones.
-
-    Args:
-        sample: independent uniform draws alone.
-        confidence: 1 - beta, the probability with which the statement holds.
-        discarded: k, the number of the largest distances to discard; 0 is scenario optimisation. It must be chosen
-            before the distances are known.
+    k = 0 is scenario optimisation. k must be chosen before the distances are known. A failed execution counts as a
+    violation, larger than any distance, so it must be among the discarded ones.
 
     Raises:
         CertificateError: if a trial is no independent draw, the number of draws depended on their distances, k is
             not below the number of draws, or more executions failed than are discarded.
     """
-    beta = 1 - confidence
+    kind = "sampling-discarding" if discarded else "scenario"
     foreign = [origin for origin in sample.origins if origin != "iid"]
     if foreign:
         raise CertificateError(
-            f"a {_name(discarded)} bound takes independent draws alone, but {len(foreign)} of {len(sample)} trials "
-            f"were chosen otherwise ({', '.join(sorted(set(foreign)))}); run --search random, or say --kind audit."
+            f"a {kind} bound takes independent draws alone, but {len(foreign)} of {len(sample)} trials were chosen "
+            f"otherwise ({', '.join(sorted(set(foreign)))}); run --search random, or say --kind audit."
         )
     _require_counts(len(sample), discarded)
-    _require_one_number(sample, _name(discarded))
+    _require_one_number(sample, kind)
     if sample.failed > discarded:
         raise CertificateError(
             f"{violations(sample)}, more than the {discarded} discarded; nothing bounds them."
@@ -196,45 +153,26 @@ def certify_scenario(sample: Sample, confidence: Probability = 0.95, discarded: 
         )
     ordered = np.sort(np.nan_to_num(sample.distances, nan=np.inf))
     h = float(ordered[len(sample) - 1 - discarded])
-    volume = volume_bound(len(sample), discarded, beta)
+    volume = volume_bound(len(sample), discarded, 1 - confidence)
     return Certificate(
-        kind=_name(discarded),
-        statement=(
-            f"With confidence {confidence}, at most {at_most(100 * volume, 3)} % "
-            f"{of_tasks(sample.distribution)} has a distance above {at_most(h)}."
-        ),
+        kind=kind,
+        statement=share_above(sample, volume, confidence, at_most(h), len(sample)),
         upper_bound=h,
         confidence=confidence,
         volume=volume,
         trials=len(sample),
         assumptions=(
-            f"the trials are independent and {drawn_from(sample.distribution)}, and "
-            f"{when_planned(sample, len(sample))}",
+            *how_drawn(sample, sample, "the trials"),
             "the number discarded was chosen before the distances were known",
             UNSEEN,
             "each task has one distance: the system is deterministic",
-            "nothing is said of how large the distance is in the volume left out: this is no bound on d*",
+            NO_BOUND,
             *sample.remarks,
             ONE_CAMPAIGN,
         ),
         details={"discarded": discarded, "failed": sample.failed, "failures": sample.failures},
         distribution=sample.distribution,
     )
-
-
-def when_planned(sample: Sample, drawn: int) -> str:
-    """Return, as a clause of an assumption, when the number of draws was chosen.
-
-    Args:
-        sample: the draws that count.
-        drawn: number of all independent draws.
-    """
-    planned = sample.planned[-1] if len(sample) else None
-    if planned is None:
-        return "their number was chosen before they were executed (the store does not know when)"
-    if planned > drawn:
-        return f"their number did not depend on their distances, although {planned} were planned and {drawn} are known"
-    return "their number was chosen before they were executed"
 
 
 def _require_one_number(sample: Sample, kind: str) -> None:
@@ -252,19 +190,82 @@ def _require_one_number(sample: Sample, kind: str) -> None:
         )
 
 
-def violations(sample: Sample) -> str:
-    """Return a clause that draws without a distance count as violations, with their numbers."""
-    numbers = [*sample.numbers_of("failed"), *sample.numbers_of("unmeasured")]
-    return (
-        f"{sample.failed} of {len(sample)} executions of independent draws have no distance and count as violations, "
-        f"larger than any distance ({listed(numbers)})"
-    )
-
-
-def _name(discarded: int) -> str:
-    return "sampling-discarding" if discarded else "scenario"
-
-
 def _require_counts(n: int, discarded: int) -> None:
     if not 0 <= discarded < n:
         raise CertificateError(f"of {n} trials, from 0 to {max(n - 1, 0)} can be discarded, not {discarded}.")
+
+
+# Independent draws among trials of any origin
+
+
+def countable_draws(sample: Sample, kind: str) -> Sample:
+    """Return the independent draws whose number was chosen before they were executed; ``kind`` is for messages.
+
+    Raises:
+        CertificateError: if there is none.
+    """
+    everything, drawn = len(sample.only("iid")), sample.rows(sample.countable)
+    if not everything:
+        raise CertificateError(f"{kind} needs independent draws of tasks, but there is none; run certify --audit N.")
+    if not len(drawn):
+        raise CertificateError(
+            f"the {everything} independent draws ended with the verdict, so their number depended on their distances "
+            "and none counts; certify --audit N draws until there are N in all, and counts only those after the first "
+            f"{everything}."
+        )
+    return drawn
+
+
+@part("audit")
+@dataclass(frozen=True, repr=False)
+class Audit(CertificateKind):
+    """Bound on all tasks except a share of the task space, from the independent draws among the trials."""
+
+    name: ClassVar[str] = "audit"
+    bounds_maximum: ClassVar[bool] = False
+    sorts_draws: ClassVar[bool] = True
+
+    def certify(self, sample: Sample, confidence: float = 0.95) -> Certificate:
+        """Return :func:`certify_audit` of the trials."""
+        return certify_audit(sample, confidence)
+
+
+@checked
+def certify_audit(sample: Sample, confidence: Probability = 0.95) -> Certificate:
+    """Return a bound on the volume of the tasks whose distance exceeds the largest one known, from independent draws.
+
+    Let h be the largest of N independent distances. The volume of tasks above h is bounded for any distance function.
+    The largest distance of all trials is at least h, so the volume above it is not larger, however those trials were
+    chosen. Only draws count whose number was chosen before they were executed (:attr:`Sample.countable`).
+
+    Raises:
+        CertificateError: if no independent draw counts, or the execution of a draw failed.
+    """
+    drawn = countable_draws(sample, "an audit")
+    if drawn.failed:
+        raise CertificateError(
+            f"{violations(drawn)}; to audit the other tasks, start a new store whose task space excludes these tasks."
+            f"{advice_to_remeasure(drawn)}"
+        )
+    volume, h = volume_bound(len(drawn), 0, 1 - confidence), sample.best
+    chosen = sample.distances[[origin != "iid" for origin in sample.origins]]
+    largest = float(np.nanmax(chosen)) if np.isfinite(chosen).any() else None
+    return Certificate(
+        kind="audit",
+        statement=share_above(sample, volume, confidence, at_most(h), len(drawn), ", the largest one found"),
+        upper_bound=h,
+        confidence=confidence,
+        volume=volume,
+        trials=len(drawn),
+        assumptions=(*how_drawn(sample, drawn), *ABOUT_DRAWS, *sample.remarks, ONE_CAMPAIGN),
+        details={
+            "largest_found": h,
+            "largest_drawn": drawn.best,
+            "largest_chosen": largest,
+            "exceeding": None if largest is None else int((drawn.distances > largest).sum()),
+            "not_counted": len(sample.only("iid")) - len(drawn),
+            "failed": sample.failed,
+            "failures": sample.failures,
+        },
+        distribution=sample.distribution,
+    )

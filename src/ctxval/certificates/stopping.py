@@ -39,17 +39,9 @@ class StoppingDecision(ShortRepr):
     next_point: Array | None = None
 
 
-@dataclass(frozen=True)
-class Screening:
-    """A cheap test whether the bound is clearly above the threshold.
-
-    Attributes:
-        draws: number of draws of the hyperparameters.
-        margin: allowance for the error of so few draws, in the probability that d* keeps the threshold.
-    """
-
-    draws: int
-    margin: float
+_SCREENINGS = ((8, 0.3), (32, 0.05))
+"""Cheap tests whether the bound is clearly above the threshold: how many draws of the hyperparameters, and a margin
+that allows for the error of so few draws, in the probability that d* keeps the threshold."""
 
 
 @checked
@@ -60,18 +52,13 @@ class StoppingRule(ShortRepr):
     Attributes:
         threshold: tau, in the distance's units.
         options: the certificate of the verdict; it must be the posterior bound.
-        screenings: cheap tests; while one shows that the bound is clearly above the threshold, it is not computed.
         confirmations: number of trials after the bound first keeps the threshold; it must still keep the threshold
             after them. They are executed where the largest draws of d* lie, and mostly correct a bound that is too
             low.
-
-    Raises:
-        InputError: if the certificate is not the posterior bound.
     """
 
     threshold: PositiveFloat
     options: CertificateOptions = field(default_factory=CertificateOptions.posterior)
-    screenings: tuple[Screening, ...] = (Screening(8, 0.3), Screening(32, 0.05))
     confirmations: NonNegativeInt = 2
 
     def __post_init__(self) -> None:
@@ -79,14 +66,10 @@ class StoppingRule(ShortRepr):
             raise InputError(f"this rule is for the posterior bound, got {self.options.kind.name!r}.")
 
     def decide(self, trials: Sequence[Trial], left: int) -> StoppingDecision:
-        """Return whether a campaign stops and, if not, which task must be executed next.
+        """Return whether a campaign with so many executions left stops and, if not, which task must be executed next.
 
-        While the bound is far above the threshold, this costs much less than the verdict.
-
-        Args:
-            trials: all trials of the campaign. Open trials count for the coverage of the task space, but their
-                distances are not waited for.
-            left: number of executions that are left.
+        While the bound is far above the threshold, this costs much less than the verdict. Open trials count for the
+        coverage of the task space, but their distances are not waited for.
         """
         if counterexample(trials, self.threshold) is not None:
             return StoppingDecision(decided=True)
@@ -96,7 +79,7 @@ class StoppingRule(ShortRepr):
             return StoppingDecision()
 
     def _by_the_bound(self, trials: Sequence[Trial], left: int) -> StoppingDecision:
-        sample, points = _ended(trials), _points(trials)
+        sample, points = _ended(trials), np.array([trial.unit_point for trial in trials])
         missing = covering(points, self._posterior.resolution, left)
         if missing is None or self._is_surely_too_high(sample):
             return StoppingDecision()
@@ -118,7 +101,8 @@ class StoppingRule(ShortRepr):
 
     def _has_stood(self, trials: Sequence[Trial]) -> bool:
         """Return whether the earlier trials already covered the task space with a bound that kept the threshold."""
-        if not trials or covering(_points(trials), self._posterior.resolution, 0) is None:
+        points = np.array([trial.unit_point for trial in trials])
+        if not trials or covering(points, self._posterior.resolution, 0) is None:
             return False
         try:
             return self._is_kept(_ended(trials))[1]
@@ -139,15 +123,11 @@ class StoppingRule(ShortRepr):
         if instantaneous is not None and instantaneous["max_ucb"] > self.threshold:
             return True
         return any(
-            draw_maxima(sample, draws=one.draws, stochastic=stochastic).probability(self.threshold)
-            < self.options.confidence - one.margin
-            for one in self.screenings
+            draw_maxima(sample, draws=draws, stochastic=stochastic).probability(self.threshold)
+            < self.options.confidence - margin
+            for draws, margin in _SCREENINGS
         )
 
 
 def _ended(trials: Sequence[Trial]) -> Sample:
     return Sample.of([trial for trial in trials if trial.state != "open"])
-
-
-def _points(trials: Sequence[Trial]) -> Array:
-    return np.array([trial.unit_point for trial in trials])

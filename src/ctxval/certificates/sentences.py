@@ -1,0 +1,204 @@
+"""What certificates state and assume, in sentences: numbers in, text out.
+
+The sentences of verdicts are in :mod:`ctxval.certificates.verdict_sentences`. Why a bound is withdrawn
+stands beside the test that withdraws it, in the diagnostics.
+"""
+
+from __future__ import annotations
+
+from ctxval._util.representation import counted
+from ctxval.certificates.bounds import at_most, of_tasks, percent, with_error, with_units
+from ctxval.certificates.dynamics_evidence import DynamicsEvidence
+from ctxval.certificates.sample import Sample, listed
+
+ONE_CAMPAIGN = (
+    "this campaign was fixed beforehand and not chosen among several: the best of several is wrong more often than "
+    "stated"
+)
+"""The assumption that all certificates share."""
+
+UNSEEN = (
+    "M was not learned from these tasks, nor chosen after seeing them: a model that is retrained on them needs a new "
+    "store and fresh draws"
+)
+"""The assumption that all bounds from independent draws share."""
+
+NO_BOUND = "nothing is said of how large the distance is in the volume left out: this is no bound on d*"
+
+ABOUT_DRAWS = (
+    UNSEEN,
+    "each task has one distance: the system is deterministic",
+    "nothing is assumed of how the distance depends on the task",
+    NO_BOUND,
+)
+"""Assumptions and limits of the statements by independent draws among trials of any origin."""
+
+FROZEN = (
+    "the prediction was learned only from the model's own data and from trials before the first of these draws, and M "
+    "and the way of predicting were not changed after the draws were known"
+)
+"""The assumption that the prediction was fixed before the draws."""
+
+ANY_ORDER = "how the tasks were chosen and when the campaign stopped does not matter"
+
+
+# Independent draws
+
+
+def share_above(sample: Sample, volume: float, confidence: float, limit: str, draws: int, remark: str = "") -> str:
+    """Return the statement that at most a share of the tasks exceeds a limit, by independent draws."""
+    return (
+        f"With {percent(confidence)} confidence, at most {at_most(100 * volume, 3)} % {of_tasks(sample.distribution)} "
+        f"have a distance above {limit}{remark} ({counted(draws, 'independent draw')})."
+    )
+
+
+def how_drawn(sample: Sample, drawn: Sample, tasks: str = "the audited tasks") -> tuple[str, ...]:
+    """Return, as assumptions, how the draws that count were drawn, and how many draws do not count."""
+    missing = len(sample.only("iid")) - len(drawn)
+    first = f"{tasks} are independent and {distributed(sample)}, and {_when_planned(drawn, len(drawn) + missing)}"
+    if not missing:
+        return (first,)
+    return (
+        first,
+        f"{missing} other independent draws do not count: the number of draws was changed, or the verdict ended them, "
+        "after they were known",
+    )
+
+
+def distributed(sample: Sample) -> str:
+    """Return how independent draws are distributed, as the end of a clause "the tasks are independent and ..."."""
+    if sample.distribution is None:
+        return "uniform over the task space"
+    return f"follow the stated distribution of tasks ({sample.distribution})"
+
+
+def _when_planned(drawn: Sample, known: int) -> str:
+    planned = drawn.planned[-1]
+    if planned is None:
+        return "their number was chosen before they were executed (the store does not know when)"
+    if planned > known:
+        return f"their number did not depend on their distances, although {planned} were planned and {known} are known"
+    return "their number was chosen before they were executed"
+
+
+def violations(sample: Sample) -> str:
+    """Return a clause that draws without a distance count as violations, with their numbers."""
+    numbers = [*sample.numbers_of("failed"), *sample.numbers_of("unmeasured")]
+    return (
+        f"{sample.failed} of {len(sample)} executions of independent draws have no distance and count as violations, "
+        f"larger than any distance ({listed(numbers)})"
+    )
+
+
+def margin_and_map(
+    sample: Sample, margin: float, volume: float, total: float, confidence: float, limit: str, kept: str
+) -> str:
+    """Return the statement of a region: the margin of the prediction, and the share of the tasks above a limit."""
+    excess = (
+        f"exceeds the predicted one by at most {at_most(margin)}"
+        if margin >= 0
+        else f"is below the predicted one by at least {at_most(margin).removeprefix('-')}"
+    )
+    return (
+        f"With {percent(confidence)} confidence, the distance {excess}, except on at most {at_most(100 * volume, 3)} % "
+        f"{of_tasks(sample.distribution)}; {kept}, so that the distance exceeds {limit} on at most "
+        f"{at_most(100 * total, 3)} % in all."
+    )
+
+
+# The posterior of the distance
+
+
+def posterior_statement(upper: float, error: float, confidence: float, *, stochastic: bool) -> str:
+    """Return the bound on d* from a Gaussian process of the distance."""
+    what, bound = "the largest expected distance" if stochastic else "d*", with_error(upper, error)
+    remark = " (plus or minus one standard error of the random draws that it is computed from)" if "±" in bound else ""
+    return (
+        f"With {percent(confidence)} probability under a Gaussian process of the distance, given the trials, {what} is "
+        f"at most {bound}{remark}."
+    )
+
+
+def posterior_assumptions(sample: Sample, used: int, resolution: float, *, stochastic: bool) -> tuple[str, ...]:
+    """Return what the posterior bound assumes; the process is conditioned on so many of the trials."""
+    noise = (
+        "executions of one task differ by independent normal noise of one size"
+        if stochastic
+        else "each task has one distance: the system is deterministic"
+    )
+    left_out = (
+        f"the process is conditioned on {used} of the {len(sample)} trials, the largest distances, the latest and "
+        "well-spread ones, because all would take too long; the others would hardly raise the bound",
+    )
+    return (
+        f"the {'expected distance' if stochastic else 'distance, or its logarithm,'} is a draw from a Gaussian "
+        "process: a constant mean, a Matern kernel of smoothness 3/2 or 5/2, one length-scale for each parameter, all "
+        "of them unknown and integrated over",
+        f"it is as rough in one part of the task space as in another, as far as {resolution:g} of its diagonal from "
+        "the trials: a peak in a gap between them, of which no trial shows a trace, is not covered; audit for that",
+        noise,
+        ANY_ORDER,
+        *(left_out if used < len(sample) else ()),
+    )
+
+
+def both_outcomes(sample: Sample, *, stochastic: bool) -> str | None:
+    """Return why a bound is withdrawn if a failed task later succeeded for no stated reason; None if none did."""
+    first = next((success for success in sample.made_good if success.because is None), None)
+    if first is None:
+        return None
+    what = (
+        "a failure has no distance, so that nothing is known of the expected one there"
+        if stochastic
+        else "the system is not deterministic there"
+    )
+    return (
+        f"trial {first.trial} failed and trial {first.by} executed the same task with success, for no stated reason: "
+        f"{what}, and the bound is withdrawn; if the cause was removed in between, execute the task once more and say "
+        f'so: ctxval ask STORE --again {first.trial} --because "what was changed"'
+    )
+
+
+# Learned dynamics
+
+
+def dynamics_statement(upper: float, error: float, confidence: float) -> str:
+    """Return the bound on d* from learned dynamics."""
+    return (
+        f"With {percent(confidence)} probability under a Gaussian process of the residual dynamics, d* is at most "
+        f"{with_error(upper, error)}."
+    )
+
+
+def dynamics_assumptions(evidence: DynamicsEvidence) -> tuple[str, ...]:
+    """Return what the bound from learned dynamics assumes."""
+    coordinates = len(evidence.coverage.resolution)
+    prior = (
+        "the residual x' - M(x, u) is a draw from a Gaussian process: a Matern kernel of smoothness 3/2 or 5/2 that "
+        "may grow with the inputs, plus a linear function"
+    )
+    if evidence.without_model:
+        prior = (
+            "a smooth function and a linear model explain the records far better than one and M, so the system is "
+            "learned without M: its difference from the linear model that fits best is a draw from a Gaussian process, "
+            "a Matern kernel of smoothness 3/2, 5/2 or 9/2 that may grow with the inputs, plus a linear function"
+        )
+    joint = "what happens only at a combination of three or more coordinates that was never visited is not covered"
+    if evidence.coverage.pair is None:
+        joint = (
+            f"with {coordinates} coordinates of state and input, the records cover each one alone and not all "
+            "combinations: what happens only at a combination that was never visited, such as a contact in a corner, "
+            "is not covered"
+        )
+    return (
+        "the recorded state is complete: the next state depends on it and on the input alone",
+        "the system is deterministic, and its dynamics do not change with time or with the task",
+        f"{prior}; its hyperparameters are unknown and integrated over",
+        "in gaps of the records, the residual is like what was seen beside them; the largest gaps of states and inputs "
+        f"are {with_units(evidence.coverage.resolution)}",
+        joint,
+        f"the search of {evidence.evaluations} closed loops on the learned dynamics found the largest distance of each "
+        "posterior sample",
+        ANY_ORDER,
+    )

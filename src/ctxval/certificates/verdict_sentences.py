@@ -1,0 +1,321 @@
+"""What verdicts say, in sentences with units, tasks and numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import islice
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ctxval._util.representation import counted, shown
+from ctxval._util.texts import parted
+from ctxval.certificates.bounds import at_most, of_tasks, percent, with_error, with_units
+from ctxval.certificates.covering import RESOLUTION
+from ctxval.certificates.sample import executions_of
+from ctxval.core.space import TaskSpace
+from ctxval.core.trial import Trial
+
+if TYPE_CHECKING:
+    from ctxval.certificates.base import Certificate
+    from ctxval.certificates.forecast import Forecast
+
+_NAMED = 3  # most task parameters that a sentence names
+
+
+@dataclass(frozen=True)
+class Quantities:
+    """What gives numbers their units, and tasks their names.
+
+    Attributes:
+        units: the units of the distance.
+        space: the task space; None if it is not known.
+    """
+
+    units: str = ""
+    space: TaskSpace | None = None
+
+    def of(self, text: str) -> str:
+        """Return a distance as text with its units."""
+        return f"{text} {self.units}".rstrip()
+
+    @property
+    def ranges(self) -> str:
+        """The tasks, such as `` (start 0 to 0.4 m, goal 0.2 to 1.2 m)``; empty if they are not known or too many."""
+        if self.space is None or self.space.dimension > _NAMED:
+            return ""
+        ends = zip(self.space.labels, self.space.low.tolist(), self.space.high.tolist(), strict=True)
+        ranges = ((*parted(label), low, high) for label, low, high in ends)
+        return f" ({', '.join(f'{name} {low:.4g} to {high:.4g} {unit}'.rstrip() for name, unit, low, high in ranges)})"
+
+    def task(self, trial: Trial) -> str:
+        """Return the task of a trial by its parameters, at most six of them."""
+        space, at = self.space, trial.unit_point
+        if space is None or at.shape != (space.dimension,):
+            return shown(trial.parameters)
+        values = dict(islice(zip(space.labels, space.from_unit(at).tolist(), strict=True), 6))
+        return with_units(values, digits=4) + (", ..." if len(at) > 6 else "")
+
+    def lengths(self, share: float) -> str:
+        """Return a share of each range in the units of the task parameters, if they are few and known."""
+        space = self.space
+        if space is None or space.dimension > _NAMED:
+            return f"{share:.2g} of each parameter's range"
+        widths = zip(space.labels, (space.high - space.low).tolist(), strict=True)
+        lengths = {label: f"{share * width:.2g} {parted(label)[1]}".rstrip() for label, width in widths}
+        return " and ".join(f"{length} in {parted(label)[0]}" for label, length in lengths.items())
+
+
+NO_UNITS = Quantities()
+
+# Falsified
+
+
+def falsified(worst: Trial, trials: Sequence[Trial], tau: float, quantities: Quantities) -> str:
+    """Return which executed task exceeds a threshold, and how often an execution of the same task reproduced it."""
+    distance, limit = distinguishable(worst.distance or 0.0, tau)
+    again = [(trial.distance or 0.0) > tau for trial in executions_of(worst, trials) if trial is not worst]
+    reproduced = ""
+    if again:
+        times = {1: "once", 2: "twice"}.get(sum(again), f"{sum(again)} times")
+        reproduced = f", reproduced {times}" if any(again) else ""
+        if not all(again):
+            reproduced += f" ({len(again) - sum(again)} of {len(again)} repetitions of the task did not exceed it)"
+    return (
+        f"trial {worst.number} was executed and its distance {quantities.of(distance)} exceeds {quantities.of(limit)}, "
+        f"at {quantities.task(worst)}{reproduced}."
+    )
+
+
+def distinguishable(value: float, tau: float) -> tuple[str, str]:
+    """Return two numbers as texts, with enough digits to show which one is larger."""
+    for digits in range(4, 17):
+        texts = at_most(value, digits) if value <= tau else f"{value:.{digits}g}", f"{tau:.{max(digits, 6)}g}"
+        if np.sign(float(texts[0]) - float(texts[1])) == np.sign(value - tau):
+            return texts
+    return repr(value), repr(tau)
+
+
+def _bound_and_limit(certificate: Certificate, tau: float, quantities: Quantities) -> tuple[str, str]:
+    """Return a bound and the threshold as texts, the bound with its error if it has one."""
+    upper, limit = with_error(certificate.upper_bound, certificate.error), f"{tau:.6g}"
+    if "±" not in upper:
+        upper, limit = distinguishable(certificate.upper_bound, tau)
+    return quantities.of(upper), quantities.of(limit)
+
+
+# Validated
+
+
+def validated(certificate: Certificate, tau: float, quantities: Quantities) -> str:
+    """Return what is validated: which tasks stay below the threshold, by which bound, and if what holds."""
+    upper, limit = _bound_and_limit(certificate, tau, quantities)
+    level, tests = percent(certificate.confidence), certificate.details.get("tests")
+    untested = "" if tests is None or tests["drawn"] else f"{_UNTESTED}; "
+    if certificate.volume:
+        return (
+            f"{untested}with {level} confidence, at most {at_most(100 * certificate.volume, 3)} % "
+            f"{of_tasks(certificate.distribution)}{quantities.ranges} exceed {limit}: the {certificate.kind} bound is "
+            f"{upper}, from {counted(certificate.trials, 'independent draw')}."
+        )
+    best = certificate.details.get("best")
+    largest = "" if best is None else f", the largest distance {quantities.of(f'{best:.4g}')}"
+    return (
+        f"{untested}every task{quantities.ranges} stays at or below {limit}: the {certificate.kind} bound is {upper}, "
+        f"with {level} {_condition(certificate, quantities)}. {counted(certificate.trials, 'execution')}{largest}"
+        f"{_tested(certificate, tau)}."
+    )
+
+
+_UNTESTED = "no prediction was tested where nobody chose to look (tests = 0)"
+
+
+def _condition(certificate: Certificate, quantities: Quantities) -> str:
+    """Return what the confidence of a bound on d* is, and the condition under which it holds."""
+    if certificate.kind == "dynamics":
+        missed = "the system" if certificate.details["without_model"] else "what M misses"
+        return (
+            f"probability under a Gaussian process, if {missed} is one smooth function of recorded state and input, "
+            "the same in every task and over time"
+        )
+    if certificate.kind == "posterior":
+        what = "expected distance" if certificate.details.get("stochastic") else "distance"
+        return (
+            f"probability under a Gaussian process, if the {what} is as smooth between the trials as at "
+            f"them{_unusual(certificate, quantities)}"
+        )
+    return "confidence, if its assumptions hold"
+
+
+def _unusual(certificate: Certificate, quantities: Quantities) -> str:
+    """Return a resolution other than the default; empty if it is the default."""
+    resolution = certificate.details.get("resolution")
+    if resolution is None or resolution["diagonals"] == RESOLUTION:
+        return ""
+    diagonals = f"{resolution['diagonals']:g} diagonals; usual: {RESOLUTION:g}"
+    return f"{_gaps(resolution, quantities)} ({diagonals})"
+
+
+def _gaps(resolution: Mapping[str, float], quantities: Quantities) -> str:
+    """Return how large the gaps between trials may be, in the units of the tasks and as a share of the task space."""
+    share = 100 * resolution["of_the_space"]
+    if resolution["of_each_range"] >= 1:
+        return ", also in whole regions without a trial"
+    volume = f"{share:.0f}" if share >= 10 else f"{share:.2g}"
+    return f", in gaps of up to {quantities.lengths(resolution['of_each_range'])}, {volume} % of the task space"
+
+
+def _tested(certificate: Certificate, tau: float) -> str:
+    """Return what tests of predictions have shown, as the end of a sentence on the trials."""
+    tests = certificate.details.get("tests")
+    if tests is None or not tests["drawn"]:
+        return ""
+    if tests["largest_error"] is None:
+        return f"; {tests['drawn']} of them at tasks drawn over the whole task space"
+    within = at_most(100 * tests["largest_error"] / tau, 2)
+    return (
+        f"; {tests['drawn']} of them predicted beforehand at tasks drawn over the whole task space, all within "
+        f"{within} % of the threshold"
+    )
+
+
+# What it rests on
+
+
+def conditions(certificate: Certificate, space: TaskSpace | None) -> list[str]:
+    """Return what a validation by a built-in kind rests on: each entry completes a sentence "It rests on ..."."""
+    details = certificate.details
+    match certificate.kind:
+        case "dynamics":
+            gaps = with_units(details["resolution"])
+            return [
+                "the recorded state being complete",
+                "the system being deterministic, and its dynamics changing neither with time nor with the task",
+                f"its dynamics being, in gaps of the records of up to {gaps}, like what was seen",
+            ]
+        case "posterior":
+            return _posterior_conditions(details, Quantities(space=space))
+        case "audit" | "anytime" | "scenario" | "sampling-discarding" | "region":
+            draws = (
+                "tasks that were drawn independently, and from which M was not learned (how large the distance is in "
+                f"the {at_most(100 * certificate.volume, 3)} % that are left out is not known)"
+            )
+            fixed = ["a prediction that was fixed before these tasks were drawn"]
+            return [draws, *(fixed if certificate.kind == "region" else [])]
+    return ["what its certificate assumes"]
+
+
+def _posterior_conditions(details: Mapping[str, Any], quantities: Quantities) -> list[str]:
+    resolution = details.get("resolution")
+    where = "" if resolution is None else f"{_gaps(resolution, quantities)} (a peak inside one may be missed)"
+    smooth = f"the distance being as smooth between the trials as at them{where}"
+    if details.get("stochastic"):
+        return [
+            smooth,
+            "the noise that you declared being normal and alike everywhere (it is the expected distance that is "
+            "bounded: single executions may exceed it)",
+        ]
+    return [smooth, "each task having one distance, however often it is executed"]
+
+
+def rests_on(
+    conditions: Sequence[str], certificate: Certificate, tau: float, quantities: Quantities, remarks: Sequence[str]
+) -> str:
+    """Return what a validation rests on, and what independent draws say without any of it."""
+    parts = list(conditions)
+    made_good = certificate.details.get("failures", {}).get("made_good", [])
+    if made_good:
+        numbers = ", ".join(str(failure["trial"]) for failure in made_good)
+        parts.append(f"your word that what made trial {numbers} fail is removed for good")
+    parts += [f"your word that {remark}" for remark in remarks]
+    parts.append("this campaign not being chosen among several")
+    return f"It rests on {'; on '.join(parts)}.{_without_assumptions(certificate, tau, quantities)}"
+
+
+def _without_assumptions(certificate: Certificate, tau: float, quantities: Quantities) -> str:
+    """Return what independent draws say whatever the system is: none of them exceeds the threshold.
+
+    This holds at any time: a share of v is missed by the first n draws with probability (1 - v)^n.
+    """
+    draws = certificate.details.get("tests", {}).get("independent", 0)
+    if not draws:
+        return ""
+    share = at_most(100 * (1 - (1 - certificate.confidence) ** (1 / draws)), 2)
+    return (
+        f" Without assumptions: at most {share} % {of_tasks(certificate.distribution)} exceed "
+        f"{quantities.of(f'{tau:.6g}')} ({counted(draws, 'independent draw')}, {percent(certificate.confidence)})."
+    )
+
+
+# Undecided
+
+
+def undecided(certificate: Certificate, tau: float, volume: float, quantities: Quantities) -> str:
+    """Return why a certificate does not validate a threshold that a share of the tasks may exceed."""
+    if certificate.doubt is not None:
+        support = supported(certificate, tau, quantities)
+        return f"{support}; but {certificate.doubt}." if support else f"{certificate.doubt}."
+    upper, limit = _bound_and_limit(certificate, tau, quantities)
+    if certificate.upper_bound > tau:
+        return f"no distance above {limit} was executed, but d* may be up to {upper}{_shortfall(certificate)}."
+    if not certificate.covers(tau, certificate.volume):
+        return (
+            f"the {certificate.kind} bound is {upper}, and {limit} is too near to it for the random draws that it is "
+            "computed from; more executions tighten it."
+        )
+    return (
+        f"the {certificate.kind} bound of {counted(certificate.trials, 'trial')} leaves out "
+        f"{at_most(100 * certificate.volume, 3)} % {of_tasks(certificate.distribution)}, more than the "
+        f"{100 * volume:.3g} % that are acceptable{_shortfall(certificate)}; it is no bound on d*."
+    )
+
+
+def supported(certificate: Certificate, tau: float, quantities: Quantities = NO_UNITS) -> str:
+    """Return what speaks for a threshold although a bound from dynamics is withdrawn; empty if nothing does."""
+    if certificate.kind != "dynamics":
+        return ""
+    details = certificate.details
+    largest, predictions = details["largest_draw"], details["predictions"]
+    if largest is None or largest > tau or not predictions["held"]:
+        return ""
+    return (
+        f"supported by the model: no posterior sample of the dynamics exceeds "
+        f"{quantities.of(f'{tau:.6g}')} in a search of {details['evaluations']} closed loops; "
+        f"{predictions['held']} of the last {predictions['last_ones']} predictions held"
+    )
+
+
+def _shortfall(certificate: Certificate) -> str:
+    """Return why the bound or the volume left out is not smaller, as the end of a sentence; empty if unknown."""
+    details = certificate.details
+    if details.get("raised_from") is not None:
+        worst = next(checked for checked in details["checked"] if checked["trial"] == details["raised_by_trial"])
+        return (
+            f": trial {worst['trial']} came out at {worst['distance']:.4g} where {worst['median']:.4g} was predicted, "
+            f"which raises the bound from {details['raised_from']:.4g} until 3 predictions in a row hold. If "
+            "predictions go on failing, a state that is not recorded, a jump such as a contact or dry friction, or "
+            "noise is the likely cause: record more states, or use --kind posterior or an audit"
+        )
+    outside, missing = "", details.get("not_counted")
+    if "share_kept" in details:
+        outside = (
+            f" ({at_most(100 * details['volume_of_draws'], 3)} % because of the number of draws, and the rest because "
+            "the prediction plus its margin exceeds the threshold there)"
+        )
+    left = f"; {missing} draws do not count, as their number was changed after they were known" if missing else ""
+    return f"{outside}{left}"
+
+
+def outlook(forecast: Forecast, horizon: int) -> str:
+    """Return how many more executions are expected, and what they would decide, without a full stop."""
+    many = f"about {forecast.executions}" if forecast.executions is not None else f"more than {horizon}"
+    plural = "execution is" if forecast.executions == 1 else "executions are"
+    if forecast.fewest:
+        validate = f"{100 * forecast.validated:.0f} % of the posterior samples of the dynamics validate the threshold"
+        others = ", and the others falsify it" if forecast.falsified else ""
+        return f"at least {forecast.executions} more {plural} needed to decide: {validate}{others}"
+    shares = {"validated": forecast.validated, "falsified": forecast.falsified}
+    answer = max(shares, key=lambda name: shares[name])
+    outcome = f" ({answer} in {100 * shares[answer]:.0f} % of the simulated futures)" if shares[answer] else ""
+    return f"{many} more {plural} expected to decide{outcome}"
