@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 from ctxval import Campaign, Validation, cases, searches
-from ctxval.campaign.choices import Choice
+from ctxval.campaign.choices import Choice, Execution
 from ctxval.campaign.dynamics import NEAR
 from ctxval.campaign.execution import RetryPolicy, Schedule, execute_schedule
 from ctxval.campaign.interval_search import IntervalSearch
-from ctxval.campaign.workers import ExecutionResult, WorkerPool, execute_task
+from ctxval.campaign.workers import WorkerPool, execute_task
 from ctxval.certificates import CertificateOptions
 from ctxval.core.plan import Plan
 
@@ -33,7 +33,7 @@ class Pool(WorkerPool):
     def start(self, number: int, plan: Plan) -> None:
         self.running.append((number, plan))
 
-    def wait(self) -> tuple[int, ExecutionResult]:
+    def wait(self) -> tuple[int, Execution]:
         self.together.append([number for number, _ in self.running])
         row = np.random.default_rng([self.seed, len(self.together)]).integers(len(self.running))
         number, plan = self.running.pop(row)

@@ -19,7 +19,14 @@ from ctxval.campaign.dynamics import NEAR
 from ctxval.campaign.history import largest_distance, waiting_points
 from ctxval.campaign.steadiness import Steadiness
 from ctxval.campaign.trials import TrialRecorder
-from ctxval.certificates import CertificateOptions, CheckedPrediction, DynamicsEvidence, Sample, StoppingRule
+from ctxval.certificates import (
+    CertificateOptions,
+    CheckedPrediction,
+    DynamicsEvidence,
+    Sample,
+    StoppingRule,
+    Verdict,
+)
 from ctxval.certificates.anytime import AnytimeAudit
 from ctxval.certificates.automatic import Automatic
 from ctxval.certificates.covering import RESOLUTION, covering
@@ -36,22 +43,16 @@ from ctxval.certificates.dynamics_diagnostics import (
     untested,
     untried_parameter,
 )
+from ctxval.certificates.dynamics_evidence import with_units
 from ctxval.certificates.options import WITHIN
 from ctxval.certificates.posterior import Posterior
 from ctxval.certificates.prediction_tests import DRAWN, fewest_spread_tests, next_spread_test
 from ctxval.core.trial import Trial
 from ctxval.errors import CertificateError, InputError
 
-_FAILING = 6
-"""Number of the last predictions, of which at least half must hold."""
-_PATIENCE = 16
-"""Number of executions, besides tests, after which ``auto`` uses the posterior bound if the dynamics decide nothing."""
-_EXPLORE = 3
-"""Every so many executions, the task that leads farthest from the records is executed in any case."""
-_CROSSED = 6
-"""Largest number of tasks that share a parameter with a test that failed and the others with the worst task."""
-_SPREAD = 256
-"""Number of random tasks of which the one farthest from all known ones is taken."""
+_FAILING = 6  # of so many last predictions, at least half must hold
+
+_PATIENCE = 16  # executions, besides tests, after which `auto` uses the posterior bound if the dynamics decide nothing
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,14 +112,11 @@ class IntervalSearch:
             return None
         if isinstance(self.options.kind, AnytimeAudit):
             return self._by_draws(trials, self.options.kind)
-        test = self._next_test(trials)
-        if test is not None:
+        if (test := self._next_test(trials)) is not None:
             return test
         evidence = self._evidence(trials)
-        if evidence is not None:
-            task = self._beside_a_failed_test(trials, evidence)
-            if task is not None:
-                return Choice(task, "covering", planned_draws=0, rejected=0)
+        if evidence is not None and (task := self._beside_a_failed_test(trials, evidence)) is not None:
+            return Choice(task, "covering", planned_draws=0, rejected=0)
         if evidence is None or self._fails(evidence):
             return self._by_distance(trials)
         if self._may_decide(trials, evidence):
@@ -136,6 +134,10 @@ class IntervalSearch:
                 choice = self._by_distance(trials)
                 if not patient or choice is None:
                     return choice
+        return self._by_evidence(trials, evidence)
+
+    def _by_evidence(self, trials: Sequence[Trial], evidence: DynamicsEvidence) -> Choice:
+        """Return the task that the learned dynamics choose, or a test if nothing else is missing."""
         best, limit, confidence = largest_distance(trials), self.limit, self.options.confidence
         bound = bound_of(evidence, best, confidence)
         if max(bound, evidence.highest) <= limit and only_tests_missing(evidence, best, bound):
@@ -178,8 +180,8 @@ class IntervalSearch:
         if not self.predicts or any(trial.state == "failed" for trial in trials):
             return None
         dynamics = self.recorder.dynamics
-        found = dynamics.kept_evidence(trials, self.options.confidence) or dynamics.screening(trials)
-        return None if found is None else replace(found, tests=self.tests)
+        evidence = dynamics.kept_evidence(trials, self.options.confidence) or dynamics.screening(trials)
+        return None if evidence is None else replace(evidence, tests=self.tests)
 
     def _fails(self, evidence: DynamicsEvidence) -> bool:
         """Return whether predictions fail so often that the dynamics cannot be learned."""
@@ -187,7 +189,7 @@ class IntervalSearch:
             return False
         last, bound = evidence.predictions[-_FAILING:], evidence.upper(self.options.confidence)
         tolerated = max(min(bound, self.limit), self.limit - bound)  # as far as the margin to the limit allows
-        return len(last) == _FAILING and 2 * sum(held(one, tolerated) for one in last) < _FAILING
+        return len(last) == _FAILING and 2 * sum(held(prediction, tolerated) for prediction in last) < _FAILING
 
     def _may_decide(self, trials: Sequence[Trial], screened: DynamicsEvidence) -> bool:
         """Return whether the whole evidence may decide: nothing that a few draws show leaves the verdict open."""
@@ -200,10 +202,9 @@ class IntervalSearch:
     def _decides(self, trials: Sequence[Trial], evidence: DynamicsEvidence) -> bool:
         ended = [trial for trial in trials if trial.state != "open"]
         try:
-            found = certify_dynamics(Sample.of(ended), evidence, self.options.confidence)
+            return certify_dynamics(Sample.of(ended), evidence, self.options.confidence).covers(self.limit)
         except CertificateError:
             return False
-        return found.covers(self.limit)
 
     def _next_test(self, trials: Sequence[Trial]) -> Choice | None:
         """Return the next test if the last one held and more are missing: nothing needs to be searched for that."""
@@ -225,15 +226,15 @@ class IntervalSearch:
         best = largest_distance(trials)
         if raised(evidence, bound_of(evidence, best, self.options.confidence)) <= self.limit:
             return None
-        tests = (one for one in reversed(evidence.predictions) if one.stored and one.origin in DRAWN)
-        failed = next((one for one in tests if not held(one, best)), None)
+        tests = (test for test in reversed(evidence.predictions) if test.stored and test.origin in DRAWN)
+        failed = next((test for test in tests if not held(test, best)), None)
         worst = next((trial.unit_point for trial in trials if trial.distance == best), None)
         if failed is None or worst is None:
             return None
         known = _points(trials, self._dimension)
         learned = self.recorder.dynamics.learned(trials)
         unseen = [] if learned is None else learned.study.unseen_parameters
-        for j in [*unseen, *(j for j in range(self._dimension) if j not in unseen)][:_CROSSED]:
+        for j in [*unseen, *(j for j in range(self._dimension) if j not in unseen)][:6]:
             task = worst.copy()
             task[j] = failed.point[j]
             if np.abs(known - task).max(axis=1).min() > NEAR:
@@ -245,7 +246,7 @@ class IntervalSearch:
         if predictions is None:
             tests = [(trial.unit_point, trial.origin) for trial in trials if trial.distance is not None]
         else:
-            tests = [(np.array(one.point), one.origin) for one in tested(predictions, self.tests)]
+            tests = [(np.array(test.point), test.origin) for test in tested(predictions, self.tests)]
         tests += [(trial.unit_point, trial.origin) for trial in trials if trial.state == "open"]
         points = np.array([point for point, _ in tests]).reshape(-1, self._dimension)
         drawn = sum(origin in DRAWN for _, origin in tests)
@@ -259,8 +260,8 @@ class IntervalSearch:
         """Return the next independent draw of an anytime audit, which may end whenever its bound suffices."""
         ended = [trial for trial in trials if trial.state != "open"]
         if any(trial.origin == "iid" for trial in ended):
-            found, _ = kind.certify_against(Sample.of(ended), self.limit, self.options.confidence)
-            if found.covers(self.limit, self.options.volume):
+            certificate, _ = kind.certify_against(Sample.of(ended), self.limit, self.options.confidence)
+            if certificate.covers(self.limit, self.options.volume):
                 return None
         return Choice(self.recorder.draw(), "iid", planned_draws=0)
 
@@ -297,6 +298,22 @@ def require_decisive(options: CertificateOptions) -> None:
         raise InputError("a verdict by an anytime audit needs the volume that may exceed the threshold.")
 
 
+def with_next_task(verdict: Verdict, recorder: TrialRecorder, options: CertificateOptions) -> Verdict:
+    """Return a verdict; if it is undecided and learned dynamics choose the next task, with this task."""
+    failed = any(trial.state == "failed" for trial in recorder.trials)
+    if verdict.answer != "undecided" or failed or not is_decisive(options):
+        return verdict
+    search = IntervalSearch(recorder, options, recorder.executions + 1, verdict.threshold, keeps=False)
+    unit_point = search.by_dynamics()
+    if unit_point is None:
+        return verdict
+    space = recorder.validation.space
+    point = space.from_unit(space.rounded(unit_point))
+    task = with_units(dict(zip(space.labels, point.tolist(), strict=True)))
+    reason = f"{verdict.reason.removesuffix('.')}; next task: {task}."
+    return replace(verdict, reason=reason, next_task=space.describe_point(point))
+
+
 def next_task(
     evidence: DynamicsEvidence,
     known: Array,
@@ -325,7 +342,7 @@ def next_task(
     highest = evidence.points[[*order[rank::-1], *order[:rank:-1]]]
     farthest, largest = evidence.coverage.task[None], evidence.elites
     exceeds = evidence.upper(confidence) > limit
-    if exceeds and len(known) % _EXPLORE == _EXPLORE - 1:
+    if exceeds and len(known) % 3 == 2:  # every third execution leads farthest from the records in any case
         candidates = [farthest, highest]
     elif evidence.highest > limit:
         candidates = [largest, highest, farthest]
@@ -346,15 +363,11 @@ def next_task(
         most = 2 if np.array_equal(point, evidence.coverage.task) else 1
         return len(near) < most and not (near == point).all(axis=1).any()
 
-    candidates.append(_farthest_first(known))
-    return next((point for point in np.concatenate(candidates) if is_new(point) and steady(point)), None)
-
-
-def _farthest_first(known: Array) -> Array:
-    """Return tasks spread over the cube, points ``(m, d)``, the one farthest from the known tasks first."""
-    spread = np.random.default_rng(len(known)).random((_SPREAD, known.shape[1]))
+    # Of random tasks, the one farthest from all known tasks comes first.
+    spread = np.random.default_rng(len(known)).random((256, known.shape[1]))
     away = np.abs(spread[:, None] - known).max(axis=2).min(axis=1, initial=1.0)
-    return spread[np.argsort(-away, kind="stable")]
+    candidates.append(spread[np.argsort(-away, kind="stable")])
+    return next((point for point in np.concatenate(candidates) if is_new(point) and steady(point)), None)
 
 
 def _points(trials: Sequence[Trial], dimension: int) -> Array:

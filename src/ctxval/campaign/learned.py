@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from ctxval._util.arrays import Array
 from ctxval.campaign.dynamics import CampaignDynamics
-from ctxval.certificates import DynamicsEvidence
+from ctxval.campaign.history import executed_trials
+from ctxval.campaign.trials import TrialRecorder
+from ctxval.certificates import DynamicsEvidence, Provenance
+from ctxval.core.preflight import start_offset
 from ctxval.core.trial import Trial
 from ctxval.core.validation import Validation
 from ctxval.errors import CertificateError
 from ctxval.searches import Prediction
-
-_TASKS = 0x7461
-"""Identifies the random stream of tasks that are only predicted; it is none of the streams of trials."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -47,11 +47,26 @@ class LearnedFromTrials:
 
     def dynamics(self, confidence: float) -> DynamicsEvidence | None:
         """Return what the dynamics learned from all trials say about d*; None if nothing can be learned."""
-        found = self.study.evidence(self.trials, confidence)
-        if found is None and self.study.failure is not None:
+        evidence = self.study.evidence(self.trials, confidence)
+        if evidence is None and self.study.failure is not None:
             raise CertificateError(f"no dynamics can be learned: {self.study.failure.rstrip('.')}.")
-        return found
+        return evidence
 
     def tasks(self, count: int, seed: int) -> Array:
         """Return independent draws of tasks, points of the unit cube ``(count, d)``."""
-        return self.validation.space.unit_draws(count, np.random.default_rng([seed, _TASKS]))
+        # This random stream is none of those of trials.
+        return self.validation.space.unit_draws(count, np.random.default_rng([seed, 0x7461]))
+
+
+def provenance_of(recorder: TrialRecorder) -> Provenance:
+    """Return what a certificate needs besides the trials of a campaign."""
+    store, space, trials = recorder.store, recorder.validation.space, recorder.trials
+    with store.snapshot():
+        known = Provenance.of(store.description(), store.history())
+    offsets = [
+        (start_offset(recorder.validation, space.point(trial.parameters), executed), trial.number)
+        for trial, executed in executed_trials(store, trials)
+    ]
+    start = max(((offset.size, f"{offset.text} (trial {number})") for offset, number in offsets), default=None)
+    learned = LearnedFromTrials(recorder.validation, trials, recorder.dynamics)
+    return replace(known, space=space, learned=learned, start=start)

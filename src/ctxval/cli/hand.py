@@ -12,7 +12,7 @@ from ctxval._util.checked import NonNegativeFloat, require
 from ctxval._util.progress import advance, stage
 from ctxval._util.texts import enumerated
 from ctxval.campaign.by_hand import TRIAL_FILES, parameters_from, read_runs, write_files
-from ctxval.campaign.known import KnownExecution
+from ctxval.campaign.choices import Execution
 from ctxval.campaign.storage.other_stores import STORE_SUFFIXES
 from ctxval.campaign.storage.store import Store
 from ctxval.campaign.telling import ToldResult, parameters_of_trial, result_sentence, tell_result
@@ -22,6 +22,7 @@ from ctxval.cli.config.stored_settings import trusted_settings
 from ctxval.cli.options import named_values, require_folder
 from ctxval.cli.trust import Opened, budget_of, limit_of, open_store, open_target
 from ctxval.core.exchange import TASK_FORMAT
+from ctxval.core.plan import Plan
 from ctxval.core.trial import CONVERGED, Trial
 from ctxval.errors import InputError
 from ctxval.web.served import ServedCampaign
@@ -170,12 +171,14 @@ def import_runs(
     opened = open_store(Store.existing(store), store, experiment, trust, accept_change)
     campaign, made, mapping = opened.campaign, opened.experiment, opened.settings.log_mapping
     space = made.validation.space
-    runs = read_runs(files, parameters_from(parameters, space) if parameters else None, space)
-    checked = list[KnownExecution]()
+    given = parameters_from(parameters, space) if parameters else None
+    how = {"resample": resample, "start_tolerance": start_tolerance, "mapping": mapping}
+    runs = read_runs(files, given, space, **how)
+    checked = list[tuple[Plan, Execution]]()
     with stage("checking", len(runs), "runs"):
         for run in runs:  # all of them before any is stored
             try:
-                checked.append(run.checked(campaign.validation, made, resample, start_tolerance, mapping))
+                checked.append(run.checked(campaign.validation, made))
             except InputError as error:
                 raise InputError(f"{run.where}: {error}") from error
             advance(1)

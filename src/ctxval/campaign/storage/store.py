@@ -22,8 +22,7 @@ from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import Change, Trial
 from ctxval.errors import CtxvalError, ForeignStoreError, InputError, StoreAccessError, StoreMismatchError
 
-_DRAWS = "draws"
-"""Key in the table experiment that is not part of the description of the experiment."""
+_DRAWS = "draws"  # a key in the table experiment that is not part of the description of the experiment
 
 _CONTENT = (
     "SELECT key, value FROM experiment ORDER BY key",
@@ -41,7 +40,8 @@ _ENDED = "state = ?, distance = ?, failure = ?, executed = ?, checksum = ?"
 class Store:
     """A file with the trials of one experiment.
 
-    Every change is one transaction, which is on the disk before the call returns.
+    Every change is one transaction, which is on the disk before the call returns. Methods with the argument ``changes``
+    raise a :class:`StoreMismatchError` if the store has another number of changes; None skips this check.
 
     Args:
         path: the file; it is created if it does not exist. None keeps the trials in memory.
@@ -54,10 +54,8 @@ class Store:
     def __init__(self, path: str | Path | None = None) -> None:
         self._database = self._opened(path)
         self._trajectories = StoredTrajectories(self._database)
-        self.path: Path | None = self._database.path
-        """The absolute path of the file; None if the trials are in memory."""
-        self.name = self._database.name
-        """The name of the store in messages."""
+        # The absolute path of the file, None if the trials are in memory; and the name of the store in messages.
+        self.path, self.name = self._database.path, self._database.name
 
     def _opened(self, path: str | Path | None) -> Database:
         return Database(path)
@@ -123,8 +121,8 @@ class Store:
 
     def draws(self) -> int | None:
         """Return the number that seeds independent draws together with the seed. Returns None if none is stored."""
-        kept = self._pairs("experiment").get(_DRAWS)
-        return kept if isinstance(kept, int) else None
+        number = self._pairs("experiment").get(_DRAWS)
+        return number if isinstance(number, int) else None
 
     def keep_draws(self, number: int) -> None:
         """Store the number that seeds independent draws; a number that is stored already stays."""
@@ -149,9 +147,9 @@ class Store:
 
     def _pairs(self, table: str) -> dict[str, Any]:
         bounded = (f"CASE WHEN length({cell}) <= {rows.MOST_CHARACTERS} THEN {cell} END" for cell in ("key", "value"))
-        with self._database.rows(f"SELECT {', '.join(bounded)} FROM {table} ORDER BY rowid") as found:
+        with self._database.rows(f"SELECT {', '.join(bounded)} FROM {table} ORDER BY rowid") as pairs:
             try:
-                return rows.read_pairs(found)
+                return rows.read_pairs(pairs)
             except InputError as error:
                 raise self._database.damaged(f"the {table} in it cannot be read") from error
 
@@ -159,9 +157,9 @@ class Store:
 
     def history(self) -> list[Change]:
         """Return the later changes of the store in order, each with its reason."""
-        with self._database.rows("SELECT what, why, content, at FROM history ORDER BY number") as found:
+        with self._database.rows("SELECT what, why, content, at FROM history ORDER BY number") as changes:
             try:
-                return [Change(str(what), str(why), rows.read_json(text), str(at)) for what, why, text, at in found]
+                return [Change(str(what), str(why), rows.read_json(text), str(at)) for what, why, text, at in changes]
             except InputError as error:
                 raise self._database.damaged("its history cannot be read") from error
 
@@ -200,44 +198,26 @@ class Store:
 
     def open_trial(self, trial: Trial, model_trajectory: Trajectory, *, changes: int | None = None) -> None:
         """Store a new trial with its model trajectory, before its execution starts."""
-        with self._database.transaction():
-            self._require_unchanged(changes)
-            self._insert(trial)
-            self._trajectories.write(trial.number, "model", model_trajectory)
+        self.add([(trial, model_trajectory, None)], changes=changes)
 
-    def record_failed_plan(self, trial: Trial, *, changes: int | None = None) -> None:
-        """Store a new trial that failed before an execution of S."""
-        with self._database.transaction():
-            self._require_unchanged(changes)
-            self._insert(trial)
-
-    def record_known(
-        self, ended: Iterable[tuple[Trial, Trajectory, Trajectory | None]], *, changes: int | None = None
+    def add(
+        self, new: Iterable[tuple[Trial, Trajectory | None, Trajectory | None]], *, changes: int | None = None
     ) -> None:
-        """Store new trials that have ended already, with the trajectories of model and system, in one transaction."""
+        """Store new trials with their trajectories of model and system, None if there is none, in one transaction."""
         with self._database.transaction():
             self._require_unchanged(changes)
-            for trial, model_trajectory, system_trajectory in ended:
-                self._insert(trial)
+            for trial, model_trajectory, system_trajectory in new:
+                row = row_of(trial)
+                values = (*row, checksum_of(row), now(), None if trial.state == "open" else now())
+                places = ", ".join("?" * len(values))
+                self._database.execute(
+                    f"INSERT INTO trials ({COLUMNS}, checksum, opened_at, closed_at) VALUES ({places})", values
+                )
                 self._trajectories.write(trial.number, "model", model_trajectory)
-                if system_trajectory is not None:
-                    self._trajectories.write(trial.number, "system", system_trajectory)
-
-    def _insert(self, trial: Trial) -> None:
-        row = row_of(trial)
-        closed_at = None if trial.state == "open" else now()
-        places = ", ".join("?" * (len(row) + 3))
-        self._database.execute(
-            f"INSERT INTO trials ({COLUMNS}, checksum, opened_at, closed_at) VALUES ({places})",
-            (*row, checksum_of(row), now(), closed_at),
-        )
+                self._trajectories.write(trial.number, "system", system_trajectory)
 
     def begin_attempt(self, trial: Trial, *, changes: int | None = None) -> None:
-        """Record one more attempt, which the trial counts, before the execution starts.
-
-        Raises:
-            StoreMismatchError: if the store has another number of changes than ``changes``; None skips the check.
-        """
+        """Record one more attempt, which the trial counts, before the execution starts."""
         with self._database.transaction():
             self._require_unchanged(changes)
             changed = self._database.execute(
@@ -248,11 +228,7 @@ class Store:
                 raise self._not_open(trial.number)
 
     def close_trial(self, trial: Trial, system_trajectory: Trajectory | None, *, changes: int | None = None) -> None:
-        """Store the result of an open trial; of two results for one trial, the first is stored.
-
-        Raises:
-            StoreMismatchError: if the store has another number of changes than ``changes``.
-        """
+        """Store the result of an open trial; of two results for one trial, the first is stored."""
         with self._database.transaction():
             self._require_unchanged(changes)
             changed = self._database.execute(
@@ -262,17 +238,12 @@ class Store:
             ).rowcount
             if changed != 1:
                 raise self._not_open(trial.number)
-            if system_trajectory is not None:
-                self._trajectories.write(trial.number, "system", system_trajectory)
+            self._trajectories.write(trial.number, "system", system_trajectory)
 
     def replace_result(
         self, before: Trial, after: Trial, trajectory: Trajectory | None, why: str, *, changes: int | None = None
     ) -> None:
-        """Replace the result of a trial; the history keeps the earlier one, with its trajectory as NPZ in base 64.
-
-        Raises:
-            StoreMismatchError: if the store has another number of changes than ``changes``.
-        """
+        """Replace the result of a trial; the history keeps the earlier one, with its trajectory as NPZ in base 64."""
         executed = self.trajectory(before.number, "system")
         npz = None if executed is None else base64.b64encode(executed.to_npz()).decode()
         result = {"state": before.state, "distance": before.distance, "failure": before.failure, "npz": npz}
@@ -283,8 +254,7 @@ class Store:
                 (*_ended(after), now(), after.number),
             )
             self._trajectories.remove(after.number, "system")
-            if trajectory is not None:
-                self._trajectories.write(after.number, "system", trajectory)
+            self._trajectories.write(after.number, "system", trajectory)
             self._insert_change(Change("replaced", why, {"before": {str(before.number): result}}))
 
     def _not_open(self, number: int) -> InputError:
@@ -339,11 +309,7 @@ class Store:
             self._database.execute("INSERT OR REPLACE INTO computed VALUES (?, ?, ?)", (key, digest, text))
 
     def trajectory(self, number: int, side: Side) -> Trajectory | None:
-        """Return a stored trajectory of a trial, whose arrays may be changed. Returns None if there is none.
-
-        Raises:
-            ForeignStoreError: if the trajectory is damaged.
-        """
+        """Return a stored trajectory of a trial, whose arrays may be changed; None if there is none."""
         trajectory = self.trajectories([number], side).get(number)
         # Some distances change the arrays that they are given.
         return None if trajectory is None else trajectory.copy()
@@ -352,9 +318,7 @@ class Store:
         """Return stored trajectories by the numbers of their trials; a trial without one is left out.
 
         Those of the system are kept in memory, up to 512 MiB, so that they are read once. Their arrays are read-only.
-
-        Raises:
-            ForeignStoreError: if a trajectory is damaged.
+        A damaged trajectory is a :class:`ForeignStoreError`.
         """
         return self._trajectories.read(numbers, side)
 

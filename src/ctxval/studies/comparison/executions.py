@@ -10,7 +10,7 @@ from functools import partial
 import numpy as np
 
 from ctxval._util.arrays import Array
-from ctxval.campaign.choices import Choice
+from ctxval.campaign.choices import Choice, Execution
 from ctxval.campaign.execution import RetryPolicy, Schedule, execute_schedule
 from ctxval.core.plan import Plan, gives_inputs
 from ctxval.core.trajectory import Trajectory
@@ -133,7 +133,7 @@ class Executions:
                 with other.recorder.predicting(not of_draw):
                     copy = other.recorder.open(choice).trial
             try:
-                ended = other.recorder.complete(copy, other.recorder.validation.accept(plan, trajectory), trajectory)
+                ended = other.recorder.close(copy, Execution(trajectory).measured(other.recorder.validation, plan))
             except DistanceError:  # it is stored as unmeasured
                 return
         self._ended(other, ended)
