@@ -211,7 +211,7 @@ def study(one: tuple[str, str, int, int]) -> dict[str, Any]:
     with single_threaded():
         validation, largest = case(system, seed)
         campaign = Campaign(validation, search=searches.Auto("thorough"), seed=seed)
-        recorder, pool = campaign._recorder, SimulatedPool(validation.system, workers, seed)
+        recorder, pool = campaign.recorder, SimulatedPool(validation.system, workers, seed)
         decides = None
         if mode == "decide":
             decides = IntervalSearch(

@@ -48,7 +48,7 @@ def linear(dim: int = 2, seed: int = 0) -> Validation:
 
 
 def run(campaign: Campaign, pool: Pool, budget: int, rule: Callable[[], Choice | None] = Choice) -> Campaign:
-    execute_schedule(Schedule(campaign._recorder, rule, budget), pool, None, RetryPolicy())
+    execute_schedule(Schedule(campaign.recorder, rule, budget), pool, None, RetryPolicy())
     return campaign
 
 
@@ -96,8 +96,8 @@ def test_workers_never_run_the_same_task_at_the_same_time(seed: int) -> None:
 def test_spare_workers_that_decide_execute_different_tasks() -> None:
     validation = linear(2)
     pool, campaign = Pool(validation, 4), Campaign(validation, search=searches.Auto("fast"))
-    decides = IntervalSearch(campaign._recorder, CertificateOptions.or_automatic(None, 0.95, False, 0.1), 10)
-    with campaign._recorder.predicting(decides.predicts):
+    decides = IntervalSearch(campaign.recorder, CertificateOptions.or_automatic(None, 0.95, False, 0.1), 10)
+    with campaign.recorder.predicting(decides.predicts):
         found = points(run(campaign, pool, 10, decides.choose))
     for together in pool.together:
         gaps = np.abs(found[together][:, None] - found[together]).max(axis=2) + np.eye(len(together))
@@ -127,7 +127,7 @@ def test_what_is_being_executed_counts_as_predicted() -> None:
     validation = linear(3)
     campaign = Campaign(validation, search=searches.Auto("fast")).run(2, explore=True)
     opened = campaign.ask({"x_init": [1.0, -1.0, 1.0], "x_final": [-1.0, -1.0, 1.0]})
-    dynamics, place = campaign._recorder.dynamics, opened.trial.unit_point[None]
+    dynamics, place = campaign.recorder.dynamics, opened.trial.unit_point[None]
     prediction = dynamics.prediction(campaign.trials, pending=True)
     assert prediction is not None
     assert prediction.pending is not None

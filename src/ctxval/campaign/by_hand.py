@@ -6,7 +6,7 @@ import os
 import re
 import shutil
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -149,40 +149,26 @@ def parameters_from(settings: Sequence[str], space: TaskSpace) -> dict[str, Any]
     """
     given: dict[str, Any] = {}
     for text in settings:
-        for name, value in _assignments(text):
-            if name in given:
+        # A text after a comma that has no name is a further value of the last name.
+        for assignment in re.split(r",(?=[^,=]*=)", text):
+            name, equals, value = assignment.partition("=")
+            name = name.strip()
+            if not equals or not name or name in given:
                 raise InputError(f"each task parameter must be given once, as name=value, got {text!r}.")
-            given[name] = _value(name, value, space)
+            given[name] = _value(name, value.strip(), space)
     return _whole(given, space)
-
-
-def _assignments(text: str) -> Iterator[tuple[str, str]]:
-    """Yield names and values; a text after a comma that has no name is a further value of the last name."""
-    open_name, values = "", list[str]()
-    for part in text.split(","):
-        name, equals, value = part.partition("=")
-        if equals and open_name:
-            yield open_name, ",".join(values)
-        if equals:
-            open_name, values = name.strip(), [value]
-        else:
-            values.append(part)
-        if not open_name:
-            raise InputError(f"each task parameter must be given once, as name=value, got {text!r}.")
-    yield open_name, ",".join(values)
 
 
 def _value(name: str, text: str, space: TaskSpace) -> float | list[float]:
     """Return the number or the list of numbers in a text, which may have the unit of the parameter."""
-    base = name if name in space.units else name.partition("[")[0]
-    listed = text.strip()
-    if listed.startswith("["):
-        inside, bracket, unit = listed[1:].partition("]")
+    unit = space.units.get(name if name in space.units else name.partition("[")[0], "")
+    inside, given_unit, is_list = text, "", text.startswith("[")
+    if is_list:
+        inside, bracket, given_unit = text[1:].partition("]")
         if not bracket:
-            raise InputError(f"{name} must be a list such as [1.5, 0.5], got {listed!r}.")
-        return [_quantity(name, f"{number} {unit}", space.units.get(base, "")) for number in inside.split(",")]
-    numbers = [_quantity(name, number, space.units.get(base, "")) for number in listed.split(",")]
-    return numbers if len(numbers) > 1 else numbers[0]
+            raise InputError(f"{name} must be a list such as [1.5, 0.5], got {text!r}.")
+    numbers = [_quantity(name, f"{number} {given_unit}", unit) for number in inside.split(",")]
+    return numbers if is_list or len(numbers) > 1 else numbers[0]
 
 
 def _quantity(name: str, text: str, unit: str) -> float:

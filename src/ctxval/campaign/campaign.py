@@ -13,12 +13,12 @@ from ctxval._util.arrays import Array
 from ctxval._util.checked import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, Seconds, checked
 from ctxval._util.progress import stage
 from ctxval._util.progress_display import progress_shown
-from ctxval.campaign import display, remeasuring
+from ctxval.campaign import display
 from ctxval.campaign.choices import Choice, Execution, OpenTrial
+from ctxval.campaign.dynamics import provenance_of
 from ctxval.campaign.execution import RetryPolicy, Schedule, execute_schedule
 from ctxval.campaign.identity import description_of, identify, search_of
 from ctxval.campaign.interval_search import IntervalSearch, with_next_task
-from ctxval.campaign.learned import provenance_of
 from ctxval.campaign.plot import overview
 from ctxval.campaign.storage.store import Store
 from ctxval.campaign.trials import TrialRecorder
@@ -82,31 +82,27 @@ class Campaign:
         self.search: Search = search_of(trials) if search is None else search
         description = description_of(validation, self.search, self.seed, name)
         identify(trials, validation, description, accept_change, remeasure)
-        self._recorder = TrialRecorder(validation, self.search, trials, self.seed, description)
+        # The recorder of the trials, for code that chooses the tasks of several campaigns.
+        self.recorder = TrialRecorder(validation, self.search, trials, self.seed, description)
         if remeasure:
             self.remeasure()
 
     # The trials
 
     @property
-    def recorder(self) -> TrialRecorder:
-        """The recorder of the trials, for code that chooses the tasks of several campaigns."""
-        return self._recorder
-
-    @property
     def validation(self) -> Validation:
         """The map p -> d(p), with the present distance function."""
-        return self._recorder.validation
+        return self.recorder.validation
 
     @property
     def store(self) -> Store:
         """The store of the trials."""
-        return self._recorder.store
+        return self.recorder.store
 
     @property
     def trials(self) -> tuple[Trial, ...]:
         """All trials in the order of asking."""
-        return self._recorder.trials
+        return self.recorder.trials
 
     @property
     def completed(self) -> list[Trial]:
@@ -126,7 +122,7 @@ class Campaign:
     @property
     def executions(self) -> int:
         """The number of executions of S that have ended, with or without success."""
-        return self._recorder.executions
+        return self.recorder.executions
 
     @property
     def worst(self) -> Trial | None:
@@ -139,7 +135,7 @@ class Campaign:
 
     def start_offset(self, trial: Trial) -> StartOffset | None:
         """Return how far an execution started from the initial state of its task; None if it was not recorded."""
-        return self._recorder.start_offset(trial)
+        return self.recorder.start_offset(trial)
 
     # Running
 
@@ -208,7 +204,7 @@ class Campaign:
         options = CertificateOptions.or_automatic(certificate, confidence, stochastic, resolution)
         if explore is None:
             explore = threshold is None and not isinstance(self.search, Auto)
-        decides = None if explore else IntervalSearch(self._recorder, options, budget, threshold, within)
+        decides = None if explore else IntervalSearch(self.recorder, options, budget, threshold, within)
         by_search = Choice(planned_draws=budget if until is None else 0)
 
         def rule() -> Choice | None:
@@ -220,8 +216,8 @@ class Campaign:
         if retry_failures and pool is None:
             raise InputError("retry_failures needs workers, an executor or a timeout.")
         predicts = decides is not None and decides.predicts
-        with self._recorder.predicting(predicts), progress_shown(progress):
-            schedule = Schedule(self._recorder, rule, budget)
+        with self.recorder.predicting(predicts), progress_shown(progress):
+            schedule = Schedule(self.recorder, rule, budget)
             execute_schedule(schedule, pool, on_trial, RetryPolicy(retries, retry_failures))
         return self
 
@@ -246,16 +242,15 @@ class Campaign:
             workers, executor, timeout, progress: as in :meth:`run`.
 
         Raises:
-            InputError: if the number is not a positive integer.
             CertificateError: if people are executing open trials.
-            ModelError, DesignError, DistanceError: as in :meth:`run`.
+            InputError, ModelError, DesignError, DistanceError: as in :meth:`run`.
         """
 
         def missing() -> int:
             return max(0, draws - sum(trial.origin == "iid" for trial in self.trials))
 
         def rule() -> Choice | None:
-            return Choice(self._recorder.draw(), "iid", planned_draws=draws) if missing() else None
+            return Choice(self.recorder.draw(), "iid", planned_draws=draws) if missing() else None
 
         pool = worker_pool(self.validation.system, workers=workers, executor=executor, timeout=timeout)
         self.refresh()
@@ -267,7 +262,7 @@ class Campaign:
                 "before an audit."
             )
         with progress_shown(progress):
-            schedule = Schedule(self._recorder, rule, expected=self.executions + missing())
+            schedule = Schedule(self.recorder, rule, expected=self.executions + missing())
             execute_schedule(schedule, pool, on_trial, RetryPolicy())
         return self
 
@@ -301,15 +296,15 @@ class Campaign:
         if because is not None and (parameters is None or not because.strip()):
             raise InputError('because needs the parameters of an earlier task and a reason, such as "fuse replaced".')
         # An operator's time is worth a prediction: it is stored, and the execution tests it.
-        predicts = self._recorder.search.uses_prediction
-        with progress_shown(progress), self.store.sole_writer(wait), self._recorder.predicting(predicts):
+        predicts = self.recorder.search.uses_prediction
+        with progress_shown(progress), self.store.sole_writer(wait), self.recorder.predicting(predicts):
             self.refresh()
             if parameters is None:
-                return self._recorder.open(Choice(self._recorder.draw(), "iid") if draw else Choice())
+                return self.recorder.open(Choice(self.recorder.draw(), "iid") if draw else Choice())
             space = self.validation.space
             point = space.point(parameters)
             choice = Choice(space.to_unit(point), "manual", because, parameters=space.describe_point(point))
-            return self._recorder.open(choice)
+            return self.recorder.open(choice)
 
     @checked
     def ask_for_verdict(
@@ -327,38 +322,26 @@ class Campaign:
         """Open the trial that :meth:`run` would execute next for a threshold, if people execute it.
 
         Returns None if the model is validated or falsified for the threshold, or if the budget is spent. Open trials
-        count for the budget.
-
-        Args:
-            threshold, budget, confidence, stochastic, resolution, certificate: as in :meth:`run`.
-            wait, progress: as in :meth:`ask`.
-
-        Raises:
-            InputError, StoreAccessError, ModelError, DesignError: as in :meth:`ask`.
-            CertificateError: if an option of the certificate is not valid.
+        count for the budget. The arguments and the errors raised are those of :meth:`run` and :meth:`ask`.
         """
         options = CertificateOptions.or_automatic(certificate, confidence, stochastic, resolution)
         with progress_shown(progress), self.store.sole_writer(wait):
             self.refresh()
-            search = IntervalSearch(self._recorder, options, budget, threshold)
+            search = IntervalSearch(self.recorder, options, budget, threshold)
             waiting = sum(trial.state == "open" for trial in self.trials)
-            with self._recorder.predicting(search.predicts):
+            with self.recorder.predicting(search.predicts):
                 choice = search.choose() if self.executions + waiting < budget else None
-                return None if choice is None else self._recorder.open(choice)
+                return None if choice is None else self.recorder.open(choice)
 
     def reopen(self, number: int, *, ended: bool = False) -> OpenTrial:
         """Return an open trial again, with its task and controller.
 
-        Args:
-            number: the number of the trial.
-            ended: return a trial whose result was told, to replace the result.
-
-        Raises:
-            InputError: if there is no such trial, or it is in another state.
+        With ``ended``, return a trial whose result was told, to replace the result. An InputError is raised if there is
+        no such trial, or it is in another state.
         """
         self.refresh()
-        trial = self._recorder.trial(number, told=ended)
-        return OpenTrial(trial, self._recorder.plan(trial))
+        trial = self.recorder.trial(number, told=ended)
+        return OpenTrial(trial, self.recorder.plan(trial))
 
     @checked
     def tell(
@@ -391,7 +374,7 @@ class Campaign:
         self.refresh()
         if replace is not None and not replace.strip():
             raise InputError('replace needs a reason, such as "wrong file".')
-        recorder, told = self._recorder, replace is not None
+        recorder, told = self.recorder, replace is not None
         trial = recorder.trial(opened.number if isinstance(opened, OpenTrial) else opened, told=told)
         if isinstance(opened, OpenTrial) and not np.array_equal(opened.trial.unit_point, trial.unit_point):
             raise InputError(f"the open trial {opened.number} belongs to another campaign.")
@@ -416,12 +399,8 @@ class Campaign:
     ) -> Trial | None:
         """Record an earlier execution as a trial with the origin manual. It counts as an execution.
 
-        Returns:
-            the trial; None if the execution is already in the store.
-
-        Raises:
-            InputError, ExecutionError: as in :meth:`tell`; nothing is stored.
-            ModelError, DesignError: if the task cannot be planned; nothing is stored.
+        Returns None if the execution is already in the store. Nothing is stored if an error is raised: those of
+        :meth:`tell`, and a ModelError or a DesignError if the task cannot be planned.
         """
         point = self.validation.space.point(parameters)
         execution = Execution.reported(trajectory, distance, failed)
@@ -432,15 +411,11 @@ class Campaign:
         self, executions: Sequence[tuple[Plan, Execution]], wait: NonNegativeFloat = 0.0
     ) -> list[Trial | None]:
         """Record earlier executions that are measured; None if one is already in the store."""
-        return self._recorder.add(executions, wait)
+        return self.recorder.add(executions, wait)
 
     def refresh(self) -> None:
-        """Read the trials again if another process has changed the store.
-
-        Raises:
-            StoreMismatchError: if the store now belongs to another experiment.
-        """
-        self._recorder.refresh()
+        """Read the trials again if another process has changed the store; refuse it if its experiment has changed."""
+        self.recorder.refresh()
 
     def remeasure(self, distance: Distance | None = None) -> list[Trial]:
         """Recompute the distances of all stored executions, without an execution; return the trials that changed.
@@ -455,7 +430,7 @@ class Campaign:
             DistanceError: if the distance of a measured trial cannot be computed any more; nothing is changed.
             StoreAccessError: if another process is running the store.
         """
-        return remeasuring.remeasure(self._recorder, distance)
+        return self.recorder.remeasure(distance)
 
     # Results
 
@@ -466,12 +441,12 @@ class Campaign:
         If the search repeats its tasks, the estimate is the largest mean distance of a task with all its repetitions.
         It is None if there are too few distances.
         """
-        return self._recorder.search.estimate(*self._distances())
+        return self.recorder.search.estimate(*self._distances())
 
     @property
     def provenance(self) -> Provenance:
         """What a certificate needs besides the trials: the task space, the search, changes, and what M predicts."""
-        return provenance_of(self._recorder)
+        return provenance_of(self.store, self.validation, self.trials, self.recorder.dynamics)
 
     @checked
     def verdict(
@@ -500,12 +475,12 @@ class Campaign:
             progress: whether to show the progress on standard error; None to show it at a terminal and in a notebook.
 
         Raises:
-            InputError: if the threshold is not a positive number, or the confidence is below 0.5.
+            InputError: if the confidence is below 0.5.
             CertificateError: if an option of the certificate is not valid.
         """
         options = CertificateOptions.or_automatic(certificate, confidence, stochastic, resolution)
         with progress_shown(progress), stage("certifying"):
-            return with_next_task(judge(self.trials, threshold, options, self.provenance), self._recorder, options)
+            return with_next_task(judge(self.trials, threshold, options, self.provenance), self.recorder, options)
 
     @checked
     def certify(
@@ -517,10 +492,7 @@ class Campaign:
         certificate: CertificateOptions | None = None,
         progress: bool | None = None,
     ) -> Certificate:
-        """Return the bound on d*, which needs no threshold.
-
-        Args:
-            confidence, stochastic, resolution, certificate, progress: as in :meth:`verdict`.
+        """Return the bound on d*, which needs no threshold. The arguments are those of :meth:`verdict`.
 
         Raises:
             InputError: if the confidence is below 0.5.
@@ -533,12 +505,8 @@ class Campaign:
         return certified
 
     def surrogate(self) -> Surrogate:
-        """Return the Gaussian process of the distance over the task space, for every search.
-
-        Raises:
-            InputError: if fewer than two distances are known.
-        """
-        of_search = self._recorder.search.surrogate()
+        """Return the Gaussian process of the distance over the task space, for every search, from two distances on."""
+        of_search = self.recorder.search.surrogate()
         return fit_surrogate(*self._distances()) if of_search is None else of_search
 
     def to_dataframe(self) -> DataFrame:
@@ -547,9 +515,6 @@ class Campaign:
         The columns are number, origin, state, one for each task parameter (``name[0], name[1], ...`` for a vector),
         distance, seconds, attempts and failure. If a parameter has the name of another column, such as ``distance``,
         its column is ``parameters.distance``. Unknown values are missing values.
-
-        Raises:
-            InputError: if pandas is not installed.
         """
         return display.to_dataframe(self.trials, self.validation.space)
 
@@ -568,9 +533,6 @@ class Campaign:
             threshold: tau, drawn as a line; None if there is none.
             bound: a bound on d* from a certificate, drawn as a line; None if there is none.
             ax: matplotlib axes to draw into; new ones of ``matplotlib.pyplot`` by default.
-
-        Raises:
-            InputError: if no distance is known.
         """
         return overview(self, units=units, threshold=threshold, bound=bound, ax=ax)
 

@@ -11,7 +11,6 @@ from ctxval._util.interrupts import Interrupts, exits_as_exceptions
 from ctxval._util.progress import advance, is_heard, stage
 from ctxval._util.representation import named
 from ctxval.campaign.choices import Choice, Execution, OpenTrial
-from ctxval.campaign.remeasuring import remeasure
 from ctxval.campaign.trials import TrialRecorder
 from ctxval.campaign.workers import SerialPool, WorkerPool
 from ctxval.core.trial import CONVERGED, Trial
@@ -66,7 +65,7 @@ def execute_schedule(schedule: Schedule, pool: WorkerPool | None, on_trial: OnTr
     with recorder.store.sole_writer(), Interrupts() as interrupts, exits_as_exceptions():
         recorder.refresh()
         if any(trial.state == "unmeasured" for trial in recorder.trials):
-            remeasure(recorder)
+            recorder.remeasure()
         workers = SerialPool(recorder.validation.system) if pool is None else pool
         total = schedule.expected if schedule.budget is None else schedule.budget
         try:

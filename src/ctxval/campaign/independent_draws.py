@@ -15,9 +15,6 @@ from ctxval.core.trial import Trial
 from ctxval.core.validation import Validation
 from ctxval.errors import CtxvalError
 
-_AUDIT = 0x6175
-"""Identifies the random stream of an audit; the streams of searches have small numbers."""
-
 
 class IndependentDraws:
     """The random numbers of the independent draws of one campaign.
@@ -25,11 +22,6 @@ class IndependentDraws:
     They depend on the seed, so that a study can be repeated. They also depend on the model: otherwise, a model that was
     learned again with the results of an audit would be audited by the same tasks. The store keeps the number that
     depends on the model, so that a campaign continues with the same draws on another machine.
-
-    Args:
-        store: the store of the campaign.
-        validation: contains the model.
-        seed: the seed of the campaign.
     """
 
     def __init__(self, store: Store, validation: Validation, seed: int) -> None:
@@ -45,28 +37,19 @@ class IndependentDraws:
         return space.rounded(space.unit_draws(1, self.generator(trials))[0])
 
     def generator(self, trials: Sequence[Trial]) -> np.random.Generator:
-        """Return the random numbers of the next draw."""
-        entropy = [self._seed, len(trials), _AUDIT, self.of_model()]
+        """Return the random numbers of the next draw; the streams of searches have smaller numbers."""
+        entropy = [self._seed, len(trials), 0x6175, self.of_model()]
         return np.random.default_rng(np.random.SeedSequence(entropy))
 
     def of_model(self) -> int:
         """Return the number of the model, which the store keeps, because another processor rounds differently."""
-        kept = self._store.draws()
-        if kept is None:
+        if self._store.draws() is None:
             self._store.keep_draws(_number_of_model(self._validation))
-            kept = self._store.draws()
-        return kept or 0
-
-
-_STEPS = 2000
-"""Number of steps of a model, from states and inputs around those of its closed loops, that identify it."""
+        return self._store.draws() or 0
 
 
 def _number_of_model(validation: Validation) -> int:
-    """Return a number that identifies a model by what it computes; it changes if the model is learned again.
-
-    Independent draws of tasks depend on it, so that a model is never judged by the tasks of an earlier model.
-    """
+    """Return a number that identifies a model by its closed loops, and by steps from states and inputs around them."""
     space = validation.space
     rows: list[Array] = []
     for point in (space.low, 0.5 * (space.low + space.high), space.high):
@@ -78,7 +61,7 @@ def _number_of_model(validation: Validation) -> int:
     visited, n = np.concatenate(rows), loop.states.shape[-1]
     low, high = visited.min(axis=0), visited.max(axis=0)
     with suppress(CtxvalError):
-        z = np.random.default_rng(0).uniform(2 * low - high, 2 * high - low, (_STEPS, len(low)))
+        z = np.random.default_rng(0).uniform(2 * low - high, 2 * high - low, (2000, len(low)))
         rows.append(validation.model.step(z[:, :n], z[:, n:]))
     content = json.dumps([[f"{0.0 if abs(value) < 1e-12 else value:.5g}" for value in row.ravel()] for row in rows])
     return int.from_bytes(hashlib.sha256(content.encode()).digest()[:8], "big")

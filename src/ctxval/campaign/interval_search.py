@@ -17,7 +17,7 @@ from ctxval._util.arrays import Array
 from ctxval.campaign.choices import Choice
 from ctxval.campaign.dynamics import NEAR
 from ctxval.campaign.history import largest_distance, waiting_points
-from ctxval.campaign.steadiness import Steadiness
+from ctxval.campaign.proposals import Steadiness
 from ctxval.campaign.trials import TrialRecorder
 from ctxval.certificates import (
     CertificateOptions,
@@ -66,9 +66,6 @@ class IntervalSearch:
         threshold: tau, in the distance's units; None if there is none.
         within: without a threshold, the share by which the bound may exceed the largest executed distance at the end.
         keeps: whether the store keeps the evidence that may decide.
-
-    Raises:
-        InputError: if the certificate cannot be used, or an anytime audit may leave out no volume or has no threshold.
     """
 
     recorder: TrialRecorder

@@ -1,44 +1,119 @@
-"""Points that a search proposes, with what the executions so far teach and what thinking costs."""
+"""Points that a search proposes, and a test of tasks before they are executed.
+
+A design that ends by chance, such as one that rounding errors stop, gives nearly equal tasks different controllers. A
+search for the largest distance would find such chances, which nobody meets again. So a task is executed only if its
+distance is that of the tasks next to it.
+"""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
 import numpy as np
 
-from ctxval._util.arrays import Array
+from ctxval._util.arrays import Array, Rows
 from ctxval._util.progress import stage
 from ctxval._util.texts import enumerated, shortened
 from ctxval.campaign.choices import Choice
 from ctxval.campaign.costs import costs_of
 from ctxval.campaign.dynamics import PREDICTION, CampaignDynamics
 from ctxval.campaign.history import waiting_points
-from ctxval.campaign.steadiness import Steadiness
+from ctxval.core.model import Model
+from ctxval.core.rollout import rollout
 from ctxval.core.trial import CONVERGED, UNSTEADY, Trial
 from ctxval.core.validation import Validation
 from ctxval.errors import InputError
+from ctxval.learning.closed_loops import LoopPlanner
 from ctxval.searches import BaseSearch, SequentialSearch
 
-_MOVED = 0x6D6F
-"""Identifies the random stream of moves away from tasks that are not steady."""
+_MOVED = 0x6D6F  # identifies the random stream of moves away from tasks that are not steady
 
 
-_SPREAD = 512
-"""Number of random tasks of which the one farthest from all that are being executed is taken."""
+@dataclass(frozen=True, eq=False)
+class Steadiness:
+    """Tells for one choice which tasks may be executed, and counts the others.
+
+    Attributes:
+        planner: designs controllers; S is never executed.
+        expected: points ``(m, d)`` -> predicted distances ``(m,)``; None if nothing is predicted: then the closed loops
+            of a slightly disturbed M are compared.
+    """
+
+    planner: LoopPlanner
+    expected: Callable[[Array], Array] | None = None
+
+    _tested: dict[bytes, bool] = field(default_factory=dict, init=False)
+
+    @property
+    def rejected(self) -> int:
+        """The number of tasks that are not steady."""
+        return sum(not steady for steady in self._tested.values())
+
+    def __call__(self, point: Array) -> bool:
+        """Return whether rounding a task ``(d,)``, or moving it by 1e-9 of its ranges, hardly changes its distance.
+
+        After too many tests it is false, and the task does not count as rejected.
+        """
+        key = point.tobytes()
+        if key not in self._tested:
+            if len(self._tested) >= 24:
+                return False
+            rounded = self.planner.validation.space.rounded(point)
+            beside = np.where(rounded > 0.5, rounded - 1e-9, rounded + 1e-9)
+            with stage("testing a task", unit="designs"):
+                self._tested[key] = self._alike(np.stack([point, rounded, beside]))
+        return self._tested[key]
+
+    def moved(self, point: Array, rng: np.random.Generator) -> Array:
+        """Return a steady task next to a task that is not steady; the task itself if none is found."""
+        deviations = 1e-6 * 2.0 ** np.arange(12)
+        moves = deviations[:, None] * rng.normal(size=(len(deviations), len(point)))
+        steady = next(filter(self, np.clip(point + moves, 0, 1)), None)
+        if steady is None:
+            self._tested[point.tobytes()] = True  # it is executed, and so not rejected
+        return point if steady is None else steady
+
+    def _alike(self, points: Array) -> bool:
+        """Return whether tasks ``(m, d)`` have the same distance, or none of them a known one."""
+        try:
+            if self.expected is None:
+                shares = self._pushed_loops(points)
+            else:
+                values = self.expected(points)
+                shares = values[:, None] / max(values[np.isfinite(values)].max(initial=0.0), 1e-300)
+        except (Exception, SystemExit):  # the user's own parts; their failure is reported when the task is planned
+            return True
+        known = np.isfinite(shares).all(axis=1)
+        return not known.any() or bool(known.all() and (np.ptp(shares, axis=0) <= 0.05).all())
+
+    def _pushed_loops(self, points: Array) -> Array:
+        """Return the states of M, disturbed by 1 % of their ranges in each step, as shares of these ranges.
+
+        The shape is ``(m, (H + 1) n)``; NaN if the loop of a task is not known.
+        """
+        model, pushed = self.planner.validation.model, list[tuple[Rows, Array]]()
+        for planned in self.planner.plan(points):
+            ranges = np.ptp(planned.promised.states.reshape(-1, planned.promised.states.shape[-1]), axis=0)
+            ranges = np.maximum(ranges, 1e-3 * ranges.max())
+            step = partial(_pushed_step, model, 0.01 * ranges)
+            loops = rollout(step, planned.controller, planned.task)
+            pushed.append((planned.rows, (loops.states / ranges).reshape(len(planned.rows), -1)))
+        shares = np.full((len(points), max((states.shape[1] for _, states in pushed), default=1)), np.nan)
+        for rows, states in pushed:
+            shares[rows] = states
+        return shares
+
+
+def _pushed_step(model: Model, push: Array, x: Array, u: Array) -> Array:
+    return np.asarray(model.step(x, u) + push)
 
 
 class Proposals:
-    """Asks the search of a campaign for points, and tests points before they are executed.
-
-    Args:
-        validation: the map p -> d(p).
-        search: chooses points of the unit cube.
-        dynamics: predicts distances from the executed trajectories.
-    """
+    """Asks the search of a campaign for points, and tests points before they are executed."""
 
     def __init__(self, validation: Validation, search: BaseSearch, dynamics: CampaignDynamics) -> None:
         self._validation, self._search, self._dynamics = validation, search, dynamics
@@ -71,10 +146,10 @@ class Proposals:
         if self._dynamics.prediction(trials) is not None:
             return None
         rng = np.random.default_rng([len(trials), _MOVED])
-        some = rng.random((_SPREAD, waiting.shape[1]))
-        some = np.where(rng.random(some.shape) < rng.random((_SPREAD, 1)), np.round(some), some)
-        gaps = np.linalg.norm(some[:, None] - waiting, axis=2).min(axis=1)
-        return np.asarray(some[gaps.argmax()])
+        tasks = rng.random((512, waiting.shape[1]))
+        tasks = np.where(rng.random(tasks.shape) < rng.random((512, 1)), np.round(tasks), tasks)
+        gaps = np.linalg.norm(tasks[:, None] - waiting, axis=2).min(axis=1)
+        return np.asarray(tasks[gaps.argmax()])
 
     def tested(self, choice: Choice, trials: Sequence[Trial]) -> tuple[Array, dict[str, Any] | None]:
         """Return the point ``(d,)`` of a choice that another part has made, rounded and tested, and its note."""
@@ -102,7 +177,7 @@ class Proposals:
     def _executable(
         self, point: Array, trials: Sequence[Trial], steady: Steadiness, rejected: int
     ) -> tuple[Array, dict[str, Any] | None]:
-        """Return a proposed point, tested and rounded, and its note; tell the search which point it has become.
+        """Return a point that the search proposes, tested and rounded, and its note; tell the search the difference.
 
         The point of an earlier trial stays, and independent draws are only rounded.
         """

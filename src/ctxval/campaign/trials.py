@@ -17,13 +17,14 @@ from ctxval.campaign.choices import Choice, Execution, OpenTrial
 from ctxval.campaign.dynamics import CampaignDynamics
 from ctxval.campaign.goals_of_model import GoalsOfModel
 from ctxval.campaign.history import history_of
-from ctxval.campaign.identity import identify
+from ctxval.campaign.identity import identify, remeasure, with_distance
 from ctxval.campaign.independent_draws import IndependentDraws
 from ctxval.campaign.proposals import Proposals
-from ctxval.campaign.storage.fallback import error_with_fallback
+from ctxval.campaign.storage.disks import error_with_fallback
 from ctxval.campaign.storage.store import Store
 from ctxval.certificates import PLANNED
 from ctxval.core.controller import converged_of
+from ctxval.core.distance import Distance
 from ctxval.core.plan import Plan
 from ctxval.core.preflight import StartOffset, start_offset, try_distance
 from ctxval.core.trajectory import Trajectory
@@ -37,15 +38,10 @@ from ctxval.searches import BaseSearch, Search, SequentialSearch
 class TrialRecorder:
     """Opens and closes the trials of one campaign; the search knows exactly the trials in the store.
 
-    Args:
-        validation: the map p -> d(p).
-        search: chooses points of the unit cube.
-        store: the store of the trials, after a check that it belongs to this experiment.
-        seed: the seed of the search.
-        description: the description of the experiment from :func:`ctxval.campaign.identity.description_of`.
-
     Attributes:
-        validation, store, description: as above; :meth:`redefine` replaces validation and description.
+        validation: the map p -> d(p), which :meth:`remeasure` replaces.
+        store: the store of the trials, after a check that it belongs to this experiment.
+        description: the description of the experiment from :func:`ctxval.campaign.identity.description_of`.
         search: with the optional methods of :class:`ctxval.searches.BaseSearch`.
         draws: chooses the points of an audit.
         dynamics: what the trajectories teach of the dynamics.
@@ -144,7 +140,17 @@ class TrialRecorder:
         if stored != known:
             self.replay()
 
-    def redefine(self, validation: Validation, description: dict[str, Any]) -> None:
+    def remeasure(self, distance: Distance | None = None) -> list[Trial]:
+        """Recompute the distances of all stored executions, with another distance if one is given."""
+        validation, description = self.validation, self.description
+        if distance is not None:
+            validation = validation.with_distance(distance)
+            description = with_distance(description, validation.distance)
+        changed = remeasure(self.store, validation, description)
+        self._redefine(validation, description)
+        return changed
+
+    def _redefine(self, validation: Validation, description: dict[str, Any]) -> None:
         """Continue with another distance, after its values were stored."""
         self.validation, self.description, self._distance_tried = validation, description, False
         elsewhere = self.dynamics.elsewhere
@@ -244,17 +250,13 @@ class TrialRecorder:
     ) -> Trial:
         """Store a measured execution; return the trial in its final state.
 
-        Args:
-            trial: the open trial, or the trial whose result is replaced.
-            execution: what the execution gave.
-            replacing: the reason why the result replaces an earlier one.
-            executed: whether S was executed.
+        The trial is open, unless there is a reason for ``replacing`` its result.
         """
         ended = execution.ended(trial, executed=executed)
         trajectory = None if ended.state == "failed" else execution.trajectory
         if replacing is not None:
             self.store.replace_result(self._trials[ended.number], ended, trajectory, replacing, changes=self._changes)
-            self.redefine(self.validation, self.description)
+            self._redefine(self.validation, self.description)
         else:
             try:
                 self.store.close_trial(ended, trajectory, changes=self._changes)

@@ -12,6 +12,7 @@ import signal
 import threading
 import time
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from multiprocessing.connection import wait as wait_for
@@ -100,7 +101,7 @@ class SerialPool(WorkerPool):
 
 @dataclass(eq=False)
 class _Worker:
-    """A process, the number of the trial that it executes, and the start time of the execution."""
+    """A process, the number of the trial that it executes, None if it is free, and the start time of the execution."""
 
     process: Any
     pipe: Connection
@@ -108,7 +109,6 @@ class _Worker:
     started: float = 0.0
 
     def release(self) -> int:
-        """Make the worker free for another execution; return the number of the trial that it has executed."""
         number, self.number = self.number, None
         assert number is not None
         return number
@@ -117,12 +117,8 @@ class _Worker:
 class ProcessPool(WorkerPool):
     """Processes of this computer, each with its own copy of the system.
 
-    If processes can be forked, the system need not be picklable. A worker that dies or takes too long is replaced.
-
-    Args:
-        system: the system to execute.
-        size: the number of processes.
-        timeout: time limit of an execution in seconds; a longer execution is ended and has failed.
+    If processes can be forked, the system need not be picklable. A worker that dies, or whose execution takes longer
+    than ``timeout`` seconds, is ended and replaced.
     """
 
     def __init__(self, system: System, size: int, timeout: float | None = None) -> None:
@@ -132,7 +128,8 @@ class ProcessPool(WorkerPool):
 
     def start(self, number: int, plan: Plan) -> None:
         """Start the execution of a trial on a free worker."""
-        worker = next((one for one in self._workers if one.number is None), None) or self._start_worker()
+        free = (worker for worker in self._workers if worker.number is None)
+        worker = next(free, None) or self._start_worker()
         try:
             message = pickle.dumps((plan.controller, plan.task))
         except Exception as error:
@@ -177,7 +174,7 @@ class ProcessPool(WorkerPool):
             for worker in busy:
                 elapsed = time.monotonic() - worker.started
                 if self.timeout is not None and elapsed >= self.timeout:
-                    self._stop(worker)
+                    self._stop([worker])
                     return worker.release(), _timed_out(self.timeout, elapsed)
 
     def _received(self, worker: _Worker) -> tuple[int, Execution]:
@@ -185,29 +182,25 @@ class ProcessPool(WorkerPool):
         try:
             execution: Execution = pickle.loads(worker.pipe.recv_bytes())
         except (EOFError, OSError, pickle.UnpicklingError):
-            self._stop(worker)
+            self._stop([worker])
             return number, _result_of_exit(worker.process.exitcode)
         return number, execution
 
-    def _stop(self, worker: _Worker) -> None:
-        """End a worker, with some time to clean up, because it must end the process of a command too."""
-        worker.process.terminate()
-        self._await_end(worker)
-
-    def _await_end(self, worker: _Worker) -> None:
-        worker.process.join(_GRACE_PERIOD)
-        if worker.process.is_alive():
-            worker.process.kill()
-            worker.process.join()
-        worker.pipe.close()
-        self._workers.remove(worker)
+    def _stop(self, workers: Sequence[_Worker]) -> None:
+        """End workers, with some time to clean up, because they must end the process of a command too."""
+        for worker in workers:
+            worker.process.terminate()
+        for worker in workers:
+            worker.process.join(_GRACE_PERIOD)
+            if worker.process.is_alive():
+                worker.process.kill()
+                worker.process.join()
+            worker.pipe.close()
+            self._workers.remove(worker)
 
     def close(self) -> None:
         """End all workers and their executions at once."""
-        for worker in self._workers:
-            worker.process.terminate()
-        for worker in list(self._workers):
-            self._await_end(worker)
+        self._stop(list(self._workers))
 
 
 def _run_worker(system: System, pipe: Connection, others: list[Connection], parent: int) -> None:
@@ -237,7 +230,7 @@ def _run_worker(system: System, pipe: Connection, others: list[Connection], pare
 
 
 def _result_of_exit(status: int | None) -> Execution:
-    """Return the result after the end of a worker's process: failed if the system ended it, lost if it was killed."""
+    """Return what an execution gave whose process has ended: it failed if the system ended it, else it is lost."""
     if status is None:
         return Execution(lost="the worker ended for no known reason")
     if status < 0 or status == _TERMINATED:
@@ -280,14 +273,8 @@ def _exit_with_parent(parent: int) -> None:
 class ExecutorPool(WorkerPool):
     """An executor of ``concurrent.futures``: a pool of threads or processes, Dask, and others.
 
-    All threads of a pool share one system. An execution that takes too long is cancelled; a thread cannot be cancelled
-    and continues in the background.
-
-    Args:
-        system: the system to execute.
-        executor: the executor that runs the executions.
-        size: the number of executions at a time.
-        timeout: time limit of an execution in seconds; a longer execution has failed.
+    All threads of a pool share one system. An execution that takes longer than ``timeout`` seconds is cancelled; a
+    thread cannot be cancelled and continues in the background.
     """
 
     def __init__(self, system: System, executor: cf.Executor, size: int, timeout: float | None = None) -> None:

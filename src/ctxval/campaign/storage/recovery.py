@@ -163,20 +163,16 @@ def _take_trial(row: tuple[Any, ...], recovered: Recovered) -> None:
     if trial is None:
         fits = checksum_of(row[:-1]) == checksum
         recovered.note(f"trial {number}: {'it holds what no trial can' if fits else 'its checksum does not fit'}")
-    elif trial.number in recovered.trials:
-        recovered.note(f"trial {number} is there more than once, and the first one is taken")
     else:
-        recovered.trials[trial.number] = trial
+        recovered.trials.setdefault(trial.number, trial)
 
 
 def _take_trajectory(number: Any, side: Any, npz: Any, checksum: Any, recovered: Recovered) -> None:
     name = f"the {side}'s trajectory of trial {number}"
     if side not in get_args(Side) or not isinstance(number, int):
         recovered.note(f"{name}: there is no such thing")
-    elif (number, side) in recovered.trajectories:
-        recovered.note(f"{name} is there more than once, and the first one is taken")
     elif trajectory := read_trajectory(number, side, npz, checksum):
-        recovered.trajectories[number, side] = trajectory
+        recovered.trajectories.setdefault((number, side), trajectory)
     else:
         recovered.note(f"{name}: its checksum does not fit")
 

@@ -16,24 +16,13 @@ from ctxval._util.representation import Shown, call
 from ctxval._util.version import VERSION
 from ctxval.campaign.storage import rows, schema
 from ctxval.campaign.storage.database import Database, now
-from ctxval.campaign.storage.rows import COLUMNS, checksum_of, read_trial, real, row_of
+from ctxval.campaign.storage.rows import COLUMNS, checksum_of, read_trial, row_of
 from ctxval.campaign.storage.trajectories import Side, StoredTrajectories
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import Change, Trial
 from ctxval.errors import CtxvalError, ForeignStoreError, InputError, StoreAccessError, StoreMismatchError
 
 _DRAWS = "draws"  # a key in the table experiment that is not part of the description of the experiment
-
-_CONTENT = (
-    "SELECT key, value FROM experiment ORDER BY key",
-    "SELECT number, checksum FROM trials ORDER BY number",
-    "SELECT trial, side, checksum FROM trajectories ORDER BY trial, side",
-    "SELECT number, what, why, content FROM history ORDER BY number",
-)
-"""Queries of all that results follow from."""
-
-_ENDED = "state = ?, distance = ?, failure = ?, executed = ?, checksum = ?"
-"""The assignments that take the values of :func:`_ended`."""
 
 
 @checked
@@ -62,12 +51,7 @@ class Store:
 
     @classmethod
     def existing(cls, path: str | Path) -> Store:
-        """Open a store that must exist already.
-
-        Raises:
-            StoreAccessError: if there is no such file, or it cannot be read.
-            ForeignStoreError: if the file is not a store, or a store of another version.
-        """
+        """Open a store that must exist already; otherwise, and for other files, as the constructor raises."""
         schema.require_files(Path(path))
         if not os.path.exists(path):
             raise StoreAccessError(f"there is no store at {path}.")
@@ -84,11 +68,8 @@ class Store:
     def sole_writer(self, wait: float = 0.0) -> AbstractContextManager[None]:
         """Prevent other processes from running this store. The lock is released when the process ends, however it ends.
 
-        Args:
-            wait: seconds to wait for another process that is about to end.
-
-        Raises:
-            StoreAccessError: if another process is running the store.
+        If another process is running the store, wait so many seconds for its end, and then raise a
+        :class:`StoreAccessError`.
         """
         return self._database.sole_writer(wait)
 
@@ -181,7 +162,7 @@ class Store:
             if self.signature() != seen:
                 return False
             for trial in trials:
-                self._database.execute(f"UPDATE trials SET {_ENDED} WHERE number = ?", (*_ended(trial), trial.number))
+                self._update(trial)
             self._write_description(description)
             self._insert_change(change)
         return True
@@ -220,23 +201,14 @@ class Store:
         """Record one more attempt, which the trial counts, before the execution starts."""
         with self._database.transaction():
             self._require_unchanged(changes)
-            changed = self._database.execute(
-                "UPDATE trials SET attempts = ?, checksum = ? WHERE number = ? AND state = 'open'",
-                (trial.attempts, checksum_of(row_of(trial)), trial.number),
-            ).rowcount
-            if changed != 1:
+            if not self._update(trial, "AND state = 'open'"):
                 raise self._not_open(trial.number)
 
     def close_trial(self, trial: Trial, system_trajectory: Trajectory | None, *, changes: int | None = None) -> None:
         """Store the result of an open trial; of two results for one trial, the first is stored."""
         with self._database.transaction():
             self._require_unchanged(changes)
-            changed = self._database.execute(
-                f"UPDATE trials SET {_ENDED}, seconds = ?, closed_at = ? "
-                "WHERE number = ? AND state = 'open' AND attempts = ?",
-                (*_ended(trial), real(trial.seconds), now(), trial.number, trial.attempts),
-            ).rowcount
-            if changed != 1:
+            if not self._update(trial, f"AND state = 'open' AND attempts = {trial.attempts:d}", closed_at=now()):
                 raise self._not_open(trial.number)
             self._trajectories.write(trial.number, "system", system_trajectory)
 
@@ -249,13 +221,18 @@ class Store:
         result = {"state": before.state, "distance": before.distance, "failure": before.failure, "npz": npz}
         with self._database.transaction():
             self._require_unchanged(changes)
-            self._database.execute(
-                f"UPDATE trials SET {_ENDED}, closed_at = ? WHERE number = ?",
-                (*_ended(after), now(), after.number),
-            )
+            self._update(after, closed_at=now())
             self._trajectories.remove(after.number, "system")
             self._trajectories.write(after.number, "system", trajectory)
             self._insert_change(Change("replaced", why, {"before": {str(before.number): result}}))
+
+    def _update(self, trial: Trial, where: str = "", closed_at: str | None = None) -> bool:
+        """Store what an execution changes in a trial; return whether its row satisfies a further condition."""
+        columns = ("attempts", "state", "distance", "failure", "executed", "seconds")
+        row = dict(zip(COLUMNS.split(", "), row_of(trial), strict=True))
+        values = (*(row[name] for name in columns), checksum_of(row_of(trial)), closed_at, trial.number)
+        assignments = f"{' = ?, '.join(columns)} = ?, checksum = ?, closed_at = coalesce(?, closed_at)"
+        return self._database.execute(f"UPDATE trials SET {assignments} WHERE number = ? {where}", values).rowcount == 1
 
     def _not_open(self, number: int) -> InputError:
         row = self._database.execute("SELECT state FROM trials WHERE number = ?", (number,)).fetchone()
@@ -285,7 +262,12 @@ class Store:
         """Return a digest of all that results follow from: trials, trajectories, the experiment, and this version."""
         digest = hashlib.sha256(VERSION.encode())
         with self._database.snapshot():
-            for query in _CONTENT:
+            for query in (
+                "SELECT key, value FROM experiment ORDER BY key",
+                "SELECT number, checksum FROM trials ORDER BY number",
+                "SELECT trial, side, checksum FROM trajectories ORDER BY trial, side",
+                "SELECT number, what, why, content FROM history ORDER BY number",
+            ):
                 with self._database.rows(query) as content:
                     for row in content:
                         digest.update(repr(row).encode())
@@ -329,7 +311,3 @@ class Store:
         except CtxvalError:
             return call(self, place, Shown("cannot be read"))
         return call(self, place, trials=trials, open=waiting)
-
-
-def _ended(trial: Trial) -> tuple[Any, ...]:
-    return (trial.state, real(trial.distance), trial.failure, int(trial.executed), checksum_of(row_of(trial)))
