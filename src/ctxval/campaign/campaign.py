@@ -234,16 +234,8 @@ class Campaign:
     ) -> Campaign:
         """Execute independent draws from the distribution of tasks until the trials contain this number of them.
 
-        The search does not choose these tasks.
-
-        Args:
-            draws: total number of independent draws, including earlier ones.
-            on_trial: called with each trial that has ended.
-            workers, executor, timeout, progress: as in :meth:`run`.
-
-        Raises:
-            CertificateError: if people are executing open trials.
-            InputError, ModelError, DesignError, DistanceError: as in :meth:`run`.
+        The number of draws includes earlier ones. The other arguments and the errors raised are those of :meth:`run`;
+        a CertificateError is raised if people are executing open trials.
         """
 
         def missing() -> int:
@@ -428,7 +420,6 @@ class Campaign:
 
         Raises:
             DistanceError: if the distance of a measured trial cannot be computed any more; nothing is changed.
-            StoreAccessError: if another process is running the store.
         """
         return self.recorder.remeasure(distance)
 
@@ -467,16 +458,15 @@ class Campaign:
 
         Args:
             threshold: tau, in the units of the distance.
-            confidence: the confidence level of the certificate.
+            confidence: the confidence level of the certificate, at least 0.5.
             stochastic: whether two executions of one task may differ.
             resolution: the largest distance between a task and its nearest trial that a validation permits, in
                 diagonals of the task space.
             certificate: the kind and the options of the certificate, in place of ``auto`` with the three options above.
-            progress: whether to show the progress on standard error; None to show it at a terminal and in a notebook.
+            progress: as in :meth:`run`.
 
         Raises:
-            InputError: if the confidence is below 0.5.
-            CertificateError: if an option of the certificate is not valid.
+            InputError, CertificateError: if an option of the certificate is not valid.
         """
         options = CertificateOptions.or_automatic(certificate, confidence, stochastic, resolution)
         with progress_shown(progress), stage("certifying"):
@@ -494,9 +484,7 @@ class Campaign:
     ) -> Certificate:
         """Return the bound on d*, which needs no threshold. The arguments are those of :meth:`verdict`.
 
-        Raises:
-            InputError: if the confidence is below 0.5.
-            CertificateError: if an option of the certificate is not valid, or its theory refuses the trials.
+        A CertificateError is raised if the theory of the certificate refuses the trials.
         """
         options = CertificateOptions.or_automatic(certificate, confidence, stochastic, resolution)
         with progress_shown(progress), stage("certifying"):
@@ -528,11 +516,8 @@ class Campaign:
     ) -> Axes:
         """Draw the surrogate over one task parameter, or else the distances in their order; return the axes.
 
-        Args:
-            units: the units of the distance; by default, those of the validation.
-            threshold: tau, drawn as a line; None if there is none.
-            bound: a bound on d* from a certificate, drawn as a line; None if there is none.
-            ax: matplotlib axes to draw into; new ones of ``matplotlib.pyplot`` by default.
+        By default, the units are those of the validation, and the axes new ones of ``matplotlib.pyplot``. The threshold
+        and a bound on d* are drawn as lines.
         """
         return overview(self, units=units, threshold=threshold, bound=bound, ax=ax)
 

@@ -235,14 +235,12 @@ class CampaignDynamics:
         """Return the labels of the states and inputs, with units; ``x[0], ..., u[0], ...`` for those without names."""
         inputs = learned.posterior.data.inputs
         states = len(learned.coverage.resolution) - inputs
-        named = self._study.validation.names(states, inputs)
-        numbered = [*(f"x[{i}]" for i in range(states)), *(f"u[{i}]" for i in range(inputs))]
-        labels = [label for names in named for label in labels_of(names)]
-        if len(set(labels)) < len(labels):  # a state and an input of the same name
-            return tuple(numbered)
-        unnamed = [*(f"x{i}" for i in range(states)), *(f"u{i}" for i in range(inputs))]
+        coordinates = [*(("x", i) for i in range(states)), *(("u", i) for i in range(inputs))]
+        labels = [label for names in self._study.validation.names(states, inputs) for label in labels_of(names)]
+        twice = len(set(labels)) < len(labels)  # a state and an input of the same name
         return tuple(
-            number if label == none else label for number, none, label in zip(numbered, unnamed, labels, strict=True)
+            f"{letter}[{i}]" if twice or label == f"{letter}{i}" else label
+            for (letter, i), label in zip(coordinates, labels, strict=True)
         )
 
     def checked(self, trials: Sequence[Trial]) -> tuple[CheckedPrediction, ...]:

@@ -38,12 +38,8 @@ class RetryPolicy:
 class Schedule:
     """The order of the executions: first the interrupted trials, then the choices of a rule.
 
-    Attributes:
-        recorder: the recorder of the trials.
-        rule: returns the choice of a new trial, or None if there is none at present. It is called again after an
-            execution has ended.
-        budget: the total number of executions; None if only the rule ends the campaign.
-        expected: the total number of executions that are expected if there is no budget.
+    The rule returns None if there is no choice at present; it is called again after an execution has ended. Without a
+    budget, the total number of executions, only the rule ends the campaign, after about the expected number.
     """
 
     recorder: TrialRecorder
@@ -135,7 +131,8 @@ class _Loop:
             self.losses[opened.number] += 1
             losses = self.losses[opened.number]
             if losses <= self.retry.retries:
-                return self._repeat(opened)
+                self._repeat(opened)
+                return None
             failure = f"the worker was lost {losses} times, at last: {execution.lost}"
             return self.recorder.close(opened.trial, Execution(failed=failure))
         try:
@@ -145,7 +142,8 @@ class _Loop:
         if execution.failed is not None:
             self.failures[opened.number] += 1
             if self.failures[opened.number] <= self.retry.retry_failures:
-                return self._repeat(opened)
+                self._repeat(opened)
+                return None
         return self.recorder.close(opened.trial, execution)
 
     def _repeat(self, opened: OpenTrial) -> None:

@@ -33,8 +33,11 @@ def description_of(validation: Validation, search: Search, seed: int, name: str)
 def search_of(store: Store) -> Search:
     """Return the search of a store, made from its description; the default search for a new store."""
     described = store.description().get("search")
-    search = by_name(DEFAULT) if described is None else _search_described(described)
-    if search is None:
+    if described is None:
+        return by_name(DEFAULT)
+    search = _ready_made(described)
+    # A user's search may have the same name, and options that are not numbers cannot be restored.
+    if search is None or _plain(search) != described:
         kind = described.get("type", "unknown") if isinstance(described, dict) else described
         raise StoreMismatchError(
             f"{store.name} was made with the search {kind!r}, which cannot be made from its description in the store: "
@@ -43,33 +46,26 @@ def search_of(store: Store) -> Search:
     return search
 
 
-def _search_described(described: Any) -> Search | None:
-    """Return a search of this package from its description; None if it is another one or has other options."""
+def _ready_made(described: Any) -> Search | None:
+    """Return a search of this package, with the described options that differ from the default; None if it is none."""
     if not isinstance(described, dict):
         return None
-    if described.get("type") == Repeated.__name__:
-        inner, times = _ready_made(described.get("search")), described.get("times")
-        search: Search | None = None if inner is None or not isinstance(times, int) else Repeated(inner, times)
-    else:
-        search = _ready_made(described)
-    # A user's search may have the same name, and options that are not numbers cannot be restored.
-    return search if search is not None and _plain(search) == described else None
-
-
-def _ready_made(described: Any) -> Search | None:
-    """Return the search of a description, with the options that differ from the default."""
-    name = described.get("type") if isinstance(described, dict) else None
+    name = described.get("type")
     kind = next((kind for kind in NAMES.values() if kind.__name__ == name), None)
-    if kind is None:
-        return None
-    default = _plain(kind())
-    options = {name: value for name, value in described.items() if value != default.get(name)}
-    if not all(_is_numeric(value) or isinstance(default.get(name), str) for name, value in options.items()):
-        return None
     try:
-        return kind(**{name: tuple(v) if isinstance(v, list) else v for name, v in options.items()})
+        if name == Repeated.__name__:
+            repeated = _ready_made(described.get("search"))
+            return None if repeated is None else Repeated(repeated, described.get("times", 0))
+        if kind is None:
+            return None
+        default = _plain(kind())
+        options = {name: value for name, value in described.items() if value != default.get(name)}
+        if not all(_is_numeric(value) or isinstance(default.get(name), str) for name, value in options.items()):
+            return None
+        search: Search = kind(**{name: tuple(v) if isinstance(v, list) else v for name, v in options.items()})
     except (TypeError, InputError):
         return None
+    return search
 
 
 def _is_numeric(value: Any) -> bool:

@@ -84,8 +84,9 @@ class IntervalSearch:
     @property
     def limit(self) -> float:
         """The value that the bound must not exceed at the end: the threshold, or a little more than was executed."""
-        largest = largest_distance(self.recorder.trials)
-        return (1 + self.within) * largest if self.threshold is None else self.threshold
+        if self.threshold is not None:
+            return self.threshold
+        return (1 + self.within) * largest_distance(self.recorder.trials)
 
     @property
     def predicts(self) -> bool:
@@ -326,13 +327,8 @@ def next_task(
     the task with the largest predicted distance, while no similar distance was executed or a deeper search found it.
     Further tasks test the predictions, and if all of these are known, the task that is farthest from all others does.
 
-    Args:
-        evidence: what the learned dynamics say.
-        known: executed and open tasks, points ``(n, d)``.
-        best: the largest executed distance.
-        limit: what the bound must not exceed, in the distance's units.
-        confidence: the probability with which the bound holds.
-        steady: whether a task may be executed, because its distance is that of its neighbours.
+    The known tasks ``(n, d)`` are executed or open, ``best`` is the largest executed distance, and ``limit`` is what
+    the bound must not exceed. A task may be executed only if it is steady: its distance is that of its neighbours.
     """
     order = np.argsort(evidence.maxima, kind="stable")
     rank = evidence.rank(confidence)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
@@ -162,11 +163,9 @@ class Proposals:
         return self._validation.space.rounded(point), _with_rejected(choice.note, rejected)
 
     def _asked(self) -> Array:
-        asked, dimension = self._search.ask(1), self._validation.space.dimension
-        try:
-            point: Array = np.asarray(asked, dtype=np.float64) if np.isrealobj(asked) else np.array(np.nan)
-        except (TypeError, ValueError):
-            point = np.array(np.nan)
+        asked, dimension, point = self._search.ask(1), self._validation.space.dimension, np.empty(0)
+        with suppress(TypeError, ValueError):
+            point = np.asarray(asked, dtype=np.float64) if np.isrealobj(asked) else point
         if point.shape != (1, dimension) or not ((point >= 0) & (point <= 1)).all():
             raise InputError(
                 f"a search must return points of the unit cube, shape (1, {dimension}), "
@@ -207,9 +206,7 @@ def _plain_note(note: Any) -> dict[str, Any] | None:
     reserved = (PREDICTION, CONVERGED, UNSTEADY)
     if isinstance(note, dict) and set(reserved) & set(note):
         raise InputError(f"the note of a search must not have the keys {enumerated(reserved, 10)}.")
-    try:
+    with suppress(TypeError, ValueError):
         if note is None or (isinstance(note, dict) and json.dumps(note, allow_nan=False)):
             return note
-    except (TypeError, ValueError):
-        pass
     raise InputError(f"the note of a search must be a dictionary of plain values for JSON, got {note!r}.")

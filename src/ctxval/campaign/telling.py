@@ -21,7 +21,7 @@ from ctxval.errors import InputError
 
 @dataclass(frozen=True)
 class ToldResult:
-    """The result of an open trial, before it is checked. Exactly one of recording, distance and failed is given.
+    """The result of a trial, before it is checked. Exactly one of recording, distance and failed is given.
 
     Attributes:
         recording: the file of the recorded trajectory: CSV, NPZ or a log of another kind.

@@ -93,7 +93,7 @@ class SerialPool(WorkerPool):
         return number, execute_task(self.system, plan.controller, plan.task)
 
     def close(self) -> None:
-        """Do nothing: an execution has ended or raised an exception."""
+        """Do nothing: no execution is running any more."""
 
 
 # Processes of this computer

@@ -122,7 +122,7 @@ def _read(connection: sqlite3.Connection, tables: dict[str, set[str]], size: int
             if table == "trials":
                 _take_trial(row, recovered)
             elif table == "trajectories":
-                _take_trajectory(*row, recovered)
+                _take_trajectory(row, recovered)
             else:
                 try:
                     content = read_json(row[-1], finite=False)
@@ -167,7 +167,8 @@ def _take_trial(row: tuple[Any, ...], recovered: Recovered) -> None:
         recovered.trials.setdefault(trial.number, trial)
 
 
-def _take_trajectory(number: Any, side: Any, npz: Any, checksum: Any, recovered: Recovered) -> None:
+def _take_trajectory(row: tuple[Any, ...], recovered: Recovered) -> None:
+    number, side, npz, checksum = row
     name = f"the {side}'s trajectory of trial {number}"
     if side not in get_args(Side) or not isinstance(number, int):
         recovered.note(f"{name}: there is no such thing")
