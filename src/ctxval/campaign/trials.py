@@ -18,8 +18,7 @@ from ctxval.campaign.dynamics import CampaignDynamics
 from ctxval.campaign.goals_of_model import GoalsOfModel
 from ctxval.campaign.history import history_of
 from ctxval.campaign.identity import identify, remeasure, with_distance
-from ctxval.campaign.independent_draws import IndependentDraws
-from ctxval.campaign.proposals import Proposals
+from ctxval.campaign.proposals import IndependentDraws, Proposals
 from ctxval.campaign.storage.disks import error_with_fallback
 from ctxval.campaign.storage.store import Store
 from ctxval.certificates import PLANNED

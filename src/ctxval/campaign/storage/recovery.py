@@ -114,11 +114,10 @@ def _read(connection: sqlite3.Connection, tables: dict[str, set[str]], size: int
     about: dict[str, Any] = {"experiment": {}, "settings": {}, "history": []}
     recovered.about = about
     for table, names in _COLUMNS.items():
-        if table not in tables:
-            recovered.damaged.append(f"the table {table} is missing, or is no plain table")
+        if not set(names.split(", ")) <= tables.get(table, set()):
+            recovered.damaged.append(f"the table {table} is missing, or is not that of a store")
             continue
-        present = (name if name in tables[table] else f"NULL AS {name}" for name in names.split(", "))
-        for row in _rows(connection, table, ", ".join(present), size, recovered):
+        for row in _rows(connection, table, names, size, recovered):
             if table == "trials":
                 _take_trial(row, recovered)
             elif table == "trajectories":
