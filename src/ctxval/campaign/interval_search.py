@@ -86,7 +86,7 @@ class IntervalSearch:
         """The value that the bound must not exceed at the end: the threshold, or a little more than was executed."""
         if self.threshold is not None:
             return self.threshold
-        return (1 + self.within) * largest_distance(self.recorder.trials)
+        return (1 + self.within) * self.best
 
     @property
     def predicts(self) -> bool:
@@ -100,50 +100,48 @@ class IntervalSearch:
     @property
     def interval(self) -> tuple[float, float | None]:
         """The largest executed distance, and the bound that a few posterior samples give; None if they give none."""
-        best, evidence = largest_distance(self.recorder.trials), self._evidence(self.recorder.trials)
-        return best, None if evidence is None else bound_of(evidence, best, self.options.confidence)
+        evidence = self._evidence()
+        return self.best, None if evidence is None else self._bound(evidence)
 
     def choose(self) -> Choice | None:
         """Return the next task; None if the interval decides."""
-        trials = self.recorder.trials
-        if largest_distance(trials) > self.limit:
+        if self.best > self.limit:
             return None
         if isinstance(self.options.kind, AnytimeAudit):
-            return self._by_draws(trials, self.options.kind)
-        if (test := self._next_test(trials)) is not None:
+            return self._by_draws(self.options.kind)
+        if (test := self._next_test()) is not None:
             return test
-        evidence = self._evidence(trials)
-        if evidence is not None and (task := self._beside_a_failed_test(trials, evidence)) is not None:
+        evidence = self._evidence()
+        if evidence is not None and (task := self._beside_a_failed_test(evidence)) is not None:
             return Choice(task, "covering", planned_draws=0, rejected=0)
         if evidence is None or self._fails(evidence):
-            return self._by_distance(trials)
-        if self._may_decide(trials, evidence):
-            whole = self.recorder.dynamics.evidence(trials, self.options.confidence, keep=self.keeps)
+            return self._by_distance()
+        if self._may_decide(evidence):
+            whole = self.recorder.dynamics.evidence(self.recorder.trials, self.options.confidence, keep=self.keeps)
             if whole is None:
-                return self._by_distance(trials)
+                return self._by_distance()
             evidence = replace(whole, tests=self.tests)
-            if self._decides(trials, evidence):
+            if self._decides(evidence):
                 return None
         if isinstance(self.options.kind, Automatic):
-            known = _points(trials, self._dimension)
-            patient = sum(trial.origin not in DRAWN for trial in trials) < _PATIENCE
+            known = self._points(self.recorder.trials)
+            patient = sum(trial.origin not in DRAWN for trial in self.recorder.trials) < _PATIENCE
             # In few dimensions, executions soon cover the tasks, and the posterior bound of the distance may decide.
             if not patient or covering(known, self.options.kind.posterior.resolution, 0) is not None:
-                choice = self._by_distance(trials)
+                choice = self._by_distance()
                 if not patient or choice is None:
                     return choice
-        return self._by_evidence(trials, evidence)
+        return self._by_evidence(evidence)
 
-    def _by_evidence(self, trials: Sequence[Trial], evidence: DynamicsEvidence) -> Choice:
+    def _by_evidence(self, evidence: DynamicsEvidence) -> Choice:
         """Return the task that the learned dynamics choose, or a test if nothing else is missing."""
-        best, limit, confidence = largest_distance(trials), self.limit, self.options.confidence
-        bound = bound_of(evidence, best, confidence)
+        best, limit, confidence, trials = self.best, self.limit, self.options.confidence, self.recorder.trials
+        bound = self._bound(evidence)
         if max(bound, evidence.highest) <= limit and only_tests_missing(evidence, best, bound):
-            return self._test(evidence.predictions, trials)
+            return self._test(evidence.predictions)
         learned = self.recorder.dynamics.learned(trials)
         steady = Steadiness(self.recorder.dynamics.planner, None if learned is None else learned.expected)
-        ended = _points([trial for trial in trials if trial.state != "open"], self._dimension)
-        point = next_task(evidence, ended, best, limit, confidence, steady)
+        point = next_task(evidence, self._points(self._ended), best, limit, confidence, steady)
         waiting = waiting_points(trials)
         if len(waiting) and (point is None or np.abs(waiting - point).max(axis=1).min() <= NEAR):
             # It is being executed already. Another worker prepares for the results that are expected.
@@ -152,12 +150,12 @@ class IntervalSearch:
                 best = max(best, float(expected[np.isfinite(expected)].max(initial=0.0)))
                 limit = (1 + self.within) * best if self.threshold is None else limit
             after = self.recorder.dynamics.screening(trials, pending=True) or evidence
-            point = next_task(after, _points(trials, self._dimension), best, limit, confidence, steady)
+            point = next_task(after, self._points(trials), best, limit, confidence, steady)
         return Choice(point, "covering", planned_draws=0, rejected=steady.rejected)
 
     def by_dynamics(self) -> Array | None:
         """Return the next task, a point ``(d,)``; None if it is decided or learned dynamics do not choose the task."""
-        evidence = self._evidence(self.recorder.trials)
+        evidence = self._evidence()
         choice = None if evidence is None or self._fails(evidence) else self.choose()
         return None if choice is None else choice.unit_point
 
@@ -167,14 +165,26 @@ class IntervalSearch:
         return self.options.kind.tests if isinstance(self.options.kind, Automatic | Dynamics) else 0
 
     @property
-    def _dimension(self) -> int:
-        return self.recorder.validation.space.dimension
+    def best(self) -> float:
+        """The largest executed distance; 0 if none is known."""
+        return largest_distance(self.recorder.trials)
 
-    def _evidence(self, trials: Sequence[Trial]) -> DynamicsEvidence | None:
+    @property
+    def _ended(self) -> list[Trial]:
+        return [trial for trial in self.recorder.trials if trial.state != "open"]
+
+    def _points(self, trials: Sequence[Trial]) -> Array:
+        return np.array([trial.unit_point for trial in trials]).reshape(-1, self.recorder.validation.space.dimension)
+
+    def _bound(self, evidence: DynamicsEvidence) -> float:
+        return bound_of(evidence, self.best, self.options.confidence)
+
+    def _evidence(self) -> DynamicsEvidence | None:
         """Return what the store keeps, or else what a few draws of the learned dynamics say.
 
         It is None if the certificate does not use them.
         """
+        trials = self.recorder.trials
         if not self.predicts or any(trial.state == "failed" for trial in trials):
             return None
         dynamics = self.recorder.dynamics
@@ -189,64 +199,62 @@ class IntervalSearch:
         tolerated = max(min(bound, self.limit), self.limit - bound)  # as far as the margin to the limit allows
         return len(last) == _FAILING and 2 * sum(held(prediction, tolerated) for prediction in last) < _FAILING
 
-    def _may_decide(self, trials: Sequence[Trial], screened: DynamicsEvidence) -> bool:
+    def _may_decide(self, screened: DynamicsEvidence) -> bool:
         """Return whether the whole evidence may decide: nothing that a few draws show leaves the verdict open."""
-        if sum(trial.state != "open" for trial in trials) < FEWEST:
-            return False
-        best = largest_distance(trials)
-        bound = bound_of(screened, best, self.options.confidence)
-        return raised(screened, bound) <= self.limit and doubt_of(screened, best, bound) is None
+        bound = self._bound(screened)
+        enough = len(self._ended) >= FEWEST
+        return enough and raised(screened, bound) <= self.limit and doubt_of(screened, self.best, bound) is None
 
-    def _decides(self, trials: Sequence[Trial], evidence: DynamicsEvidence) -> bool:
-        ended = [trial for trial in trials if trial.state != "open"]
+    def _decides(self, evidence: DynamicsEvidence) -> bool:
         try:
-            return certify_dynamics(Sample.of(ended), evidence, self.options.confidence).covers(self.limit)
+            return certify_dynamics(Sample.of(self._ended), evidence, self.options.confidence).covers(self.limit)
         except CertificateError:
             return False
 
-    def _next_test(self, trials: Sequence[Trial]) -> Choice | None:
+    def _next_test(self) -> Choice | None:
         """Return the next test if the last one held and more are missing: nothing needs to be searched for that."""
+        trials = self.recorder.trials
         if not self.tests or not self.predicts or any(trial.state != "completed" for trial in trials):
             return None
         if not trials or trials[-1].origin not in DRAWN:
             return None
         predictions = self.recorder.dynamics.checked(trials)
-        if not predictions or not held(predictions[-1], largest_distance(trials)):
+        if not predictions or not held(predictions[-1], self.best):
             return None
-        return self._test(predictions, trials) if missing_tests(predictions, self.tests) else None
+        return self._test(predictions) if missing_tests(predictions, self.tests) else None
 
-    def _beside_a_failed_test(self, trials: Sequence[Trial], evidence: DynamicsEvidence) -> Array | None:
+    def _beside_a_failed_test(self, evidence: DynamicsEvidence) -> Array | None:
         """Return a task where a test that failed may be worst; None if there is no such test, or all are executed.
 
         A dynamics that depends on the task is large where the one parameter that it depends on is that of the test and
         the others are those of the worst task. Parameters that M's loops do not depend on come first.
         """
-        best = largest_distance(trials)
-        if raised(evidence, bound_of(evidence, best, self.options.confidence)) <= self.limit:
+        if raised(evidence, self._bound(evidence)) <= self.limit:
             return None
         tests = (test for test in reversed(evidence.predictions) if test.stored and test.origin in DRAWN)
-        failed = next((test for test in tests if not held(test, best)), None)
-        worst = next((trial.unit_point for trial in trials if trial.distance == best), None)
+        failed = next((test for test in tests if not held(test, self.best)), None)
+        worst = next((trial.unit_point for trial in self.recorder.trials if trial.distance == self.best), None)
         if failed is None or worst is None:
             return None
-        known = _points(trials, self._dimension)
-        learned = self.recorder.dynamics.learned(trials)
+        known = self._points(self.recorder.trials)
+        learned = self.recorder.dynamics.learned(self.recorder.trials)
         unseen = [] if learned is None else learned.study.unseen_parameters
-        for j in [*unseen, *(j for j in range(self._dimension) if j not in unseen)][:6]:
+        for j in [*unseen, *(j for j in range(len(worst)) if j not in unseen)][:6]:
             task = worst.copy()
             task[j] = failed.point[j]
             if np.abs(known - task).max(axis=1).min() > NEAR:
                 return task
         return None
 
-    def _test(self, predictions: Sequence[CheckedPrediction] | None, trials: Sequence[Trial]) -> Choice:
+    def _test(self, predictions: Sequence[CheckedPrediction] | None) -> Choice:
         """Return the next task that tests predictions where nobody chose to look; see ``prediction_tests``."""
+        trials = self.recorder.trials
         if predictions is None:
             tests = [(trial.unit_point, trial.origin) for trial in trials if trial.distance is not None]
         else:
             tests = [(np.array(test.point), test.origin) for test in tested(predictions, self.tests)]
         tests += [(trial.unit_point, trial.origin) for trial in trials if trial.state == "open"]
-        points = np.array([point for point, _ in tests]).reshape(-1, self._dimension)
+        points = np.array([point for point, _ in tests]).reshape(-1, self.recorder.validation.space.dimension)
         drawn = sum(origin in DRAWN for _, origin in tests)
         if self.tests - drawn > fewest_spread_tests(points):
             # The results decide when the campaign ends, so the number of independent draws is not planned.
@@ -254,16 +262,15 @@ class IntervalSearch:
         task = next_spread_test(points, self.recorder.draws.generator(trials))
         return Choice(task, "spread", planned_draws=0, rejected=0)
 
-    def _by_draws(self, trials: Sequence[Trial], kind: AnytimeAudit) -> Choice | None:
+    def _by_draws(self, kind: AnytimeAudit) -> Choice | None:
         """Return the next independent draw of an anytime audit, which may end whenever its bound suffices."""
-        ended = [trial for trial in trials if trial.state != "open"]
-        if any(trial.origin == "iid" for trial in ended):
-            certificate, _ = kind.certify_against(Sample.of(ended), self.limit, self.options.confidence)
+        if any(trial.origin == "iid" for trial in self._ended):
+            certificate, _ = kind.certify_against(Sample.of(self._ended), self.limit, self.options.confidence)
             if certificate.covers(self.limit, self.options.volume):
                 return None
         return Choice(self.recorder.draw(), "iid", planned_draws=0)
 
-    def _by_distance(self, trials: Sequence[Trial]) -> Choice | None:
+    def _by_distance(self) -> Choice | None:
         kind = self.options.kind
         if isinstance(kind, Dynamics):
             return Choice(planned_draws=0)
@@ -271,12 +278,11 @@ class IntervalSearch:
             return Choice(planned_draws=0)  # no distance is known, or all are 0
         posterior = kind.posterior if isinstance(kind, Automatic) else kind
         rule = StoppingRule(self.limit, replace(self.options, kind=posterior))
-        now = rule.decide(trials, self.budget - self.recorder.executions)
+        now = rule.decide(self.recorder.trials, self.budget - self.recorder.executions)
         if not now.decided:
             return Choice(now.next_point, "covering", planned_draws=0)
-        ended = [trial for trial in trials if trial.state != "open"]
-        missing = isinstance(kind, Automatic) and kind.missing_tests(Sample.of(ended))
-        return self._test(None, trials) if missing else None
+        missing = isinstance(kind, Automatic) and kind.missing_tests(Sample.of(self._ended))
+        return self._test(None) if missing else None
 
 
 def is_decisive(options: CertificateOptions) -> bool:
@@ -361,7 +367,3 @@ def next_task(
     away = np.abs(spread[:, None] - known).max(axis=2).min(axis=1, initial=1.0)
     candidates.append(spread[np.argsort(-away, kind="stable")])
     return next((point for point in np.concatenate(candidates) if is_new(point) and steady(point)), None)
-
-
-def _points(trials: Sequence[Trial], dimension: int) -> Array:
-    return np.array([trial.unit_point for trial in trials]).reshape(-1, dimension)

@@ -165,9 +165,11 @@ class Proposals:
         return self._validation.space.rounded(point), _with_rejected(choice.note, rejected)
 
     def _asked(self) -> Array:
-        asked, dimension, point = self._search.ask(1), self._validation.space.dimension, np.empty(0)
+        asked, dimension = self._search.ask(1), self._validation.space.dimension
+        point: Array = np.empty(0)
         with suppress(TypeError, ValueError):
-            point = np.asarray(asked, dtype=np.float64) if np.isrealobj(asked) else point
+            if np.isrealobj(asked):
+                point = np.asarray(asked, dtype=np.float64)
         if point.shape != (1, dimension) or not ((point >= 0) & (point <= 1)).all():
             raise InputError(
                 f"a search must return points of the unit cube, shape (1, {dimension}), "
