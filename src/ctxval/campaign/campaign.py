@@ -59,6 +59,9 @@ class Campaign:
             of the system. The store keeps the reason.
         remeasure: recompute the distances of all stored executions, because the distance function was changed.
 
+    Attributes:
+        recorder: opens and closes the trials, for code that chooses the tasks of several campaigns.
+
     Raises:
         InputError: if a value cannot be used.
         DistanceError: if the distance of a stored execution cannot be recomputed; nothing is changed.
@@ -82,7 +85,6 @@ class Campaign:
         self.search: Search = search_of(trials) if search is None else search
         description = description_of(validation, self.search, self.seed, name)
         identify(trials, validation, description, accept_change, remeasure)
-        # The recorder of the trials, for code that chooses the tasks of several campaigns.
         self.recorder = TrialRecorder(validation, self.search, trials, self.seed, description)
         if remeasure:
             self.remeasure()
