@@ -509,12 +509,7 @@ class Campaign:
         return display.to_dataframe(self.trials, self.validation.space)
 
     def plot(
-        self,
-        *,
-        units: str = "",
-        threshold: float | None = None,
-        bound: float | None = None,
-        ax: Axes | None = None,
+        self, *, units: str = "", threshold: float | None = None, bound: float | None = None, ax: Axes | None = None
     ) -> Axes:
         """Draw the surrogate over one task parameter, or else the distances in their order; return the axes.
 

@@ -19,14 +19,7 @@ from ctxval.campaign.dynamics import NEAR
 from ctxval.campaign.history import largest_distance, waiting_points
 from ctxval.campaign.proposals import Steadiness
 from ctxval.campaign.trials import TrialRecorder
-from ctxval.certificates import (
-    CertificateOptions,
-    CheckedPrediction,
-    DynamicsEvidence,
-    Sample,
-    StoppingRule,
-    Verdict,
-)
+from ctxval.certificates import CertificateOptions, CheckedPrediction, DynamicsEvidence, Sample, StoppingRule, Verdict
 from ctxval.certificates.anytime import AnytimeAudit
 from ctxval.certificates.automatic import Automatic
 from ctxval.certificates.covering import RESOLUTION, covering
