@@ -39,10 +39,10 @@ from ctxval import (
 )
 from ctxval._util.arrays import Array, single_threaded
 from ctxval._util.json_lines import JsonLines
-from ctxval.campaign.choices import Choice
+from ctxval.campaign.choices import Choice, Execution
 from ctxval.campaign.execution import RetryPolicy, Schedule, execute_schedule
 from ctxval.campaign.interval_search import IntervalSearch
-from ctxval.campaign.workers import ExecutionResult, WorkerPool, execute_task
+from ctxval.campaign.workers import WorkerPool, execute_task
 from ctxval.certificates import CertificateOptions
 from ctxval.core.plan import Plan
 from ctxval.core.trial import Trial
@@ -194,7 +194,7 @@ class SimulatedPool(WorkerPool):
         lasts = 1 + SPREAD * np.random.default_rng([self.seed, number, 47]).random()
         heapq.heappush(self._running, (self.now + lasts, number, plan))
 
-    def wait(self) -> tuple[int, ExecutionResult]:
+    def wait(self) -> tuple[int, Execution]:
         """Go on to the time at which the next execution ends."""
         self.now, number, plan = heapq.heappop(self._running)
         return number, execute_task(self.system, plan.controller, plan.task)
@@ -211,7 +211,7 @@ def study(one: tuple[str, str, int, int]) -> dict[str, Any]:
     with single_threaded():
         validation, largest = case(system, seed)
         campaign = Campaign(validation, search=searches.Auto("thorough"), seed=seed)
-        recorder, pool = campaign._recorder, SimulatedPool(validation.system, workers, seed)
+        recorder, pool = campaign.recorder, SimulatedPool(validation.system, workers, seed)
         decides = None
         if mode == "decide":
             decides = IntervalSearch(

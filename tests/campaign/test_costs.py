@@ -64,7 +64,7 @@ def test_the_estimate_is_that_of_a_real_suggestion_within_a_factor() -> None:
     validation = make_validation()
     campaign = Campaign(validation, search=searches.Auto("thorough"), seed=1).run(3, explore=True)
     started = time.process_time()
-    campaign._recorder._proposals.next(campaign.trials)
+    campaign.recorder._proposals.next(campaign.trials)
     real = time.process_time() - started
     estimated = costs(validation).suggestion
     assert estimated is not None

@@ -56,7 +56,7 @@ def test_a_prediction_is_about_the_known_values_in_the_order_of_the_search() -> 
     assert late.trial.state == "open"
     known = [t for t in history_of(campaign.trials) if t.distance is not None]
     assert [t.number for t in known] == [5, 1, 2, 3, 4]
-    found = campaign._recorder.dynamics.prediction(campaign.trials)
+    found = campaign.recorder.dynamics.prediction(campaign.trials)
     assert found is not None
     expected = found.left_out(np.arange(5))
     np.testing.assert_allclose(expected, [t.distance for t in known], rtol=0.5)

@@ -117,7 +117,7 @@ def test_it_resumes_with_the_same_choices_and_the_same_predictions(tmp_path: Pat
 def test_predictions_are_stored_before_executions_and_equal_those_computed_afterwards() -> None:
     validation, largest = linear()
     campaign = Campaign(validation, seed=1).run(12, 1.1 * largest)
-    dynamics = campaign._recorder.dynamics
+    dynamics = campaign.recorder.dynamics
     stored = dynamics.evidence(campaign.trials, 0.95)
     without = [replace(trial, note=None) for trial in campaign.trials]
     anew = dynamics.evidence(without, 0.95)

@@ -98,7 +98,7 @@ def test_a_result_that_was_replaced_teaches_what_replaced_it() -> None:
     right = validation.execute(opened.plan)
     wrong = Trajectory(right.times, right.states * np.linspace(1, 1.1, len(right.states))[:, None], right.inputs)
     campaign.tell(opened, wrong)
-    dynamics = campaign._recorder.dynamics
+    dynamics = campaign.recorder.dynamics
     before = dynamics.learned(campaign.trials)
     assert dynamics.learned(campaign.trials) is before
     campaign.tell(opened.number, right, replace="wrong file")

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 from ctxval import Campaign, Validation, cases, searches
-from ctxval.campaign.choices import Choice
+from ctxval.campaign.choices import Choice, Execution
 from ctxval.campaign.dynamics import NEAR
 from ctxval.campaign.execution import RetryPolicy, Schedule, execute_schedule
 from ctxval.campaign.interval_search import IntervalSearch
-from ctxval.campaign.workers import ExecutionResult, WorkerPool, execute_task
+from ctxval.campaign.workers import WorkerPool, execute_task
 from ctxval.certificates import CertificateOptions
 from ctxval.core.plan import Plan
 
@@ -33,7 +33,7 @@ class Pool(WorkerPool):
     def start(self, number: int, plan: Plan) -> None:
         self.running.append((number, plan))
 
-    def wait(self) -> tuple[int, ExecutionResult]:
+    def wait(self) -> tuple[int, Execution]:
         self.together.append([number for number, _ in self.running])
         row = np.random.default_rng([self.seed, len(self.together)]).integers(len(self.running))
         number, plan = self.running.pop(row)
@@ -48,7 +48,7 @@ def linear(dim: int = 2, seed: int = 0) -> Validation:
 
 
 def run(campaign: Campaign, pool: Pool, budget: int, rule: Callable[[], Choice | None] = Choice) -> Campaign:
-    execute_schedule(Schedule(campaign._recorder, rule, budget), pool, None, RetryPolicy())
+    execute_schedule(Schedule(campaign.recorder, rule, budget), pool, None, RetryPolicy())
     return campaign
 
 
@@ -96,8 +96,8 @@ def test_workers_never_run_the_same_task_at_the_same_time(seed: int) -> None:
 def test_spare_workers_that_decide_execute_different_tasks() -> None:
     validation = linear(2)
     pool, campaign = Pool(validation, 4), Campaign(validation, search=searches.Auto("fast"))
-    decides = IntervalSearch(campaign._recorder, CertificateOptions.or_automatic(None, 0.95, False, 0.1), 10)
-    with campaign._recorder.predicting(decides.predicts):
+    decides = IntervalSearch(campaign.recorder, CertificateOptions.or_automatic(None, 0.95, False, 0.1), 10)
+    with campaign.recorder.predicting(decides.predicts):
         found = points(run(campaign, pool, 10, decides.choose))
     for together in pool.together:
         gaps = np.abs(found[together][:, None] - found[together]).max(axis=2) + np.eye(len(together))
@@ -127,7 +127,7 @@ def test_what_is_being_executed_counts_as_predicted() -> None:
     validation = linear(3)
     campaign = Campaign(validation, search=searches.Auto("fast")).run(2, explore=True)
     opened = campaign.ask({"x_init": [1.0, -1.0, 1.0], "x_final": [-1.0, -1.0, 1.0]})
-    dynamics, place = campaign._recorder.dynamics, opened.trial.unit_point[None]
+    dynamics, place = campaign.recorder.dynamics, opened.trial.unit_point[None]
     prediction = dynamics.prediction(campaign.trials, pending=True)
     assert prediction is not None
     assert prediction.pending is not None

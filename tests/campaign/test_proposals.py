@@ -90,7 +90,7 @@ def test_the_costs_are_those_of_a_design_and_an_execution() -> None:
 
 
 def measured(campaign: Campaign) -> tuple[float, float | None]:
-    prediction = campaign._recorder.dynamics.prediction(campaign.trials)
+    prediction = campaign.recorder.dynamics.prediction(campaign.trials)
     assert prediction is not None
     costs = costs_of(prediction, campaign.validation, campaign.trials)
     return costs.prediction, costs.evaluation

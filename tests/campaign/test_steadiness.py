@@ -12,7 +12,7 @@ from conftest import make_validation
 from ctxval import Campaign, Task, Validation, controllers, searches
 from ctxval._util.arrays import Array
 from ctxval.campaign.choices import Choice
-from ctxval.campaign.steadiness import Steadiness
+from ctxval.campaign.proposals import Steadiness
 from ctxval.core.controller import AffineFeedback, Controller
 from ctxval.core.model import Model
 from ctxval.core.trial import UNSTEADY

@@ -253,7 +253,7 @@ def test_what_a_store_does_not_take_is_kept_beside_it_every_time(tmp_path: Path)
     whole = campaign.validation.execute(opened.plan)
     late = [Campaign(campaign.validation, search=searches.GPUCB(), store=path, seed=1) for _ in range(3)]
     for one in late:  # they have looked before the first one told
-        one._recorder.refresh = lambda: None  # type: ignore[method-assign]
+        one.recorder.refresh = lambda: None  # type: ignore[method-assign]
     campaign.tell(opened, distance=0.1)
     for one in late[:2]:
         with pytest.raises(InputError, match=r"kept in .*a\.trial-0.*\.npz"):

@@ -6,38 +6,29 @@ import os
 import re
 import shutil
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from ctxval._util.columns import column_of
 from ctxval._util.csv_table import CsvTable
 from ctxval._util.texts import shortened, unguarded
 from ctxval._util.units import conversion
-from ctxval.campaign.choices import OpenTrial
-from ctxval.campaign.known import KnownExecution, TrialResult, check_known
-from ctxval.campaign.recording_file import RecordingFile, require_file
+from ctxval.campaign.choices import Execution, OpenTrial
+from ctxval.campaign.recording_file import require_file
+from ctxval.campaign.telling import ToldResult
 from ctxval.core.controller import AffineFeedback
 from ctxval.core.exchange import write_controller, write_task
 from ctxval.core.experiment import Experiment
 from ctxval.core.plan import Plan
 from ctxval.core.space import TaskSpace
-from ctxval.core.trajectory import Trajectory
 from ctxval.core.validation import Validation
-from ctxval.data import LogMapping
 from ctxval.errors import InputError
 
 _RESULTS = ("trajectory", "distance", "failed")
 
 TRIAL_FILES = ("task.json", "controller.json", "controller.npz", "model.csv")
 """The files of a trial that a person executes."""
-
-_LONGEST_NAME = 255
-"""Number of characters that no file name reaches."""
-
-_MOST_TABLE = 16 * 2**20
-"""Largest size of a table of runs in bytes."""
 
 
 def write_files(folder: Path, experiment: Experiment, opened: OpenTrial) -> list[str]:
@@ -65,10 +56,10 @@ def write_files(folder: Path, experiment: Experiment, opened: OpenTrial) -> list
 
 
 def _written(folder: Path, experiment: Experiment, opened: OpenTrial) -> list[str]:
-    plan = opened.plan
-    states, inputs = _names(experiment, plan)
+    plan, promised = opened.plan, opened.plan.model_trajectory
+    states, inputs = experiment.names(promised.states.shape[-1], promised.inputs.shape[-1])
     write_task(folder / "task.json", plan.task, states=states)
-    plan.model_trajectory.to_csv(folder / "model.csv", states=list(states), inputs=list(inputs))
+    promised.to_csv(folder / "model.csv", states=list(states), inputs=list(inputs))
     if not isinstance(plan.controller, AffineFeedback):
         return ["task.json", "model.csv"]
     files = ["controller.json", "controller.npz"]
@@ -77,70 +68,40 @@ def _written(folder: Path, experiment: Experiment, opened: OpenTrial) -> list[st
     return ["task.json", *files, "model.csv"]
 
 
-def _names(experiment: Experiment, plan: Plan) -> tuple[dict[str, str], dict[str, str]]:
-    return experiment.names(plan.model_trajectory.states.shape[-1], plan.model_trajectory.inputs.shape[-1])
-
-
-def read_recording(path: Path, experiment: Experiment, plan: Plan, **options: Any) -> Trajectory:
-    """Read a recorded trajectory; a log in a format of another program is read in a confined process."""
-    file = RecordingFile(path, *_names(experiment, plan), plan.task.times, **options)
-    return file.read_confined() if file.foreign else file.read()
-
-
-@dataclass(frozen=True, eq=False)
-class KnownRun:
-    """An earlier execution, as a file describes it.
-
-    Exactly one of ``trajectory``, ``distance`` and ``failed`` is given.
-
-    Attributes:
-        where: the file and the line of the description.
-        parameters: the task parameters.
-        trajectory: the file of the recorded trajectory.
-        distance: the distance d(p).
-        failed: the reason why there is no result.
-    """
+class KnownRun(NamedTuple):
+    """An earlier execution, as a file describes it: the place of the description, the task, and the result."""
 
     where: str
     parameters: Mapping[str, Any]
-    trajectory: Path | None = None
-    distance: float | None = None
-    failed: str | None = None
+    told: ToldResult
 
-    def checked(
-        self,
-        validation: Validation,
-        experiment: Experiment,
-        resample: bool,
-        tolerance: float | None,
-        mapping: LogMapping | None = None,
-    ) -> KnownExecution:
-        """Return the execution with its recording, if it has one, after all checks; nothing is stored."""
-        point = validation.space.point(self.parameters)
-        recording = None
-        if self.trajectory is not None:
-            plan = validation.plan(point)
-            recording = read_recording(self.trajectory, experiment, plan, resample=resample, mapping=mapping)
-        return check_known(validation, point, TrialResult(recording, self.distance, self.failed), tolerance)
+    def checked(self, validation: Validation, experiment: Experiment) -> tuple[Plan, Execution]:
+        """Return the plan of the task and the measured execution; nothing is stored."""
+        plan = validation.plan(validation.space.point(self.parameters))
+        recording = self.told.read(experiment, plan)
+        execution = Execution.reported(recording, self.told.distance, self.told.failed)
+        return plan, execution.measured(validation, plan, self.told.start_tolerance)
 
 
-def read_runs(files: Sequence[Path], parameters: Mapping[str, Any] | None, space: TaskSpace) -> list[KnownRun]:
+def read_runs(
+    files: Sequence[Path], parameters: Mapping[str, Any] | None, space: TaskSpace, **reading: Any
+) -> list[KnownRun]:
     """Read earlier runs from tables, or from one trajectory if its parameters are given.
 
     A table is a CSV file with a column for each task parameter (``name[0]``, ... for a vector), and the columns
     trajectory (a path relative to the folder of the table), distance or failed. Each row has a value in exactly one of
-    these three columns.
+    these three columns. Keywords are options of each :class:`ToldResult` for the reading of recordings.
     """
     if parameters is not None:
         if len(files) != 1:
             raise InputError(f"--set gives the parameters of one trajectory, got {len(files)} files.")
-        return [KnownRun(str(files[0]), parameters, trajectory=files[0])]
-    return [run for path in files for run in _table(path, space)]
+        return [KnownRun(str(files[0]), parameters, ToldResult(files[0], **reading))]
+    return [run for path in files for run in _table(path, space, reading)]
 
 
-def _table(path: Path, space: TaskSpace) -> list[KnownRun]:
+def _table(path: Path, space: TaskSpace, reading: Mapping[str, Any]) -> list[KnownRun]:
     require_file(path)
-    table = CsvTable(path, _MOST_TABLE)
+    table = CsvTable(path, 16 * 2**20)
     columns = {name: column_of(str(path), table.names, name) for name in space.names}
     if None in columns.values() or not any(name in table.names for name in _RESULTS):
         raise InputError(
@@ -148,37 +109,31 @@ def _table(path: Path, space: TaskSpace) -> list[KnownRun]:
             f"it has {', '.join(filter(None, table.names)) or 'none'}. For one trajectory, give --set NAME=VALUE."
         )
     units = {name: space.units.get(name, space.units.get(name.partition("[")[0], "")) for name in columns}
-    found = [(name, *column) for name, column in columns.items() if column is not None]
-    factors = {name: (own, conversion(unit, units[name]) if unit else 1.0) for name, own, unit in found}
-    runs = [
-        _run(table, line, dict(zip(table.names, cells, strict=True)), factors, space) for line, cells in table.rows()
-    ]
+    named = [(name, *column) for name, column in columns.items() if column is not None]
+    factors = {name: (column, conversion(unit, units[name]) if unit else 1.0) for name, column, unit in named}
+    runs = []
+    for line, cells in table.rows():
+        where, row = f"{table.path}, line {line}", dict(zip(table.names, cells, strict=True))
+        point = [factor * table.number(line, name, row[column]) for name, (column, factor) in factors.items()]
+        given = {name: unguarded(row.get(name, "").strip()) for name in _RESULTS}
+        if sum(bool(text) for text in given.values()) != 1:
+            raise InputError(f"{where}: exactly one of {', '.join(_RESULTS)} must be filled in.")
+        told = ToldResult(
+            _beside(path, given["trajectory"], where) if given["trajectory"] else None,
+            table.number(line, "distance", given["distance"]) if given["distance"] else None,
+            given["failed"] or None,
+            **reading,
+        )
+        runs.append(KnownRun(where, space.describe_point(space.parameters(point).points), told))
     if not runs:
         raise InputError(f"{path} has no run below its header.")
     return runs
 
 
-def _run(
-    table: CsvTable, line: int, row: Mapping[str, str], factors: Mapping[str, tuple[str, float]], space: TaskSpace
-) -> KnownRun:
-    where = f"{table.path}, line {line}"
-    point = [factor * table.number(line, name, row[column]) for name, (column, factor) in factors.items()]
-    given = {name: unguarded(row.get(name, "").strip()) for name in _RESULTS}
-    if sum(bool(text) for text in given.values()) != 1:
-        raise InputError(f"{where}: exactly one of {', '.join(_RESULTS)} must be filled in.")
-    parameters = space.describe_point(space.parameters(point).points)
-    if given["trajectory"]:
-        return KnownRun(where, parameters, trajectory=_beside(Path(table.path), given["trajectory"], where))
-    if given["distance"]:
-        return KnownRun(where, parameters, distance=table.number(line, "distance", given["distance"]))
-    return KnownRun(where, parameters, failed=given["failed"])
-
-
 def _beside(table: Path, name: str, where: str) -> Path:
     """Return a file that a table names; one outside of the table's folder is refused before it is opened."""
     folder = table.parent
-    inside = len(name) < _LONGEST_NAME and (folder / name).resolve().is_relative_to(folder.resolve())
-    if not inside:
+    if len(name) >= 255 or not (folder / name).resolve().is_relative_to(folder.resolve()):
         raise InputError(f"{where}: trajectory must be a file in the folder of the table, got {shortened(name, 60)!r}.")
     return folder / name
 
@@ -192,42 +147,28 @@ def parameters_from(settings: Sequence[str], space: TaskSpace) -> dict[str, Any]
     The forms are ``goal=1.5``, ``goal = 1.5 rad``, ``goal=[1.5, 0.5]``, ``goal=1.5,0.5``, ``goal[0]=1.5`` together with
     every other component, and several parameters in one text: ``goal = 1.5, load = 0.2``.
     """
-    found: dict[str, Any] = {}
+    given: dict[str, Any] = {}
     for text in settings:
-        for name, value in _assignments(text):
-            if name in found:
+        # A text after a comma that has no name is a further value of the last name.
+        for assignment in re.split(r",(?=[^,=]*=)", text):
+            name, equals, value = assignment.partition("=")
+            name = name.strip()
+            if not equals or not name or name in given:
                 raise InputError(f"each task parameter must be given once, as name=value, got {text!r}.")
-            found[name] = _value(name, value, space)
-    return _whole(found, space)
-
-
-def _assignments(text: str) -> Iterator[tuple[str, str]]:
-    """Yield names and values; a text after a comma that has no name is a further value of the last name."""
-    open_name, values = "", list[str]()
-    for part in text.split(","):
-        name, equals, value = part.partition("=")
-        if equals and open_name:
-            yield open_name, ",".join(values)
-        if equals:
-            open_name, values = name.strip(), [value]
-        else:
-            values.append(part)
-        if not open_name:
-            raise InputError(f"each task parameter must be given once, as name=value, got {text!r}.")
-    yield open_name, ",".join(values)
+            given[name] = _value(name, value.strip(), space)
+    return _whole(given, space)
 
 
 def _value(name: str, text: str, space: TaskSpace) -> float | list[float]:
     """Return the number or the list of numbers in a text, which may have the unit of the parameter."""
-    base = name if name in space.units else name.partition("[")[0]
-    listed = text.strip()
-    if listed.startswith("["):
-        inside, bracket, unit = listed[1:].partition("]")
+    unit = space.units.get(name if name in space.units else name.partition("[")[0], "")
+    inside, given_unit, is_list = text, "", text.startswith("[")
+    if is_list:
+        inside, bracket, given_unit = text[1:].partition("]")
         if not bracket:
-            raise InputError(f"{name} must be a list such as [1.5, 0.5], got {listed!r}.")
-        return [_quantity(name, f"{number} {unit}", space.units.get(base, "")) for number in inside.split(",")]
-    numbers = [_quantity(name, number, space.units.get(base, "")) for number in listed.split(",")]
-    return numbers if len(numbers) > 1 else numbers[0]
+            raise InputError(f"{name} must be a list such as [1.5, 0.5], got {text!r}.")
+    numbers = [_quantity(name, f"{number} {given_unit}", unit) for number in inside.split(",")]
+    return numbers if is_list or len(numbers) > 1 else numbers[0]
 
 
 def _quantity(name: str, text: str, unit: str) -> float:
@@ -246,14 +187,14 @@ def _quantity(name: str, text: str, unit: str) -> float:
 
 def _whole(given: Mapping[str, Any], space: TaskSpace) -> dict[str, Any]:
     """Return values by parameter, with the single components of a vector put together."""
-    found = {name: value for name, value in given.items() if name in space.units or name not in space.names}
-    for name in {name.partition("[")[0]: None for name in given if name not in found}:
+    whole = {name: value for name, value in given.items() if name in space.units or name not in space.names}
+    for name in {name.partition("[")[0]: None for name in given if name not in whole}:
         columns = space.columns(name)
         components = space.names[columns] if isinstance(columns, slice) else ()
         missing = [component for component in components if component not in given]
-        if name in found:
+        if name in whole:
             raise InputError(f"--set: {name} must be given once, either completely or by its components.")
         if missing:
             raise InputError(f"--set: {name} must be given completely: {', '.join(missing)} is missing.")
-        found[name] = [given[component] for component in components]
-    return found
+        whole[name] = [given[component] for component in components]
+    return whole

@@ -3,33 +3,47 @@
 from __future__ import annotations
 
 import concurrent.futures as cf
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-from ctxval._util.checked import NonNegativeInt, PositiveFloat, PositiveInt, Seconds, checked
+import numpy as np
+
+from ctxval._util.arrays import Array
+from ctxval._util.checked import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, Seconds, checked
+from ctxval._util.progress import stage
 from ctxval._util.progress_display import progress_shown
-from ctxval.campaign import display, remeasuring
-from ctxval.campaign.choices import Choice, OpenTrial
+from ctxval.campaign import display
+from ctxval.campaign.choices import Choice, Execution, OpenTrial
+from ctxval.campaign.dynamics import provenance_of
 from ctxval.campaign.execution import RetryPolicy, Schedule, execute_schedule
 from ctxval.campaign.identity import description_of, identify, search_of
-from ctxval.campaign.interval_search import IntervalSearch
-from ctxval.campaign.operated import OperatedCampaign
+from ctxval.campaign.interval_search import IntervalSearch, with_next_task
+from ctxval.campaign.plot import overview
 from ctxval.campaign.storage.store import Store
 from ctxval.campaign.trials import TrialRecorder
-from ctxval.campaign.workers import WorkerPool, worker_pool
-from ctxval.certificates import RESOLUTION, CertificateOptions
+from ctxval.campaign.workers import worker_pool
+from ctxval.certificates import RESOLUTION, Certificate, CertificateOptions, Provenance, Verdict, assess, judge
 from ctxval.certificates.options import CONFIDENCE, WITHIN
 from ctxval.core.distance import Distance
+from ctxval.core.plan import Plan
+from ctxval.core.preflight import StartOffset
+from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import Trial
 from ctxval.core.validation import Validation
 from ctxval.errors import CertificateError, InputError
+from ctxval.gp.surrogate import Surrogate, fit_surrogate
 from ctxval.searches import Auto, Search
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from pandas import DataFrame
 
 __all__ = ["Campaign", "OpenTrial"]
 
 
 @checked
-class Campaign(OperatedCampaign):
+class Campaign:
     """A search for the worst task, with every trial stored before and after its execution.
 
     The budget is a total: running again resumes the campaign. A resumed campaign makes the same choices as an
@@ -44,6 +58,9 @@ class Campaign(OperatedCampaign):
         accept_change: the reason why the experiment may differ from the one that made the store, for example a repair
             of the system. The store keeps the reason.
         remeasure: recompute the distances of all stored executions, because the distance function was changed.
+
+    Attributes:
+        recorder: opens and closes the trials, for code that chooses the tasks of several campaigns.
 
     Raises:
         InputError: if a value cannot be used.
@@ -68,9 +85,59 @@ class Campaign(OperatedCampaign):
         self.search: Search = search_of(trials) if search is None else search
         description = description_of(validation, self.search, self.seed, name)
         identify(trials, validation, description, accept_change, remeasure)
-        super().__init__(TrialRecorder(validation, self.search, trials, self.seed, description))
+        self.recorder = TrialRecorder(validation, self.search, trials, self.seed, description)
         if remeasure:
             self.remeasure()
+
+    # The trials
+
+    @property
+    def validation(self) -> Validation:
+        """The map p -> d(p), with the present distance function."""
+        return self.recorder.validation
+
+    @property
+    def store(self) -> Store:
+        """The store of the trials."""
+        return self.recorder.store
+
+    @property
+    def trials(self) -> tuple[Trial, ...]:
+        """All trials in the order of asking."""
+        return self.recorder.trials
+
+    @property
+    def completed(self) -> list[Trial]:
+        """The trials with a distance."""
+        return [trial for trial in self.trials if trial.state == "completed"]
+
+    @property
+    def failed(self) -> list[Trial]:
+        """The trials that failed."""
+        return [trial for trial in self.trials if trial.state == "failed"]
+
+    @property
+    def unmeasured(self) -> list[Trial]:
+        """The trials that were executed but have no distance, because it could not be measured."""
+        return [trial for trial in self.trials if trial.state == "unmeasured"]
+
+    @property
+    def executions(self) -> int:
+        """The number of executions of S that have ended, with or without success."""
+        return self.recorder.executions
+
+    @property
+    def worst(self) -> Trial | None:
+        """The completed trial with the largest distance."""
+        return max(self.completed, key=lambda trial: trial.distance or 0.0, default=None)
+
+    def trajectories(self, trial: Trial) -> tuple[Trajectory | None, Trajectory | None]:
+        """Return the trajectories of the model and of the system in a trial; None if a trajectory is not stored."""
+        return self.store.trajectory(trial.number, "model"), self.store.trajectory(trial.number, "system")
+
+    def start_offset(self, trial: Trial) -> StartOffset | None:
+        """Return how far an execution started from the initial state of its task; None if it was not recorded."""
+        return self.recorder.start_offset(trial)
 
     # Running
 
@@ -139,9 +206,7 @@ class Campaign(OperatedCampaign):
         options = CertificateOptions.or_automatic(certificate, confidence, stochastic, resolution)
         if explore is None:
             explore = threshold is None and not isinstance(self.search, Auto)
-        decides = None
-        if not explore:
-            decides = IntervalSearch(self._recorder, options, budget, threshold, within)
+        decides = None if explore else IntervalSearch(self.recorder, options, budget, threshold, within)
         by_search = Choice(planned_draws=budget if until is None else 0)
 
         def rule() -> Choice | None:
@@ -149,12 +214,14 @@ class Campaign(OperatedCampaign):
                 return None
             return by_search if decides is None else decides.choose()
 
-        pool, retry = self._pool(workers, executor, timeout), RetryPolicy(retries, retry_failures)
+        pool = worker_pool(self.validation.system, workers=workers, executor=executor, timeout=timeout)
         if retry_failures and pool is None:
             raise InputError("retry_failures needs workers, an executor or a timeout.")
         predicts = decides is not None and decides.predicts
-        with self._recorder.predicting(predicts), progress_shown(progress):
-            return self._execute(Schedule(self._recorder, rule, budget), pool, on_trial, retry)
+        with self.recorder.predicting(predicts), progress_shown(progress):
+            schedule = Schedule(self.recorder, rule, budget)
+            execute_schedule(schedule, pool, on_trial, RetryPolicy(retries, retry_failures))
+        return self
 
     @checked
     def audit(
@@ -169,63 +236,180 @@ class Campaign(OperatedCampaign):
     ) -> Campaign:
         """Execute independent draws from the distribution of tasks until the trials contain this number of them.
 
-        The search does not choose these tasks.
-
-        Args:
-            draws: total number of independent draws, including earlier ones.
-            on_trial: called with each trial that has ended.
-            workers, executor, timeout, progress: as in :meth:`run`.
-
-        Raises:
-            InputError: if the number is not a positive integer.
-            CertificateError: if people are executing open trials.
-            ModelError, DesignError, DistanceError: as in :meth:`run`.
+        The number of draws includes earlier ones. The other arguments and the errors raised are those of :meth:`run`;
+        a CertificateError is raised if people are executing open trials.
         """
 
         def missing() -> int:
             return max(0, draws - sum(trial.origin == "iid" for trial in self.trials))
 
         def rule() -> Choice | None:
-            return Choice(self._recorder.draw(), "iid", planned_draws=draws) if missing() else None
+            return Choice(self.recorder.draw(), "iid", planned_draws=draws) if missing() else None
 
-        pool = self._pool(workers, executor, timeout)
-        self._require_no_open_trials()
-        with progress_shown(progress):
-            expected = self.executions + missing()
-            return self._execute(Schedule(self._recorder, rule, expected=expected), pool, on_trial)
-
-    def _require_no_open_trials(self) -> None:
-        """Refuse open trials that people are executing; an audit itself executes interrupted trials again."""
-        self._recorder.refresh()
+        pool = worker_pool(self.validation.system, workers=workers, executor=executor, timeout=timeout)
+        self.refresh()
+        # Interrupted trials are executed again; these are open, because people are executing them.
         waiting = [str(trial.number) for trial in self.trials if trial.state == "open" and not trial.attempts]
         if waiting:
             raise CertificateError(
                 f"trials are open: {', '.join(waiting)}. Record their results with `ctxval tell` (tell in Python) "
                 "before an audit."
             )
-
-    def _pool(
-        self, workers: PositiveInt | None, executor: cf.Executor | None, timeout: Seconds | None
-    ) -> WorkerPool | None:
-        system = self.validation.system
-        if getattr(system, "manual", False):
-            raise InputError(
-                "this system is executed by people, not by run or audit: get tasks with `ctxval ask` and record the "
-                "results with `ctxval tell` (ask and tell in Python)."
-            )
-        return worker_pool(system, workers=workers, executor=executor, timeout=timeout)
-
-    def _execute(
-        self,
-        schedule: Schedule,
-        pool: WorkerPool | None,
-        on_trial: Callable[[Trial], None] | None,
-        retry: RetryPolicy | None = None,
-    ) -> Campaign:
-        execute_schedule(schedule, pool, on_trial, retry or RetryPolicy())
+        with progress_shown(progress):
+            schedule = Schedule(self.recorder, rule, expected=self.executions + missing())
+            execute_schedule(schedule, pool, on_trial, RetryPolicy())
         return self
 
-    # Measuring again
+    # Trials that people execute
+
+    @checked
+    def ask(
+        self,
+        parameters: Mapping[str, Any] | None = None,
+        *,
+        draw: bool = False,
+        because: str | None = None,
+        wait: NonNegativeFloat = 0.0,
+        progress: bool | None = None,
+    ) -> OpenTrial:
+        """Open the next trial: the search's choice, the task with these parameters, or an independent draw.
+
+        Args:
+            parameters: the parameters of a task that you chose yourself.
+            draw: draw the task from the distribution of tasks, for an audit.
+            because: the change that was made to the system since the task with these parameters was executed before.
+            wait: seconds to wait while another process chooses a task.
+            progress: as in :meth:`run`.
+
+        Raises:
+            InputError: if the parameters are not in the task space.
+            StoreAccessError: if another process is running the store.
+            ModelError, DesignError: if no controller can be designed and run on the model. The trial is stored as
+                failed and does not count as an execution.
+        """
+        if because is not None and (parameters is None or not because.strip()):
+            raise InputError('because needs the parameters of an earlier task and a reason, such as "fuse replaced".')
+        # An operator's time is worth a prediction: it is stored, and the execution tests it.
+        predicts = self.recorder.search.uses_prediction
+        with progress_shown(progress), self.store.sole_writer(wait), self.recorder.predicting(predicts):
+            self.refresh()
+            if parameters is None:
+                return self.recorder.open(Choice(self.recorder.draw(), "iid") if draw else Choice())
+            space = self.validation.space
+            point = space.point(parameters)
+            choice = Choice(space.to_unit(point), "manual", because, parameters=space.describe_point(point))
+            return self.recorder.open(choice)
+
+    @checked
+    def ask_for_verdict(
+        self,
+        threshold: PositiveFloat,
+        budget: PositiveInt,
+        *,
+        confidence: float = CONFIDENCE,
+        stochastic: bool = False,
+        resolution: float = RESOLUTION,
+        certificate: CertificateOptions | None = None,
+        wait: NonNegativeFloat = 0.0,
+        progress: bool | None = None,
+    ) -> OpenTrial | None:
+        """Open the trial that :meth:`run` would execute next for a threshold, if people execute it.
+
+        Returns None if the model is validated or falsified for the threshold, or if the budget is spent. Open trials
+        count for the budget. The arguments and the errors raised are those of :meth:`run` and :meth:`ask`.
+        """
+        options = CertificateOptions.or_automatic(certificate, confidence, stochastic, resolution)
+        with progress_shown(progress), self.store.sole_writer(wait):
+            self.refresh()
+            search = IntervalSearch(self.recorder, options, budget, threshold)
+            waiting = sum(trial.state == "open" for trial in self.trials)
+            with self.recorder.predicting(search.predicts):
+                choice = search.choose() if self.executions + waiting < budget else None
+                return None if choice is None else self.recorder.open(choice)
+
+    def reopen(self, number: int, *, ended: bool = False) -> OpenTrial:
+        """Return an open trial again, with its task and controller.
+
+        With ``ended``, return a trial whose result was told, to replace the result. An InputError is raised if there is
+        no such trial, or it is in another state.
+        """
+        self.refresh()
+        trial = self.recorder.trial(number, told=ended)
+        return OpenTrial(trial, self.recorder.plan(trial))
+
+    @checked
+    def tell(
+        self,
+        opened: OpenTrial | NonNegativeInt,
+        trajectory: Trajectory | None = None,
+        *,
+        distance: NonNegativeFloat | None = None,
+        failed: str | None = None,
+        start_tolerance: NonNegativeFloat | None = None,
+        replace: str | None = None,
+    ) -> Trial:
+        """Record the result of an open trial: its trajectory, its distance, or the reason of its failure.
+
+        Args:
+            opened: the open trial, or its number.
+            trajectory: the recorded trajectory.
+            distance: the distance, if there is no recording.
+            failed: the reason why there is no result.
+            start_tolerance: replaces the start tolerance of the validation.
+            replace: why this result replaces one that was told before, such as "wrong file". The history of the store
+                keeps the earlier result with its trajectory.
+
+        Raises:
+            InputError: if not exactly one result is given, if the trial is not open (with ``replace``: if its result
+                was not told by a person), or if the trajectory belongs to another task.
+            ExecutionError: if the trajectory is not a complete execution of the task; the trial stays open.
+            DistanceError: if the distance function gives no usable number; the execution is stored.
+        """
+        self.refresh()
+        if replace is not None and not replace.strip():
+            raise InputError('replace needs a reason, such as "wrong file".')
+        recorder, told = self.recorder, replace is not None
+        trial = recorder.trial(opened.number if isinstance(opened, OpenTrial) else opened, told=told)
+        if isinstance(opened, OpenTrial) and not np.array_equal(opened.trial.unit_point, trial.unit_point):
+            raise InputError(f"the open trial {opened.number} belongs to another campaign.")
+        execution = Execution.reported(trajectory, distance, failed)
+        with recorder.not_executing(trial):
+            trial = recorder.trial(trial.number, told=told)
+            if trajectory is not None:
+                plan = opened.plan if isinstance(opened, OpenTrial) else recorder.plan(trial)
+                execution = execution.measured(self.validation, plan, start_tolerance)
+            return recorder.close(trial, execution, replacing=replace)
+
+    @checked
+    def add(
+        self,
+        parameters: Mapping[str, Any],
+        trajectory: Trajectory | None = None,
+        *,
+        distance: NonNegativeFloat | None = None,
+        failed: str | None = None,
+        start_tolerance: NonNegativeFloat | None = None,
+        wait: NonNegativeFloat = 0.0,
+    ) -> Trial | None:
+        """Record an earlier execution as a trial with the origin manual. It counts as an execution.
+
+        Returns None if the execution is already in the store. Nothing is stored if an error is raised: those of
+        :meth:`tell`, and a ModelError or a DesignError if the task cannot be planned.
+        """
+        point = self.validation.space.point(parameters)
+        execution = Execution.reported(trajectory, distance, failed)
+        plan = self.validation.plan(point)
+        return self.add_known([(plan, execution.measured(self.validation, plan, start_tolerance))], wait)[0]
+
+    def add_known(
+        self, executions: Sequence[tuple[Plan, Execution]], wait: NonNegativeFloat = 0.0
+    ) -> list[Trial | None]:
+        """Record earlier executions that are measured; None if one is already in the store."""
+        return self.recorder.add(executions, wait)
+
+    def refresh(self) -> None:
+        """Read the trials again if another process has changed the store; refuse it if its experiment has changed."""
+        self.recorder.refresh()
 
     def remeasure(self, distance: Distance | None = None) -> list[Trial]:
         """Recompute the distances of all stored executions, without an execution; return the trials that changed.
@@ -238,11 +422,107 @@ class Campaign(OperatedCampaign):
 
         Raises:
             DistanceError: if the distance of a measured trial cannot be computed any more; nothing is changed.
-            StoreAccessError: if another process is running the store.
         """
-        return remeasuring.remeasure(self._recorder, distance)
+        return self.recorder.remeasure(distance)
 
-    # What a person sees
+    # Results
+
+    @property
+    def estimate(self) -> float | None:
+        """The search's estimate of d*: the largest distance, unless the search discards some (SD) or repeats its tasks.
+
+        If the search repeats its tasks, the estimate is the largest mean distance of a task with all its repetitions.
+        It is None if there are too few distances.
+        """
+        return self.recorder.search.estimate(*self._distances())
+
+    @property
+    def provenance(self) -> Provenance:
+        """What a certificate needs besides the trials: the task space, the search, changes, and what M predicts."""
+        return provenance_of(self.store, self.validation, self.trials, self.recorder.dynamics)
+
+    @checked
+    def verdict(
+        self,
+        threshold: PositiveFloat,
+        confidence: float = CONFIDENCE,
+        *,
+        stochastic: bool = False,
+        resolution: float = RESOLUTION,
+        certificate: CertificateOptions | None = None,
+        progress: bool | None = None,
+    ) -> Verdict:
+        """Return whether the model can be trusted up to a threshold tau.
+
+        The model is falsified if an executed distance exceeds the threshold, and validated if a certificate bounds d*
+        by the threshold. Otherwise the verdict is undecided, with a forecast of the executions that would decide
+        and, if learned dynamics choose it, the next task.
+
+        Args:
+            threshold: tau, in the units of the distance.
+            confidence: the confidence level of the certificate, at least 0.5.
+            stochastic: whether two executions of one task may differ.
+            resolution: the largest distance between a task and its nearest trial that a validation permits, in
+                diagonals of the task space.
+            certificate: the kind and the options of the certificate, in place of ``auto`` with the three options above.
+            progress: as in :meth:`run`.
+
+        Raises:
+            InputError, CertificateError: if an option of the certificate is not valid.
+        """
+        options = CertificateOptions.or_automatic(certificate, confidence, stochastic, resolution)
+        with progress_shown(progress), stage("certifying"):
+            return with_next_task(judge(self.trials, threshold, options, self.provenance), self.recorder, options)
+
+    @checked
+    def certify(
+        self,
+        confidence: float = CONFIDENCE,
+        *,
+        stochastic: bool = False,
+        resolution: float = RESOLUTION,
+        certificate: CertificateOptions | None = None,
+        progress: bool | None = None,
+    ) -> Certificate:
+        """Return the bound on d*, which needs no threshold. The arguments are those of :meth:`verdict`.
+
+        A CertificateError is raised if the theory of the certificate refuses the trials.
+        """
+        options = CertificateOptions.or_automatic(certificate, confidence, stochastic, resolution)
+        with progress_shown(progress), stage("certifying"):
+            certified = assess(self.trials, options, provenance=self.provenance).certificate
+        assert certified is not None  # without a threshold, a refusal is raised
+        return certified
+
+    def surrogate(self) -> Surrogate:
+        """Return the Gaussian process of the distance over the task space, for every search, from two distances on."""
+        of_search = self.recorder.search.surrogate()
+        return fit_surrogate(*self._distances()) if of_search is None else of_search
+
+    def to_dataframe(self) -> DataFrame:
+        """Return the trials as a table of pandas, one row for each.
+
+        The columns are number, origin, state, one for each task parameter (``name[0], name[1], ...`` for a vector),
+        distance, seconds, attempts and failure. If a parameter has the name of another column, such as ``distance``,
+        its column is ``parameters.distance``. Unknown values are missing values.
+        """
+        return display.to_dataframe(self.trials, self.validation.space)
+
+    def plot(
+        self, *, units: str = "", threshold: float | None = None, bound: float | None = None, ax: Axes | None = None
+    ) -> Axes:
+        """Draw the surrogate over one task parameter, or else the distances in their order; return the axes.
+
+        By default, the units are those of the validation, and the axes new ones of ``matplotlib.pyplot``. The threshold
+        and a bound on d* are drawn as lines.
+        """
+        return overview(self, units=units, threshold=threshold, bound=bound, ax=ax)
+
+    def _distances(self) -> tuple[Array, Array]:
+        """Return the points of the unit cube with a distance ``(n, d)``, and the distances ``(n,)``."""
+        completed = self.completed
+        points = np.array([trial.unit_point for trial in completed]).reshape(-1, self.validation.space.dimension)
+        return points, np.array([trial.distance for trial in completed], dtype=np.float64)
 
     def __repr__(self) -> str:
         return display.as_text(self)

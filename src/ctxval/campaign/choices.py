@@ -1,15 +1,45 @@
-"""The task that is chosen for a new trial, and the trial that is opened for it."""
+"""What is executed next, and what its execution gave."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
+
+import numpy as np
 
 from ctxval._util.arrays import Array
 from ctxval._util.representation import call, fields_of, lines, shown
+from ctxval._util.texts import text_of
 from ctxval.core.plan import Plan
-from ctxval.core.trial import Origin, Trial
+from ctxval.core.trajectory import Trajectory
+from ctxval.core.trial import Origin, State, Trial
+from ctxval.core.validation import Validation
+from ctxval.errors import InputError
+
+
+@dataclass(frozen=True, eq=False)
+class Choice:
+    """The task of a new trial.
+
+    Attributes:
+        unit_point: point of the unit cube, shape ``(d,)``; None if the search chooses it.
+        origin: the reason for this point; not used if the search chooses the point.
+        because: the change that was made to the system since the task was executed before.
+        planned_draws: the planned number of independent draws, which is stored with each draw; 0 if the results decide
+            the number, None if it is not known.
+        note: what is recorded about the choice, in types that JSON has.
+        rejected: the number of tasks that were tested and are not steady; None if this task is to be tested.
+        parameters: the task parameters as a person gave them; None if they are those of the point, rounded.
+    """
+
+    unit_point: Array | None = None
+    origin: Origin = "acquisition"
+    because: str | None = None
+    planned_draws: int | None = None
+    note: dict[str, Any] | None = None
+    rejected: int | None = None
+    parameters: Mapping[str, Any] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,24 +65,58 @@ class OpenTrial:
 
 
 @dataclass(frozen=True, eq=False)
-class Choice:
-    """The task of a new trial.
+class Execution:
+    """What an execution of S gave.
 
     Attributes:
-        unit_point: point of the unit cube, shape ``(d,)``; None if the search chooses it.
-        origin: the reason for this point; not used if the search chooses the point.
-        because: the change that was made to the system since the task was executed before.
-        planned_draws: the planned number of independent draws, which is stored with each draw; 0 if the results decide
-            the number, None if it is not known.
-        note: what is recorded about the choice, in types that JSON has.
-        rejected: the number of tasks that were tested and are not steady; None if this task is to be tested.
-        parameters: the task parameters as a person gave them; None if they are those of the point, rounded.
+        trajectory: the object that the system returned or a person recorded; None if there is none.
+        distance: d(p); None if it is not known.
+        failed: the reason why there is no result: the system failed, or the execution took too long.
+        unusable: the reason why the distance function gave no usable number.
+        lost: the reason why the worker was lost, which is not a failure of the system.
+        seconds: the duration, if it is known.
     """
 
-    unit_point: Array | None = None
-    origin: Origin = "acquisition"
-    because: str | None = None
-    planned_draws: int | None = None
-    note: dict[str, Any] | None = None
-    rejected: int | None = None
-    parameters: Mapping[str, Any] | None = None
+    trajectory: Trajectory | None = None
+    distance: float | None = None
+    failed: str | None = None
+    unusable: str | None = None
+    lost: str | None = None
+    seconds: float | None = None
+
+    @classmethod
+    def reported(cls, trajectory: Trajectory | None, distance: float | None, failed: str | None) -> Execution:
+        """Return an execution as a user reports it: by exactly one of the three."""
+        if sum(given is not None for given in (trajectory, distance, failed)) != 1:
+            raise InputError("exactly one of a trajectory, a distance and the reason of a failure must be given.")
+        if distance is not None and not 0 <= distance < np.inf:
+            raise InputError(f"the distance must be a finite number >= 0, got {distance!r}.")
+        return cls(trajectory, None if distance is None else float(distance), failed)
+
+    def measured(self, validation: Validation, plan: Plan, start_tolerance: float | None = None) -> Execution:
+        """Return the execution with its distance, after the checks of :meth:`Validation.accept`."""
+        if self.failed is not None or self.distance is not None:
+            return self
+        measurement = validation.accept(plan, self.trajectory, start_tolerance)
+        return replace(self, distance=measurement.distance, unusable=measurement.unusable)
+
+    def ended(self, trial: Trial, *, executed: bool = True) -> Trial:
+        """Return a trial in the final state that this measured execution gives it."""
+        failed = self.failed is not None
+        state: State = "failed" if failed else "unmeasured" if self.distance is None else "completed"
+        return replace(
+            trial, state=state, executed=executed, distance=self.distance, failure=self._failure, seconds=self.seconds
+        )
+
+    def is_that_of(self, trial: Trial) -> bool:
+        """Return whether a trial of the same task has stored this execution already."""
+        if trial.distance is None or self.distance is None:
+            same = trial.distance is self.distance
+        else:
+            # A distance that another type of processor has computed differs in its last digits.
+            same = bool(np.isclose(trial.distance, self.distance, rtol=1e-9, atol=0))
+        return same and trial.failure == self._failure and trial.state != "open"
+
+    @property
+    def _failure(self) -> str | None:
+        return self.unusable if self.failed is None else text_of(self.failed)

@@ -1,4 +1,7 @@
-"""What an execution of the system and the prediction of a task cost, in seconds."""
+"""What an execution of the system and the prediction of a task cost, in seconds of CPU time.
+
+Elapsed time would depend on what else the machine does.
+"""
 
 from __future__ import annotations
 
@@ -24,29 +27,19 @@ from ctxval.learning import DynamicsStudy
 from ctxval.searches import Auto, Costs, Prediction
 from ctxval.searches.auto import FAST
 
-_BATCHES = (1, 8, 64)
-"""Numbers of tasks that may be predicted at once to measure what a task costs, and a batch besides its tasks."""
-
-_QUICK, _ENOUGH = 0.02, 0.1
-"""Seconds of a single prediction up to which the large batch is timed if designs take batches, and up to which the
-medium one is timed if they do not."""
-
-_SCREENED = 5.0
-"""Seconds of the designs of a screening up to which it is timed."""
-
 
 @dataclass(frozen=True)
 class ThinkingCosts:
-    """What the choice of a task costs after a few executions of S, in seconds of CPU time.
+    """What the choice of a task costs after a few executions of S; None if it cannot be estimated.
 
     Attributes:
         design: seconds of the design of one controller.
         closed_loop: seconds of one closed loop on the model.
-        choice: estimated seconds of the choice of a task that decides; None if it cannot be estimated.
-        verdict: estimated seconds of the bound that decides; None likewise.
-        suggestion: estimated seconds of one suggestion of the search ``auto``; None likewise.
-        designs: number of designs of this suggestion; None likewise.
-        fast: estimated seconds of one suggestion with the thinking ``"fast"``; None likewise.
+        choice: estimated seconds of the choice of a task that decides.
+        verdict: estimated seconds of the bound that decides.
+        suggestion: estimated seconds of one suggestion of the search ``auto``.
+        designs: number of designs of this suggestion.
+        fast: estimated seconds of one suggestion with the thinking ``"fast"``.
     """
 
     design: float
@@ -59,32 +52,27 @@ class ThinkingCosts:
 
     @classmethod
     def measured(cls, validation: Validation, points: Sequence[Array]) -> ThinkingCosts:
-        """Measure the costs. S is not executed: made-up trajectories that differ from those of M take its place.
-
-        Args:
-            validation: the map p -> d(p).
-            points: tasks of these executions, each ``(d,)``.
-        """
-        parts, task = validation, validation.task(validation.space.parameters(points[0]))
-        design = _cpu_seconds(lambda: parts.synthesizer.design(task, parts.model))
-        controller = parts.synthesizer.design(task, parts.model)
-        loop = _cpu_seconds(lambda: rollout(parts.model.step, controller, task))
+        """Measure the costs at tasks, each ``(d,)``; made-up trajectories take the place of executions of S."""
+        model, task = validation.model, validation.task(validation.space.parameters(points[0]))
+        controller = validation.synthesizer.design(task, model)
+        design = min(_seconds(lambda: validation.synthesizer.design(task, model)) for _ in range(3))
+        loop = min(_seconds(lambda: rollout(model.step, controller, task)) for _ in range(3))
         made_up = [(validation.space.to_unit(point), _unlike(validation.plan(point))) for point in points]
-        begun, study = _cpu_now(), DynamicsStudy(validation)
+        begun, study = _now(), DynamicsStudy(validation)
         learned = study.learn(made_up)
         prediction = study.prediction_of(learned, made_up)
         if prediction is None:
             return cls(design, loop)
-        learning = _cpu_now() - begun
+        learning = _now() - begun
         costs = costs_of(prediction, validation, ())
         choice = verdict = None
         if learned is not None:
             designing = study.search.settings.pool * (costs.rough or costs.prediction)
             loops, each = study.search.screening_loops, costs.prediction
-            if designing < _SCREENED:
-                begun = _cpu_now()
+            if designing < 5:  # then the screening itself is timed
+                begun = _now()
                 learned.screened  # noqa: B018 (what is computed first takes long)
-                each = (_cpu_now() - begun) / loops
+                each = (_now() - begun) / loops
             choice = learning + max(designing, loops * each)
             verdict = choice + study.search.expected_loops(draws_for(CONFIDENCE)) * each
         search = Auto("thorough")
@@ -101,54 +89,35 @@ def _unlike(plan: Plan) -> Trajectory:
     return replace(promised, states=promised.states + away)
 
 
-def _cpu_seconds(work: Callable[[], object]) -> float:
-    """Return the seconds of CPU time of some work, as the least of three times."""
-    found = []
-    for _ in range(3):
-        begun = _cpu_now()
-        work()
-        found.append(_cpu_now() - begun)
-    return min(found)
+def costs_of(prediction: Prediction, validation: Validation, trials: Sequence[Trial]) -> Costs:
+    """Return the costs that decide how long a search thinks."""
+    dimension, rng = validation.space.dimension, np.random.default_rng(0)
+    batched = bool(getattr(validation.synthesizer, "batched", False))
+    predict = prediction.rough or prediction.expected
+    with stage("timing predictions", unit="designs"):
+        first = rng.random((1, dimension))
+        single = _seconds(lambda: predict(first))
+        count = 64 if batched and single <= 0.02 else 8 if batched or single <= 0.1 else 1
+        points = rng.random((count, dimension))
+        seconds = _seconds(lambda: predict(points))
+        # What a batch costs besides its points follows from a batch of one point.
+        each = seconds if count == 1 else min(max(seconds - single, 0.0) / (count - 1), seconds / count)
+        # The controllers of these points are known now, so the exact prediction adds what its closed loops cost.
+        more = _seconds(lambda: prediction.expected(points)) / count
+    timed = [trial.seconds for trial in trials if trial.executed and trial.seconds is not None]
+    execution = statistics.median(timed) if timed else None
+    if getattr(validation.system, "manual", False):
+        execution = math.inf
+    return Costs(each + more, execution, each, seconds - count * each)
 
 
-def _cpu_now() -> float:
+def _seconds(work: Callable[[], object]) -> float:
+    begun = _now()
+    work()
+    return _now() - begun
+
+
+def _now() -> float:
     """Return the seconds of CPU time of this process and of its child processes that have ended."""
     times = os.times()
     return time.process_time() + times.children_user + times.children_system
-
-
-def costs_of(prediction: Prediction, validation: Validation, trials: Sequence[Trial]) -> Costs:
-    """Return the costs that decide how long a search thinks."""
-    batched = bool(getattr(validation.synthesizer, "batched", False))
-    with stage("timing predictions", unit="designs"):
-        each, batch, more = _measured(prediction, validation.space.dimension, batched)
-    return Costs(each + more, _seconds_of_execution(validation, trials), each, batch)
-
-
-def _measured(prediction: Prediction, dimension: int, batched: bool) -> tuple[float, float, float]:
-    """Return the seconds of a rough prediction, of a batch besides its points, and what an exact prediction adds."""
-    predict, rng = prediction.rough or prediction.expected, np.random.default_rng(0)
-    single = _predicting_seconds(predict, rng.random((1, dimension)))
-    small, medium, large = _BATCHES
-    timed = large if batched and single <= _QUICK else medium if batched or single <= _ENOUGH else small
-    points = rng.random((timed, dimension))
-    seconds, count = _predicting_seconds(predict, points), len(points)
-    # What a batch costs besides its points follows from a batch of one point.
-    each = seconds if count == 1 else min(max(seconds - single, 0.0) / (count - 1), seconds / count)
-    # The controllers of these points are known now, so the exact prediction adds what its closed loops cost.
-    return each, seconds - count * each, _predicting_seconds(prediction.expected, points) / count
-
-
-def _predicting_seconds(predict: Callable[[Array], object], points: Array) -> float:
-    """Return the seconds of CPU time of a prediction; elapsed time would depend on what else the machine does."""
-    started = _cpu_now()
-    predict(points)
-    return _cpu_now() - started
-
-
-def _seconds_of_execution(validation: Validation, trials: Sequence[Trial]) -> float | None:
-    """Return the median of the seconds of executions; None if none was timed."""
-    if getattr(validation.system, "manual", False):
-        return math.inf
-    timed = [trial.seconds for trial in trials if trial.executed and trial.seconds is not None]
-    return statistics.median(timed) if timed else None

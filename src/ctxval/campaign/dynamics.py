@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -15,6 +15,7 @@ from ctxval._util.progress import stage
 from ctxval._util.texts import reason_of
 from ctxval.campaign.history import executed_trials, for_known_values, largest_distance, waiting_points
 from ctxval.campaign.storage.store import Store
+from ctxval.certificates import Provenance
 from ctxval.certificates.dynamics import bound_of, draws_for
 from ctxval.certificates.dynamics_diagnostics import DENSE, FEWEST, PREDICTIONS, doubt_of, jumps
 from ctxval.certificates.dynamics_evidence import (
@@ -25,9 +26,11 @@ from ctxval.certificates.dynamics_evidence import (
     UntriedParameter,
 )
 from ctxval.core.labels import labels_of
+from ctxval.core.preflight import start_offset
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import REDEFINED, Trial
 from ctxval.core.validation import Validation
+from ctxval.errors import CertificateError
 from ctxval.learning import DynamicsStudy, ExecutionPrediction, LearnedDynamics
 from ctxval.learning.closed_loops import LoopPlanner
 from ctxval.learning.coverage import Coverage, Gap
@@ -42,22 +45,12 @@ PREDICTION = "prediction"
 NEAR = 0.02
 """A task that differs from an executed one by less than this in every coordinate is no new one."""
 
-_RECOMPUTED = PREDICTIONS + 1
-"""Number of the last trials whose predictions are computed afterwards, if none were stored."""
-
-
-_REMEMBERED = 6
-"""Number of sets of executions whose dynamics are kept."""
-
 
 class CampaignDynamics:
     """The dynamics learned from the trials of a campaign. The system is never executed.
 
-    Args:
-        validation: the map p -> d(p).
-        store: the store of the trajectories.
-        seed: the seed of the campaign.
-        description: what the experiment is, as the store describes it.
+    Users' parts run here at states that no execution has reached, so any exception of theirs means that nothing is
+    learned or predicted; it must not end a campaign.
 
     Attributes:
         experiment: a digest of the description and of how often the distance has changed; a stored prediction belongs
@@ -83,7 +76,7 @@ class CampaignDynamics:
         return self._study.planner
 
     def learned(self, trials: Sequence[Trial], *, alone: bool = False) -> LearnedDynamics | None:
-        """Return what the completed trials teach; None if they teach nothing."""
+        """Return what the completed trials, and unless ``alone`` other recordings teach; None if it is nothing."""
         return self._learned_from(executed_trials(self._store, trials), () if alone else self.elsewhere())
 
     def _learned_from(
@@ -96,30 +89,33 @@ class CampaignDynamics:
         # replaced, and then has another distance.
         key = (*((trial.number, trial.distance) for trial, _ in executed), *map(id, others))
         if key not in self._learned:
-            if len(self._learned) == _REMEMBERED:
+            if len(self._learned) == 6:
                 del self._learned[next(iter(self._learned))]
-            self._learned[key] = others, *self._learn(executed, others)
-        _, found, self.failure = self._learned[key]
-        return found
+            learned, failure = None, None
+            try:
+                learned = self._study.learn([(trial.unit_point, trajectory) for trial, trajectory in executed], others)
+            except Exception as error:  # users' parts
+                failure = reason_of(error)
+            self._learned[key] = others, learned, failure
+        _, learned, self.failure = self._learned[key]
+        return learned
 
     def prediction(self, trials: Sequence[Trial], *, pending: bool = False) -> Prediction | None:
         """Return the distance predicted from the executed trajectories, for a search; None if there is none.
 
-        Args:
-            trials: the trials.
-            pending: whether open trials count as if they had been executed as predicted.
+        With ``pending``, open trials count as if they had been executed as predicted.
         """
         executed = executed_trials(self._store, trials)
         learned = self._learned_from(executed, self.elsewhere())
         pairs = [(trial.unit_point, trajectory) for trial, trajectory in executed]
-        found = self._study.prediction_of(learned, pairs)
-        if found is None:
+        prediction = self._study.prediction_of(learned, pairs)
+        if prediction is None:
             return None
-        found = for_known_values(found, trials, [trial for trial, _ in executed])
-        return self._with_pending(found, learned, pairs, trials) if pending else found
+        prediction = for_known_values(prediction, trials, [trial for trial, _ in executed])
+        return self._with_pending(prediction, learned, pairs, trials) if pending else prediction
 
     def _with_pending(
-        self, found: Prediction, learned: LearnedDynamics | None, executed: Executed, trials: Sequence[Trial]
+        self, prediction: Prediction, learned: LearnedDynamics | None, executed: Executed, trials: Sequence[Trial]
     ) -> Prediction:
         """Return a prediction to which open trials are executions that have gone as predicted.
 
@@ -127,105 +123,94 @@ class CampaignDynamics:
         """
         waiting = waiting_points(trials)
         if not len(waiting):
-            return found
-        otherwise = found.otherwise
+            return prediction
+        otherwise = prediction.otherwise
 
         def after() -> Prediction:
             as_if = None if learned is None else self._as_if(learned, executed, waiting)
-            return (None if as_if is None else self._study.prediction_of(as_if, executed)) or found
+            return (None if as_if is None else self._study.prediction_of(as_if, executed)) or prediction
 
         def fallback() -> Prediction | None:
             other = None if otherwise is None else otherwise()
             return None if other is None else replace(other, pending=Pending(waiting, lambda: other))
 
-        return replace(found, otherwise=fallback, pending=Pending(waiting, after))
+        return replace(prediction, otherwise=fallback, pending=Pending(waiting, after))
 
     def _as_if(self, learned: LearnedDynamics, executed: Executed, waiting: Array) -> LearnedDynamics | None:
         """Return what is learned as if tasks ``(k, d)`` had been executed as predicted; None if it cannot be said."""
         try:
             return self._study.as_if_executed(learned, executed, learned.trajectories(waiting), self.elsewhere())
-        except Exception:  # the user's parts, at states that no execution has reached, must not end a campaign
+        except Exception:  # users' parts
             return None
 
     def predict(self, trials: Sequence[Trial], point: Array, *, alone: bool = False) -> ExecutionPrediction | None:
-        """Return the prediction of the execution of a task from completed trials; None if nothing can be predicted.
+        """Return the prediction of an execution at a point ``(d,)`` of the unit cube; None if there is none.
 
-        Args:
-            trials: the trials.
-            point: the task, a point of the unit cube ``(d,)``.
-            alone: as in :meth:`learned`.
+        It is learned from completed trials, with ``alone`` from no other recordings.
         """
         try:
             with stage("predicting the execution", unit="closed loops"):
                 learned = self.learned(trials, alone=alone)
                 return None if learned is None else learned.predict(point)
-        except Exception:  # the user's parts, at states that no execution has reached, must not end a campaign
+        except Exception:  # users' parts
             return None
 
     def screening(self, trials: Sequence[Trial], *, pending: bool = False) -> DynamicsEvidence | None:
         """Return quick evidence, whose bound is too low and whose diagnostics lack expensive ones.
 
-        It has a few draws, and none but the posterior mean after fewer executions than a bound needs.
-
-        Args:
-            trials: the trials.
-            pending: as in :meth:`prediction`. Such evidence helps to choose a task; it decides nothing.
+        It has a few draws, and none but the posterior mean after fewer executions than a bound needs. With ``pending``
+        as in :meth:`prediction`, it helps to choose a task and decides nothing.
         """
         with stage("searching the learned dynamics", self._study.search.screening_loops, "closed loops"):
             learned = self.learned(trials)
             few = learned is not None and len(learned.executed) < FEWEST
             if learned is not None and pending:
-                executed = [(trial.unit_point, one) for trial, one in executed_trials(self._store, trials)]
+                executed = [(trial.unit_point, known) for trial, known in executed_trials(self._store, trials)]
                 learned = self._as_if(learned, executed, waiting_points(trials))
-            if learned is None:
+            try:
+                worst = None if learned is None else learned.worst_of_mean if few else learned.screened
+                return None if learned is None or worst is None else self._evidence(learned, trials, worst)
+            except Exception as error:  # users' parts
+                self.failure = reason_of(error)
                 return None
-            found = learned
-            return self._guarded(lambda: self._evidence(found, trials, found.worst_of_mean if few else found.screened))
 
     def evidence(self, trials: Sequence[Trial], confidence: float, *, keep: bool = False) -> DynamicsEvidence | None:
-        """Return what the learned dynamics say about d*; None if nothing can be learned.
+        """Return what the learned dynamics say about d*, with a confidence; None if nothing can be learned.
 
-        Args:
-            trials: the trials.
-            confidence: the probability with which a bound is to hold.
-            keep: whether the store keeps it, with the trials that it follows from.
+        With ``keep``, the store keeps it with the trials that it follows from.
         """
-        known = self.kept_evidence(trials, confidence)
-        if known is not None:
-            return known
+        kept = self.kept_evidence(trials, confidence)
+        if kept is not None:
+            return kept
         digest, draws = self._store.digest(), draws_for(confidence)
         with stage("searching the learned dynamics", self._study.search.expected_loops(draws), "closed loops"):
             learned = self.learned(trials)
-            found = None if learned is None else self._guarded(lambda: self._whole(learned, trials, draws, confidence))
-        if keep and found is not None and not self.elsewhere():
-            self._store.keep_computed(_key(trials, confidence), found.to_json(), digest)
-        return found
+            try:
+                evidence = None if learned is None else self._whole(learned, trials, draws, confidence)
+            except Exception as error:  # users' parts
+                self.failure, evidence = reason_of(error), None
+        if keep and evidence is not None and not self.elsewhere():
+            self._store.keep_computed(_key(trials, confidence), evidence.to_json(), digest)
+        return evidence
 
     def kept_evidence(self, trials: Sequence[Trial], confidence: float) -> DynamicsEvidence | None:
         """Return :meth:`evidence` that the store keeps for these trials; None if there is none."""
         return None if self.elsewhere() else DynamicsEvidence.from_json(self._store.computed(_key(trials, confidence)))
 
-    def _guarded(self, function: Callable[[], DynamicsEvidence]) -> DynamicsEvidence | None:
-        try:
-            return function()
-        except Exception as error:  # the user's parts, at states that no execution has reached, must not end a campaign
-            self.failure = reason_of(error)
-            return None
-
     def _whole(
         self, learned: LearnedDynamics, trials: Sequence[Trial], draws: int, confidence: float
     ) -> DynamicsEvidence:
-        found = self._evidence(learned, trials, learned.worst_case_of(draws))
-        found = replace(
-            found,
+        evidence = self._evidence(learned, trials, learned.worst_case_of(draws))
+        evidence = replace(
+            evidence,
             noise=learned.posterior.noise,
-            groups=len(found.maxima) // len(learned.posterior.components),
+            groups=len(evidence.maxima) // len(learned.posterior.components),
             without_model=learned.posterior.covariances.without_model,
         )
         best = largest_distance(trials)
-        bound = bound_of(found, best, confidence)
+        bound = bound_of(evidence, best, confidence)
         # Many closed loops, which only matter to a bound that nothing else withdraws.
-        return found if doubt_of(found, best, bound) else _with_jumps(found, learned, bound)
+        return evidence if doubt_of(evidence, best, bound) else _with_jumps(evidence, learned, bound)
 
     def _evidence(self, learned: LearnedDynamics, trials: Sequence[Trial], worst: WorstCase) -> DynamicsEvidence:
         names, untried = self._study.validation.space.names, learned.untried_parameter
@@ -250,23 +235,13 @@ class CampaignDynamics:
         """Return the labels of the states and inputs, with units; ``x[0], ..., u[0], ...`` for those without names."""
         inputs = learned.posterior.data.inputs
         states = len(learned.coverage.resolution) - inputs
-        named = self._study.validation.names(states, inputs)
-        numbered = [*(f"x[{i}]" for i in range(states)), *(f"u[{i}]" for i in range(inputs))]
-        labels = [label for names in named for label in labels_of(names)]
-        if len(set(labels)) < len(labels):  # a state and an input of the same name
-            return tuple(numbered)
-        unnamed = [*(f"x{i}" for i in range(states)), *(f"u{i}" for i in range(inputs))]
+        coordinates = [*(("x", i) for i in range(states)), *(("u", i) for i in range(inputs))]
+        labels = [label for names in self._study.validation.names(states, inputs) for label in labels_of(names)]
+        twice = len(set(labels)) < len(labels)  # a state and an input of the same name
         return tuple(
-            number if label == none else label for number, none, label in zip(numbered, unnamed, labels, strict=True)
+            f"{letter}[{i}]" if twice or label == f"{letter}{i}" else label
+            for (letter, i), label in zip(coordinates, labels, strict=True)
         )
-
-    def _learn(
-        self, executed: Sequence[tuple[Trial, Trajectory]], others: Sequence[Trajectory]
-    ) -> tuple[LearnedDynamics | None, str | None]:
-        try:
-            return self._study.learn([(trial.unit_point, trajectory) for trial, trajectory in executed], others), None
-        except Exception as error:  # the same
-            return None, reason_of(error)
 
     def checked(self, trials: Sequence[Trial]) -> tuple[CheckedPrediction, ...]:
         """Return the predictions of completed trials; of those without a stored one, of the last few only.
@@ -274,24 +249,22 @@ class CampaignDynamics:
         The first trials, before which nothing could be learned, have no prediction.
         """
         completed = [trial for trial in trials if trial.state == "completed" and trial.distance is not None]
-        found = []
+        checked = []
         for place, trial in enumerate(completed):
             before = completed[:place]
-            stored = self.stored_prediction(trial)
-            prediction = stored
-            if stored is None and place >= len(completed) - _RECOMPUTED:
-                if self.learned(before, alone=True) is None:
+            prediction = stored = self.stored_prediction(trial)
+            if stored is None:
+                recent = place >= len(completed) - PREDICTIONS - 1
+                if not recent or self.learned(before, alone=True) is None:
                     continue
                 prediction = self.predict(before, trial.unit_point, alone=True)
-            elif stored is None:
-                continue
-            found.append(self._compared(trial, prediction, before, stored is not None))
-        return tuple(found)
+            checked.append(self._compared(trial, prediction, before, stored is not None))
+        return tuple(checked)
 
     def _compared(
         self, trial: Trial, prediction: ExecutionPrediction | None, before: Sequence[Trial], stored: bool
     ) -> CheckedPrediction:
-        known = np.array([one.unit_point for one in before]).reshape(-1, len(trial.unit_point))
+        known = np.array([earlier.unit_point for earlier in before]).reshape(-1, len(trial.unit_point))
         how: dict[str, Any] = {
             "stored": stored,
             "new": not len(known) or float(np.abs(known - trial.unit_point).max(axis=1).min()) > NEAR,
@@ -318,34 +291,87 @@ class CampaignDynamics:
         return {PREDICTION: {**prediction.to_json(), "experiment": self.experiment}}
 
 
+@dataclass(frozen=True, eq=False, repr=False)
+class LearnedFromTrials:
+    """The :class:`ctxval.certificates.LearnedDistance` of a campaign. The system is never executed.
+
+    Attributes:
+        validation: the map p -> d(p).
+        trials: all trials of the campaign.
+        study: what the trajectories teach of the dynamics.
+    """
+
+    validation: Validation
+    trials: Sequence[Trial]
+    study: CampaignDynamics
+    _predictions: dict[int, Prediction | None] = field(default_factory=dict, init=False)
+
+    def expected(self, points: Array, before: int) -> Array:
+        """Return predicted distances ``(m,)`` at points ``(m, d)``, learned from the trials with smaller numbers.
+
+        They are NaN if a task cannot be predicted, or if the trials teach nothing.
+        """
+        if before not in self._predictions:
+            earlier = [trial for trial in self.trials if trial.number < before]
+            self._predictions[before] = self.study.prediction(earlier)
+        prediction = self._predictions[before]
+        return np.full(len(points), np.nan) if prediction is None else prediction.expected(points)[0]
+
+    def dynamics(self, confidence: float) -> DynamicsEvidence | None:
+        """Return what the dynamics learned from all trials say about d*; None if nothing can be learned."""
+        evidence = self.study.evidence(self.trials, confidence)
+        if evidence is None and self.study.failure is not None:
+            raise CertificateError(f"no dynamics can be learned: {self.study.failure.rstrip('.')}.")
+        return evidence
+
+    def tasks(self, count: int, seed: int) -> Array:
+        """Return independent draws of tasks, points of the unit cube ``(count, d)``."""
+        # This random stream is none of those of trials.
+        return self.validation.space.unit_draws(count, np.random.default_rng([seed, 0x7461]))
+
+
+def provenance_of(
+    store: Store, validation: Validation, trials: Sequence[Trial], dynamics: CampaignDynamics
+) -> Provenance:
+    """Return what a certificate needs besides the trials of a campaign."""
+    with store.snapshot():
+        known = Provenance.of(store.description(), store.history())
+    offsets = [
+        (start_offset(validation, validation.space.point(trial.parameters), executed), trial.number)
+        for trial, executed in executed_trials(store, trials)
+    ]
+    start = max(((offset.size, f"{offset.text} (trial {number})") for offset, number in offsets), default=None)
+    learned = LearnedFromTrials(validation, trials, dynamics)
+    return replace(known, space=validation.space, learned=learned, start=start, units=validation.labels.units)
+
+
 def _key(trials: Sequence[Trial], confidence: float) -> str:
     """Return the key of the evidence of some trials in the store."""
     text = json.dumps([(trial.number, trial.state, trial.distance, trial.note) for trial in trials])
     return f"evidence {confidence} {hashlib.sha256(text.encode()).hexdigest()}"
 
 
-def _with_jumps(found: DynamicsEvidence, learned: LearnedDynamics, bound: float) -> DynamicsEvidence:
+def _with_jumps(evidence: DynamicsEvidence, learned: LearnedDynamics, bound: float) -> DynamicsEvidence:
     """Return evidence with the largest jump between tasks; if there are jumps, with what deeper searches have found."""
-    found = replace(found, jump=learned.largest_jump)
-    if not found.dense or not jumps(found, bound):
-        return found
+    evidence = replace(evidence, jump=learned.largest_jump)
+    if not evidence.dense or not jumps(evidence, bound):
+        return evidence
     values, points = learned.deeper
     low, high = values.min(), values.max()
-    found = replace(found, disagreement=float(1 - low / high) if high > 0 else 0.0)
-    if high <= found.highest:
-        return found
-    elites = np.concatenate([points[values.argmax()][None], found.elites])
-    return replace(found, missed=float(high / found.highest), highest=float(high), elites=elites)
+    evidence = replace(evidence, disagreement=float(1 - low / high) if high > 0 else 0.0)
+    if high <= evidence.highest:
+        return evidence
+    elites = np.concatenate([points[values.argmax()][None], evidence.elites])
+    return replace(evidence, missed=float(high / evidence.highest), highest=float(high), elites=elites)
 
 
-def _coverage(found: Coverage, names: Sequence[str]) -> StateInputCoverage:
+def _coverage(coverage: Coverage, names: Sequence[str]) -> StateInputCoverage:
     def named(values: Array) -> dict[str, float]:
         return dict(zip(names, values.tolist(), strict=True))
 
     def gap(of: Gap) -> StateInputGap:
         return StateInputGap(of.size, tuple(names[i] for i in of.coordinates), named(of.place))
 
-    pair = None if found.pair is None else gap(found.pair)
-    return StateInputCoverage(
-        gap(found.marginal), gap(found.beyond), pair, named(found.resolution), found.task, found.tasks
-    )
+    pair = None if coverage.pair is None else gap(coverage.pair)
+    marginal, beyond = gap(coverage.marginal), gap(coverage.beyond)
+    return StateInputCoverage(marginal, beyond, pair, named(coverage.resolution), coverage.task, coverage.tasks)

@@ -1,4 +1,4 @@
-"""The loop over executions: one after the other in this process, or several at a time on workers."""
+"""The loop over executions, one or several at a time."""
 
 from __future__ import annotations
 
@@ -10,20 +10,11 @@ from ctxval._util.checked import NonNegativeInt, checked
 from ctxval._util.interrupts import Interrupts, exits_as_exceptions
 from ctxval._util.progress import advance, is_heard, stage
 from ctxval._util.representation import named
-from ctxval.campaign.choices import Choice, OpenTrial
-from ctxval.campaign.remeasuring import remeasure
+from ctxval.campaign.choices import Choice, Execution, OpenTrial
 from ctxval.campaign.trials import TrialRecorder
-from ctxval.campaign.workers import ExecutionResult, WorkerPool, execute_task
-from ctxval.core.plan import Measurement, Plan
+from ctxval.campaign.workers import SerialPool, WorkerPool
 from ctxval.core.trial import CONVERGED, Trial
-from ctxval.core.validation import Validation
 from ctxval.errors import CtxvalError, ExecutionError, InputError
-
-_SLOW = 1.0
-"""Seconds from which on the duration of an execution is said."""
-
-_CLEAR = 5e-4
-"""Share of a predicted distance from which on its standard deviation is said."""
 
 OnTrial = Callable[[Trial], None]
 """Called with each trial that has ended."""
@@ -47,12 +38,8 @@ class RetryPolicy:
 class Schedule:
     """The order of the executions: first the interrupted trials, then the choices of a rule.
 
-    Attributes:
-        recorder: the recorder of the trials.
-        rule: returns the choice of a new trial, or None if there is none at present. It is called again after an
-            execution has ended.
-        budget: the total number of executions; None if only the rule ends the campaign.
-        expected: the total number of executions that are expected if there is no budget.
+    The rule returns None if there is no choice at present; it is called again after an execution has ended. Without a
+    budget, the total number of executions, only the rule ends the campaign, after about the expected number.
     """
 
     recorder: TrialRecorder
@@ -69,88 +56,23 @@ class Schedule:
 
 
 def execute_schedule(schedule: Schedule, pool: WorkerPool | None, on_trial: OnTrial | None, retry: RetryPolicy) -> None:
-    """Execute a schedule to its end, as the only process that runs the store."""
+    """Execute a schedule to its end, as the only process that runs the store; without a pool, in this process."""
     recorder = schedule.recorder
     with recorder.store.sole_writer(), Interrupts() as interrupts, exits_as_exceptions():
         recorder.refresh()
         if any(trial.state == "unmeasured" for trial in recorder.trials):
-            remeasure(recorder)
+            recorder.remeasure()
+        workers = SerialPool(recorder.validation.system) if pool is None else pool
         total = schedule.expected if schedule.budget is None else schedule.budget
         try:
             with stage("executions", total, done=recorder.executions):
-                if pool is None:
-                    _execute_in_turn(schedule, on_trial, interrupts)
-                else:
-                    _ParallelExecution(schedule, pool, on_trial, retry).run(interrupts)
+                _Loop(schedule, workers, on_trial, retry).run(interrupts)
         finally:
             recorder.abandon_executions()
 
 
-def _report(recorder: TrialRecorder, ended: Trial, on_trial: OnTrial | None) -> None:
-    """Tell whoever listens that a trial has ended."""
-    if is_heard():
-        advance(int(ended.executed), _result(recorder, ended))
-    if on_trial is not None:
-        on_trial(ended)
-
-
-def _result(recorder: TrialRecorder, ended: Trial) -> str:
-    """Return a trial in one line: its task, what was predicted, and what was executed."""
-    validation, predicted = recorder.validation, recorder.dynamics.stored_prediction(ended)
-    parts = [f"trial {ended.number:<2}", str(named(ended.parameters, validation.space.units))]
-    if predicted is not None:
-        clear = predicted.deviation >= _CLEAR * predicted.median
-        parts.append(f"predicted {predicted.median:.4g}" + (f" ± {predicted.deviation:.1g}" if clear else ""))
-    if ended.distance is None:
-        parts.append(f"failed: {ended.failure}")
-    else:
-        parts.append(f"executed {ended.distance:.4g} {validation.labels.units}".rstrip())
-    if ended.seconds is not None and ended.seconds >= _SLOW:
-        parts.append(f"{ended.seconds:.2g} s")
-    offset = recorder.start_offset(ended)
-    if offset is not None and offset.size:
-        parts.append(f"its start was off by {offset.text}")
-    if (ended.note or {}).get(CONVERGED) is False:
-        parts.append("the design of its controller did not converge")
-    return "   ".join(parts)
-
-
-def _execute_in_turn(schedule: Schedule, on_trial: OnTrial | None, interrupts: Interrupts) -> None:
-    recorder = schedule.recorder
-    while (chosen := schedule.next()) is not None:
-        opened = recorder.start(chosen)
-        with interrupts.shielded():
-            system, plan = recorder.validation.system, opened.plan
-            result = execute_task(system, plan.controller, plan.task)
-            try:
-                measurement = _measured(recorder.validation, plan, result)
-            except ExecutionError as error:
-                ended = recorder.fail(opened.trial, error, seconds=result.seconds)
-            else:
-                ended = recorder.complete(opened.trial, measurement, result.trajectory, result.seconds)
-            _report(recorder, ended, on_trial)
-        interrupts.raise_if_asked()
-
-
-def _measured(validation: Validation, plan: Plan, result: ExecutionResult) -> Measurement:
-    """Return the distance of an execution."""
-    if result.failure is not None:
-        raise ExecutionError(result.failure)
-    try:
-        return validation.accept(plan, result.trajectory)
-    except InputError as error:
-        raise ExecutionError(str(error)) from error
-
-
-class _ParallelExecution:
-    """Several executions at a time.
-
-    Args:
-        schedule: the trials to execute.
-        pool: the workers.
-        on_trial: called with each trial that has ended.
-        retry: the limits on repetitions.
-    """
+class _Loop:
+    """Keeps all workers busy, and records what their executions gave."""
 
     def __init__(self, schedule: Schedule, pool: WorkerPool, on_trial: OnTrial | None, retry: RetryPolicy) -> None:
         self.schedule, self.pool, self.on_trial, self.retry = schedule, pool, on_trial, retry
@@ -191,37 +113,60 @@ class _ParallelExecution:
         self.pool.start(opened.number, opened.plan)
         self.running[opened.number] = opened
 
-    def _take(self, number: int, result: ExecutionResult) -> None:
-        opened = self.running.pop(number)
+    def _take(self, number: int, execution: Execution) -> None:
+        """Record an execution that has ended, or repeat it."""
         try:
-            ended = self._lost(opened, result.lost) if result.lost is not None else self._ended(opened, result)
+            ended = self._recorded(self.running.pop(number), execution)
         except CtxvalError as error:
             self.stopped = self.stopped or error
             return
-        if ended is not None:
-            _report(self.recorder, ended, self.on_trial)
+        if ended is not None and is_heard():
+            advance(int(ended.executed), _result(self.recorder, ended))
+        if ended is not None and self.on_trial is not None:
+            self.on_trial(ended)
 
-    def _lost(self, opened: OpenTrial, reason: str) -> Trial | None:
-        """Repeat an execution whose worker was lost and return None; after too many losses, return the failed trial."""
-        self.losses[opened.number] += 1
-        if self.losses[opened.number] <= self.retry.retries:
-            self._repeat(opened)
-            return None
-        failure = f"the worker was lost {self.losses[opened.number]} times, at last: {reason}"
-        return self.recorder.fail(opened.trial, failure)
-
-    def _ended(self, opened: OpenTrial, result: ExecutionResult) -> Trial | None:
-        """Store the result of an execution and return its trial; return None if it failed and is repeated."""
+    def _recorded(self, opened: OpenTrial, execution: Execution) -> Trial | None:
+        """Return the trial of an execution that was stored; None if the execution is repeated."""
+        if execution.lost is not None:
+            self.losses[opened.number] += 1
+            losses = self.losses[opened.number]
+            if losses <= self.retry.retries:
+                self._repeat(opened)
+                return None
+            failure = f"the worker was lost {losses} times, at last: {execution.lost}"
+            return self.recorder.close(opened.trial, Execution(failed=failure))
         try:
-            measurement = _measured(self.recorder.validation, opened.plan, result)
-        except ExecutionError as error:
+            execution = execution.measured(self.recorder.validation, opened.plan)
+        except (ExecutionError, InputError) as error:
+            execution = Execution(failed=str(error), seconds=execution.seconds)
+        if execution.failed is not None:
             self.failures[opened.number] += 1
             if self.failures[opened.number] <= self.retry.retry_failures:
                 self._repeat(opened)
                 return None
-            return self.recorder.fail(opened.trial, error, seconds=result.seconds)
-        return self.recorder.complete(opened.trial, measurement, result.trajectory, result.seconds)
+        return self.recorder.close(opened.trial, execution)
 
     def _repeat(self, opened: OpenTrial) -> None:
         if self.stopped is None:
             self._start(self.recorder.repeat(opened))
+
+
+def _result(recorder: TrialRecorder, ended: Trial) -> str:
+    """Return a trial in one line: its task, what was predicted, and what was executed."""
+    validation, predicted = recorder.validation, recorder.dynamics.stored_prediction(ended)
+    parts = [f"trial {ended.number:<2}", str(named(ended.parameters, validation.space.units))]
+    if predicted is not None:
+        visible = predicted.deviation >= 5e-4 * predicted.median
+        parts.append(f"predicted {predicted.median:.4g}" + (f" ± {predicted.deviation:.1g}" if visible else ""))
+    if ended.distance is None:
+        parts.append(f"failed: {ended.failure}")
+    else:
+        parts.append(f"executed {ended.distance:.4g} {validation.labels.units}".rstrip())
+    if ended.seconds is not None and ended.seconds >= 1:
+        parts.append(f"{ended.seconds:.2g} s")
+    offset = recorder.start_offset(ended)
+    if offset is not None and offset.size:
+        parts.append(f"its start was off by {offset.text}")
+    if (ended.note or {}).get(CONVERGED) is False:
+        parts.append("the design of its controller did not converge")
+    return "   ".join(parts)

@@ -9,12 +9,6 @@ from ctxval.core.plan import Plan
 from ctxval.core.soundness import MISSED, goal_misses
 from ctxval.core.validation import Validation
 
-_LEAST = 3
-"""Number of plans from which the range of the states is known well enough."""
-
-_KEPT = 20
-"""Number of plans that are kept for the range of the states."""
-
 
 class GoalWarning(UserWarning):
     """The model itself misses the goals of its tasks, so that validating S against it says little."""
@@ -24,9 +18,6 @@ class GoalsOfModel:
     """Watches the plans of a campaign and warns once if M misses a goal; nothing is planned for this.
 
     Nothing is said of tasks without a goal, and of synthesizers that do not tell which states they bring to a goal.
-
-    Args:
-        validation: the map p -> d(p).
     """
 
     def __init__(self, validation: Validation) -> None:
@@ -35,30 +26,26 @@ class GoalsOfModel:
         self._warned = False
 
     def watch(self, plan: Plan) -> None:
-        """Take note of a plan.
-
-        Warns:
-            GoalWarning: if M misses its goal in this task or an earlier one, the first time.
-        """
+        """Take note of a plan; warn if M misses its goal in this task or an earlier one, the first time."""
         if self._warned or not plan.task.has_goal:
             return
-        self._plans = [*self._plans[: _KEPT - 1], plan]
-        sentence = self._sentence() if len(self._plans) >= _LEAST else None
+        self._plans = [*self._plans[:19], plan]  # which show the range of the states
+        sentence = self._sentence() if len(self._plans) >= 3 else None
         if sentence is not None:
             self._warned = True
             warnings.warn(sentence, GoalWarning, stacklevel=2)
 
     def _sentence(self) -> str | None:
-        on_model = [one.model_trajectory for one in self._plans]
-        found = goal_misses(self._validation, on_model, [one.task.goal for one in self._plans])
-        if found is None or not found.missed.any():
+        on_model = [plan.model_trajectory for plan in self._plans]
+        misses = goal_misses(self._validation, on_model, [plan.task.goal for plan in self._plans])
+        if misses is None or not misses.missed.any():
             return None
-        row, column = found.worst
+        row, column = misses.worst
         names = labels_of(self._validation.names(on_model[0].states.shape[-1], on_model[0].inputs.shape[-1])[0])
         where = self._validation.space.describe_point(self._plans[row].parameters.points)
+        miss = f"{misses.misses[row, column]:.3g} in {names[int(misses.states[column])]}"
         return (
-            f"the model itself does not complete its tasks: in {found.missed.sum()} of {len(self._plans)} it ends more "
-            f"than {100 * MISSED:g} % of the range of a state from its goal, by {found.misses[row, column]:.3g} in "
-            f"{names[int(found.states[column])]} for the task {where}. A validation against such a model says little: "
-            "see `ctxval check --aspect1`."
+            f"the model itself does not complete its tasks: in {misses.missed.sum()} of {len(self._plans)} it ends "
+            f"more than {100 * MISSED:g} % of the range of a state from its goal, by {miss} for the task {where}. "
+            "A validation against such a model says little: see `ctxval check --aspect1`."
         )

@@ -34,8 +34,8 @@ def history_of(trials: Sequence[Trial]) -> list[Trial]:
 def executed_trials(store: Store, trials: Sequence[Trial]) -> list[tuple[Trial, Trajectory]]:
     """Return the completed trials that have a trajectory of the system, with these trajectories."""
     completed = [trial for trial in trials if trial.state == "completed"]
-    found = store.trajectories([trial.number for trial in completed], "system")
-    return [(trial, found[trial.number]) for trial in completed if trial.number in found]
+    executed = store.trajectories([trial.number for trial in completed], "system")
+    return [(trial, executed[trial.number]) for trial in completed if trial.number in executed]
 
 
 def largest_distance(trials: Sequence[Trial]) -> float:
@@ -55,23 +55,19 @@ def for_known_values(prediction: Prediction, trials: Sequence[Trial], executed: 
         return prediction
     # A distance without a recording is a value that the search knows, but there is no trajectory for it.
     row_of = {trial.number: row for row, trial in enumerate(executed)}
-    rows = np.array([row_of.get(trial.number, -1) for trial in known], dtype=np.intp)
-    return _by_known_value(prediction, np.array([trial.unit_point for trial in known]), rows)
+    row_of_known = np.array([row_of.get(trial.number, -1) for trial in known], dtype=np.intp)
+    points = np.array([trial.unit_point for trial in known])
 
-
-def _by_known_value(prediction: Prediction, points: Array, executed: Rows) -> Prediction:
-    """Return a prediction with one row for each known value."""
-
-    def left_out_of(one: Prediction) -> Callable[[Rows], Array]:
+    def left_out_of(part: Prediction) -> Callable[[Rows], Array]:
         def left_out(rows: Rows) -> Array:
-            found = np.empty(len(rows))
-            has_trajectory = executed[rows] >= 0
+            values = np.empty(len(rows))
+            has_trajectory = row_of_known[rows] >= 0
             if has_trajectory.any():
-                found[has_trajectory] = one.left_out(executed[rows[has_trajectory]])
+                values[has_trajectory] = part.left_out(row_of_known[rows[has_trajectory]])
             if not has_trajectory.all():
                 # Nothing was learned from this point, so leaving it out does not change the prediction there.
-                found[~has_trajectory] = one.expected(points[rows[~has_trajectory]])[0]
-            return found
+                values[~has_trajectory] = part.expected(points[rows[~has_trajectory]])[0]
+            return values
 
         return left_out
 

@@ -1,47 +1,43 @@
-"""Checks that a store belongs to an experiment: by its description, and by recomputing some stored results."""
+"""Whether a store belongs to an experiment: by its description, and by results that are computed again."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from ctxval._util.arrays import Array
 from ctxval._util.describe import describe, differences
+from ctxval._util.progress import advance, stage
+from ctxval._util.texts import text_of
 from ctxval.campaign.storage.store import Store
 from ctxval.core.distance import Distance
 from ctxval.core.trajectory import Trajectory
-from ctxval.core.trial import Change, Trial
+from ctxval.core.trial import REDEFINED, TOLD_ALONE, Change, Trial
 from ctxval.core.validation import Validation
 from ctxval.errors import CtxvalError, DistanceError, InputError, StoreMismatchError
 from ctxval.searches import DEFAULT, NAMES, Repeated, Search, by_name
 
-_RECOMPUTED = 1e-4
-"""Largest difference between a recomputed and a stored closed loop on the model, as a fraction of each range."""
-
-REMEASURED = 1e-6
-"""Largest relative difference between a recomputed and a stored distance."""
-
 _QUESTION = ("name", "seed", "search", "validation.space")
 """Parts of the description that must not differ, whatever reason the user gives."""
-
-_DISTANCE = "validation.distance"
 
 
 def description_of(validation: Validation, search: Search, seed: int, name: str) -> dict[str, Any]:
     """Return the description that identifies an experiment in a store, in the form that JSON returns."""
     described = {"name": name, "seed": seed, "search": describe(search), "validation": validation.describe()}
-    plain: dict[str, Any] = json.loads(json.dumps(described))
-    return plain
+    return dict(json.loads(json.dumps(described)))
 
 
 def search_of(store: Store) -> Search:
     """Return the search of a store, made from its description; the default search for a new store."""
     described = store.description().get("search")
-    search = by_name(DEFAULT) if described is None else _search_described(described)
-    if search is None:
+    if described is None:
+        return by_name(DEFAULT)
+    search = _ready_made(described)
+    # A user's search may have the same name, and options that are not numbers cannot be restored.
+    if search is None or _plain(search) != described:
         kind = described.get("type", "unknown") if isinstance(described, dict) else described
         raise StoreMismatchError(
             f"{store.name} was made with the search {kind!r}, which cannot be made from its description in the store: "
@@ -50,31 +46,22 @@ def search_of(store: Store) -> Search:
     return search
 
 
-def _search_described(described: Any) -> Search | None:
-    """Return a search of this package from its description; None if it is another one or has other options."""
-    if not isinstance(described, dict):
-        return None
-    if described.get("type") == Repeated.__name__:
-        inner, times = _ready_made(described.get("search")), described.get("times")
-        search: Search | None = None if inner is None or not isinstance(times, int) else Repeated(inner, times)
-    else:
-        search = _ready_made(described)
-    # A user's search may have the same name, and options that are not numbers cannot be restored.
-    return search if search is not None and _plain(search) == described else None
-
-
 def _ready_made(described: Any) -> Search | None:
-    """Return the search of a description, with the options that differ from the default."""
+    """Return a search of this package, with the described options that differ from the default; None if it is none."""
     if not isinstance(described, dict):
         return None
-    kind = next((kind for kind in NAMES.values() if kind.__name__ == described.get("type")), None)
-    if kind is None:
-        return None
-    default = _plain(kind())
-    options = {name: value for name, value in described.items() if value != default.get(name)}
-    if not all(_is_numeric(value) or isinstance(default.get(name), str) for name, value in options.items()):
-        return None
+    name = described.get("type")
+    kind = next((kind for kind in NAMES.values() if kind.__name__ == name), None)
     try:
+        if name == Repeated.__name__:
+            repeated = _ready_made(described.get("search"))
+            return None if repeated is None else Repeated(repeated, described.get("times", 0))
+        if kind is None:
+            return None
+        default = _plain(kind())
+        options = {name: value for name, value in described.items() if value != default.get(name)}
+        if not all(_is_numeric(value) or isinstance(default.get(name), str) for name, value in options.items()):
+            return None
         search: Search = kind(**{name: tuple(v) if isinstance(v, list) else v for name, v in options.items()})
     except (TypeError, InputError):
         return None
@@ -92,7 +79,11 @@ def _plain(value: Any) -> Any:
 
 def with_distance(description: dict[str, Any], distance: Distance) -> dict[str, Any]:
     """Return a description with another distance and all other parts unchanged."""
-    return {**description, "validation": {**description["validation"], "distance": _plain(distance)}}
+    return _of_distance(description, _plain(distance))
+
+
+def _of_distance(description: dict[str, Any], distance: Any) -> dict[str, Any]:
+    return {**description, "validation": {**description["validation"], "distance": distance}}
 
 
 def identify(
@@ -108,27 +99,30 @@ def identify(
     store.describe_first(description)
     with store.snapshot():
         stored, trials = store.description(), store.trials()
-    found = list(differences(stored, description))
-    asked = [sentence for path, sentence in found if path.startswith(_QUESTION)]
+    differing = list(differences(stored, description))
+    asked = [sentence for path, sentence in differing if path.startswith(_QUESTION)]
     if asked:
         raise _mismatch(store, asked[0], "use another store")
     loop = _changed_loop(store, validation, trials)
     if loop is not None:
-        raise _mismatch(store, next((sentence for _, sentence in found), loop), _LOOP_CHANGED)
-    others = [sentence for path, sentence in found if not path.startswith(_DISTANCE)]
+        raise _mismatch(store, next((sentence for _, sentence in differing), loop), _LOOP_CHANGED)
+    others = [sentence for path, sentence in differing if not path.startswith("validation.distance")]
     if others and accept is None:
         raise _mismatch(store, others[0], _OTHER_CHANGED)
     if not remeasuring:
-        _require_same_distance(store, validation, trials, [s for p, s in found if p.startswith(_DISTANCE)], accept)
-        others = [sentence for _, sentence in found]
-    kept = _with_distance(description, stored) if remeasuring else description
+        described = [sentence for path, sentence in differing if path.startswith("validation.distance")]
+        measured = _changed_distance(store, validation, trials)
+        if measured is not None:
+            raise _mismatch(store, (described or [measured])[0], _DISTANCE_CHANGED)
+        if described and accept is None:
+            advice = f'{_DISTANCE_CHANGED}; if the distance still computes the same, give --accept-change "REASON"'
+            raise _mismatch(store, described[0], advice)
+        others = [sentence for _, sentence in differing]
     if others or accept is not None:
-        store.describe_anew(kept, Change("accepted", str(accept), {"differences": others, "trials": len(trials)}))
-
-
-def _with_distance(description: dict[str, Any], stored: dict[str, Any]) -> dict[str, Any]:
-    """Return a description with the distance function of the stored values."""
-    return {**description, "validation": {**description["validation"], "distance": stored["validation"]["distance"]}}
+        change = Change("accepted", str(accept), {"differences": others, "trials": len(trials)})
+        if remeasuring:  # the stored values are still those of the earlier distance
+            description = _of_distance(description, stored["validation"]["distance"])
+        store.describe_anew(description, change)
 
 
 _LOOP_CHANGED = "the model, the task or the controller design has changed since the executions: use another store"
@@ -144,20 +138,6 @@ _DISTANCE_CHANGED = (
 
 def _mismatch(store: Store, difference: str, advice: str) -> StoreMismatchError:
     return StoreMismatchError(f"{store.name} was made by another experiment: {difference}; {advice}.")
-
-
-def _require_same_distance(
-    store: Store, validation: Validation, trials: Sequence[Trial], described: list[str], accept: str | None
-) -> None:
-    measured = _changed_distance(store, validation, trials)
-    if measured is not None:
-        raise _mismatch(store, (described or [measured])[0], _DISTANCE_CHANGED)
-    if described and accept is None:
-        advice = f'{_DISTANCE_CHANGED}; if the distance still computes the same, give --accept-change "REASON"'
-        raise _mismatch(store, described[0], advice)
-
-
-# Recomputed results
 
 
 def _samples(trials: Sequence[Trial]) -> list[Trial]:
@@ -179,8 +159,8 @@ def _changed_loop(store: Store, validation: Validation, trials: Sequence[Trial])
             now = _loop(validation, trial)
             gap = _gap(stored, now)
             # Results that differ from one call to the next, such as those of a random planner, cannot be compared.
-            if gap > _RECOMPUTED and _gap(now, _loop(validation, trial)) <= _RECOMPUTED:
-                if stored.states.shape != now.states.shape or stored.inputs.shape != now.inputs.shape:
+            if gap > 1e-4 and _gap(now, _loop(validation, trial)) <= 1e-4:
+                if np.isinf(gap):
                     return f"{what} had {_size(stored)} and has now {_size(now)}"
                 return f"{what} differs from the stored one by {100 * min(gap, 1e6):.2g} % of its range"
         except CtxvalError as error:
@@ -196,19 +176,17 @@ def _loop(validation: Validation, trial: Trial) -> Trajectory:
     return validation.plan(validation.space.point(trial.parameters)).model_trajectory
 
 
-def _gap(one: Trajectory, other: Trajectory) -> float:
-    """Return the largest difference of a state or input, as a fraction of its range."""
-    if one.states.shape != other.states.shape or one.inputs.shape != other.inputs.shape:
-        return np.inf
-    return max(_relative(one.states, other.states), _relative(one.inputs, other.inputs))
-
-
-def _relative(one: Array, other: Array) -> float:
-    if not one.size:
-        return 0.0
-    size = np.maximum(np.ptp(one, axis=0), np.abs(one).max(axis=0))
-    scale = np.maximum(size, max(1e-3 * float(size.max()), 1e-9))
-    return float((np.abs(one - other) / scale).max())
+def _gap(before: Trajectory, after: Trajectory) -> float:
+    """Return the largest difference of a state or input, as a fraction of its range; infinity for another shape."""
+    gaps = [0.0]
+    for old, new in ((before.states, after.states), (before.inputs, after.inputs)):
+        if old.shape != new.shape:
+            return np.inf
+        if old.size:
+            size = np.maximum(np.ptp(old, axis=0), np.abs(old).max(axis=0))
+            scale = np.maximum(size, max(1e-3 * float(size.max()), 1e-9))
+            gaps.append(float((np.abs(old - new) / scale).max()))
+    return max(gaps)
 
 
 def _changed_distance(store: Store, validation: Validation, trials: Sequence[Trial]) -> str | None:
@@ -223,6 +201,68 @@ def _changed_distance(store: Store, validation: Validation, trials: Sequence[Tri
             again = validation.remeasure(point, model, system)
         except (DistanceError, InputError) as error:
             return f"the distance of trial {trial.number} cannot be computed any more ({error})"
-        if now == again and not np.isclose(now, trial.distance, rtol=REMEASURED, atol=1e-12):
+        if now == again and not _equal(trial.distance, now):
             return f"the distance of trial {trial.number} was {trial.distance:.6g} and is now {now:.6g}"
     return None
+
+
+def _equal(before: float, after: float) -> bool:
+    return bool(np.isclose(after, before, rtol=1e-6, atol=1e-12))
+
+
+# Another distance
+
+
+def remeasure(store: Store, validation: Validation, description: dict[str, Any]) -> list[Trial]:
+    """Recompute the distance of every stored execution; return the trials that changed."""
+    with store.sole_writer():
+        # Another process may record a result meanwhile; the distances are then computed again.
+        while (changed := _remeasured(store, validation, description)) is None:
+            pass
+    return changed
+
+
+def _remeasured(store: Store, validation: Validation, description: dict[str, Any]) -> list[Trial] | None:
+    """Store the recomputed distances; return the trials that changed, or None if the store has changed meanwhile."""
+    with store.snapshot():
+        seen, before, stored = store.signature(), store.trials(), store.description()
+    redefined = any(path.startswith("validation.distance") for path, _ in differences(stored, description))
+    with stage("measuring again", len(before), "trials"):
+        after = [_measured_again(store, validation, trial) for trial in before]
+    pairs = [(old.distance, new.distance) for old, new in zip(before, after, strict=True)]
+    known = [(old, new) for old, new in pairs if old is not None and new is not None]
+    redefined |= any(not _equal(old, new) for old, new in known)
+    if redefined:
+        # A distance without trajectories was told in another definition.
+        alone = [t.distance is not None and store.trajectory(t.number, "system") is None for t in after]
+        unknown: dict[str, Any] = {"state": "unmeasured", "distance": None, "failure": TOLD_ALONE}
+        after = [replace(t, **unknown) if told else t for t, told in zip(after, alone, strict=True)]
+    changed = [(old, new) for old, new in zip(before, after, strict=True) if _measured(old) != _measured(new)]
+    trials = [new for _, new in changed]
+    if not changed and not redefined:
+        return trials
+    outcomes = {str(old.number): _measured(old) for old, _ in changed}
+    change = Change("remeasured", REDEFINED if redefined else "asked for", {"before": outcomes})
+    return trials if store.remeasure(trials, description, change, seen) else None
+
+
+def _measured(trial: Trial) -> dict[str, Any]:
+    """Return the fields of a trial that a new measurement can change."""
+    return {"state": trial.state, "distance": trial.distance, "failure": trial.failure}
+
+
+def _measured_again(store: Store, validation: Validation, trial: Trial) -> Trial:
+    advance()
+    if trial.state == "open" or not trial.executed:
+        return trial
+    model, system = store.trajectory(trial.number, "model"), store.trajectory(trial.number, "system")
+    if model is None or system is None:
+        return trial
+    try:
+        distance = validation.remeasure(validation.space.point(trial.parameters), model, system)
+    except DistanceError as error:
+        if trial.distance is not None:
+            sentence = f"the distance of trial {trial.number} cannot be computed again, and nothing is changed: {error}"
+            raise DistanceError(sentence) from error
+        return replace(trial, state="unmeasured", failure=text_of(error))
+    return replace(trial, state="completed", distance=distance, failure=None)

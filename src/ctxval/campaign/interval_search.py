@@ -17,11 +17,12 @@ from ctxval._util.arrays import Array
 from ctxval.campaign.choices import Choice
 from ctxval.campaign.dynamics import NEAR
 from ctxval.campaign.history import largest_distance, waiting_points
-from ctxval.campaign.steadiness import Steadiness
+from ctxval.campaign.proposals import Steadiness
 from ctxval.campaign.trials import TrialRecorder
-from ctxval.certificates import CertificateOptions, CheckedPrediction, DynamicsEvidence, Sample, StoppingRule
+from ctxval.certificates import CertificateOptions, CheckedPrediction, DynamicsEvidence, Sample, StoppingRule, Verdict
 from ctxval.certificates.anytime import AnytimeAudit
 from ctxval.certificates.automatic import Automatic
+from ctxval.certificates.bounds import with_units
 from ctxval.certificates.covering import RESOLUTION, covering
 from ctxval.certificates.dynamics import Dynamics, bound_of, certify_dynamics
 from ctxval.certificates.dynamics_diagnostics import (
@@ -42,16 +43,9 @@ from ctxval.certificates.prediction_tests import DRAWN, fewest_spread_tests, nex
 from ctxval.core.trial import Trial
 from ctxval.errors import CertificateError, InputError
 
-_FAILING = 6
-"""Number of the last predictions, of which at least half must hold."""
-_PATIENCE = 16
-"""Number of executions, besides tests, after which ``auto`` uses the posterior bound if the dynamics decide nothing."""
-_EXPLORE = 3
-"""Every so many executions, the task that leads farthest from the records is executed in any case."""
-_CROSSED = 6
-"""Largest number of tasks that share a parameter with a test that failed and the others with the worst task."""
-_SPREAD = 256
-"""Number of random tasks of which the one farthest from all known ones is taken."""
+_FAILING = 6  # of so many last predictions, at least half must hold
+
+_PATIENCE = 16  # executions, besides tests, after which `auto` uses the posterior bound if the dynamics decide nothing
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,9 +59,6 @@ class IntervalSearch:
         threshold: tau, in the distance's units; None if there is none.
         within: without a threshold, the share by which the bound may exceed the largest executed distance at the end.
         keeps: whether the store keeps the evidence that may decide.
-
-    Raises:
-        InputError: if the certificate cannot be used, or an anytime audit may leave out no volume or has no threshold.
     """
 
     recorder: TrialRecorder
@@ -86,8 +77,9 @@ class IntervalSearch:
     @property
     def limit(self) -> float:
         """The value that the bound must not exceed at the end: the threshold, or a little more than was executed."""
-        largest = largest_distance(self.recorder.trials)
-        return (1 + self.within) * largest if self.threshold is None else self.threshold
+        if self.threshold is not None:
+            return self.threshold
+        return (1 + self.within) * self.best
 
     @property
     def predicts(self) -> bool:
@@ -101,49 +93,48 @@ class IntervalSearch:
     @property
     def interval(self) -> tuple[float, float | None]:
         """The largest executed distance, and the bound that a few posterior samples give; None if they give none."""
-        best, evidence = largest_distance(self.recorder.trials), self._evidence(self.recorder.trials)
-        return best, None if evidence is None else bound_of(evidence, best, self.options.confidence)
+        evidence = self._evidence()
+        return self.best, None if evidence is None else self._bound(evidence)
 
     def choose(self) -> Choice | None:
         """Return the next task; None if the interval decides."""
-        trials = self.recorder.trials
-        if largest_distance(trials) > self.limit:
+        if self.best > self.limit:
             return None
         if isinstance(self.options.kind, AnytimeAudit):
-            return self._by_draws(trials, self.options.kind)
-        test = self._next_test(trials)
-        if test is not None:
+            return self._by_draws(self.options.kind)
+        if (test := self._next_test()) is not None:
             return test
-        evidence = self._evidence(trials)
-        if evidence is not None:
-            task = self._beside_a_failed_test(trials, evidence)
-            if task is not None:
-                return Choice(task, "covering", planned_draws=0, rejected=0)
+        evidence = self._evidence()
+        if evidence is not None and (task := self._beside_a_failed_test(evidence)) is not None:
+            return Choice(task, "covering", planned_draws=0, rejected=0)
         if evidence is None or self._fails(evidence):
-            return self._by_distance(trials)
-        if self._may_decide(trials, evidence):
-            whole = self.recorder.dynamics.evidence(trials, self.options.confidence, keep=self.keeps)
+            return self._by_distance()
+        if self._may_decide(evidence):
+            whole = self.recorder.dynamics.evidence(self.recorder.trials, self.options.confidence, keep=self.keeps)
             if whole is None:
-                return self._by_distance(trials)
+                return self._by_distance()
             evidence = replace(whole, tests=self.tests)
-            if self._decides(trials, evidence):
+            if self._decides(evidence):
                 return None
         if isinstance(self.options.kind, Automatic):
-            known = _points(trials, self._dimension)
-            patient = sum(trial.origin not in DRAWN for trial in trials) < _PATIENCE
+            known = self._points(self.recorder.trials)
+            patient = sum(trial.origin not in DRAWN for trial in self.recorder.trials) < _PATIENCE
             # In few dimensions, executions soon cover the tasks, and the posterior bound of the distance may decide.
             if not patient or covering(known, self.options.kind.posterior.resolution, 0) is not None:
-                choice = self._by_distance(trials)
+                choice = self._by_distance()
                 if not patient or choice is None:
                     return choice
-        best, limit, confidence = largest_distance(trials), self.limit, self.options.confidence
-        bound = bound_of(evidence, best, confidence)
+        return self._by_evidence(evidence)
+
+    def _by_evidence(self, evidence: DynamicsEvidence) -> Choice:
+        """Return the task that the learned dynamics choose, or a test if nothing else is missing."""
+        best, limit, confidence, trials = self.best, self.limit, self.options.confidence, self.recorder.trials
+        bound = self._bound(evidence)
         if max(bound, evidence.highest) <= limit and only_tests_missing(evidence, best, bound):
-            return self._test(evidence.predictions, trials)
+            return self._test(evidence.predictions)
         learned = self.recorder.dynamics.learned(trials)
         steady = Steadiness(self.recorder.dynamics.planner, None if learned is None else learned.expected)
-        ended = _points([trial for trial in trials if trial.state != "open"], self._dimension)
-        point = next_task(evidence, ended, best, limit, confidence, steady)
+        point = next_task(evidence, self._points(self._ended), best, limit, confidence, steady)
         waiting = waiting_points(trials)
         if len(waiting) and (point is None or np.abs(waiting - point).max(axis=1).min() <= NEAR):
             # It is being executed already. Another worker prepares for the results that are expected.
@@ -152,12 +143,12 @@ class IntervalSearch:
                 best = max(best, float(expected[np.isfinite(expected)].max(initial=0.0)))
                 limit = (1 + self.within) * best if self.threshold is None else limit
             after = self.recorder.dynamics.screening(trials, pending=True) or evidence
-            point = next_task(after, _points(trials, self._dimension), best, limit, confidence, steady)
+            point = next_task(after, self._points(trials), best, limit, confidence, steady)
         return Choice(point, "covering", planned_draws=0, rejected=steady.rejected)
 
     def by_dynamics(self) -> Array | None:
         """Return the next task, a point ``(d,)``; None if it is decided or learned dynamics do not choose the task."""
-        evidence = self._evidence(self.recorder.trials)
+        evidence = self._evidence()
         choice = None if evidence is None or self._fails(evidence) else self.choose()
         return None if choice is None else choice.unit_point
 
@@ -167,19 +158,31 @@ class IntervalSearch:
         return self.options.kind.tests if isinstance(self.options.kind, Automatic | Dynamics) else 0
 
     @property
-    def _dimension(self) -> int:
-        return self.recorder.validation.space.dimension
+    def best(self) -> float:
+        """The largest executed distance; 0 if none is known."""
+        return largest_distance(self.recorder.trials)
 
-    def _evidence(self, trials: Sequence[Trial]) -> DynamicsEvidence | None:
+    @property
+    def _ended(self) -> list[Trial]:
+        return [trial for trial in self.recorder.trials if trial.state != "open"]
+
+    def _points(self, trials: Sequence[Trial]) -> Array:
+        return np.array([trial.unit_point for trial in trials]).reshape(-1, self.recorder.validation.space.dimension)
+
+    def _bound(self, evidence: DynamicsEvidence) -> float:
+        return bound_of(evidence, self.best, self.options.confidence)
+
+    def _evidence(self) -> DynamicsEvidence | None:
         """Return what the store keeps, or else what a few draws of the learned dynamics say.
 
         It is None if the certificate does not use them.
         """
+        trials = self.recorder.trials
         if not self.predicts or any(trial.state == "failed" for trial in trials):
             return None
         dynamics = self.recorder.dynamics
-        found = dynamics.kept_evidence(trials, self.options.confidence) or dynamics.screening(trials)
-        return None if found is None else replace(found, tests=self.tests)
+        evidence = dynamics.kept_evidence(trials, self.options.confidence) or dynamics.screening(trials)
+        return None if evidence is None else replace(evidence, tests=self.tests)
 
     def _fails(self, evidence: DynamicsEvidence) -> bool:
         """Return whether predictions fail so often that the dynamics cannot be learned."""
@@ -187,67 +190,64 @@ class IntervalSearch:
             return False
         last, bound = evidence.predictions[-_FAILING:], evidence.upper(self.options.confidence)
         tolerated = max(min(bound, self.limit), self.limit - bound)  # as far as the margin to the limit allows
-        return len(last) == _FAILING and 2 * sum(held(one, tolerated) for one in last) < _FAILING
+        return len(last) == _FAILING and 2 * sum(held(prediction, tolerated) for prediction in last) < _FAILING
 
-    def _may_decide(self, trials: Sequence[Trial], screened: DynamicsEvidence) -> bool:
+    def _may_decide(self, screened: DynamicsEvidence) -> bool:
         """Return whether the whole evidence may decide: nothing that a few draws show leaves the verdict open."""
-        if sum(trial.state != "open" for trial in trials) < FEWEST:
-            return False
-        best = largest_distance(trials)
-        bound = bound_of(screened, best, self.options.confidence)
-        return raised(screened, bound) <= self.limit and doubt_of(screened, best, bound) is None
+        bound = self._bound(screened)
+        enough = len(self._ended) >= FEWEST
+        return enough and raised(screened, bound) <= self.limit and doubt_of(screened, self.best, bound) is None
 
-    def _decides(self, trials: Sequence[Trial], evidence: DynamicsEvidence) -> bool:
-        ended = [trial for trial in trials if trial.state != "open"]
+    def _decides(self, evidence: DynamicsEvidence) -> bool:
         try:
-            found = certify_dynamics(Sample.of(ended), evidence, self.options.confidence)
+            return certify_dynamics(Sample.of(self._ended), evidence, self.options.confidence).covers(self.limit)
         except CertificateError:
             return False
-        return found.covers(self.limit)
 
-    def _next_test(self, trials: Sequence[Trial]) -> Choice | None:
+    def _next_test(self) -> Choice | None:
         """Return the next test if the last one held and more are missing: nothing needs to be searched for that."""
+        trials = self.recorder.trials
         if not self.tests or not self.predicts or any(trial.state != "completed" for trial in trials):
             return None
         if not trials or trials[-1].origin not in DRAWN:
             return None
         predictions = self.recorder.dynamics.checked(trials)
-        if not predictions or not held(predictions[-1], largest_distance(trials)):
+        if not predictions or not held(predictions[-1], self.best):
             return None
-        return self._test(predictions, trials) if missing_tests(predictions, self.tests) else None
+        return self._test(predictions) if missing_tests(predictions, self.tests) else None
 
-    def _beside_a_failed_test(self, trials: Sequence[Trial], evidence: DynamicsEvidence) -> Array | None:
+    def _beside_a_failed_test(self, evidence: DynamicsEvidence) -> Array | None:
         """Return a task where a test that failed may be worst; None if there is no such test, or all are executed.
 
         A dynamics that depends on the task is large where the one parameter that it depends on is that of the test and
         the others are those of the worst task. Parameters that M's loops do not depend on come first.
         """
-        best = largest_distance(trials)
-        if raised(evidence, bound_of(evidence, best, self.options.confidence)) <= self.limit:
+        if raised(evidence, self._bound(evidence)) <= self.limit:
             return None
-        tests = (one for one in reversed(evidence.predictions) if one.stored and one.origin in DRAWN)
-        failed = next((one for one in tests if not held(one, best)), None)
-        worst = next((trial.unit_point for trial in trials if trial.distance == best), None)
+        tests = (test for test in reversed(evidence.predictions) if test.stored and test.origin in DRAWN)
+        failed = next((test for test in tests if not held(test, self.best)), None)
+        worst = next((trial.unit_point for trial in self.recorder.trials if trial.distance == self.best), None)
         if failed is None or worst is None:
             return None
-        known = _points(trials, self._dimension)
-        learned = self.recorder.dynamics.learned(trials)
+        known = self._points(self.recorder.trials)
+        learned = self.recorder.dynamics.learned(self.recorder.trials)
         unseen = [] if learned is None else learned.study.unseen_parameters
-        for j in [*unseen, *(j for j in range(self._dimension) if j not in unseen)][:_CROSSED]:
+        for j in [*unseen, *(j for j in range(len(worst)) if j not in unseen)][:6]:
             task = worst.copy()
             task[j] = failed.point[j]
             if np.abs(known - task).max(axis=1).min() > NEAR:
                 return task
         return None
 
-    def _test(self, predictions: Sequence[CheckedPrediction] | None, trials: Sequence[Trial]) -> Choice:
+    def _test(self, predictions: Sequence[CheckedPrediction] | None) -> Choice:
         """Return the next task that tests predictions where nobody chose to look; see ``prediction_tests``."""
+        trials = self.recorder.trials
         if predictions is None:
             tests = [(trial.unit_point, trial.origin) for trial in trials if trial.distance is not None]
         else:
-            tests = [(np.array(one.point), one.origin) for one in tested(predictions, self.tests)]
+            tests = [(np.array(test.point), test.origin) for test in tested(predictions, self.tests)]
         tests += [(trial.unit_point, trial.origin) for trial in trials if trial.state == "open"]
-        points = np.array([point for point, _ in tests]).reshape(-1, self._dimension)
+        points = np.array([point for point, _ in tests]).reshape(-1, self.recorder.validation.space.dimension)
         drawn = sum(origin in DRAWN for _, origin in tests)
         if self.tests - drawn > fewest_spread_tests(points):
             # The results decide when the campaign ends, so the number of independent draws is not planned.
@@ -255,16 +255,15 @@ class IntervalSearch:
         task = next_spread_test(points, self.recorder.draws.generator(trials))
         return Choice(task, "spread", planned_draws=0, rejected=0)
 
-    def _by_draws(self, trials: Sequence[Trial], kind: AnytimeAudit) -> Choice | None:
+    def _by_draws(self, kind: AnytimeAudit) -> Choice | None:
         """Return the next independent draw of an anytime audit, which may end whenever its bound suffices."""
-        ended = [trial for trial in trials if trial.state != "open"]
-        if any(trial.origin == "iid" for trial in ended):
-            found, _ = kind.certify_against(Sample.of(ended), self.limit, self.options.confidence)
-            if found.covers(self.limit, self.options.volume):
+        if any(trial.origin == "iid" for trial in self._ended):
+            certificate, _ = kind.certify_against(Sample.of(self._ended), self.limit, self.options.confidence)
+            if certificate.covers(self.limit, self.options.volume):
                 return None
         return Choice(self.recorder.draw(), "iid", planned_draws=0)
 
-    def _by_distance(self, trials: Sequence[Trial]) -> Choice | None:
+    def _by_distance(self) -> Choice | None:
         kind = self.options.kind
         if isinstance(kind, Dynamics):
             return Choice(planned_draws=0)
@@ -272,12 +271,11 @@ class IntervalSearch:
             return Choice(planned_draws=0)  # no distance is known, or all are 0
         posterior = kind.posterior if isinstance(kind, Automatic) else kind
         rule = StoppingRule(self.limit, replace(self.options, kind=posterior))
-        now = rule.decide(trials, self.budget - self.recorder.executions)
+        now = rule.decide(self.recorder.trials, self.budget - self.recorder.executions)
         if not now.decided:
             return Choice(now.next_point, "covering", planned_draws=0)
-        ended = [trial for trial in trials if trial.state != "open"]
-        missing = isinstance(kind, Automatic) and kind.missing_tests(Sample.of(ended))
-        return self._test(None, trials) if missing else None
+        missing = isinstance(kind, Automatic) and kind.missing_tests(Sample.of(self._ended))
+        return self._test(None) if missing else None
 
 
 def is_decisive(options: CertificateOptions) -> bool:
@@ -297,6 +295,22 @@ def require_decisive(options: CertificateOptions) -> None:
         raise InputError("a verdict by an anytime audit needs the volume that may exceed the threshold.")
 
 
+def with_next_task(verdict: Verdict, recorder: TrialRecorder, options: CertificateOptions) -> Verdict:
+    """Return a verdict; if it is undecided and learned dynamics choose the next task, with this task."""
+    failed = any(trial.state == "failed" for trial in recorder.trials)
+    if verdict.answer != "undecided" or failed or not is_decisive(options):
+        return verdict
+    search = IntervalSearch(recorder, options, recorder.executions + 1, verdict.threshold, keeps=False)
+    unit_point = search.by_dynamics()
+    if unit_point is None:
+        return verdict
+    space = recorder.validation.space
+    point = space.from_unit(space.rounded(unit_point))
+    task = with_units(dict(zip(space.labels, point.tolist(), strict=True)))
+    reason = f"{verdict.reason.removesuffix('.')}; next task: {task}."
+    return replace(verdict, reason=reason, next_task=space.describe_point(point))
+
+
 def next_task(
     evidence: DynamicsEvidence,
     known: Array,
@@ -312,20 +326,15 @@ def next_task(
     the task with the largest predicted distance, while no similar distance was executed or a deeper search found it.
     Further tasks test the predictions, and if all of these are known, the task that is farthest from all others does.
 
-    Args:
-        evidence: what the learned dynamics say.
-        known: executed and open tasks, points ``(n, d)``.
-        best: the largest executed distance.
-        limit: what the bound must not exceed, in the distance's units.
-        confidence: the probability with which the bound holds.
-        steady: whether a task may be executed, because its distance is that of its neighbours.
+    The known tasks ``(n, d)`` are executed or open, ``best`` is the largest executed distance, and ``limit`` is what
+    the bound must not exceed. A task may be executed only if it is steady: its distance is that of its neighbours.
     """
     order = np.argsort(evidence.maxima, kind="stable")
     rank = evidence.rank(confidence)
     highest = evidence.points[[*order[rank::-1], *order[:rank:-1]]]
     farthest, largest = evidence.coverage.task[None], evidence.elites
     exceeds = evidence.upper(confidence) > limit
-    if exceeds and len(known) % _EXPLORE == _EXPLORE - 1:
+    if exceeds and len(known) % 3 == 2:  # every third execution leads farthest from the records in any case
         candidates = [farthest, highest]
     elif evidence.highest > limit:
         candidates = [largest, highest, farthest]
@@ -346,16 +355,8 @@ def next_task(
         most = 2 if np.array_equal(point, evidence.coverage.task) else 1
         return len(near) < most and not (near == point).all(axis=1).any()
 
-    candidates.append(_farthest_first(known))
-    return next((point for point in np.concatenate(candidates) if is_new(point) and steady(point)), None)
-
-
-def _farthest_first(known: Array) -> Array:
-    """Return tasks spread over the cube, points ``(m, d)``, the one farthest from the known tasks first."""
-    spread = np.random.default_rng(len(known)).random((_SPREAD, known.shape[1]))
+    # Of random tasks, the one farthest from all known tasks comes first.
+    spread = np.random.default_rng(len(known)).random((256, known.shape[1]))
     away = np.abs(spread[:, None] - known).max(axis=2).min(axis=1, initial=1.0)
-    return spread[np.argsort(-away, kind="stable")]
-
-
-def _points(trials: Sequence[Trial], dimension: int) -> Array:
-    return np.array([trial.unit_point for trial in trials]).reshape(-1, dimension)
+    candidates.append(spread[np.argsort(-away, kind="stable")])
+    return next((point for point in np.concatenate(candidates) if is_new(point) and steady(point)), None)

@@ -1,44 +1,122 @@
-"""Points that a search proposes, with what the executions so far teach and what thinking costs."""
+"""Points that a search proposes, a test of tasks before they are executed, and independent draws of tasks.
+
+A design that ends by chance, such as one that rounding errors stop, gives nearly equal tasks different controllers. A
+search for the largest distance would find such chances, which nobody meets again. So a task is executed only if its
+distance is that of the tasks next to it.
+"""
 
 from __future__ import annotations
 
+import hashlib
 import json
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
 import numpy as np
 
-from ctxval._util.arrays import Array
+from ctxval._util.arrays import Array, Rows
 from ctxval._util.progress import stage
 from ctxval._util.texts import enumerated, shortened
 from ctxval.campaign.choices import Choice
 from ctxval.campaign.costs import costs_of
 from ctxval.campaign.dynamics import PREDICTION, CampaignDynamics
 from ctxval.campaign.history import waiting_points
-from ctxval.campaign.steadiness import Steadiness
+from ctxval.campaign.storage.store import Store
+from ctxval.core.model import Model
+from ctxval.core.rollout import rollout
 from ctxval.core.trial import CONVERGED, UNSTEADY, Trial
 from ctxval.core.validation import Validation
-from ctxval.errors import InputError
+from ctxval.errors import CtxvalError, InputError
+from ctxval.learning.closed_loops import LoopPlanner
 from ctxval.searches import BaseSearch, SequentialSearch
 
-_MOVED = 0x6D6F
-"""Identifies the random stream of moves away from tasks that are not steady."""
+_MOVED = 0x6D6F  # identifies the random stream of moves away from tasks that are not steady
 
 
-_SPREAD = 512
-"""Number of random tasks of which the one farthest from all that are being executed is taken."""
+@dataclass(frozen=True, eq=False)
+class Steadiness:
+    """Tells for one choice which tasks may be executed, and counts the others.
+
+    Attributes:
+        planner: designs controllers; S is never executed.
+        expected: points ``(m, d)`` -> predicted distances ``(m,)``; None if nothing is predicted: then the closed loops
+            of a slightly disturbed M are compared.
+    """
+
+    planner: LoopPlanner
+    expected: Callable[[Array], Array] | None = None
+
+    _tested: dict[bytes, bool] = field(default_factory=dict, init=False)
+
+    @property
+    def rejected(self) -> int:
+        """The number of tasks that are not steady."""
+        return sum(not steady for steady in self._tested.values())
+
+    def __call__(self, point: Array) -> bool:
+        """Return whether rounding a task ``(d,)``, or moving it by 1e-9 of its ranges, hardly changes its distance.
+
+        After too many tests it is false, and the task does not count as rejected.
+        """
+        key = point.tobytes()
+        if key not in self._tested:
+            if len(self._tested) >= 24:
+                return False
+            rounded = self.planner.validation.space.rounded(point)
+            beside = np.where(rounded > 0.5, rounded - 1e-9, rounded + 1e-9)
+            with stage("testing a task", unit="designs"):
+                self._tested[key] = self._alike(np.stack([point, rounded, beside]))
+        return self._tested[key]
+
+    def moved(self, point: Array, rng: np.random.Generator) -> Array:
+        """Return a steady task next to a task that is not steady; the task itself if none is found."""
+        deviations = 1e-6 * 2.0 ** np.arange(12)
+        moves = deviations[:, None] * rng.normal(size=(len(deviations), len(point)))
+        steady = next(filter(self, np.clip(point + moves, 0, 1)), None)
+        if steady is None:
+            self._tested[point.tobytes()] = True  # it is executed, and so not rejected
+        return point if steady is None else steady
+
+    def _alike(self, points: Array) -> bool:
+        """Return whether tasks ``(m, d)`` have the same distance, or none of them a known one."""
+        try:
+            if self.expected is None:
+                shares = self._pushed_loops(points)
+            else:
+                values = self.expected(points)
+                shares = values[:, None] / max(values[np.isfinite(values)].max(initial=0.0), 1e-300)
+        except (Exception, SystemExit):  # the user's own parts; their failure is reported when the task is planned
+            return True
+        known = np.isfinite(shares).all(axis=1)
+        return not known.any() or bool(known.all() and (np.ptp(shares, axis=0) <= 0.05).all())
+
+    def _pushed_loops(self, points: Array) -> Array:
+        """Return the states of M, disturbed by 1 % of their ranges in each step, as shares of these ranges.
+
+        The shape is ``(m, (H + 1) n)``; NaN if the loop of a task is not known.
+        """
+        model, pushed = self.planner.validation.model, list[tuple[Rows, Array]]()
+        for planned in self.planner.plan(points):
+            ranges = np.ptp(planned.promised.states.reshape(-1, planned.promised.states.shape[-1]), axis=0)
+            ranges = np.maximum(ranges, 1e-3 * ranges.max())
+            step = partial(_pushed_step, model, 0.01 * ranges)
+            loops = rollout(step, planned.controller, planned.task)
+            pushed.append((planned.rows, (loops.states / ranges).reshape(len(planned.rows), -1)))
+        shares = np.full((len(points), max((states.shape[1] for _, states in pushed), default=1)), np.nan)
+        for rows, states in pushed:
+            shares[rows] = states
+        return shares
+
+
+def _pushed_step(model: Model, push: Array, x: Array, u: Array) -> Array:
+    return np.asarray(model.step(x, u) + push)
 
 
 class Proposals:
-    """Asks the search of a campaign for points, and tests points before they are executed.
-
-    Args:
-        validation: the map p -> d(p).
-        search: chooses points of the unit cube.
-        dynamics: predicts distances from the executed trajectories.
-    """
+    """Asks the search of a campaign for points, and tests points before they are executed."""
 
     def __init__(self, validation: Validation, search: BaseSearch, dynamics: CampaignDynamics) -> None:
         self._validation, self._search, self._dynamics = validation, search, dynamics
@@ -71,10 +149,10 @@ class Proposals:
         if self._dynamics.prediction(trials) is not None:
             return None
         rng = np.random.default_rng([len(trials), _MOVED])
-        some = rng.random((_SPREAD, waiting.shape[1]))
-        some = np.where(rng.random(some.shape) < rng.random((_SPREAD, 1)), np.round(some), some)
-        gaps = np.linalg.norm(some[:, None] - waiting, axis=2).min(axis=1)
-        return np.asarray(some[gaps.argmax()])
+        tasks = rng.random((512, waiting.shape[1]))
+        tasks = np.where(rng.random(tasks.shape) < rng.random((512, 1)), np.round(tasks), tasks)
+        gaps = np.linalg.norm(tasks[:, None] - waiting, axis=2).min(axis=1)
+        return np.asarray(tasks[gaps.argmax()])
 
     def tested(self, choice: Choice, trials: Sequence[Trial]) -> tuple[Array, dict[str, Any] | None]:
         """Return the point ``(d,)`` of a choice that another part has made, rounded and tested, and its note."""
@@ -88,10 +166,10 @@ class Proposals:
 
     def _asked(self) -> Array:
         asked, dimension = self._search.ask(1), self._validation.space.dimension
-        try:
-            point: Array = np.asarray(asked, dtype=np.float64) if np.isrealobj(asked) else np.array(np.nan)
-        except (TypeError, ValueError):
-            point = np.array(np.nan)
+        point: Array = np.empty(0)
+        with suppress(TypeError, ValueError):
+            if np.isrealobj(asked):
+                point = np.asarray(asked, dtype=np.float64)
         if point.shape != (1, dimension) or not ((point >= 0) & (point <= 1)).all():
             raise InputError(
                 f"a search must return points of the unit cube, shape (1, {dimension}), "
@@ -102,7 +180,7 @@ class Proposals:
     def _executable(
         self, point: Array, trials: Sequence[Trial], steady: Steadiness, rejected: int
     ) -> tuple[Array, dict[str, Any] | None]:
-        """Return a proposed point, tested and rounded, and its note; tell the search which point it has become.
+        """Return a point that the search proposes, tested and rounded, and its note; tell the search the difference.
 
         The point of an earlier trial stays, and independent draws are only rounded.
         """
@@ -132,9 +210,58 @@ def _plain_note(note: Any) -> dict[str, Any] | None:
     reserved = (PREDICTION, CONVERGED, UNSTEADY)
     if isinstance(note, dict) and set(reserved) & set(note):
         raise InputError(f"the note of a search must not have the keys {enumerated(reserved, 10)}.")
-    try:
+    with suppress(TypeError, ValueError):
         if note is None or (isinstance(note, dict) and json.dumps(note, allow_nan=False)):
             return note
-    except (TypeError, ValueError):
-        pass
     raise InputError(f"the note of a search must be a dictionary of plain values for JSON, got {note!r}.")
+
+
+class IndependentDraws:
+    """The random numbers of the independent draws of one campaign.
+
+    They depend on the seed, so that a study can be repeated. They also depend on the model: otherwise, a model that was
+    learned again with the results of an audit would be audited by the same tasks. The store keeps the number that
+    depends on the model, so that a campaign continues with the same draws on another machine.
+    """
+
+    def __init__(self, store: Store, validation: Validation, seed: int) -> None:
+        self._store, self._validation, self._seed = store, validation, seed
+
+    def search_seed(self) -> int:
+        """Return the seed of a search that depends on the model, because of independent draws or a refined model."""
+        return int(np.random.SeedSequence([self._seed, self.of_model()]).generate_state(1)[0])
+
+    def point(self, trials: Sequence[Trial]) -> Array:
+        """Return the next draw from the distribution of tasks, a point of the unit cube ``(d,)``."""
+        space = self._validation.space
+        return space.rounded(space.unit_draws(1, self.generator(trials))[0])
+
+    def generator(self, trials: Sequence[Trial]) -> np.random.Generator:
+        """Return the random numbers of the next draw; the streams of searches have smaller numbers."""
+        entropy = [self._seed, len(trials), 0x6175, self.of_model()]
+        return np.random.default_rng(np.random.SeedSequence(entropy))
+
+    def of_model(self) -> int:
+        """Return the number of the model, which the store keeps, because another processor rounds differently."""
+        if self._store.draws() is None:
+            self._store.keep_draws(_number_of_model(self._validation))
+        return self._store.draws() or 0
+
+
+def _number_of_model(validation: Validation) -> int:
+    """Return a number that identifies a model by its closed loops, and by steps from states and inputs around them."""
+    space = validation.space
+    rows: list[Array] = []
+    for point in (space.low, 0.5 * (space.low + space.high), space.high):
+        with suppress(CtxvalError):
+            loop = validation.plan(point).model_trajectory
+            rows.append(np.hstack([loop.states[:-1], loop.inputs]))
+    if not rows:
+        return 0
+    visited, n = np.concatenate(rows), loop.states.shape[-1]
+    low, high = visited.min(axis=0), visited.max(axis=0)
+    with suppress(CtxvalError):
+        z = np.random.default_rng(0).uniform(2 * low - high, 2 * high - low, (2000, len(low)))
+        rows.append(validation.model.step(z[:, :n], z[:, n:]))
+    content = json.dumps([[f"{0.0 if abs(value) < 1e-12 else value:.5g}" for value in row.ravel()] for row in rows])
+    return int.from_bytes(hashlib.sha256(content.encode()).digest()[:8], "big")

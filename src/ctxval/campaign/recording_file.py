@@ -8,6 +8,7 @@ import re
 import sys
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -15,7 +16,9 @@ from ctxval._util.arrays import Array
 from ctxval._util.columns import sentinels
 from ctxval._util.confinement import MOST_MEMORY
 from ctxval._util.temporary import temporary_folder
+from ctxval.core.experiment import Experiment
 from ctxval.core.labels import labels_of
+from ctxval.core.plan import Plan
 from ctxval.core.trajectory import COMPLETE, Trajectory
 from ctxval.data import LogMapping, is_log, read_recordings
 from ctxval.errors import ExecutionError, InputError
@@ -25,8 +28,6 @@ _PROGRAM = Path(__file__).absolute().with_name("recording_process.py")
 
 REFUSED = 3
 """Exit status of the confined process if the file cannot be used; its output is the reason."""
-
-_SECONDS, _SECONDS_OF_UPLOAD = 3600, 60
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,42 +78,35 @@ class RecordingFile:
 
     def _logged(self) -> Trajectory:
         """Return the only recording in a log, at the time step of the task."""
-        found = read_recordings(
-            [self.path],
-            self.mapping,
-            states=self.states,
-            inputs=self.inputs,
-            dt=float(self.times[1] - self.times[0]),
-        )
-        if len(found.runs) > 1 or found.breaks:
-            why = f"; it was split: {found.breaks[0]}" if found.breaks else ""
-            raise InputError(f"{self.path} must be one recording without gaps, and has {len(found.runs)}{why}.")
-        return found.runs[0].trajectory
+        dt = float(self.times[1] - self.times[0])
+        recordings = read_recordings([self.path], self.mapping, states=self.states, inputs=self.inputs, dt=dt)
+        if len(recordings.runs) > 1 or recordings.breaks:
+            why = f"; it was split: {recordings.breaks[0]}" if recordings.breaks else ""
+            raise InputError(f"{self.path} must be one recording without gaps, and has {len(recordings.runs)}{why}.")
+        return recordings.runs[0].trajectory
 
     def _require_finite(self, recording: Trajectory) -> None:
         """Refuse a complete recording with a number that is missing, infinite or a mark; the message says where."""
         if recording.ended != COMPLETE:
             return  # the reason why it ended is reported instead
+        advice = "If the execution has no usable recording, report it with --failed."
         for names, values in ((list(self.states), recording.states), (list(self.inputs), recording.inputs)):
             wrong = np.argwhere(~np.isfinite(values[:, : len(names)]))
             if len(wrong):
                 row, column = wrong[0]
-                raise InputError(
-                    f"{self.path} is not finite: {names[column]} is {values[row, column]} at "
-                    f"{recording.times[row]:g} s. If the execution has no usable recording, report it with --failed."
-                )
+                where = f"{names[column]} is {values[row, column]} at {recording.times[row]:g} s"
+                raise InputError(f"{self.path} is not finite: {where}. {advice}")
             for name, column in zip(names, values.T, strict=False):
                 if marks := sentinels(column):
-                    row = int(np.argmax(column == marks[0]))
+                    at = recording.times[int(np.argmax(column == marks[0]))]
                     raise InputError(
-                        f"{self.path}: {name} is {marks[0]:g} at {recording.times[row]:g} s, far from all other "
-                        "values, which stands for a missing one. If the execution has no usable recording, report it "
-                        "with --failed."
+                        f"{self.path}: {name} is {marks[0]:g} at {at:g} s, far from all other values, which stands "
+                        f"for a missing one. {advice}"
                     )
 
     def read_confined(self) -> Trajectory:
         """Return the recording as a process without rights reads it; see :mod:`ctxval._util.confinement`."""
-        seconds = _SECONDS_OF_UPLOAD if self.uploaded else _SECONDS
+        seconds = 60 if self.uploaded else 3600
         with temporary_folder() as folder:
             (folder / "request").write_bytes(pickle.dumps((self, seconds)))
             with (folder / "answer").open("w+b") as answer, open(os.devnull, "wb") as nothing:
@@ -143,8 +137,15 @@ class RecordingFile:
 def require_file(path: Path) -> None:
     """Refuse a path that is not a readable file, with a clearer message than that of a reader."""
     try:
-        found, folder = path.is_file(), path.is_dir()
+        is_file, is_folder = path.is_file(), path.is_dir()
     except OSError as error:
         raise InputError(f"{path} cannot be read: {error.strerror}.") from error
-    if not found:
-        raise InputError(f"{path} cannot be read: it is a folder." if folder else f"there is no file {path}.")
+    if not is_file:
+        raise InputError(f"{path} cannot be read: it is a folder." if is_folder else f"there is no file {path}.")
+
+
+def read_recording(path: Path, experiment: Experiment, plan: Plan, **options: Any) -> Trajectory:
+    """Read a recorded trajectory; a log in a format of another program is read in a confined process."""
+    names = experiment.names(plan.model_trajectory.states.shape[-1], plan.model_trajectory.inputs.shape[-1])
+    file = RecordingFile(path, *names, plan.task.times, **options)
+    return file.read_confined() if file.foreign else file.read()

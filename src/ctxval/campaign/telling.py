@@ -7,11 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ctxval.campaign.by_hand import read_recording
 from ctxval.campaign.campaign import Campaign
 from ctxval.campaign.choices import OpenTrial
+from ctxval.campaign.recording_file import read_recording
 from ctxval.core.experiment import Experiment
+from ctxval.core.plan import Plan
 from ctxval.core.preflight import StartOffset
+from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import Trial
 from ctxval.data import LogMapping
 from ctxval.errors import InputError
@@ -19,7 +21,7 @@ from ctxval.errors import InputError
 
 @dataclass(frozen=True)
 class ToldResult:
-    """The result of an open trial, before it is checked. Exactly one of recording, distance and failed is given.
+    """The result of a trial, before it is checked. Exactly one of recording, distance and failed is given.
 
     Attributes:
         recording: the file of the recorded trajectory: CSV, NPZ or a log of another kind.
@@ -43,19 +45,20 @@ class ToldResult:
     replace: str | None = None
     uploaded: bool = False
 
+    def read(self, experiment: Experiment, plan: Plan) -> Trajectory | None:
+        """Return the recording; None if there is none."""
+        if self.recording is None:
+            return None
+        how = {"npz": self.npz, "resample": self.resample, "mapping": self.mapping, "uploaded": self.uploaded}
+        return read_recording(self.recording, experiment, plan, **how)
+
 
 def tell_result(campaign: Campaign, experiment: Experiment, trial: OpenTrial | int, told: ToldResult) -> Trial:
     """Check and store the result of an open trial."""
     recording = None
     if told.recording is not None:
         trial = trial if isinstance(trial, OpenTrial) else campaign.reopen(trial, ended=told.replace is not None)
-        recording = read_recording(
-            *(told.recording, experiment, trial.plan),
-            npz=told.npz,
-            resample=told.resample,
-            mapping=told.mapping,
-            uploaded=told.uploaded,
-        )
+        recording = told.read(experiment, trial.plan)
     return campaign.tell(
         trial,
         recording,

@@ -13,22 +13,21 @@ import numpy as np
 from ctxval._util.arrays import Array
 from ctxval._util.progress import advance, stage
 from ctxval._util.texts import text_of
-from ctxval.campaign.choices import Choice, OpenTrial
+from ctxval.campaign.choices import Choice, Execution, OpenTrial
 from ctxval.campaign.dynamics import CampaignDynamics
-from ctxval.campaign.fallback import error_with_fallback
 from ctxval.campaign.goals_of_model import GoalsOfModel
 from ctxval.campaign.history import history_of
-from ctxval.campaign.identity import identify
-from ctxval.campaign.independent_draws import IndependentDraws
-from ctxval.campaign.known import KnownExecution, is_execution_of
-from ctxval.campaign.proposals import Proposals
+from ctxval.campaign.identity import identify, remeasure, with_distance
+from ctxval.campaign.proposals import IndependentDraws, Proposals
+from ctxval.campaign.storage.disks import error_with_fallback
 from ctxval.campaign.storage.store import Store
 from ctxval.certificates import PLANNED
 from ctxval.core.controller import converged_of
-from ctxval.core.plan import Measurement, Plan
+from ctxval.core.distance import Distance
+from ctxval.core.plan import Plan
 from ctxval.core.preflight import StartOffset, start_offset, try_distance
 from ctxval.core.trajectory import Trajectory
-from ctxval.core.trial import CONVERGED, Origin, State, Trial
+from ctxval.core.trial import CONVERGED, Origin, Trial
 from ctxval.core.validation import Validation
 from ctxval.errors import CtxvalError, DistanceError, InputError, StoreAccessError, StoreError
 from ctxval.models import Refined
@@ -36,19 +35,12 @@ from ctxval.searches import BaseSearch, Search, SequentialSearch
 
 
 class TrialRecorder:
-    """Opens and closes the trials of one campaign.
-
-    It keeps the store, the list of trials and the search consistent: the search knows exactly the trials in the store.
-
-    Args:
-        validation: the map p -> d(p).
-        search: chooses points of the unit cube.
-        store: the store of the trials, after a check that it belongs to this experiment.
-        seed: the seed of the search.
-        description: the description of the experiment from :func:`ctxval.campaign.identity.description_of`.
+    """Opens and closes the trials of one campaign; the search knows exactly the trials in the store.
 
     Attributes:
-        validation, store, description: as above; :meth:`redefine` replaces validation and description.
+        validation: the map p -> d(p), which :meth:`remeasure` replaces.
+        store: the store of the trials, after a check that it belongs to this experiment.
+        description: the description of the experiment from :func:`ctxval.campaign.identity.description_of`.
         search: with the optional methods of :class:`ctxval.searches.BaseSearch`.
         draws: chooses the points of an audit.
         dynamics: what the trajectories teach of the dynamics.
@@ -58,10 +50,8 @@ class TrialRecorder:
     def __init__(
         self, validation: Validation, search: Search, store: Store, seed: int, description: dict[str, Any]
     ) -> None:
-        self.validation = validation
+        self.validation, self.store, self.description = validation, store, description
         self.search = BaseSearch.of(search)
-        self.store = store
-        self.description = description
         self.draws = IndependentDraws(store, validation, seed)
         self.dynamics = CampaignDynamics(validation, store, seed, description)
         self.predicts = False
@@ -91,25 +81,19 @@ class TrialRecorder:
 
     @property
     def interrupted(self) -> Trial | None:
-        """The first trial whose execution was interrupted; None if there is none."""
+        """The first trial whose execution was interrupted."""
         begun = (trial for trial in self._trials if trial.state == "open" and trial.attempts)
         return next((trial for trial in begun if trial.number not in self._executing), None)
 
-    def open_trial(self, number: int) -> Trial:
-        """Return the open trial of this number."""
-        if not 0 <= number < len(self._trials):
-            raise InputError(f"there is no trial {number}; the campaign has {len(self._trials)}.")
-        if self._trials[number].state != "open":
-            raise InputError(f"trial {number} is {self._trials[number].state}, so nothing more can be told of it.")
-        return self._trials[number]
-
-    def told_trial(self, number: int) -> Trial:
-        """Return the trial of this number, whose result a person has told."""
+    def trial(self, number: int, *, told: bool = False) -> Trial:
+        """Return an open trial, or with ``told`` one whose result a person has told; refuse other trials."""
         if not 0 <= number < len(self._trials):
             raise InputError(f"there is no trial {number}; the campaign has {len(self._trials)}.")
         trial = self._trials[number]
-        if not trial.told:
+        if told and not trial.told:
             raise InputError(f"trial {number} has no result that was told by a person, so none can be replaced.")
+        if not told and trial.state != "open":
+            raise InputError(f"trial {number} is {trial.state}, so nothing more can be told of it.")
         return trial
 
     def plan(self, trial: Trial) -> Plan:
@@ -139,20 +123,33 @@ class TrialRecorder:
         self.search.reset(self.validation.space.dimension, seed)
         history = history_of(self._trials)
         if history:
-            values = [np.nan if trial.distance is None else trial.distance for trial in history]
-            self.search.tell(np.array([trial.unit_point for trial in history]), values)
+            self._tell_search(history)
             self.search.remember([trial.note for trial in history])
+
+    def _tell_search(self, trials: Sequence[Trial]) -> None:
+        values = [np.nan if trial.distance is None else trial.distance for trial in trials]
+        self.search.tell(np.array([trial.unit_point for trial in trials]), values)
 
     def refresh(self) -> None:
         """Read the trials again if other processes have changed the store."""
-        own = (len(self._trials), sum(trial.state == "open" for trial in self._trials), self._changes)
+        known = (len(self._trials), sum(trial.state == "open" for trial in self._trials), self._changes)
         stored = self.store.signature()
         if stored[2] != self._changes:
             identify(self.store, self.validation, self.description, None, False)
-        if stored != own:
+        if stored != known:
             self.replay()
 
-    def redefine(self, validation: Validation, description: dict[str, Any]) -> None:
+    def remeasure(self, distance: Distance | None = None) -> list[Trial]:
+        """Recompute the distances of all stored executions, with another distance if one is given."""
+        validation, description = self.validation, self.description
+        if distance is not None:
+            validation = validation.with_distance(distance)
+            description = with_distance(description, validation.distance)
+        changed = remeasure(self.store, validation, description)
+        self._redefine(validation, description)
+        return changed
+
+    def _redefine(self, validation: Validation, description: dict[str, Any]) -> None:
         """Continue with another distance, after its values were stored."""
         self.validation, self.description, self._distance_tried = validation, description, False
         elsewhere = self.dynamics.elsewhere
@@ -174,17 +171,16 @@ class TrialRecorder:
         try:
             plan = self.plan(chosen)
         except CtxvalError as error:
-            self.fail(chosen, error, executed=False)
+            self.close(chosen, Execution(failed=text_of(error)), executed=False)
             raise
         return self.repeat(OpenTrial(chosen, plan))
 
     def repeat(self, opened: OpenTrial) -> OpenTrial:
         """Store that another execution of an open trial starts."""
-        trial = opened.trial
-        begun = replace(trial, attempts=trial.attempts + 1)
+        begun = replace(opened.trial, attempts=opened.trial.attempts + 1)
         self.store.begin_attempt(begun, changes=self._changes)
-        self._trials[trial.number] = begun
-        self._executing.add(trial.number)
+        self._trials[begun.number] = begun
+        self._executing.add(begun.number)
         return OpenTrial(begun, opened.plan)
 
     def _open(self, choice: Choice, attempts: int) -> OpenTrial:
@@ -201,7 +197,7 @@ class TrialRecorder:
             plan = self.plan(trial)
         except CtxvalError as error:
             failed = replace(trial, state="failed", failure=text_of(error), attempts=0)
-            self.store.record_failed_plan(failed, changes=self._changes)
+            self.store.add([(failed, None, None)], changes=self._changes)
             raise
         if not self._distance_tried:
             try_distance(self.validation, plan)
@@ -211,7 +207,7 @@ class TrialRecorder:
         with suppress(InputError):  # an attribute of a user's controller that has this name and is something else
             if (converged := converged_of(plan.controller)) is not None:
                 trial = replace(trial, note={**(trial.note or {}), CONVERGED: bool(converged)})
-        self.store.open_trial(trial, plan.model_trajectory, changes=self._changes)
+        self.store.add([(trial, plan.model_trajectory, None)], changes=self._changes)
         self._trials.append(trial)
         if attempts:
             self._executing.add(trial.number)
@@ -248,101 +244,67 @@ class TrialRecorder:
 
     # Closing
 
-    def complete(
-        self,
-        trial: Trial,
-        measurement: Measurement,
-        trajectory: Trajectory | None = None,
-        seconds: float | None = None,
-        replacing: str | None = None,
+    def close(
+        self, trial: Trial, execution: Execution, *, replacing: str | None = None, executed: bool = True
     ) -> Trial:
-        """Store an execution with its distance, or as unmeasured; return the trial in its final state."""
-        ended = replace(
-            trial,
-            state="completed" if measurement.unusable is None else "unmeasured",
-            executed=True,
-            distance=measurement.distance,
-            failure=measurement.unusable,
-            seconds=seconds,
-        )
-        self._close(ended, trajectory, replacing)
-        if measurement.unusable is not None:
+        """Store a measured execution; return the trial in its final state.
+
+        The trial is open, unless there is a reason for ``replacing`` its result.
+        """
+        ended = execution.ended(trial, executed=executed)
+        trajectory = None if ended.state == "failed" else execution.trajectory
+        if replacing is not None:
+            self.store.replace_result(self._trials[ended.number], ended, trajectory, replacing, changes=self._changes)
+            self._redefine(self.validation, self.description)
+        else:
+            try:
+                self.store.close_trial(ended, trajectory, changes=self._changes)
+            except (StoreError, InputError) as error:
+                raise error_with_fallback(ended, trajectory, self.store.path, error) from error
+            self._executing.discard(ended.number)
+            self._trials[ended.number] = ended
+            if ended.distance is not None:
+                self._tell_search([ended])
+        if ended.state == "unmeasured":
             raise DistanceError(
-                f"{measurement.unusable} The execution of trial {ended.number} is stored: correct the distance, and "
+                f"{ended.failure} The execution of trial {ended.number} is stored: correct the distance, and "
                 "`ctxval remeasure STORE` computes it without another execution."
             )
         return ended
-
-    def fail(
-        self,
-        trial: Trial,
-        reason: object,
-        *,
-        seconds: float | None = None,
-        executed: bool = True,
-        replacing: str | None = None,
-    ) -> Trial:
-        """Store the reason why a trial failed; return the failed trial."""
-        failure = text_of(reason)
-        ended = replace(trial, state="failed", executed=executed, distance=None, failure=failure, seconds=seconds)
-        self._close(ended, None, replacing)
-        return ended
-
-    def _close(self, ended: Trial, trajectory: Trajectory | None, replacing: str | None = None) -> None:
-        """Store the result of an open trial, or of a trial whose result it replaces for a reason."""
-        if replacing is not None:
-            self.store.replace_result(self._trials[ended.number], ended, trajectory, replacing, changes=self._changes)
-            self.redefine(self.validation, self.description)
-            return
-        try:
-            self.store.close_trial(ended, trajectory, changes=self._changes)
-        except (StoreError, InputError) as error:
-            raise error_with_fallback(ended, trajectory, self.store.path, error) from error
-        self._executing.discard(ended.number)
-        self._trials[ended.number] = ended
-        if ended.distance is not None:
-            self.search.tell(ended.unit_point[None], [ended.distance])
 
     def abandon_executions(self) -> None:
         """End the executions of this process; the trials that are still open become interrupted ones."""
         self._executing.clear()
 
-    def add(self, executions: Sequence[KnownExecution], wait: float = 0.0) -> list[Trial | None]:
+    def add(self, executions: Sequence[tuple[Plan, Execution]], wait: float = 0.0) -> list[Trial | None]:
         """Store earlier executions in one transaction; return their trials, None if one is already in the store."""
+        space = self.validation.space
         with self.store.sole_writer(wait), stage("importing", len(executions), "runs"):
             self.refresh()
             known = defaultdict[bytes, list[Trial]](list)
             for trial in self._trials:
                 known[(trial.unit_point + 0.0).tobytes()].append(trial)
-            added = list[Trial | None]()
-            new = list[tuple[Trial, KnownExecution]]()
-            for one in executions:
-                same = known[(one.unit_point + 0.0).tobytes()]
-                if any(is_execution_of(trial, one) for trial in same):
-                    added.append(None)
+            trials = list[Trial | None]()
+            new = list[tuple[Trial, Trajectory | None, Trajectory | None]]()
+            for plan, execution in executions:
+                point = plan.parameters.points
+                same = known[(space.to_unit(point) + 0.0).tobytes()]
+                if any(execution.is_that_of(trial) for trial in same):
+                    trials.append(None)
                     continue
-                state: State = "completed" if one.distance is not None else "unmeasured"
-                trial = Trial(
-                    len(self._trials) + len(new),
-                    "manual",
-                    state if one.failed is None else "failed",
-                    one.unit_point,
-                    self.validation.space.describe_point(one.plan.parameters.points),
-                    executed=True,
-                    distance=one.distance,
-                    failure=one.failure,
-                )
+                number = len(self._trials) + len(new)
+                opened = Trial(number, "manual", "open", space.to_unit(point), space.describe_point(point))
+                trial = execution.ended(opened)
                 same.append(trial)
-                added.append(trial)
-                new.append((trial, one))
+                trials.append(trial)
+                new.append((trial, plan.model_trajectory, execution.trajectory))
                 advance(1)
             if new:
-                stored = [(trial, one.plan.model_trajectory, one.trajectory) for trial, one in new]
-                self.store.record_known(stored, changes=self._changes)
-                self._trials += [trial for trial, _ in new]
-                values = [np.nan if trial.distance is None else trial.distance for trial, _ in new]
-                self.search.tell(np.array([trial.unit_point for trial, _ in new]), values)
-        return added
+                self.store.add(new, changes=self._changes)
+                added = [trial for trial, _, _ in new]
+                self._trials += added
+                self._tell_search(added)
+        return trials
 
     @contextmanager
     def predicting(self, predicts: bool) -> Iterator[None]:

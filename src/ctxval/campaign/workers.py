@@ -12,6 +12,7 @@ import signal
 import threading
 import time
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from multiprocessing.connection import wait as wait_for
@@ -24,11 +25,11 @@ from ctxval._util.cores import can_fork, forking
 from ctxval._util.interrupts import allow_exits, exits_as_exceptions, raised_by_signal
 from ctxval._util.progress import mute
 from ctxval._util.texts import reason_of
+from ctxval.campaign.choices import Execution
 from ctxval.core.controller import Controller
 from ctxval.core.plan import Plan
 from ctxval.core.system import System
 from ctxval.core.task import Task
-from ctxval.core.trajectory import Trajectory
 from ctxval.errors import CampaignError, InputError
 
 _GRACE_PERIOD = 2.0
@@ -37,28 +38,8 @@ _GRACE_PERIOD = 2.0
 _TERMINATED = 143
 """Exit status of a worker that ended after SIGTERM, as in shells."""
 
-_POLL_INTERVAL = 0.5
-"""Seconds between two checks of a state that cannot be waited for."""
 
-
-@dataclass(frozen=True, eq=False)
-class ExecutionResult:
-    """The result of an execution, before its trajectory is checked.
-
-    Attributes:
-        trajectory: the object that the system returned, complete or not; None if there is none.
-        failure: the reason why there is none: the system failed, or the execution took too long.
-        lost: the reason why the worker was lost, which is not a failure of the system.
-        seconds: the duration of the execution; None if it is not known.
-    """
-
-    trajectory: Trajectory | None = None
-    failure: str | None = None
-    lost: str | None = None
-    seconds: float | None = None
-
-
-def execute_task(system: System, controller: Controller, task: Task) -> ExecutionResult:
+def execute_task(system: System, controller: Controller, task: Task) -> Execution:
     """Execute a task on the system, here or in a worker; an exception of the system is returned as a failure."""
     started = time.perf_counter()
     try:
@@ -66,12 +47,12 @@ def execute_task(system: System, controller: Controller, task: Task) -> Executio
     except BaseException as error:
         if raised_by_signal(error):
             raise
-        return ExecutionResult(failure=reason_of(error), seconds=time.perf_counter() - started)
-    return ExecutionResult(trajectory, seconds=time.perf_counter() - started)
+        return Execution(failed=reason_of(error), seconds=time.perf_counter() - started)
+    return Execution(trajectory, seconds=time.perf_counter() - started)
 
 
-def _timed_out(timeout: float, seconds: float) -> ExecutionResult:
-    return ExecutionResult(failure=f"the execution did not end within {timeout:g} s", seconds=seconds)
+def _timed_out(timeout: float, seconds: float) -> Execution:
+    return Execution(failed=f"the execution did not end within {timeout:g} s", seconds=seconds)
 
 
 class WorkerPool(ABC):
@@ -88,7 +69,7 @@ class WorkerPool(ABC):
         """Start the execution of a trial on a free worker."""
 
     @abstractmethod
-    def wait(self) -> tuple[int, ExecutionResult]:
+    def wait(self) -> tuple[int, Execution]:
         """Wait for the next execution that ends; return the number of its trial, and its result."""
 
     @abstractmethod
@@ -96,12 +77,31 @@ class WorkerPool(ABC):
         """End all workers and their executions at once."""
 
 
+class SerialPool(WorkerPool):
+    """This process, which executes one plan at a time."""
+
+    def __init__(self, system: System) -> None:
+        self.system, self.size = system, 1
+
+    def start(self, number: int, plan: Plan) -> None:
+        """Take a plan, which :meth:`wait` executes."""
+        self._next = number, plan
+
+    def wait(self) -> tuple[int, Execution]:
+        """Execute the plan; return the number of its trial, and what the execution gave."""
+        number, plan = self._next
+        return number, execute_task(self.system, plan.controller, plan.task)
+
+    def close(self) -> None:
+        """Do nothing: no execution is running any more."""
+
+
 # Processes of this computer
 
 
 @dataclass(eq=False)
 class _Worker:
-    """A process, the number of the trial that it executes, and the start time of the execution."""
+    """A process, the number of the trial that it executes, None if it is free, and the start time of the execution."""
 
     process: Any
     pipe: Connection
@@ -109,7 +109,6 @@ class _Worker:
     started: float = 0.0
 
     def release(self) -> int:
-        """Make the worker free for another execution; return the number of the trial that it has executed."""
         number, self.number = self.number, None
         assert number is not None
         return number
@@ -118,12 +117,8 @@ class _Worker:
 class ProcessPool(WorkerPool):
     """Processes of this computer, each with its own copy of the system.
 
-    If processes can be forked, the system need not be picklable. A worker that dies or takes too long is replaced.
-
-    Args:
-        system: the system to execute.
-        size: the number of processes.
-        timeout: time limit of an execution in seconds; a longer execution is ended and has failed.
+    If processes can be forked, the system need not be picklable. A worker that dies, or whose execution takes longer
+    than ``timeout`` seconds, is ended and replaced.
     """
 
     def __init__(self, system: System, size: int, timeout: float | None = None) -> None:
@@ -133,7 +128,8 @@ class ProcessPool(WorkerPool):
 
     def start(self, number: int, plan: Plan) -> None:
         """Start the execution of a trial on a free worker."""
-        worker = next((one for one in self._workers if one.number is None), None) or self._start_worker()
+        free = (worker for worker in self._workers if worker.number is None)
+        worker = next(free, None) or self._start_worker()
         try:
             message = pickle.dumps((plan.controller, plan.task))
         except Exception as error:
@@ -164,53 +160,47 @@ class ProcessPool(WorkerPool):
         self._workers.append(worker)
         return worker
 
-    def wait(self) -> tuple[int, ExecutionResult]:
-        """Wait for the next execution that ends; return the number of its trial, and its result."""
+    def wait(self) -> tuple[int, Execution]:
+        """Wait for the next execution that ends, or that takes too long."""
         while True:
             busy = [worker for worker in self._workers if worker.number is not None]
-            ready = wait_for([worker.pipe for worker in busy], self._remaining(busy))
+            remaining = None
+            if self.timeout is not None:
+                remaining = max(0.0, min(worker.started for worker in busy) + self.timeout - time.monotonic())
+            ready = wait_for([worker.pipe for worker in busy], remaining)
             for worker in busy:
                 if worker.pipe in ready:
                     return self._received(worker)
             for worker in busy:
                 elapsed = time.monotonic() - worker.started
                 if self.timeout is not None and elapsed >= self.timeout:
-                    self._stop(worker)
+                    self._stop([worker])
                     return worker.release(), _timed_out(self.timeout, elapsed)
 
-    def _remaining(self, busy: list[_Worker]) -> float | None:
-        if self.timeout is None:
-            return None
-        return max(0.0, min(worker.started for worker in busy) + self.timeout - time.monotonic())
-
-    def _received(self, worker: _Worker) -> tuple[int, ExecutionResult]:
+    def _received(self, worker: _Worker) -> tuple[int, Execution]:
         number = worker.release()
         try:
-            result: ExecutionResult = pickle.loads(worker.pipe.recv_bytes())
+            execution: Execution = pickle.loads(worker.pipe.recv_bytes())
         except (EOFError, OSError, pickle.UnpicklingError):
-            self._stop(worker)
+            self._stop([worker])
             return number, _result_of_exit(worker.process.exitcode)
-        return number, result
+        return number, execution
 
-    def _stop(self, worker: _Worker) -> None:
-        """End a worker, with some time to clean up, because it must end the process of a command too."""
-        worker.process.terminate()
-        self._await_end(worker)
-
-    def _await_end(self, worker: _Worker) -> None:
-        worker.process.join(_GRACE_PERIOD)
-        if worker.process.is_alive():
-            worker.process.kill()
-            worker.process.join()
-        worker.pipe.close()
-        self._workers.remove(worker)
+    def _stop(self, workers: Sequence[_Worker]) -> None:
+        """End workers, with some time to clean up, because they must end the process of a command too."""
+        for worker in workers:
+            worker.process.terminate()
+        for worker in workers:
+            worker.process.join(_GRACE_PERIOD)
+            if worker.process.is_alive():
+                worker.process.kill()
+                worker.process.join()
+            worker.pipe.close()
+            self._workers.remove(worker)
 
     def close(self) -> None:
         """End all workers and their executions at once."""
-        for worker in self._workers:
-            worker.process.terminate()
-        for worker in list(self._workers):
-            self._await_end(worker)
+        self._stop(list(self._workers))
 
 
 def _run_worker(system: System, pipe: Connection, others: list[Connection], parent: int) -> None:
@@ -227,29 +217,25 @@ def _run_worker(system: System, pipe: Connection, others: list[Connection], pare
     np.random.seed()  # noqa: NPY002
     random.seed()
     try:
-        _execute_all(system, pipe)
+        while True:
+            try:
+                controller, task = pickle.loads(pipe.recv_bytes())
+            except EOFError:
+                return
+            with exits_as_exceptions():
+                execution = execute_task(system, controller, task)
+            pipe.send_bytes(pickle.dumps(execution))
     finally:
         _leave_once()
 
 
-def _execute_all(system: System, pipe: Connection) -> None:
-    while True:
-        try:
-            controller, task = pickle.loads(pipe.recv_bytes())
-        except EOFError:
-            return
-        with exits_as_exceptions():
-            result = execute_task(system, controller, task)
-        pipe.send_bytes(pickle.dumps(result))
-
-
-def _result_of_exit(status: int | None) -> ExecutionResult:
-    """Return the result after the end of a worker's process: failed if the system ended it, lost if it was killed."""
+def _result_of_exit(status: int | None) -> Execution:
+    """Return what an execution gave whose process has ended: it failed if the system ended it, else it is lost."""
     if status is None:
-        return ExecutionResult(lost="the worker ended for no known reason")
+        return Execution(lost="the worker ended for no known reason")
     if status < 0 or status == _TERMINATED:
-        return ExecutionResult(lost=f"the worker ended by signal {-status if status < 0 else signal.SIGTERM:d}")
-    return ExecutionResult(failure=f"the system ended its process with status {status}")
+        return Execution(lost=f"the worker ended by signal {-status if status < 0 else signal.SIGTERM:d}")
+    return Execution(failed=f"the system ended its process with status {status}")
 
 
 _leaving = False
@@ -274,7 +260,7 @@ def _leave_once() -> bool:
 def _exit_with_parent(parent: int) -> None:
     """End if the campaign's process has ended, because a resumed campaign repeats the execution."""
     while os.getppid() == parent:
-        time.sleep(_POLL_INTERVAL)
+        time.sleep(0.5)
     os.kill(os.getpid(), signal.SIGTERM)
     time.sleep(_GRACE_PERIOD)
     allow_exits()  # the execution may be going on, in code that no signal handler interrupts
@@ -287,19 +273,13 @@ def _exit_with_parent(parent: int) -> None:
 class ExecutorPool(WorkerPool):
     """An executor of ``concurrent.futures``: a pool of threads or processes, Dask, and others.
 
-    All threads of a pool share one system. An execution that takes too long is cancelled; a thread cannot be cancelled
-    and continues in the background.
-
-    Args:
-        system: the system to execute.
-        executor: the executor that runs the executions.
-        size: the number of executions at a time.
-        timeout: time limit of an execution in seconds; a longer execution has failed.
+    All threads of a pool share one system. An execution that takes longer than ``timeout`` seconds is cancelled; a
+    thread cannot be cancelled and continues in the background.
     """
 
     def __init__(self, system: System, executor: cf.Executor, size: int, timeout: float | None = None) -> None:
         self.system, self.executor, self.size, self.timeout = system, executor, size, timeout
-        self._running: dict[cf.Future[ExecutionResult], tuple[int, float]] = {}
+        self._running: dict[cf.Future[Execution], tuple[int, float]] = {}
 
     def start(self, number: int, plan: Plan) -> None:
         """Start the execution of a trial."""
@@ -312,10 +292,10 @@ class ExecutorPool(WorkerPool):
             raise InputError(f"the execution cannot be sent to a worker: {reason_of(error)}.") from error
         self._running[future] = number, time.monotonic()
 
-    def wait(self) -> tuple[int, ExecutionResult]:
-        """Wait for the next execution that ends; return the number of its trial, and its result."""
+    def wait(self) -> tuple[int, Execution]:
+        """Wait for the next execution that ends, or that takes too long."""
         while True:
-            cf.wait(self._running, timeout=_POLL_INTERVAL, return_when=cf.FIRST_COMPLETED)
+            cf.wait(self._running, timeout=0.5, return_when=cf.FIRST_COMPLETED)
             for future, (number, started) in list(self._running.items()):
                 seconds = time.monotonic() - started
                 if future.done():
@@ -331,20 +311,20 @@ class ExecutorPool(WorkerPool):
     def _await_scheduler(self) -> None:
         """Wait while a Dask client searches for a scheduler that it has lost."""
         while self._status() == "connecting":
-            time.sleep(_POLL_INTERVAL)
+            time.sleep(0.5)
         if self._status() == "closed":
             raise CampaignError("the executor takes no more work: its scheduler is gone.")
 
     def _status(self) -> str:
         return str(getattr(getattr(self.executor, "_client", None), "status", "running"))
 
-    def _result(self, future: cf.Future[ExecutionResult]) -> ExecutionResult:
+    def _result(self, future: cf.Future[Execution]) -> Execution:
         try:
             return future.result()
         except (Exception, cf.CancelledError) as error:
             if _is_loss(error):
                 self._await_scheduler()
-                return ExecutionResult(lost=reason_of(error))
+                return Execution(lost=reason_of(error))
             raise InputError(f"the execution cannot be sent to a worker: {reason_of(error)}.") from error
 
     def close(self) -> None:
@@ -360,20 +340,15 @@ def _is_loss(error: BaseException) -> bool:
 
 
 def worker_pool(
-    system: System,
-    *,
-    workers: int | None = None,
-    executor: cf.Executor | None = None,
-    timeout: float | None = None,
+    system: System, *, workers: int | None, executor: cf.Executor | None, timeout: float | None
 ) -> WorkerPool | None:
     """Return a pool of workers; None if the executions run one after the other in this process."""
-    if workers is not None and (not isinstance(workers, int) or isinstance(workers, bool) or workers < 1):
-        raise InputError(f"workers must be a positive integer, got {workers!r}.")
-    if timeout is not None and not (isinstance(timeout, int | float) and 0 < timeout < float("inf")):
-        raise InputError(f"timeout must be a positive number of seconds, got {timeout!r}.")
+    if getattr(system, "manual", False):
+        raise InputError(
+            "this system is executed by people, not by run or audit: get tasks with `ctxval ask` and record the "
+            "results with `ctxval tell` (ask and tell in Python)."
+        )
     if executor is not None:
-        if not isinstance(executor, cf.Executor):
-            raise InputError(f"executor must be one of concurrent.futures, got {type(executor).__name__}.")
         # Every pool of the standard library has its size under this name.
         size = getattr(executor, "_max_workers", 1) if workers is None else workers
         return ExecutorPool(system, executor, int(size), timeout)

@@ -12,7 +12,7 @@ from ctxval._util.checked import NonNegativeFloat, require
 from ctxval._util.progress import advance, stage
 from ctxval._util.texts import enumerated
 from ctxval.campaign.by_hand import TRIAL_FILES, parameters_from, read_runs, write_files
-from ctxval.campaign.known import KnownExecution
+from ctxval.campaign.choices import Execution
 from ctxval.campaign.storage.other_stores import STORE_SUFFIXES
 from ctxval.campaign.storage.store import Store
 from ctxval.campaign.telling import ToldResult, parameters_of_trial, result_sentence, tell_result
@@ -21,6 +21,7 @@ from ctxval.cli.config.settings import Settings
 from ctxval.cli.config.stored_settings import Opened, budget_of, limit_of, open_store, open_target, trusted_settings
 from ctxval.cli.options import Allowed, named_values, require_folder
 from ctxval.core.exchange import TASK_FORMAT
+from ctxval.core.plan import Plan
 from ctxval.core.trial import CONVERGED, Trial
 from ctxval.errors import InputError
 from ctxval.web.jobs import ServedCampaign
@@ -155,12 +156,14 @@ def import_runs(
     opened = open_store(store, allowed)
     campaign, experiment, mapping = opened.campaign, opened.experiment, opened.settings.log_mapping
     space = experiment.validation.space
-    runs = read_runs(files, parameters_from(parameters, space) if parameters else None, space)
-    checked = list[KnownExecution]()
+    given = parameters_from(parameters, space) if parameters else None
+    how = {"resample": resample, "start_tolerance": start_tolerance, "mapping": mapping}
+    runs = read_runs(files, given, space, **how)
+    checked = list[tuple[Plan, Execution]]()
     with stage("checking", len(runs), "runs"):
         for run in runs:  # all of them before any is stored
             try:
-                checked.append(run.checked(campaign.validation, experiment, resample, start_tolerance, mapping))
+                checked.append(run.checked(campaign.validation, experiment))
             except InputError as error:
                 raise InputError(f"{run.where}: {error}") from error
             advance(1)

@@ -85,7 +85,7 @@ CRAFTED: dict[str, tuple[tuple[str, ...], str, int]] = {
         "its table 'trials' is another one",
         0,
     ),
-    "a column less": (("ALTER TABLE trials DROP COLUMN seconds",), "its table 'trials' is another one", 1),
+    "a column less": (("ALTER TABLE trials DROP COLUMN seconds",), "its table 'trials' is another one", 0),
     "a table less": (("DROP TABLE settings",), "its table 'settings' is missing", 5),
     "a virtual table": (
         ("DROP TABLE trials", f"CREATE VIRTUAL TABLE trials USING fts5({columns('trials')})"),

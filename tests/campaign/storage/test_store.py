@@ -43,7 +43,7 @@ def test_a_note_comes_back_bit_for_bit_and_none_as_none(tmp_path: Path) -> None:
     note = {"engine": "climb", "climb": 2, "expected": 0.1 + 0.2, "radius": 1.0, "why": None}
     store.open_trial(replace(trial(), note=note), TRAJECTORY)
     store.open_trial(trial(1), TRAJECTORY)
-    store.record_failed_plan(replace(trial(2), state="failed", failure="x", note=note))
+    store.add([(replace(trial(2), state="failed", failure="x", note=note), None, None)])
     store.close()
     assert [t.note for t in Store(tmp_path / "a.sqlite").trials()] == [note, None, note]
 

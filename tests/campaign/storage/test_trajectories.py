@@ -23,7 +23,7 @@ def trajectory(seed: int, steps: int = 3) -> Trajectory:
 
 def add(store: Store, number: int, system: Trajectory | None) -> None:
     trial = Trial(number, "manual", "completed", np.array([0.5]), {"a": 0.5}, executed=True, distance=1.0)
-    store.record_known([(trial, trajectory(0), system)])
+    store.add([(trial, trajectory(0), system)])
 
 
 def reads_of(store: Store, monkeypatch: pytest.MonkeyPatch) -> list[int]:

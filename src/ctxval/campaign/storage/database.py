@@ -67,9 +67,13 @@ class Database:
         with self.translated_errors():
             if self._connection.in_transaction:
                 yield
-            else:
-                with schema.snapshot(self._connection):
-                    yield
+                return
+            self._connection.execute("BEGIN")
+            try:
+                yield
+            finally:
+                if self._connection.in_transaction:
+                    self._connection.execute("ROLLBACK")
 
     @contextmanager
     def sole_writer(self, wait: float = 0.0) -> Iterator[None]:
@@ -148,10 +152,8 @@ class Database:
         """Return the error that part of the store cannot be read; ``what`` says which part."""
         return ForeignStoreError(f"{self.name} is damaged: {what}; `ctxval export` saves what is readable.")
 
-    # Opening
-
     def _prepare(self) -> None:
-        with schema.snapshot(self._connection):
+        with self.snapshot():
             new = schema.is_new(self._connection, self.name)
             page = self._connection.execute("PRAGMA page_size").fetchone()[0]
             if self.path is not None and self.path.stat().st_size % page:

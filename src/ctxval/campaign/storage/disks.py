@@ -1,19 +1,21 @@
-"""Warnings about disks on which a store is not safe, and folders that survive a power cut."""
+"""Disks on which a store is not safe, folders that survive a power cut, and results that a store cannot take."""
 
 from __future__ import annotations
 
-import contextlib
+import json
 import os
+import tempfile
 import warnings
+from contextlib import suppress
 from pathlib import Path
+
+from ctxval.core.trajectory import Trajectory
+from ctxval.core.trial import Trial
+from ctxval.errors import CtxvalError
 
 
 class StoreWarning(UserWarning):
     """The disk of a store may lose or damage it."""
-
-
-_NETWORKS = ("nfs", "nfs4", "cifs", "smb3", "smbfs", "afs", "ncpfs", "fuse.sshfs", "fuse.rclone")
-"""File systems of other machines, whose locks and flushes are not reliable."""
 
 
 def file_system(path: Path, mounts: str) -> str:
@@ -26,10 +28,11 @@ def file_system(path: Path, mounts: str) -> str:
 
 def network(path: Path) -> str:
     """Return the file system of another machine that a path is on; empty if it is on none, or if that is not known."""
+    networks = ("nfs", "nfs4", "cifs", "smb3", "smbfs", "afs", "ncpfs", "fuse.sshfs", "fuse.rclone")
     kind = ""
-    with contextlib.suppress(OSError, ValueError):
+    with suppress(OSError, ValueError):
         kind = file_system(path.absolute(), Path("/proc/mounts").read_text())
-    return kind if kind in _NETWORKS else ""
+    return kind if kind in networks else ""
 
 
 def warn_of_network(path: Path) -> None:
@@ -53,9 +56,56 @@ def make_folder(folder: Path) -> None:
 
 def sync_folder(folder: Path) -> None:
     """Flush the directory entries of a folder to the disk, if the operating system supports it."""
-    with contextlib.suppress(OSError):
+    with suppress(OSError):
         opened = os.open(folder, os.O_RDONLY)
         try:
             os.fsync(opened)
         finally:
             os.close(opened)
+
+
+def error_with_fallback(
+    ended: Trial, trajectory: Trajectory | None, store: Path | None, error: CtxvalError
+) -> CtxvalError:
+    """Write the fallback file of an execution; return the error of the store with a sentence that names the file."""
+    if not ended.executed:
+        return error
+    path = _written(ended, trajectory, store)
+    if path is None:
+        return type(error)(f"{error} The result of trial {ended.number} could not be written to a file either.")
+    how = f"--npz {path}" if trajectory is not None else "--failed or --distance with the value in the file"
+    return type(error)(
+        f"{error} The result of trial {ended.number} is kept in {path}: when the store can be written again, "
+        f"run `ctxval tell STORE {ended.number} {how}` before any other command."
+    )
+
+
+def _written(trial: Trial, trajectory: Trajectory | None, store: Path | None) -> Path | None:
+    """Write the trajectory of a trial as NPZ, or its distance or failure as JSON; files of other attempts stay.
+
+    The file is next to the store, or in the temporary folder if this is not possible; None if neither is.
+    """
+    stem = "memory" if store is None else store.stem
+    ended = {"trial": trial.number, "distance": trial.distance, "failure": trial.failure}
+    content, suffix = (json.dumps(ended).encode(), "json") if trajectory is None else (trajectory.to_npz(), "npz")
+    for folder in (Path() if store is None else store.parent, Path(tempfile.gettempdir())):
+        for count in range(1000):
+            path = folder / f"{stem}.trial-{trial.number}{f'.{count}' if count else ''}.{suffix}"
+            try:
+                file = path.open("xb")
+            except FileExistsError:
+                continue
+            except OSError:
+                break
+            try:
+                with file:
+                    file.write(content)
+                    file.flush()
+                    os.fsync(file.fileno())
+            except OSError:
+                with suppress(OSError):
+                    path.unlink()
+                break
+            sync_folder(folder)
+            return path
+    return None

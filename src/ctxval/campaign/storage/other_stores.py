@@ -40,14 +40,9 @@ def other_stores(path: Path) -> list[Path]:
 
 def _validation_of(path: Path) -> dict[str, Any]:
     """Return a store's description of its validation, and the number that depends on its model."""
-    with path.open("rb") as file:
-        header = file.read(72)  # which ends with the application_id
-    if not header.startswith(b"SQLite format 3\0") or header[-4:] != b"ctxv":
-        raise ValueError(f"{path} is not a store")
     uri = f"file:{quote(str(path.absolute()))}?mode=ro&immutable=1"  # takes no lock and replays no journal
     with closing(sqlite3.connect(uri, uri=True, factory=schema.Guarded)) as connection:
-        tables = schema.plain_tables(connection, ("experiment", "trials"))
-        if len(tables) < 2 or not {"key", "value", "executed"} <= set().union(*tables.values()):
+        if schema.difference(connection, schema.TABLES) is not None:
             raise ValueError(f"{path} is not a store")
         rows = connection.execute(
             "SELECT key, value FROM experiment WHERE key IN ('validation', 'draws') AND length(value) <= ?",

@@ -8,7 +8,7 @@ import shutil
 import sqlite3
 import time
 from collections.abc import Iterator
-from contextlib import closing, contextmanager, suppress
+from contextlib import closing, contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, get_args
@@ -26,7 +26,13 @@ from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import Trial
 from ctxval.errors import CtxvalError, InputError, StoreAccessError
 
-_TABLES = ("experiment", "settings", "history", "trials", "trajectories")
+_COLUMNS = {
+    "experiment": "key, value",
+    "settings": "key, value",
+    "history": "at, what, why, content",
+    "trials": f"{COLUMNS}, checksum",
+    "trajectories": "trial, side, npz, checksum",
+}
 
 _UNREADABLE = (sqlite3.Error, CtxvalError, ValueError, TypeError, OverflowError, MemoryError, RecursionError)
 
@@ -47,6 +53,10 @@ class Recovered:
     about: dict[str, Any] = field(default_factory=dict)
     damaged: list[str] = field(default_factory=list)
 
+    def note(self, sentence: str) -> None:
+        """Add a sentence on something that cannot be read."""
+        self.damaged.append(shortened(sentence))
+
 
 def recover(path: Path) -> Recovered:
     """Read the readable parts of a store. The file is not changed if it is damaged or has a journal."""
@@ -61,27 +71,38 @@ def recover(path: Path) -> Recovered:
         except sqlite3.Error as error:
             raise StoreAccessError(f"{path} cannot be read: {error}.") from error
         with closing(connection):
-            _read(connection, path.stat().st_size, recovered)
+            try:
+                # Without this SQLite refuses a file that is shorter than its header states.
+                connection.execute("PRAGMA writable_schema = ON")
+                tables = schema.plain_tables(connection, _COLUMNS)
+            except _UNREADABLE as error:
+                recovered.damaged.append(f"nothing is readable: {error}")
+                tables = {}
+            if tables:
+                _read(connection, tables, path.stat().st_size, recovered)
     return recovered
 
 
 @contextmanager
 def _played_back(path: Path, recovered: Recovered) -> Iterator[Path]:
     """Yield the file to read: the store, or a copy into which the journal of a dead process was replayed."""
-    journals = _left_journals(path)
-    if not journals:
-        try:
-            Store.existing(path).close()
-        except CtxvalError as error:
-            recovered.damaged.append(str(error))
-        yield path
-        return
+    for _ in range(20):
+        journals = schema.beside(path)
+        if not journals:  # a journal that disappears belonged to a process that was writing
+            try:
+                Store.existing(path).close()
+            except CtxvalError as error:
+                recovered.damaged.append(str(error))
+            yield path
+            return
+        time.sleep(0.05)
     with temporary_folder() as folder:
         copy = folder / "store.sqlite"
         try:
             # On a copy, because the journal of another database would destroy readable data.
-            for file, ending in journals.items():
-                shutil.copyfile(file, f"{copy}{ending}")
+            shutil.copyfile(path, copy)
+            for journal in journals:
+                shutil.copyfile(journal, f"{copy}{str(journal).removeprefix(str(path.resolve()))}")
             Store.existing(copy).close()
         except (CtxvalError, OSError) as error:
             recovered.damaged.append(str(error).replace(str(copy), str(path)))
@@ -89,121 +110,71 @@ def _played_back(path: Path, recovered: Recovered) -> Iterator[Path]:
         yield copy
 
 
-def _left_journals(path: Path) -> dict[Path, str]:
-    """Return the store and the journals beside it, with their endings; empty if no journal stays.
-
-    A journal that disappears during the checks belonged to a process that was writing.
-    """
-    for _ in range(20):
-        journals = schema.beside(path)
-        if not journals:
-            return {}
-        time.sleep(0.05)
-    real = str(path.resolve())
-    return {path: ""} | {journal: str(journal).removeprefix(real) for journal in journals}
-
-
-def _read(connection: sqlite3.Connection, size: int, recovered: Recovered) -> None:
-    try:
-        # Without this SQLite refuses a file that is shorter than its header states.
-        connection.execute("PRAGMA writable_schema = ON")
-        tables = schema.plain_tables(connection, _TABLES)
-    except _UNREADABLE as error:
-        recovered.damaged.append(f"nothing is readable: {error}")
-        return
-    recovered.damaged += [
-        f"the table {name} is missing, or is no plain table" for name in _TABLES if name not in tables
-    ]
-    reader = _Reader(connection, tables, size, recovered)
-    for table in ("experiment", "settings"):
-        recovered.about[table] = dict(reader.pairs(table))
-    recovered.about["history"] = list(reader.history())
-    for row in reader.rows("trials", [*(name.strip() for name in COLUMNS.split(",")), "checksum"]):
-        reader.take_trial(row)
-    for row in reader.rows("trajectories", ["trial", "side", "npz", "checksum"]):
-        reader.take_trajectory(*row)
+def _read(connection: sqlite3.Connection, tables: dict[str, set[str]], size: int, recovered: Recovered) -> None:
+    about: dict[str, Any] = {"experiment": {}, "settings": {}, "history": []}
+    recovered.about = about
+    for table, names in _COLUMNS.items():
+        if not set(names.split(", ")) <= tables.get(table, set()):
+            recovered.damaged.append(f"the table {table} is missing, or is not that of a store")
+            continue
+        for row in _rows(connection, table, names, size, recovered):
+            if table == "trials":
+                _take_trial(row, recovered)
+            elif table == "trajectories":
+                _take_trajectory(row, recovered)
+            else:
+                try:
+                    content = read_json(row[-1], finite=False)
+                except InputError as error:
+                    recovered.note(f"the table {table}, {row[0]}: {error}")
+                    continue
+                if table == "history":
+                    at, what, why = map(str, row[:3])
+                    about[table].append({"at": at, "what": what, "why": why, "content": content})
+                else:
+                    about[table][str(row[0])] = content
 
 
-@dataclass(eq=False)
-class _Reader:
-    """Reads tables row by row, each row by its number, so that a damaged row does not hide the next one."""
-
-    connection: sqlite3.Connection
-    tables: dict[str, set[str]]
-    size: int
-    recovered: Recovered
-
-    def pairs(self, table: str) -> Iterator[tuple[str, Any]]:
-        for key, value in self.rows(table, ["key", "value"]):
-            try:
-                yield str(key), read_json(value, finite=False)
-            except InputError as error:
-                self._note(f"the table {table}, {key}: {error}")
-
-    def history(self) -> Iterator[dict[str, Any]]:
-        """Yield the changes of the store."""
-        for at, what, why, content in self.rows("history", ["at", "what", "why", "content"]):
-            try:
-                yield {"at": str(at), "what": str(what), "why": str(why), "content": read_json(content, finite=False)}
-            except InputError as error:
-                self._note(f"the table history, {at}: {error}")
-
-    def rows(self, table: str, columns: list[str]) -> Iterator[tuple[Any, ...]]:
-        """Yield the readable rows of a table; a column that it does not have is None."""
-        if table not in self.tables:
-            return
-        wanted = ", ".join(name if name in self.tables[table] else f"NULL AS {name}" for name in columns)
-        unreadable: dict[str, list[int]] = {}
-        for place in self._places(table):
-            try:
-                row = self.connection.execute(f"SELECT {wanted} FROM {table} WHERE rowid = ?", (place,)).fetchone()
-            except _UNREADABLE as error:
-                unreadable.setdefault(str(error), []).append(place)
-                continue
-            if row is not None:
-                yield row
-        for reason, places in unreadable.items():
-            several = f"{len(places)} rows from {places[0]} to {places[-1]}"
-            self._note(f"the table {table}, {several if len(places) > 1 else f'row {places[0]}'}: {reason}")
-
-    def _places(self, table: str) -> list[int]:
-        places: set[int] = set()
+def _rows(
+    connection: sqlite3.Connection, table: str, columns: str, size: int, recovered: Recovered
+) -> Iterator[tuple[Any, ...]]:
+    """Yield the readable rows of a table; behind a row that cannot be read, the scan begins again."""
+    last, unreadable = -(2**63), dict[str, list[int]]()
+    while last <= size // 16:  # a row has at least 16 bytes, so the size of the file limits how many there can be
+        query = f"SELECT rowid, {columns} FROM {table} NOT INDEXED WHERE rowid > ? ORDER BY rowid"
         try:
-            places.update(place for (place,) in self.connection.execute(f"SELECT rowid FROM {table} NOT INDEXED"))
+            for place, *row in connection.execute(query, (last,)):
+                if place > last:  # a damaged file may repeat its rows without end
+                    last = place
+                    yield tuple(row)
+            break
         except _UNREADABLE as error:
-            self._note(f"the table {table}: {error}")
-            # Rows behind the damage are recovered by their numbers; the size of the file limits how many there can be.
-            last = 10_000
-            with suppress(*_UNREADABLE):
-                last = int(self.connection.execute(f"SELECT max(rowid) FROM {table}").fetchone()[0] or 0)
-            places |= set(range(min(last + 1, self.size // 16)))  # a row has at least 16 bytes
-        return sorted(places)
+            last = max(last + 1, 0)
+            unreadable.setdefault(str(error), []).append(last)
+    for reason, places in unreadable.items():
+        which = f"{len(places)} rows from {places[0]} to {places[-1]}" if len(places) > 1 else f"row {places[0]}"
+        recovered.note(f"the table {table}, {which}: {reason}")
 
-    def take_trial(self, row: tuple[Any, ...]) -> None:
-        number, *values, checksum = row
-        trial = read_trial((number, *values), checksum)
-        if trial is not None and trial.number not in self.recovered.trials:
-            self.recovered.trials[trial.number] = trial
-        elif trial is not None:
-            self._note(f"trial {number} is there more than once, and the first one is taken")
-        elif checksum_of((number, *values)) == checksum:
-            self._note(f"trial {number}: it holds what no trial can")
-        else:
-            self._note(f"trial {number}: its checksum does not fit")
 
-    def take_trajectory(self, number: Any, side: Any, npz: Any, checksum: Any) -> None:
-        name = f"the {side}'s trajectory of trial {number}"
-        if side not in get_args(Side) or not isinstance(number, int):
-            self._note(f"{name}: there is no such thing")
-        elif (number, side) in self.recovered.trajectories:
-            self._note(f"{name} is there more than once, and the first one is taken")
-        elif trajectory := read_trajectory(number, side, npz, checksum):
-            self.recovered.trajectories[number, side] = trajectory
-        else:
-            self._note(f"{name}: its checksum does not fit")
+def _take_trial(row: tuple[Any, ...], recovered: Recovered) -> None:
+    number, checksum = row[0], row[-1]
+    trial = read_trial(row[:-1], checksum)
+    if trial is None:
+        fits = checksum_of(row[:-1]) == checksum
+        recovered.note(f"trial {number}: {'it holds what no trial can' if fits else 'its checksum does not fit'}")
+    else:
+        recovered.trials.setdefault(trial.number, trial)
 
-    def _note(self, sentence: str) -> None:
-        self.recovered.damaged.append(shortened(sentence))
+
+def _take_trajectory(row: tuple[Any, ...], recovered: Recovered) -> None:
+    number, side, npz, checksum = row
+    name = f"the {side}'s trajectory of trial {number}"
+    if side not in get_args(Side) or not isinstance(number, int):
+        recovered.note(f"{name}: there is no such thing")
+    elif trajectory := read_trajectory(number, side, npz, checksum):
+        recovered.trajectories.setdefault((number, side), trajectory)
+    else:
+        recovered.note(f"{name}: its checksum does not fit")
 
 
 def export(recovered: Recovered, folder: Path) -> list[Path]:
@@ -237,11 +208,10 @@ def _cell(value: Any) -> Any:
 def _flat(trial: Trial) -> dict[str, Any]:
     parameters: dict[str, Any] = {}
     for name, value in trial.parameters.items():
-        entries = {name: value} if not isinstance(value, list) else {f"{name}[{i}]": v for i, v in enumerate(value)}
-        parameters |= entries
-    first, last = ("number", "origin", "state"), ("distance", "failure", "executed", "attempts", "seconds")
+        parameters |= {f"{name}[{i}]": v for i, v in enumerate(value)} if isinstance(value, list) else {name: value}
+    last = ("distance", "failure", "executed", "attempts", "seconds")
     return {
-        **{name: getattr(trial, name) for name in first},
+        **{name: getattr(trial, name) for name in ("number", "origin", "state")},
         **parameters,
         **{name: getattr(trial, name) for name in last},
     }

@@ -11,8 +11,8 @@ import itertools
 import os
 import re
 import sqlite3
-from collections.abc import Iterable, Iterator
-from contextlib import closing, contextmanager, suppress
+from collections.abc import Iterable
+from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any
 
@@ -57,11 +57,7 @@ CREATE TABLE computed (key TEXT PRIMARY KEY, digest TEXT NOT NULL, value TEXT NO
 """
 """The statements that make the tables of a store, with which those of a file are compared."""
 
-_EVERY = 10_000  # instructions of SQLite between two checks of their number
-
 STEPS = 100_000_000  # largest number of SQLite instructions of one statement; reading a trial takes about twenty
-
-_OBJECTS = 100  # tables and indexes that are examined; a store has far fewer
 
 _LIMITS = {
     sqlite3.SQLITE_LIMIT_SQL_LENGTH: 100_000,
@@ -73,8 +69,7 @@ _LIMITS = {
     sqlite3.SQLITE_LIMIT_TRIGGER_DEPTH: 1,
 }
 
-_BESIDE = ("-journal", "-wal", "-shm")
-"""Endings of the files beside a database that SQLite reads by itself."""
+_BESIDE = ("-journal", "-wal", "-shm")  # endings of the files beside a database that SQLite reads by itself
 
 
 class Guarded(sqlite3.Connection):
@@ -82,8 +77,14 @@ class Guarded(sqlite3.Connection):
 
     def __init__(self, *args: Any, **options: Any) -> None:
         super().__init__(*args, **options)
-        self._steps = _Steps()
-        self.set_progress_handler(self._steps.too_many, _EVERY)
+        # The handler must not refer to the connection, which would never be freed.
+        steps = self._steps = [0]
+
+        def too_many() -> bool:
+            steps[0] += 10_000
+            return steps[0] > STEPS
+
+        self.set_progress_handler(too_many, 10_000)
         for limit, value in _LIMITS.items():
             self.setlimit(limit, value)
         self.execute("PRAGMA trusted_schema = OFF")
@@ -91,19 +92,8 @@ class Guarded(sqlite3.Connection):
 
     def execute(self, *statement: Any) -> sqlite3.Cursor:
         """Execute a statement; the bound allows reading millions of trials."""
-        self._steps.taken = 0
+        self._steps[0] = 0
         return super().execute(*statement)
-
-
-class _Steps:
-    """Counts instructions. It is separate from the connection, which would not be freed if it referred to itself."""
-
-    def __init__(self) -> None:
-        self.taken = 0
-
-    def too_many(self) -> bool:
-        self.taken += _EVERY
-        return self.taken > STEPS
 
 
 def require_files(path: Path) -> None:
@@ -116,13 +106,12 @@ def require_files(path: Path) -> None:
         if mode is not None and (reason := why_not_regular(mode)):
             what = reason.removeprefix("it ")
             raise StoreAccessError(f"{path} cannot be read as a store: {beside} {what}; move it away.")
-    names_another = False
+    end = b""
     with suppress(OSError), Path(f"{real}-journal").open("rb") as file:
-        # The end of the journal of a transaction over several databases, which a store never makes.
-        magic = b"\xd9\xd5\x05\xf9\x20\xa1\x63\xd7"
-        file.seek(-len(magic), os.SEEK_END)
-        names_another = file.read() == magic
-    if names_another:
+        file.seek(-8, os.SEEK_END)
+        end = file.read()
+    # The end of the journal of a transaction over several databases, which a store never makes.
+    if end == b"\xd9\xd5\x05\xf9\x20\xa1\x63\xd7":
         raise ForeignStoreError(
             f"{path} cannot be read as a store: {real}-journal belongs to several databases; move it away."
         )
@@ -152,17 +141,6 @@ def beside(path: Path) -> list[Path]:
     return [path for path in (Path(real + ending) for ending in _BESIDE) if path.is_file()]
 
 
-@contextmanager
-def snapshot(connection: sqlite3.Connection) -> Iterator[None]:
-    """Make all reads inside see the file at one moment, whatever other processes write."""
-    connection.execute("BEGIN")
-    try:
-        yield
-    finally:
-        if connection.in_transaction:
-            connection.execute("ROLLBACK")
-
-
 def is_new(connection: sqlite3.Connection, name: str) -> bool:
     """Return whether a file is empty, after a check that it has exactly the tables of a store otherwise."""
     mark = connection.execute("PRAGMA application_id").fetchone()[0]
@@ -183,7 +161,7 @@ def is_new(connection: sqlite3.Connection, name: str) -> bool:
 def plain_tables(connection: sqlite3.Connection, names: Iterable[str]) -> dict[str, set[str]]:
     """Return the column names of each table that can be read row by row without running anything in the file."""
     wanted, plain = set(names), {}
-    for kind, name, _, definition in itertools.islice(connection.execute(_MASTER), _OBJECTS):
+    for kind, name, _, definition in itertools.islice(connection.execute(_MASTER), 100):
         ordinary = re.match(r"\s*create\s+table\b", str(definition), re.IGNORECASE)
         if kind != "table" or name not in wanted or not ordinary:
             continue
@@ -198,8 +176,8 @@ def difference(connection: sqlite3.Connection, script: str) -> str | None:
     """Return how the tables of a file differ from those that a script makes. Returns None if they agree."""
     expected, present = _expected(script), {}
     for place, (kind, name, table, definition) in enumerate(connection.execute(_MASTER)):
-        if place == _OBJECTS:
-            return f"it has more than {_OBJECTS} tables"
+        if place == 100:
+            return "it has more than 100 tables"
         if (kind, name) not in expected:
             return f"it has {'an' if str(kind)[:1] in 'aeiou' else 'a'} {kind} {name!r}"
         present[kind, name] = (table, _bare(definition))

@@ -16,32 +16,21 @@ from ctxval._util.representation import Shown, call
 from ctxval._util.version import VERSION
 from ctxval.campaign.storage import rows, schema
 from ctxval.campaign.storage.database import Database, now
-from ctxval.campaign.storage.rows import COLUMNS, checksum_of, read_trial, real, row_of
+from ctxval.campaign.storage.rows import COLUMNS, checksum_of, read_trial, row_of
 from ctxval.campaign.storage.trajectories import Side, StoredTrajectories
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import Change, Trial
 from ctxval.errors import CtxvalError, ForeignStoreError, InputError, StoreAccessError, StoreMismatchError
 
-_DRAWS = "draws"
-"""Key in the table experiment that is not part of the description of the experiment."""
-
-_CONTENT = (
-    "SELECT key, value FROM experiment ORDER BY key",
-    "SELECT number, checksum FROM trials ORDER BY number",
-    "SELECT trial, side, checksum FROM trajectories ORDER BY trial, side",
-    "SELECT number, what, why, content FROM history ORDER BY number",
-)
-"""Queries of all that results follow from."""
-
-_ENDED = "state = ?, distance = ?, failure = ?, executed = ?, checksum = ?"
-"""The assignments that take the values of :func:`_ended`."""
+_DRAWS = "draws"  # a key in the table experiment that is not part of the description of the experiment
 
 
 @checked
 class Store:
     """A file with the trials of one experiment.
 
-    Every change is one transaction, which is on the disk before the call returns.
+    Every change is one transaction, which is on the disk before the call returns. Methods with the argument ``changes``
+    raise a :class:`StoreMismatchError` if the store has another number of changes; None skips this check.
 
     Args:
         path: the file; it is created if it does not exist. None keeps the trials in memory.
@@ -54,22 +43,15 @@ class Store:
     def __init__(self, path: str | Path | None = None) -> None:
         self._database = self._opened(path)
         self._trajectories = StoredTrajectories(self._database)
-        self.path: Path | None = self._database.path
-        """The absolute path of the file; None if the trials are in memory."""
-        self.name = self._database.name
-        """The name of the store in messages."""
+        # The absolute path of the file, None if the trials are in memory; and the name of the store in messages.
+        self.path, self.name = self._database.path, self._database.name
 
     def _opened(self, path: str | Path | None) -> Database:
         return Database(path)
 
     @classmethod
     def existing(cls, path: str | Path) -> Store:
-        """Open a store that must exist already.
-
-        Raises:
-            StoreAccessError: if there is no such file, or it cannot be read.
-            ForeignStoreError: if the file is not a store, or a store of another version.
-        """
+        """Open a store that must exist already; otherwise, and for other files, as the constructor raises."""
         schema.require_files(Path(path))
         if not os.path.exists(path):
             raise StoreAccessError(f"there is no store at {path}.")
@@ -86,11 +68,8 @@ class Store:
     def sole_writer(self, wait: float = 0.0) -> AbstractContextManager[None]:
         """Prevent other processes from running this store. The lock is released when the process ends, however it ends.
 
-        Args:
-            wait: seconds to wait for another process that is about to end.
-
-        Raises:
-            StoreAccessError: if another process is running the store.
+        If another process is running the store, wait so many seconds for its end, and then raise a
+        :class:`StoreAccessError`.
         """
         return self._database.sole_writer(wait)
 
@@ -123,8 +102,8 @@ class Store:
 
     def draws(self) -> int | None:
         """Return the number that seeds independent draws together with the seed. Returns None if none is stored."""
-        kept = self._pairs("experiment").get(_DRAWS)
-        return kept if isinstance(kept, int) else None
+        number = self._pairs("experiment").get(_DRAWS)
+        return number if isinstance(number, int) else None
 
     def keep_draws(self, number: int) -> None:
         """Store the number that seeds independent draws; a number that is stored already stays."""
@@ -149,9 +128,9 @@ class Store:
 
     def _pairs(self, table: str) -> dict[str, Any]:
         bounded = (f"CASE WHEN length({cell}) <= {rows.MOST_CHARACTERS} THEN {cell} END" for cell in ("key", "value"))
-        with self._database.rows(f"SELECT {', '.join(bounded)} FROM {table} ORDER BY rowid") as found:
+        with self._database.rows(f"SELECT {', '.join(bounded)} FROM {table} ORDER BY rowid") as pairs:
             try:
-                return rows.read_pairs(found)
+                return rows.read_pairs(pairs)
             except InputError as error:
                 raise self._database.damaged(f"the {table} in it cannot be read") from error
 
@@ -159,9 +138,9 @@ class Store:
 
     def history(self) -> list[Change]:
         """Return the later changes of the store in order, each with its reason."""
-        with self._database.rows("SELECT what, why, content, at FROM history ORDER BY number") as found:
+        with self._database.rows("SELECT what, why, content, at FROM history ORDER BY number") as changes:
             try:
-                return [Change(str(what), str(why), rows.read_json(text), str(at)) for what, why, text, at in found]
+                return [Change(str(what), str(why), rows.read_json(text), str(at)) for what, why, text, at in changes]
             except InputError as error:
                 raise self._database.damaged("its history cannot be read") from error
 
@@ -183,7 +162,7 @@ class Store:
             if self.signature() != seen:
                 return False
             for trial in trials:
-                self._database.execute(f"UPDATE trials SET {_ENDED} WHERE number = ?", (*_ended(trial), trial.number))
+                self._update(trial)
             self._write_description(description)
             self._insert_change(change)
         return True
@@ -200,92 +179,60 @@ class Store:
 
     def open_trial(self, trial: Trial, model_trajectory: Trajectory, *, changes: int | None = None) -> None:
         """Store a new trial with its model trajectory, before its execution starts."""
-        with self._database.transaction():
-            self._require_unchanged(changes)
-            self._insert(trial)
-            self._trajectories.write(trial.number, "model", model_trajectory)
+        self.add([(trial, model_trajectory, None)], changes=changes)
 
-    def record_failed_plan(self, trial: Trial, *, changes: int | None = None) -> None:
-        """Store a new trial that failed before an execution of S."""
-        with self._database.transaction():
-            self._require_unchanged(changes)
-            self._insert(trial)
-
-    def record_known(
-        self, ended: Iterable[tuple[Trial, Trajectory, Trajectory | None]], *, changes: int | None = None
+    def add(
+        self, new: Iterable[tuple[Trial, Trajectory | None, Trajectory | None]], *, changes: int | None = None
     ) -> None:
-        """Store new trials that have ended already, with the trajectories of model and system, in one transaction."""
+        """Store new trials with their trajectories of model and system, None if there is none, in one transaction."""
         with self._database.transaction():
             self._require_unchanged(changes)
-            for trial, model_trajectory, system_trajectory in ended:
-                self._insert(trial)
+            for trial, model_trajectory, system_trajectory in new:
+                row = row_of(trial)
+                values = (*row, checksum_of(row), now(), None if trial.state == "open" else now())
+                places = ", ".join("?" * len(values))
+                self._database.execute(
+                    f"INSERT INTO trials ({COLUMNS}, checksum, opened_at, closed_at) VALUES ({places})", values
+                )
                 self._trajectories.write(trial.number, "model", model_trajectory)
-                if system_trajectory is not None:
-                    self._trajectories.write(trial.number, "system", system_trajectory)
-
-    def _insert(self, trial: Trial) -> None:
-        row = row_of(trial)
-        closed_at = None if trial.state == "open" else now()
-        places = ", ".join("?" * (len(row) + 3))
-        self._database.execute(
-            f"INSERT INTO trials ({COLUMNS}, checksum, opened_at, closed_at) VALUES ({places})",
-            (*row, checksum_of(row), now(), closed_at),
-        )
+                self._trajectories.write(trial.number, "system", system_trajectory)
 
     def begin_attempt(self, trial: Trial, *, changes: int | None = None) -> None:
-        """Record one more attempt, which the trial counts, before the execution starts.
-
-        Raises:
-            StoreMismatchError: if the store has another number of changes than ``changes``; None skips the check.
-        """
+        """Record one more attempt, which the trial counts, before the execution starts."""
         with self._database.transaction():
             self._require_unchanged(changes)
-            changed = self._database.execute(
-                "UPDATE trials SET attempts = ?, checksum = ? WHERE number = ? AND state = 'open'",
-                (trial.attempts, checksum_of(row_of(trial)), trial.number),
-            ).rowcount
-            if changed != 1:
+            if not self._update(trial, "AND state = 'open'"):
                 raise self._not_open(trial.number)
 
     def close_trial(self, trial: Trial, system_trajectory: Trajectory | None, *, changes: int | None = None) -> None:
-        """Store the result of an open trial; of two results for one trial, the first is stored.
-
-        Raises:
-            StoreMismatchError: if the store has another number of changes than ``changes``.
-        """
+        """Store the result of an open trial; of two results for one trial, the first is stored."""
         with self._database.transaction():
             self._require_unchanged(changes)
-            changed = self._database.execute(
-                f"UPDATE trials SET {_ENDED}, seconds = ?, closed_at = ? "
-                "WHERE number = ? AND state = 'open' AND attempts = ?",
-                (*_ended(trial), real(trial.seconds), now(), trial.number, trial.attempts),
-            ).rowcount
-            if changed != 1:
+            if not self._update(trial, f"AND state = 'open' AND attempts = {trial.attempts:d}", closed_at=now()):
                 raise self._not_open(trial.number)
-            if system_trajectory is not None:
-                self._trajectories.write(trial.number, "system", system_trajectory)
+            self._trajectories.write(trial.number, "system", system_trajectory)
 
     def replace_result(
         self, before: Trial, after: Trial, trajectory: Trajectory | None, why: str, *, changes: int | None = None
     ) -> None:
-        """Replace the result of a trial; the history keeps the earlier one, with its trajectory as NPZ in base 64.
-
-        Raises:
-            StoreMismatchError: if the store has another number of changes than ``changes``.
-        """
+        """Replace the result of a trial; the history keeps the earlier one, with its trajectory as NPZ in base 64."""
         executed = self.trajectory(before.number, "system")
         npz = None if executed is None else base64.b64encode(executed.to_npz()).decode()
         result = {"state": before.state, "distance": before.distance, "failure": before.failure, "npz": npz}
         with self._database.transaction():
             self._require_unchanged(changes)
-            self._database.execute(
-                f"UPDATE trials SET {_ENDED}, closed_at = ? WHERE number = ?",
-                (*_ended(after), now(), after.number),
-            )
+            self._update(after, closed_at=now())
             self._trajectories.remove(after.number, "system")
-            if trajectory is not None:
-                self._trajectories.write(after.number, "system", trajectory)
+            self._trajectories.write(after.number, "system", trajectory)
             self._insert_change(Change("replaced", why, {"before": {str(before.number): result}}))
+
+    def _update(self, trial: Trial, where: str = "", closed_at: str | None = None) -> bool:
+        """Store what an execution changes in a trial; return whether its row satisfies a further condition."""
+        columns = ("attempts", "state", "distance", "failure", "executed", "seconds")
+        row = dict(zip(COLUMNS.split(", "), row_of(trial), strict=True))
+        values = (*(row[name] for name in columns), checksum_of(row_of(trial)), closed_at, trial.number)
+        assignments = f"{' = ?, '.join(columns)} = ?, checksum = ?, closed_at = coalesce(?, closed_at)"
+        return self._database.execute(f"UPDATE trials SET {assignments} WHERE number = ? {where}", values).rowcount == 1
 
     def _not_open(self, number: int) -> InputError:
         row = self._database.execute("SELECT state FROM trials WHERE number = ?", (number,)).fetchone()
@@ -315,7 +262,12 @@ class Store:
         """Return a digest of all that results follow from: trials, trajectories, the experiment, and this version."""
         digest = hashlib.sha256(VERSION.encode())
         with self._database.snapshot():
-            for query in _CONTENT:
+            for query in (
+                "SELECT key, value FROM experiment ORDER BY key",
+                "SELECT number, checksum FROM trials ORDER BY number",
+                "SELECT trial, side, checksum FROM trajectories ORDER BY trial, side",
+                "SELECT number, what, why, content FROM history ORDER BY number",
+            ):
                 with self._database.rows(query) as content:
                     for row in content:
                         digest.update(repr(row).encode())
@@ -339,11 +291,7 @@ class Store:
             self._database.execute("INSERT OR REPLACE INTO computed VALUES (?, ?, ?)", (key, digest, text))
 
     def trajectory(self, number: int, side: Side) -> Trajectory | None:
-        """Return a stored trajectory of a trial, whose arrays may be changed. Returns None if there is none.
-
-        Raises:
-            ForeignStoreError: if the trajectory is damaged.
-        """
+        """Return a stored trajectory of a trial, whose arrays may be changed; None if there is none."""
         trajectory = self.trajectories([number], side).get(number)
         # Some distances change the arrays that they are given.
         return None if trajectory is None else trajectory.copy()
@@ -352,9 +300,7 @@ class Store:
         """Return stored trajectories by the numbers of their trials; a trial without one is left out.
 
         Those of the system are kept in memory, up to 512 MiB, so that they are read once. Their arrays are read-only.
-
-        Raises:
-            ForeignStoreError: if a trajectory is damaged.
+        A damaged trajectory is a :class:`ForeignStoreError`.
         """
         return self._trajectories.read(numbers, side)
 
@@ -365,7 +311,3 @@ class Store:
         except CtxvalError:
             return call(self, place, Shown("cannot be read"))
         return call(self, place, trials=trials, open=waiting)
-
-
-def _ended(trial: Trial) -> tuple[Any, ...]:
-    return (trial.state, real(trial.distance), trial.failure, int(trial.executed), checksum_of(row_of(trial)))

@@ -11,8 +11,6 @@ from ctxval.core.trajectory import Trajectory
 
 Side = Literal["model", "system"]
 
-MEMORY = 512 * 2**20  # largest number of bytes of the trajectories that are kept in memory
-
 
 class StoredTrajectories:
     """Reads and writes the trajectories of one store.
@@ -22,14 +20,14 @@ class StoredTrajectories:
     checksums in the file show which ones are read again.
     """
 
-    def __init__(self, database: Database, memory: int = MEMORY) -> None:
+    def __init__(self, database: Database, memory: int = 512 * 2**20) -> None:
         self._database, self._left = database, memory
         self._kept: dict[int, tuple[int, Trajectory]] = {}
         self._missing: set[int] = set()
         self._version: int | None = None
 
     def read(self, numbers: Iterable[int], side: Side) -> dict[int, Trajectory]:
-        """Return the stored trajectories of trials by the trials' numbers; a trial without one is left out."""
+        """Return the stored trajectories of trials by number; a trial without one is left out."""
         if side == "model":
             rows = ((number, self._read(number, side)) for number in numbers)
             return {number: row[1] for number, row in rows if row is not None}
@@ -37,8 +35,10 @@ class StoredTrajectories:
         of_system = ((number, self._of_system(number)) for number in numbers)
         return {number: trajectory for number, trajectory in of_system if trajectory is not None}
 
-    def write(self, number: int, side: Side, trajectory: Trajectory) -> None:
-        """Store a trajectory of a trial. Call this inside a transaction."""
+    def write(self, number: int, side: Side, trajectory: Trajectory | None) -> None:
+        """Store a trajectory of a trial, if there is one. Call this inside a transaction."""
+        if trajectory is None:
+            return
         npz = trajectory.to_npz()
         self._missing.discard(number)
         self._database.execute(
@@ -53,7 +53,6 @@ class StoredTrajectories:
             self._left += _size(self._kept.pop(number)[1])
 
     def _of_system(self, number: int) -> Trajectory | None:
-        """Return the trajectory of the system in a trial, from memory if it is there."""
         if number in self._missing:
             return None
         if number in self._kept:
@@ -84,7 +83,6 @@ class StoredTrajectories:
             self._left += _size(self._kept.pop(number)[1])
 
     def _read(self, number: int, side: Side) -> tuple[int, Trajectory] | None:
-        """Return the checksum and the trajectory of a row. Returns None if there is none."""
         where = "FROM trajectories {} WHERE trial = ? AND side = ?"
         with self._database.snapshot():
             row = self._database.execute(f"SELECT npz, checksum {where.format('')}", (number, side)).fetchone()

@@ -15,7 +15,7 @@ from ctxval._util.arrays import Array
 from ctxval._util.describe import describe, differences
 from ctxval._util.progress import stage
 from ctxval.campaign.campaign import Campaign
-from ctxval.campaign.choices import Choice
+from ctxval.campaign.choices import Choice, Execution
 from ctxval.campaign.execution import RetryPolicy, Schedule, execute_schedule
 from ctxval.campaign.history import executed_trials, largest_distance
 from ctxval.core.plan import gives_inputs
@@ -303,7 +303,7 @@ class Executions:
                 with other.recorder.predicting(not of_draw):
                     copy = other.recorder.open(choice).trial
             try:
-                ended = other.recorder.complete(copy, other.recorder.validation.accept(plan, trajectory), trajectory)
+                ended = other.recorder.close(copy, Execution(trajectory).measured(other.recorder.validation, plan))
             except DistanceError:  # it is stored as unmeasured
                 return
         self._ended(other, ended)
