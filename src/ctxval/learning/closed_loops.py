@@ -240,7 +240,7 @@ def loop_pairs(planner: LoopPlanner, posterior: DynamicsPosterior, tasks: Array)
 def _own_step(draws: DynamicsDraws, tasks: int, rows: Rows) -> Step:
     """Return the step of draws on tasks of their own: a flat batch has some rows of all their ``S q`` tasks."""
     first, last = int(rows[0]) // tasks, int(rows[-1]) // tasks + 1
-    needed, own = draws.between(first, last), rows - first * tasks
+    needed, own = draws[np.arange(first, last)], rows - first * tasks
 
     def of_all_tasks(part: Array) -> Array:
         whole = np.zeros(((last - first) * tasks, part.shape[-1]))

@@ -55,7 +55,7 @@ class PredictedDistance:
         without = self.posterior.means_without(executions_of(self.executed, points))
 
         def own(first: int, last: int) -> Array:
-            return self.planner.own_distances(without.between(first, last), points[first:last, None]).T
+            return self.planner.own_distances(without[np.arange(first, last)], points[first:last, None]).T
 
         with single_threaded():
             found = _halved(own, 0, len(rows), 1)[0]
