@@ -73,9 +73,12 @@ class Component:
         first = left.max(initial=0.0)
         # Variances below the noise are drawn too: many noisy transitions determine a function better than one does.
         rounding = 1e-13 * kernel.diagonal(theta, relevant).max(initial=0.0)
-        towards = kernel.towards(theta, relevant)
+        towards, few = kernel.towards(theta, relevant), len(relevant) <= 300
+        covariance = towards(relevant) - half.T @ half if few else None  # cheaper than one row after the other
 
         def covariances(row: int) -> Array:
+            if covariance is not None:
+                return covariance[row]
             return np.asarray(towards(relevant[row : row + 1])[0] - half[:, row] @ half)
 
         chosen = pivoted_cholesky(left, covariances, count, least=max(1e-6 * first, rounding))

@@ -201,7 +201,9 @@ class WorstCaseSearch:
         with single_threaded():
             if not globally:
                 budget = min(_SCREENED[1], settings.evaluations)
-                rough = None if posterior.rough_mean is posterior.mean else partial(self._distances, posterior.rough_mean)
+                rough = (
+                    None if posterior.rough_mean is posterior.mean else partial(self._distances, posterior.rough_mean)
+                )
                 ascent = Ascent(distance, np.zeros(self.dimension), np.ones(self.dimension), budget, rough)
                 points, values = ascent.run(starts[: len(known) + _SHOWN], rng)
                 apart = separated_rows(points, _APART * np.sqrt(self.dimension), settings.elites)
