@@ -24,8 +24,7 @@ from ctxval.learning.dynamics_posterior import DynamicsPosterior
 
 T = TypeVar("T")
 
-_REMEMBERED = 64_000_000
-"""Largest size of the plans that are kept, in bytes, approximately."""
+_REMEMBERED = 64_000_000  # largest size of the plans that are kept, in bytes, approximately
 
 
 @dataclass(frozen=True, eq=False)

@@ -35,8 +35,7 @@ from ctxval.learning.kernel_expansion import KernelExpansion, joined, weights_wi
 from ctxval.learning.residual_data import ResidualData, residual_data
 from ctxval.learning.without_model import smoother_than
 
-_PIVOT = 0.1
-"""Variance, as a share of the noise, below which a transition adds nothing to those chosen before it."""
+_PIVOT = 0.1  # variance, as a share of the noise, below which a transition adds nothing to those chosen before it
 
 
 @dataclass(frozen=True)

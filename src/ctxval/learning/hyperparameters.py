@@ -36,8 +36,7 @@ _LENGTH = (3.0, 1.0)
 """Median of the length-scales in standard deviations of the data, and the deviation of their logarithms."""
 _LINEAR_PART = (1.0, 5.0)
 """The same for the variances of the constant and of the linear part, relative to that of the Matern part."""
-_FREEDOM = 6.0
-"""Degrees of freedom of the t distribution of the proposals."""
+_FREEDOM = 6.0  # degrees of freedom of the t distribution of the proposals
 
 _LINEAR_KERNEL = Linear(centre=0.0, variance=(1e-4, 1e6))
 

@@ -23,20 +23,14 @@ from ctxval.learning.closed_loops import LoopPlanner, PlannedTasks, loop_pairs
 from ctxval.learning.draws import DynamicsDraws
 from ctxval.learning.dynamics_posterior import DynamicsPosterior
 
-_DIVERGED = 1e30
-"""The distance of a loop that diverges, in searches: larger than all others, and finite."""
+_DIVERGED = 1e30  # the distance of a loop that diverges, in searches: larger than all others, and finite
 _EVALUATIONS = (512, 2048, 4096, 6000, 6000, 6000, 12000)
 """Number of tasks in the global search for 1, 2, ... task parameters; the last one holds for all higher numbers."""
-_SHOWN = 16
-"""Largest number of these tasks."""
-_NEARBY = 1e-3
-"""Largest change of each coordinate to a task that is nearly the same."""
-_FIRST = 8
-"""Number of draws that show which tasks may be worst on the others."""
-_SCREENED = (8, 1500)
-"""Number of draws of the hyperparameters in a screening, and of tasks in its search on the mean."""
-_APART = 0.15
-"""Least distance of two tasks that are not next to each other, as a share of the cube's diagonal."""
+_SHOWN = 16  # largest number of these tasks
+_NEARBY = 1e-3  # largest change of each coordinate to a task that is nearly the same
+_FIRST = 8  # number of draws that show which tasks may be worst on the others
+_SCREENED = (8, 1500)  # number of draws of the hyperparameters in a screening, and of tasks in its search on the mean
+_APART = 0.15  # least distance of two tasks that are not next to each other, as a share of the cube's diagonal
 
 
 @dataclass(frozen=True)
@@ -121,7 +115,7 @@ class WorstCaseSearch:
     def screening_loops(self) -> int:
         """About how many closed loops a screening runs."""
         own = self.settings
-        shared = own.elites + own.shared
+        shared = own.elites + own.shared // 4
         return 2 * own.pool + min(_SCREENED[1], own.evaluations) + (1 + _SCREENED[0]) * shared
 
     @functools.cached_property
