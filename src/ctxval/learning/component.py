@@ -78,7 +78,7 @@ class Component:
 
         def covariances(row: int) -> Array:
             if covariance is not None:
-                return covariance[row]
+                return np.asarray(covariance[row])
             return np.asarray(towards(relevant[row : row + 1])[0] - half[:, row] @ half)
 
         chosen = pivoted_cholesky(left, covariances, count, least=max(1e-6 * first, rounding))
