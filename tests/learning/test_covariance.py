@@ -64,7 +64,7 @@ def test_gradients_are_those_of_finite_differences(nu: float, growth: float, inp
     theta = np.array([0.3, -0.4, 1.0, 0.1, 0.5, -0.7])
     steps = 1e-6 * np.eye(6)
     differences = [((kernel(theta + h, X, X) - kernel(theta - h, X, X)) * W).sum() / 2e-6 for h in steps]
-    np.testing.assert_allclose(kernel.weighted_gradient(theta, X, W), differences, rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(kernel.with_gradient(theta, X)[1](W), differences, rtol=1e-6, atol=1e-6)
 
 
 def test_with_growth_the_deviation_is_proportional_to_large_inputs() -> None:

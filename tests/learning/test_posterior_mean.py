@@ -129,7 +129,7 @@ def test_a_rough_mean_has_fewer_centres_and_almost_the_same_values() -> None:
     data = record(400)
     posterior = learn(data)
     (rough,) = posterior.rough_mean.expansions
-    assert len(rough.centres) < len(posterior.rows)
+    assert rough.centres.shape[1] < len(posterior.rows)
     fine, coarse = (one.model_of(0).step(data.x, data.u) for one in (posterior.mean, posterior.rough_mean))
     size = np.abs(fine - MODEL.step(data.x, data.u)).max()
     np.testing.assert_allclose(coarse, fine, atol=0.05 * size)

@@ -24,10 +24,8 @@ class Acquisition(Protocol):
         """Return the values ``(m,)`` and their gradients ``(m, d)``."""
 
 
-_FAR_BELOW = -1e3
-"""Below this number of standard deviations, a series replaces differences of large logarithms."""
-_CERTAIN = 1e-9
-"""Least standard deviation in the expected improvement; smaller ones are replaced by it."""
+_FAR_BELOW = -1e3  # below this number of standard deviations, a series replaces differences of large logarithms
+_CERTAIN = 1e-9  # least standard deviation in the expected improvement; smaller ones are replaced by it
 _LOG_ROOT_2PI = 0.5 * float(np.log(2 * np.pi))
 
 

@@ -14,24 +14,17 @@ from ctxval._util.arrays import Array
 from ctxval._util.boxes import moves_to_bounds, separated_rows
 from ctxval.gp.evaluations import Evaluations, Values, line_search_cost
 
-_STARTS = 10
-"""Number of points from which the function, or its approximation, is climbed."""
-_ROUNDS = 3
-"""Number of line searches of each climb."""
+_STARTS = 10  # number of points from which the function, or its approximation, is climbed
+_ROUNDS = 3  # number of line searches of each climb
 _FINALISTS = (3, 2)
 """Number of points from which the function itself is climbed after its approximation, and of line searches."""
-_FEW = 3
-"""Largest dimension in which samples ever closer to the best points replace the climbs."""
-_POOL = 128
-"""Number of points in few dimensions that are the same in each search, for each dimension."""
-_ZOOMED = 6
-"""Number of points that are sampled around."""
+_FEW = 3  # largest dimension in which samples ever closer to the best points replace the climbs
+_POOL = 128  # number of points in few dimensions that are the same in each search, for each dimension
+_ZOOMED = 6  # number of points that are sampled around
 _SAMPLES = 18
 """Number of samples in each round, for each dimension; there are 1, 3 and 5 rounds in 1, 2 and 3 dimensions."""
-_MOVED = 3
-"""Number of best points of which single coordinates are moved to bounds in each round."""
-_REFINED = 16
-"""Number of points at which the function itself is evaluated after its approximation."""
+_MOVED = 3  # number of best points of which single coordinates are moved to bounds in each round
+_REFINED = 16  # number of points at which the function itself is evaluated after its approximation
 
 
 class Ascent:

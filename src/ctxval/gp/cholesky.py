@@ -48,7 +48,7 @@ class CholeskyFactor:
         """Return ``K^-1``, shape ``(n, n)``."""
         lower = dpotri(self.L, lower=1)[0]  # L is zero above its diagonal, and stays so
         inverse = lower + lower.T
-        inverse[np.diag_indices_from(inverse)] *= 0.5
+        inverse.ravel("K")[:: len(inverse) + 1] *= 0.5  # its diagonal
         return np.asarray(inverse)
 
     @functools.cached_property
@@ -82,7 +82,7 @@ def factorise(covariance: Array, noises: float | Iterable[float]) -> CholeskyFac
     tried = [noises] if isinstance(noises, float) else noises
     for noise in tried:
         noisy = np.array(covariance, order="F")
-        noisy[np.diag_indices_from(noisy)] += noise
+        noisy.ravel("K")[:: len(noisy) + 1] += noise  # its diagonal
         L, info = dpotrf(noisy, lower=1, clean=1, overwrite_a=1)
         if not info and not np.isnan(np.trace(L)):  # some LAPACKs let NaN pass
             return CholeskyFactor(np.asarray(L))

@@ -12,10 +12,8 @@ from ctxval._util.boxes import climb, moves_to_bounds
 Values = Callable[[Array], Array]
 """Points ``(m, d)`` -> values ``(m,)``."""
 
-_SHARES = np.array([0.03, 0.1, 0.3, 0.6, 1.0])
-"""Steps of a line search, as shares of the way to a corner."""
-_LENGTHS = np.array([0.1, 0.4])
-"""Steps along the slopes, as shares of the box in the steepest coordinate."""
+_SHARES = np.array([0.03, 0.1, 0.3, 0.6, 1.0])  # steps of a line search, as shares of the way to a corner
+_LENGTHS = np.array([0.1, 0.4])  # steps along the slopes, as shares of the box in the steepest coordinate
 _COORDINATES = (0.0, 0.25, 0.5)
 """Shares of the coordinates that are moved to the corner alone, at least one coordinate each."""
 

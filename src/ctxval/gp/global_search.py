@@ -22,8 +22,7 @@ _SAMPLED, _EVOLVED, _CLIMBED = 0.35, 0.7, 0.88
 """Shares of the evaluations after which sampling, evolution and climbs end."""
 _REACHES = (0.3, 0.1)
 """Least distance of good parents in the first and the last generation, and of elites, as a share of the diagonal."""
-_STEPS = (0.3, 0.005)
-"""Largest standard deviation of a mutation in the first and in the last generation."""
+_STEPS = (0.3, 0.005)  # largest standard deviation of a mutation in the first and in the last generation
 
 
 @dataclass(frozen=True, eq=False)

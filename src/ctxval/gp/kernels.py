@@ -99,7 +99,7 @@ class Matern(Kernel):
         Y = X / scales
         r = cdist(Y, Y)
         variance = np.exp(theta[0])
-        profile, slope = self._profile_and_slope(r)
+        profile, slope = self.profile_and_slope(r)
         by_variance = variance * np.vdot(W, profile)
         # dk/d log l_j = slope(r) * (y_ij - y_kj)^2; the sum over pairs is a quadratic form, without (n, n, d) storage.
         G = W * slope
@@ -113,19 +113,19 @@ class Matern(Kernel):
     def input_gradient(self, theta: Array, X: Array, Z: Array) -> Array:
         scales = np.exp(theta[1:])
         Y, V = X / scales, Z / scales
-        slope = np.exp(theta[0]) * self._profile_and_slope(cdist(Y, V))[1]
+        slope = np.exp(theta[0]) * self.profile_and_slope(cdist(Y, V))[1]
         return np.asarray(-slope[:, :, None] * (Y[:, None, :] - V[None, :, :]) / scales)
 
     def weighted_input_gradient(self, theta: Array, X: Array, Z: Array, weights: Array) -> Array:
         """Return ``sum_j weights_ij dk(x_i, z_j)/dx_i``, shape ``(n, d)``, without the ``(n, m, d)`` of its terms."""
         scales = np.exp(theta[1:])
-        pulls = np.exp(theta[0]) * weights * self._profile_and_slope(cdist(X / scales, Z / scales))[1]
+        pulls = np.exp(theta[0]) * weights * self.profile_and_slope(cdist(X / scales, Z / scales))[1]
         return np.asarray((pulls @ Z - pulls.sum(axis=1)[:, None] * X) / scales**2)
 
     def diagonal_input_gradient(self, theta: Array, X: Array) -> Array:
         return np.zeros_like(X)
 
-    def _profile_and_slope(self, r: Array) -> tuple[Array, Array]:
+    def profile_and_slope(self, r: Array) -> tuple[Array, Array]:
         """Return k(r) and ``-k'(r) / r``, which is finite at r = 0, for unit variance and length-scale."""
         s = np.sqrt(2 * self.nu) * r
         decay = np.exp(-s)

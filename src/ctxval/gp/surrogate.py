@@ -14,8 +14,7 @@ from ctxval.gp.hyperposterior import Warp
 from ctxval.gp.kernels import Kernel, Linear, Matern, Sum
 from ctxval.gp.regression import NOISE, GaussianProcess, Mean, condition, fit, zero_mean
 
-_KERNEL = Sum(Matern(1.5, ard=True, length_scale=(0.02, 100.0)), Linear())
-"""The kernel of :class:`Learned`."""
+_KERNEL = Sum(Matern(1.5, ard=True, length_scale=(0.02, 100.0)), Linear())  # the kernel of :class:`Learned`
 
 
 @dataclass(frozen=True, eq=False)

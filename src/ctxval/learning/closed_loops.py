@@ -5,8 +5,9 @@ from __future__ import annotations
 import contextlib
 import functools
 from collections import OrderedDict
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 
@@ -21,8 +22,9 @@ from ctxval.core.validation import Validation
 from ctxval.learning.draws import DynamicsDraws
 from ctxval.learning.dynamics_posterior import DynamicsPosterior
 
-_REMEMBERED = 64_000_000
-"""Largest size of the plans that are kept, in bytes, approximately."""
+T = TypeVar("T")
+
+_REMEMBERED = 64_000_000  # largest size of the plans that are kept, in bytes, approximately
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,7 +105,7 @@ class LoopPlanner:
             self._kept.move_to_end(key)
             advance(len(points))  # as if they were planned
             return self._kept[key][0]
-        planned = list(self._planned(points, np.arange(len(points))))
+        planned = self._planned(points)
         advance(len(points))
         # Trajectories, and gains as large as those of a linear feedback.
         arrays = [(one.promised.states, one.promised.inputs) for one in planned]
@@ -114,18 +116,17 @@ class LoopPlanner:
             self._size -= self._kept.popitem(last=False)[1][1]
         return planned
 
-    def _planned(self, points: Array, rows: Rows) -> Iterator[PlannedTasks]:
-        """Yield the plans of some rows. A batch that fails is halved; one task is then planned without batch axis."""
-        try:
-            yield self._plan(points[rows] if self.batched else points[rows[0]], rows)
-        except Exception:  # the user's own parts, on tasks that may never be executed
-            if len(rows) > 1:
-                half = len(rows) // 2
-                yield from self._planned(points, rows[:half])
-                yield from self._planned(points, rows[half:])
-            elif self.batched:
-                with contextlib.suppress(Exception):  # the same
-                    yield self._plan(points[rows[0]], rows)
+    def _planned(self, points: Array) -> list[PlannedTasks]:
+        """Return plans. A batch that fails is halved; one task is then planned without batch axis."""
+        plans = []
+        batches = halved(lambda rows: self._plan(points[rows] if self.batched else points[rows[0]], rows), len(points))
+        for rows, plan in batches:
+            if plan is None and self.batched:
+                with contextlib.suppress(Exception):  # the user's own parts, on tasks that may never be executed
+                    plan = self._plan(points[rows[0]], rows)
+            if plan is not None:
+                plans.append(plan)
+        return plans
 
     def _plan(self, chosen: Array, rows: Rows) -> PlannedTasks:
         parts = self.validation
@@ -219,6 +220,25 @@ class LoopPlanner:
         return np.array([float(one) for one in each])
 
 
+def halved(function: Callable[[Rows], T], count: int) -> list[tuple[Rows, T | None]]:
+    """Return what a function of rows returns for all of ``count`` rows; where it fails, the rows are halved.
+
+    It is None for a single row. The user's parts may fail on tasks and at states that no execution has reached.
+    """
+    results: list[tuple[Rows, T | None]] = []
+    left = [np.arange(count)]
+    while left:
+        rows = left.pop()
+        try:
+            results.append((rows, function(rows)))
+        except Exception:  # the user's parts
+            if len(rows) > 1:
+                left += reversed(np.array_split(rows, 2))
+            else:
+                results.append((rows, None))
+    return results
+
+
 def distances_of(loops: Sequence[Loops], planned: Sequence[PlannedTasks], draws: int, tasks: int) -> Array:
     """Return the distances ``(S, q)`` of closed loops of S draws on planned tasks; NaN for a task without a plan."""
     found = np.full((draws, tasks), np.nan)
@@ -240,7 +260,7 @@ def loop_pairs(planner: LoopPlanner, posterior: DynamicsPosterior, tasks: Array)
 def _own_step(draws: DynamicsDraws, tasks: int, rows: Rows) -> Step:
     """Return the step of draws on tasks of their own: a flat batch has some rows of all their ``S q`` tasks."""
     first, last = int(rows[0]) // tasks, int(rows[-1]) // tasks + 1
-    needed, own = draws.between(first, last), rows - first * tasks
+    needed, own = draws[np.arange(first, last)], rows - first * tasks
 
     def of_all_tasks(part: Array) -> Array:
         whole = np.zeros(((last - first) * tasks, part.shape[-1]))

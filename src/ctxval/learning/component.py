@@ -49,7 +49,7 @@ class Component:
     @property
     def mean(self) -> KernelExpansion:
         """The posterior mean, as one function."""
-        return KernelExpansion(self.hyperparameters, self.centres, self.weights[None])
+        return KernelExpansion.of(self.hyperparameters, self.centres, self.weights[None])
 
     @property
     def noise(self) -> Array:
@@ -73,9 +73,12 @@ class Component:
         first = left.max(initial=0.0)
         # Variances below the noise are drawn too: many noisy transitions determine a function better than one does.
         rounding = 1e-13 * kernel.diagonal(theta, relevant).max(initial=0.0)
-        towards = kernel.towards(theta, relevant)
+        towards, few = kernel.towards(theta, relevant), len(relevant) <= 300
+        covariance = towards(relevant) - half.T @ half if few else None  # cheaper than one row after the other
 
         def covariances(row: int) -> Array:
+            if covariance is not None:
+                return np.asarray(covariance[row])
             return np.asarray(towards(relevant[row : row + 1])[0] - half[:, row] @ half)
 
         chosen = pivoted_cholesky(left, covariances, count, least=max(1e-6 * first, rounding))
@@ -101,7 +104,8 @@ def draw_functions(
     own = alike[0]
     chosen, L, left_out = own.pivots(relevant, pivots)
     if not len(chosen):
-        return own.mean.repeated(count * len(alike)), left_out
+        weights = np.repeat(own.weights[None], count * len(alike), axis=0)
+        return KernelExpansion.of(own.hyperparameters, own.centres, weights), left_out
     kernel, theta = own.hyperparameters.kernel, own.hyperparameters.theta
     shape = (count, len(chosen), own.weights.shape[1])
     normal = np.concatenate([rng.standard_normal(shape) * one.amplitudes for one in alike])
@@ -110,4 +114,4 @@ def draw_functions(
     cross = own.factor.solve(kernel(theta, own.centres, relevant[chosen]))
     together = np.concatenate([own.weights - np.matmul(cross, weights), weights], axis=1)
     centres = np.concatenate([own.centres, relevant[chosen]])
-    return KernelExpansion(own.hyperparameters, centres, together), left_out
+    return KernelExpansion.of(own.hyperparameters, centres, together), left_out

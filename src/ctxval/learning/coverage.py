@@ -16,8 +16,7 @@ from ctxval.learning.dynamics_posterior import DynamicsPosterior
 
 MOST_COORDINATES = 6
 """Largest number of state-input coordinates for which pairs of coordinates are compared."""
-_FARTHEST = 1e3
-"""Standardised coordinates are limited to this magnitude."""
+_FARTHEST = 1e3  # standardised coordinates are limited to this magnitude
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ctxval._util.arrays import Array, rows_of
+from ctxval._util.arrays import Array, ArrayLike, rows_of
 from ctxval._util.representation import ShortRepr
 from ctxval.core.model import Model
 from ctxval.learning.kernel_expansion import KernelExpansion
@@ -18,15 +18,15 @@ class DynamicsDraws(ShortRepr):
     """S models ``M + r_s``, run together: a draw is the first axis of states and inputs.
 
     Attributes:
-        expansions: functions r_s, in groups that share their centres.
-        left_out: share of the posterior variance that the draws of each group leave out between pivots.
+        expansions: functions r_s, in groups that are evaluated together.
+        left_out: largest share of the posterior variance that draws leave out between pivots.
         limit: the largest standardised residual of each learned state, in magnitude; None if there is no limit.
     """
 
     model: Model
     data: ResidualData
     expansions: tuple[KernelExpansion, ...]
-    left_out: tuple[float, ...]
+    left_out: float = 0.0
     limit: Array | None = None
 
     def __len__(self) -> int:
@@ -36,35 +36,31 @@ class DynamicsDraws(ShortRepr):
         """Return the next states, shapes ``(S, q, n), (S, q, m) -> (S, q, n)``."""
         with np.errstate(all="ignore"):
             z = bounded(self.data.standardised(x, u))
-            residuals, learned, first = np.zeros_like(x), self.data.learned, 0
-            for one in self.expansions:
-                last = first + len(one.weights)
-                values = one(z[first:last])
-                if self.limit is not None:
-                    np.clip(values, -self.limit, self.limit, out=values)
-                residuals[first:last, :, learned] = values
-                first = last
+            values = [one(z[first:last]) for one, first, last in self._groups()]
+            learned = values[0] if len(values) == 1 else np.concatenate(values)
+            if self.limit is not None:
+                learned = np.minimum(np.maximum(learned, -self.limit), self.limit)
+            residuals = np.zeros_like(x)
+            residuals[:, :, self.data.learned] = learned
             return self.model.step(x, u) + residuals * self.data.units
 
-    def between(self, first: int, last: int) -> DynamicsDraws:
-        """Return the draws from ``first`` up to and without ``last``."""
-        groups, left_out, start = [], [], 0
-        for one, left in zip(self.expansions, self.left_out, strict=True):
-            own = slice(max(first - start, 0), max(last - start, 0))
-            start += len(one.weights)
-            if len(one.weights[own]):
-                groups.append(one[own])
-                left_out.append(left)
-        return replace(self, expansions=tuple(groups), left_out=tuple(left_out))
+    def __getitem__(self, rows: ArrayLike) -> DynamicsDraws:
+        """Return some draws; their rows are in ascending order."""
+        rows = np.atleast_1d(np.asarray(rows, dtype=np.intp))
+        if len(rows) == len(self):
+            return self
+        chosen = [(one, rows[(rows >= first) & (rows < last)] - first) for one, first, last in self._groups()]
+        return replace(self, expansions=tuple(one[own] for one, own in chosen if len(own)))
 
-    def __getitem__(self, index: int) -> DynamicsDraws:
-        """Return one draw."""
-        if not 0 <= index < len(self):
-            raise IndexError(f"there are {len(self)} draws.")
-        return self.between(index, index + 1)
+    def _groups(self) -> list[tuple[KernelExpansion, int, int]]:
+        """Return the expansions with the rows of their first draw and of the one after their last."""
+        ends = np.cumsum([len(one.weights) for one in self.expansions]).tolist()
+        return list(zip(self.expansions, [0, *ends], ends, strict=False))
 
     def model_of(self, index: int) -> DrawnModel:
         """Return one draw as a model."""
+        if not 0 <= index < len(self):
+            raise IndexError(f"there are {len(self)} draws.")
         return DrawnModel(self[index])
 
 

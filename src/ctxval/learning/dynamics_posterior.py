@@ -31,12 +31,11 @@ from ctxval.learning.hyperparameters import (
     Hyperparameters,
     learning_rows,
 )
-from ctxval.learning.kernel_expansion import KernelExpansion, weights_without
+from ctxval.learning.kernel_expansion import KernelExpansion, joined, weights_without
 from ctxval.learning.residual_data import ResidualData, residual_data
 from ctxval.learning.without_model import smoother_than
 
-_PIVOT = 0.1
-"""Variance, as a share of the noise, below which a transition adds nothing to those chosen before it."""
+_PIVOT = 0.1  # variance, as a share of the noise, below which a transition adds nothing to those chosen before it
 
 
 @dataclass(frozen=True)
@@ -176,7 +175,7 @@ class DynamicsPosterior(ShortRepr):
     def rough_mean(self) -> DynamicsDraws:
         """The same with fewer centres if those predict the others well; it is cheaper to evaluate."""
         rough = self.with_few_centres(64, 0.03)
-        return self.mean if len(rough.centres) == len(self.rows) else self._limited(rough)
+        return self.mean if rough.centres.shape[1] == len(self.rows) else self._limited(rough)
 
     def with_few_centres(self, least: int, error: float) -> KernelExpansion:
         """Return the mean of r conditioned on as few of the transitions as predict the others well.
@@ -205,7 +204,7 @@ class DynamicsPosterior(ShortRepr):
             Z, Y = self._known(rows)
             gone = np.array([np.isin(self.data.sources[rows], list(without)) for without in left_out])
             weights = weights_without(most.kernel(most.theta, Z, Z), most.noise, Y, gone)
-        return self._limited(KernelExpansion(most, Z, weights))
+        return self._limited(KernelExpansion.of(most, Z, weights))
 
     @property
     def limit(self) -> Array:
@@ -213,7 +212,7 @@ class DynamicsPosterior(ShortRepr):
         return np.asarray(5.0 * np.abs(self.data.outputs).max(axis=0))
 
     def _limited(self, mean: KernelExpansion) -> DynamicsDraws:
-        return DynamicsDraws(self.model, self.data, (mean,), (0.0,), self.limit[self.data.learned])
+        return DynamicsDraws(self.model, self.data, (mean,), limit=self.limit[self.data.learned])
 
     def unfamiliarity(self, states: Array, inputs: Array) -> Array:
         """Return the standard deviation of r along trajectories, as a share of a typical step, ``(q,)``.
@@ -251,7 +250,7 @@ class DynamicsPosterior(ShortRepr):
             groups = [list(group) for _, group in groupby(components, lambda one: id(one.factor))]
             drawn = [draw_functions(group, relevant, count, self.settings.pivots, rng) for group in groups]
         expansions, left_out = zip(*drawn, strict=True)
-        return DynamicsDraws(self.model, self.data, expansions, left_out)
+        return DynamicsDraws(self.model, self.data, joined(expansions), max(left_out))
 
     def _some_components(self, count: int) -> Sequence[Component]:
         """Return the components of about so many draws of the hyperparameters, evenly spread."""

@@ -34,8 +34,7 @@ from ctxval.learning.worst_case import WorstCase, WorstCaseSearch, WorstCaseSett
 from ctxval.models.corrected import before_refinement
 from ctxval.searches import Prediction
 
-_SLOW = 0.02
-"""Seconds: if a single closed loop on M takes longer, closed loops are distributed over the cores."""
+_SLOW = 0.02  # seconds: if a single closed loop on M takes longer, closed loops are distributed over the cores
 
 
 class DynamicsStudy(ShortRepr):

@@ -15,8 +15,7 @@ from ctxval.core.trajectory import Trajectory
 from ctxval.learning.closed_loops import LoopPlanner
 from ctxval.learning.draws import DynamicsDraws
 
-_QUANTILES = np.linspace(0.0, 1.0, 21)
-"""Levels of the stored quantiles of the distance."""
+_QUANTILES = np.linspace(0.0, 1.0, 21)  # levels of the stored quantiles of the distance
 
 
 @dataclass(frozen=True)

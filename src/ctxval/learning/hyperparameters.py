@@ -9,10 +9,11 @@ there are weighted by the ratio of the densities, with weights truncated as by I
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.distance import cdist
 from scipy.special import gammaln, logsumexp
 
 from ctxval._util.arrays import Array, Rows
@@ -35,8 +36,7 @@ _LENGTH = (3.0, 1.0)
 """Median of the length-scales in standard deviations of the data, and the deviation of their logarithms."""
 _LINEAR_PART = (1.0, 5.0)
 """The same for the variances of the constant and of the linear part, relative to that of the Matern part."""
-_FREEDOM = 6.0
-"""Degrees of freedom of the t distribution of the proposals."""
+_FREEDOM = 6.0  # degrees of freedom of the t distribution of the proposals
 
 _LINEAR_KERNEL = Linear(centre=0.0, variance=(1e-4, 1e6))
 
@@ -81,11 +81,23 @@ class ResidualKernel(Covariance):
         grown = 1 + self.growth * (self._inputs(X) ** 2).sum(axis=1)
         return np.asarray(grown + _LINEAR_KERNEL.diagonal(theta[-2:], X))
 
-    def weighted_gradient(self, theta: Array, X: Array, W: Array) -> Array:
-        """Return ``sum_ij W_ij dK_ij/dtheta`` for K = k(X, X) and a symmetric W, in the shape of theta."""
-        grown = self._grow(W.copy(), X, X)
-        of_scales = Matern(self.nu, ard=True).weighted_gradient(self._unit(theta), X, grown)[1:]
-        return np.concatenate([of_scales, _LINEAR_KERNEL.weighted_gradient(theta[-2:], X, W)])
+    def with_gradient(self, theta: Array, Z: Array) -> tuple[Array, Callable[[Array], Array]]:
+        """Return K = k(Z, Z), and the function ``W -> sum_ij W_ij dK_ij/dtheta`` of a symmetric W."""
+        constant, slope = np.exp(theta[-2:])
+        scaled = Z / np.exp(theta[:-2])
+        profile, fall = Matern(self.nu).profile_and_slope(cdist(scaled, scaled))
+        linear = slope * (Z @ Z.T)
+        K = self._grow(profile, Z, Z)
+        K += linear
+        K += constant
+
+        def gradient(W: Array) -> Array:
+            G = self._grow(W * fall, Z, Z)
+            # As in Matern.weighted_gradient, the sum over pairs is a quadratic form.
+            of_scales = 2 * (G.sum(axis=1) @ scaled**2 - (scaled * (G @ scaled)).sum(axis=0))
+            return np.array([*of_scales, constant * W.sum(), np.vdot(W, linear)])
+
+        return K, gradient
 
     def _grow(self, covariances: Array, X: Array, Z: Array) -> Array:
         """Multiply covariances ``(n, m)`` by the growth with the inputs, and return them."""
@@ -226,21 +238,19 @@ def log_posterior(kernel: ResidualKernel, parameters: Array, Z: Array, Y: Array)
     out. It does not change beyond the bounds of the hyperparameters, where only the prior does.
     """
     theta, noise = _within(kernel, parameters)
-    value, factor, scaled = _log_likelihood(kernel, theta, noise, Z, Y)
+    K, gradient = kernel.with_gradient(theta, Z)
+    value, factor, scaled = _log_likelihood(K, noise, Y)
     W = scaled @ scaled.T
     W -= Y.shape[1] * factor.inverse()
     W *= 0.5
-    gradient = np.append(kernel.weighted_gradient(theta, Z, W), noise * np.trace(W))
     prior, slope = _log_prior(parameters)
-    return float(value + prior), gradient + slope
+    return value + prior, np.append(gradient(W), noise * np.trace(W)) + slope
 
 
-def _log_likelihood(
-    kernel: ResidualKernel, theta: Array, noise: float, Z: Array, Y: Array
-) -> tuple[float, CholeskyFactor, Array]:
+def _log_likelihood(K: Array, noise: float, Y: Array) -> tuple[float, CholeskyFactor, Array]:
     """Return the log likelihood, the factor of the covariance, and ``K^-1 y_i`` over the amplitudes, ``(N, n)``."""
     N, n = Y.shape
-    factor = factorise(kernel(theta, Z, Z), noise)
+    factor = factorise(K, noise)
     weights = factor.solve(Y)
     squares = np.maximum((Y * weights).sum(axis=0) / N, 1e-300)
     value = -0.5 * N * np.log(squares).sum() - n * factor.half_log_determinant()
@@ -278,7 +288,7 @@ def _climbed(kernel: ResidualKernel, Z: Array, Y: Array) -> list[tuple[float, Ar
     bounds = list(zip(*_box(kernel, Z.shape[1]), strict=True))
     # The data can look like a rough function, or like a smooth one with noise.
     starts = [np.log([*[_LENGTH[0]] * Z.shape[1], 1.0, 1.0, noise]) for noise in (1e-5, 0.1)]
-    modes = [most_likely(density, start[None], bounds) for start in starts]
+    modes = [most_likely(density, start[None], bounds, tolerance=1e-7) for start in starts]
     return sorted(((density(mode)[0], mode) for mode in modes), key=lambda mode: -mode[0])
 
 
@@ -292,7 +302,8 @@ def _gradient_or_zero(kernel: ResidualKernel, parameters: Array, Z: Array, Y: Ar
 def _log_posterior_or_none(kernel: ResidualKernel, parameters: Array, Z: Array, Y: Array) -> float:
     """Return the log density; minus infinity if the covariance is not positive definite."""
     try:
-        value = _log_likelihood(kernel, *_within(kernel, parameters), Z, Y)[0]
+        theta, noise = _within(kernel, parameters)
+        value = _log_likelihood(kernel(theta, Z, Z), noise, Y)[0]
     except InputError:
         return -np.inf
     return value + _log_prior(parameters)[0]

@@ -1,34 +1,45 @@
-"""Functions that are weighted sums of covariances with common centres, evaluated quickly for many arguments."""
+"""Functions that are weighted sums of covariances, many of them evaluated together."""
 
 from __future__ import annotations
 
 import functools
-from dataclasses import dataclass, replace
-from itertools import product
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import groupby, product
 
 import numpy as np
 
-from ctxval._util.arrays import Array, Mask
+from ctxval._util.arrays import Array, Mask, Rows
 from ctxval.gp.cholesky import factorise, tenfold
-from ctxval.learning.hyperparameters import Hyperparameters
+from ctxval.learning.hyperparameters import Hyperparameters, ResidualKernel
 
 
 @dataclass(frozen=True, eq=False)
 class KernelExpansion:
-    """S functions ``f_s(z) = sum_j weights_sj k(z, centre_j)`` with n values each.
+    """S functions ``f_s(z) = sum_j weights_sj k_s(z, centre_sj)`` with n values each.
 
     Attributes:
-        centres: standardised pairs, shape ``(M, k)``.
+        kernel: the family of the covariances, the same for all functions.
+        thetas: logarithms of the hyperparameters of each function, shape ``(S, k + 2)``.
+        centres: standardised pairs, shape ``(S, M, k)``.
         weights: shape ``(S, M, n)``.
     """
 
-    hyperparameters: Hyperparameters
+    kernel: ResidualKernel
+    thetas: Array
     centres: Array
     weights: Array
 
+    @classmethod
+    def of(cls, hyperparameters: Hyperparameters, centres: Array, weights: Array) -> KernelExpansion:
+        """Return functions ``(S, M, n)`` that share hyperparameters and centres ``(M, k)``."""
+        S, theta = len(weights), hyperparameters.theta
+        shared = np.broadcast_to(theta, (S, *theta.shape)), np.broadcast_to(centres, (S, *centres.shape))
+        return cls(hyperparameters.kernel, *shared, weights)
+
     def __call__(self, z: Array) -> Array:
         """Return the values ``(S, q, n)`` of each function at arguments of its own, ``(S, q, k)``."""
-        S, q, k = z.shape
+        (S, q, k), M = z.shape, self.centres.shape[1]
         # The squared distance to a centre is linear in an argument, its squared entries and 1.
         extended = np.empty((S, q, 2 * k + 1))
         extended[..., :k] = z
@@ -36,61 +47,77 @@ class KernelExpansion:
         extended[..., -1] = 1.0
         values = np.matmul(extended, self._linear)
         # As many covariances as stay in the processor's cache are computed together.
-        largest = max(1, 20_000 // len(self.centres))
+        largest = max(1, 20_000 // M)
         together = max(1, largest // max(1, q))
         for s, j in product(range(0, S, together), range(0, q, largest)):
-            block = slice(s, s + together), slice(j, j + largest)
-            some = extended[block]
-            covariances = self._matern(some.reshape(-1, 2 * k + 1)).reshape(*some.shape[:2], -1)
-            values[block] += np.matmul(covariances, self.weights[block[0]])
+            block, own = (slice(s, s + together), slice(j, j + largest)), slice(s, s + together)
+            covariances = self._matern(own, extended[block].swapaxes(1, 2))
+            values[block] += np.matmul(covariances.swapaxes(1, 2), self.weights[own])
         return np.asarray(values)
 
-    def repeated(self, count: int) -> KernelExpansion:
-        """Return the only function of this expansion, ``count`` times."""
-        return replace(self, weights=np.repeat(self.weights, count, axis=0))
-
-    def __getitem__(self, rows: slice) -> KernelExpansion:
+    def __getitem__(self, rows: Rows) -> KernelExpansion:
         """Return some of the functions."""
-        return replace(self, weights=self.weights[rows])
+        return KernelExpansion(self.kernel, self.thetas[rows], self.centres[rows], self.weights[rows])
 
     @functools.cached_property
     def _linear(self) -> Array:
         """The factors of an extended argument in the linear part, shape ``(S, 2 k + 1, n)``."""
-        constant, slope = np.exp(self.hyperparameters.theta[-2:])
-        slopes = slope * np.matmul(self.centres.T, self.weights)
+        constant, slope = np.exp(self.thetas[:, -2:]).T[..., None, None]
+        slopes = slope * np.matmul(self.centres.swapaxes(1, 2), self.weights)
         constants = constant * self.weights.sum(axis=1, keepdims=True)
         return np.concatenate([slopes, np.zeros_like(slopes), constants], axis=1)
 
     @functools.cached_property
     def _squared(self) -> Array:
-        """The factors of an extended argument in the squared arguments of the Matern function, ``(2 k + 1, M)``."""
-        inverse = 2 * self.hyperparameters.kernel.nu / np.exp(2 * self.hyperparameters.theta[:-2])
-        scaled = -2 * inverse * self.centres
-        squares = (inverse * self.centres**2).sum(axis=1)
-        return np.stack([*scaled.T, *np.repeat(inverse[:, None], len(self.centres), axis=1), squares])
+        """The factors of an extended argument in the squares of a Matern function's arguments, ``(S, M, 2 k + 1)``."""
+        inverse = 2 * self.kernel.nu / np.exp(2 * self.thetas[:, None, :-2])
+        squares = (inverse * self.centres**2).sum(axis=2, keepdims=True)
+        shape = self.centres.shape
+        factors = [-2 * inverse * self.centres, np.broadcast_to(inverse, shape), squares]
+        # In this order, products with few columns are several times as fast.
+        return np.concatenate(factors, axis=2).swapaxes(1, 2).copy().swapaxes(1, 2)
 
     @functools.cached_property
     def _growth(self) -> Array:
         """The same in the growth with the inputs."""
-        kernel, (M, k) = self.hyperparameters.kernel, self.centres.shape
-        factors = np.zeros((2 * k + 1, M))
-        factors[k - kernel.inputs : k] = kernel.growth * self.centres[:, k - kernel.inputs :].T
-        factors[-1] = 1.0
+        factors = np.zeros_like(self._squared)
+        k, m = self.centres.shape[2], self.kernel.inputs
+        factors[..., k - m : k] = self.kernel.growth * self.centres[..., k - m :]
+        factors[..., -1] = 1.0
         return factors
 
-    def _matern(self, extended: Array) -> Array:
-        """Return the Matern part of the covariances ``(q, M)`` of extended arguments ``(q, 2 k + 1)``."""
-        kernel = self.hyperparameters.kernel
-        r2 = extended @ self._squared
+    def _matern(self, own: slice, extended: Array) -> Array:
+        """Return the Matern part of the covariances ``(s, M, q)`` of some functions, of ``(s, 2 k + 1, q)``."""
+        r2 = np.matmul(self._squared[own], extended)
         np.abs(r2, out=r2)  # rounding errors around zero
         r = np.sqrt(r2)
-        polynomial = _polynomial(kernel.nu, r, r2)
+        polynomial = _polynomial(self.kernel.nu, r, r2)
         np.negative(r, out=r)
         decay = np.exp(r, out=r)
         decay *= polynomial
-        if kernel.growth:
-            decay *= extended @ self._growth
+        if self.kernel.growth:
+            decay *= np.matmul(self._growth[own], extended)
         return np.asarray(decay)
+
+
+def joined(expansions: Sequence[KernelExpansion]) -> tuple[KernelExpansion, ...]:
+    """Return the same functions, those of one family that follow each other in one expansion."""
+    groups = [list(group) for _, group in groupby(expansions, lambda one: one.kernel)]
+    return tuple(group[0] if len(group) == 1 else _joined(group) for group in groups)
+
+
+def _joined(alike: Sequence[KernelExpansion]) -> KernelExpansion:
+    most = max(one.centres.shape[1] for one in alike)
+
+    def padded(values: Array) -> Array:
+        return np.pad(values, ((0, 0), (0, most - values.shape[1]), (0, 0)))
+
+    return KernelExpansion(
+        alike[0].kernel,
+        np.concatenate([one.thetas for one in alike]),
+        np.concatenate([padded(one.centres) for one in alike]),
+        np.concatenate([padded(one.weights) for one in alike]),
+    )
 
 
 def _polynomial(nu: float, r: Array, r2: Array) -> Array:

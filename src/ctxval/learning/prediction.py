@@ -14,7 +14,7 @@ import numpy as np
 
 from ctxval._util.arrays import Array, Rows, single_threaded
 from ctxval._util.cores import on_all_cores
-from ctxval.learning.closed_loops import LoopPlanner
+from ctxval.learning.closed_loops import LoopPlanner, halved
 from ctxval.learning.draws import DynamicsDraws
 from ctxval.learning.dynamics_posterior import DynamicsPosterior
 from ctxval.learning.vector import executions_of
@@ -54,11 +54,10 @@ class PredictedDistance:
         points = self.executed[rows]
         without = self.posterior.means_without(executions_of(self.executed, points))
 
-        def own(first: int, last: int) -> Array:
-            return self.planner.own_distances(without.between(first, last), points[first:last, None]).T
-
         with single_threaded():
-            found = _halved(own, 0, len(rows), 1)[0]
+            found = _nan_where_it_fails(
+                lambda some: self.planner.own_distances(without[some], points[some, None]).T, len(rows), 1
+            )[0]
         return np.where(np.isfinite(found), found, np.nan)
 
     def _predicted(self, points: Array) -> Array:
@@ -70,7 +69,7 @@ class PredictedDistance:
         return np.where(np.isfinite(found).all(axis=0), found, np.nan)
 
     def _guarded(self, points: Array) -> Array:
-        return _halved(lambda first, last: self._closed_loops(points[first:last]), 0, len(points), 2)
+        return _nan_where_it_fails(lambda rows: self._closed_loops(points[rows]), len(points), 2)
 
     def _closed_loops(self, points: Array) -> Array:
         """Return distances and doubts ``(2, m)``; NaN for a task that cannot be planned."""
@@ -83,21 +82,9 @@ class PredictedDistance:
         return found
 
 
-def _halved(function: Callable[[int, int], Array], first: int, last: int, values: int) -> Array:
-    """Return the values ``(k, m)`` of a function of a range of points, which is halved if the function fails.
-
-    They are NaN for a single point for which it fails: the user's controller may fail on states that no execution has
-    reached.
-    """
-    try:
-        return function(first, last)
-    except Exception:  # the user's parts
-        if last - first == 1:
-            return np.full((values, 1), np.nan)
-        middle = (first + last) // 2
-        return np.concatenate(
-            [_halved(function, first, middle, values), _halved(function, middle, last, values)], axis=1
-        )
+def _nan_where_it_fails(function: Callable[[Rows], Array], count: int, values: int) -> Array:
+    parts = [np.full((values, 1), np.nan) if part is None else part for _, part in halved(function, count)]
+    return np.concatenate(parts, axis=1)
 
 
 def predict_distance(

@@ -15,8 +15,7 @@ from ctxval.core.trajectory import Trajectory, Transitions
 from ctxval.core.validation import Validation
 from ctxval.models.scaling import standard_deviations
 
-_POOL = 3000
-"""Largest number of transitions that these are chosen from."""
+_POOL = 3000  # largest number of transitions that these are chosen from
 
 
 def recorded_transitions(

@@ -30,10 +30,8 @@ Compose = Callable[[Array], Array]
 """Vectors ``(..., k)`` -> values ``(...)``."""
 
 _KERNEL = Sum(Matern(2.5, ard=True, length_scale=(0.05, 100.0), variance=(1e-6, 1e3)), Linear(variance=(1e-6, 1e3)))
-_NOISE = 1e-8
-"""Noise variance relative to the vectors' mean square: it keeps the covariance matrix positive definite."""
-_LEARNED_FROM = 200
-"""Largest number of vectors, the latest ones, from which the hyperparameters are learned."""
+_NOISE = 1e-8  # noise variance relative to the vectors' mean square: it keeps the covariance matrix positive definite
+_LEARNED_FROM = 200  # largest number of vectors, the latest ones, from which the hyperparameters are learned
 
 
 def executions_of(executed: Array, points: Iterable[Array]) -> list[list[int]]:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import functools
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -22,18 +23,14 @@ from ctxval.learning.closed_loops import LoopPlanner, PlannedTasks, loop_pairs
 from ctxval.learning.draws import DynamicsDraws
 from ctxval.learning.dynamics_posterior import DynamicsPosterior
 
-_DIVERGED = 1e30
-"""The distance of a loop that diverges, in searches: larger than all others, and finite."""
+_DIVERGED = 1e30  # the distance of a loop that diverges, in searches: larger than all others, and finite
 _EVALUATIONS = (512, 2048, 4096, 6000, 6000, 6000, 12000)
 """Number of tasks in the global search for 1, 2, ... task parameters; the last one holds for all higher numbers."""
-_SHOWN = 16
-"""Largest number of these tasks."""
-_NEARBY = 1e-3
-"""Largest change of each coordinate to a task that is nearly the same."""
-_SCREENED = (8, 1500)
-"""Number of draws of the hyperparameters in a screening, and of tasks in its search on the mean."""
-_APART = 0.15
-"""Least distance of two tasks that are not next to each other, as a share of the cube's diagonal."""
+_SHOWN = 16  # largest number of these tasks
+_NEARBY = 1e-3  # largest change of each coordinate to a task that is nearly the same
+_FIRST = 8  # number of draws that show which tasks may be worst on the others
+_SCREENED = (8, 1500)  # number of draws of the hyperparameters in a screening, and of tasks in its search on the mean
+_APART = 0.15  # least distance of two tasks that are not next to each other, as a share of the cube's diagonal
 
 
 @dataclass(frozen=True)
@@ -118,7 +115,7 @@ class WorstCaseSearch:
     def screening_loops(self) -> int:
         """About how many closed loops a screening runs."""
         own = self.settings
-        shared = own.elites + own.shared
+        shared = own.elites + own.shared // 4
         return 2 * own.pool + min(_SCREENED[1], own.evaluations) + (1 + _SCREENED[0]) * shared
 
     @functools.cached_property
@@ -164,7 +161,7 @@ class WorstCaseSearch:
 
         Each of them has four times as many tasks as the usual one, and none of its tasks.
         """
-        distance, none = functools.partial(self._distances, posterior.mean), np.empty((0, self.dimension))
+        distance, none = partial(self._distances, posterior.mean), np.empty((0, self.dimension))
         evaluations = 4 * self.settings.evaluations
         with single_threaded():
             found = [search_globally(distance, self.dimension, none, rng, evaluations=evaluations) for _ in range(2)]
@@ -192,13 +189,16 @@ class WorstCaseSearch:
             known: tasks to look at in any case, such as those of earlier maxima, points ``(k, d)``.
             globally: whether large distances on a small share of the tasks are looked for.
         """
-        settings, distance = self.settings, functools.partial(self._distances, posterior.mean)
+        settings, distance = self.settings, partial(self._distances, posterior.mean)
         best = self.pool[np.argsort(-_finite(of_pool), kind="stable")[: settings.elites * 4]]
         starts = np.concatenate([known, best])
         with single_threaded():
             if not globally:
                 budget = min(_SCREENED[1], settings.evaluations)
-                ascent = Ascent(distance, np.zeros(self.dimension), np.ones(self.dimension), budget)
+                rough = (
+                    None if posterior.rough_mean is posterior.mean else partial(self._distances, posterior.rough_mean)
+                )
+                ascent = Ascent(distance, np.zeros(self.dimension), np.ones(self.dimension), budget, rough)
                 points, values = ascent.run(starts[: len(known) + _SHOWN], rng)
                 apart = separated_rows(points, _APART * np.sqrt(self.dimension), settings.elites)
                 return self._of_mean(float(values[0]), points[apart], len(points))
@@ -216,11 +216,11 @@ class WorstCaseSearch:
     ) -> WorstCase:
         """Return the largest distances of a few draws over the elites, known tasks and random ones: a lower bound."""
         with single_threaded():
-            tasks = self._shared_tasks(of_mean, known, rng)
+            tasks = self._shared_tasks(of_mean, known, self.settings.shared // 4, rng)
             draws = posterior.draw(self._relevant(posterior, tasks, rng), rng, 1, _SCREENED[0])
             values = _finite(self.planner.distances(draws, self.planner.plan(tasks), len(tasks)))
         best = values.argmax(axis=1)
-        return self._worst_case(of_mean, draws, values.max(axis=1), tasks[best], len(tasks), 0.0)
+        return self._worst_case(of_mean, draws, values.max(axis=1), tasks[best], values.size, 0.0)
 
     def maxima(
         self,
@@ -232,15 +232,15 @@ class WorstCaseSearch:
     ) -> WorstCase:
         """Return the largest distances of so many functions for each draw of the posterior's hyperparameters."""
         with single_threaded():
-            tasks = self._shared_tasks(of_mean, known, rng)
+            tasks = self._shared_tasks(of_mean, known, self.settings.shared, rng)
             draws = posterior.draw(self._relevant(posterior, tasks, rng), rng, functions)
             points, maxima, loops = self._search_draws(draws, tasks, rng)
             sharpness = self._sharpness(posterior.mean, of_mean.elites, rng)
         return self._worst_case(of_mean, draws, maxima, points, loops, sharpness)
 
-    def _shared_tasks(self, of_mean: WorstCase, known: Array, rng: np.random.Generator) -> Array:
-        """Return the tasks that all draws are run on: elites, known tasks and random ones."""
-        random = self.pool[rng.permutation(len(self.pool))[: self.settings.shared]]
+    def _shared_tasks(self, of_mean: WorstCase, known: Array, count: int, rng: np.random.Generator) -> Array:
+        """Return the tasks that draws share: elites, known tasks and random ones."""
+        random = self.pool[rng.permutation(len(self.pool))[:count]]
         return np.concatenate([of_mean.elites, known, random])
 
     def _worst_case(
@@ -250,8 +250,8 @@ class WorstCaseSearch:
             of_mean,
             maxima=np.where(maxima >= _DIVERGED, np.inf, maxima),
             points=points,
-            evaluations=of_mean.evaluations + len(draws) * loops,
-            left_out=max(draws.left_out),
+            evaluations=of_mean.evaluations + loops,
+            left_out=draws.left_out,
             sharpness=sharpness,
         )
 
@@ -279,32 +279,57 @@ class WorstCaseSearch:
         return pairs[rng.permutation(len(pairs))[: self.settings.relevant]]
 
     def _search_draws(self, draws: DynamicsDraws, tasks: Array, rng: np.random.Generator) -> tuple[Array, Array, int]:
-        """Return the best points ``(S, d)`` of draws and their distances, and the number of loops of each draw."""
-        planned = self.planner.plan(tasks)
-        values = _finite(self.planner.distances(draws, planned, len(tasks)))
+        """Return the best points ``(S, d)`` of draws and their distances, and the number of all loops."""
+        values, loops = self._on_shared(draws, tasks)
         order = np.argsort(-values, axis=1, kind="stable")
         best, points = np.take_along_axis(values, order[:, :1], 1)[:, 0], tasks[order[:, 0]]
-        second, loops = _others(tasks, order), len(tasks)
+        second, searched = _others(tasks, order), np.arange(len(draws))
         for round_, share in enumerate((0.1, 0.05, 0.02, 0.007)[: self.settings.rounds]):
+            before = best.copy()
             if round_ == 2:
                 # Each draw tries the best tasks of all others.
                 ordered = points[np.argsort(-best, kind="stable")]
                 shown = ordered[separated_rows(ordered, 0.02 * np.sqrt(self.dimension), _SHOWN)]
                 found = _finite(self.planner.distances(draws, self.planner.plan(shown), len(shown)))
                 points, best = _better(points, best, np.broadcast_to(shown, (len(best), *shown.shape)), found)
-                loops += len(shown)
-            moved = self._moves(points, second, share, rng)
-            found = _finite(self.planner.own_distances(draws, moved))
-            together = _together(points, best, moved, found)[:, None]
-            known = np.concatenate([points[:, None], moved], axis=1)
+                loops += found.size
+            some, at, highest = draws[searched], points[searched], best[searched]
+            moved = self._moves(at, second[searched], share, rng)
+            found = _finite(self.planner.own_distances(some, moved))
+            together = _together(at, highest, moved, found)[:, None]
+            known = np.concatenate([at[:, None], moved], axis=1)
             if (together == known).all(axis=2).any(axis=1).all():
-                last = np.full((len(points), 1), -np.inf)  # none of them is a new task
+                last = np.full((len(at), 1), -np.inf)  # none of them is a new task
             else:
-                last = _finite(self.planner.own_distances(draws, together))
+                last = _finite(self.planner.own_distances(some, together))
             tried, found = np.concatenate([moved, together], axis=1), np.concatenate([found, last], axis=1)
-            points, best = _better(points, best, tried, found)
-            loops += tried.shape[1]
+            points[searched], best[searched] = _better(at, highest, tried, found)
+            loops += found.size
+            # A draw that will not reach the median does not set a bound.
+            searched = np.flatnonzero(best + 3 * (best - before).max() >= np.median(best))
         return points, best, loops
+
+    def _on_shared(self, draws: DynamicsDraws, tasks: Array) -> tuple[Array, int]:
+        """Return the distances ``(S, q)`` of draws on tasks that they share, and the number of loops.
+
+        After some draws, tasks that are far below the worst one of a draw, compared with how much draws differ there,
+        are not run on the others; their distances are minus infinity.
+        """
+        values = np.full((len(draws), len(tasks)), -np.inf)
+        first = np.unique(np.linspace(0, len(draws) - 1, _FIRST).astype(int))
+        values[first] = _finite(self.planner.distances(draws[first], self.planner.plan(tasks), len(tasks)))
+        others = np.setdiff1d(np.arange(len(draws)), first)
+        if not len(others):
+            return values, values.size
+        highest = values[first].max(axis=1, keepdims=True)
+        with np.errstate(invalid="ignore"):  # no draw has a distance at a task that cannot be planned
+            below = highest - values[first]
+            may_be_worst = below.mean(axis=0) - 5 * below.std(axis=0) <= 0.01 * np.median(np.abs(highest))
+        may_be_worst[np.argsort(-values[first], axis=1, kind="stable")[:, :4]] = True
+        chosen = np.flatnonzero(may_be_worst)
+        found = self.planner.distances(draws[others], self.planner.plan(tasks[chosen]), len(chosen))
+        values[np.ix_(others, chosen)] = _finite(found)
+        return values, len(first) * len(tasks) + found.size
 
     def _moves(self, points: Array, others: Array, share: float, rng: np.random.Generator) -> Array:
         """Return the moves of each point: to bounds, 2 d of them, and at random around it and around another one."""

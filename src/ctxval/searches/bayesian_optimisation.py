@@ -29,8 +29,7 @@ _WORTH = 0.005
 """Least improvement worth an execution, as a share of the difference between the best value and the median."""
 _EVERYWHERE = 4
 """Period of executions that are chosen from the whole cube, also in a branch; in few dimensions they fill the space."""
-_BOUND = 3
-"""Period of executions that maximise the upper confidence bound."""
+_BOUND = 3  # period of executions that maximise the upper confidence bound
 _ENGINE = "scalar"
 """The name of this search in notes. Existing stores contain it, so it differs from the name of the class."""
 
