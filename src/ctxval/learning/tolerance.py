@@ -1,0 +1,100 @@
+"""What a bound survives: the largest distance if something that no record shows pushes the system.
+
+The bound from learned dynamics rests on a prior. This asks how wrong the prior may be: each learned state of the
+posterior mean is pushed in each step, by multiples of the largest residual that was recorded, everywhere or only where
+no record is near. A contact that nobody met, or a load that nobody carried, is such a push.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from ctxval._util.arrays import Array, ArrayLike, Rows, single_threaded
+from ctxval.learning.closed_loops import LoopPlanner
+from ctxval.learning.draws import DynamicsDraws
+from ctxval.learning.dynamics_posterior import DynamicsPosterior
+
+LEVELS = 2.0 ** np.arange(-4, 4)  # sizes of the pushes, as multiples of the largest recorded residual of a state
+NEAR = 0.05  # largest distance to a recorded state of what it shows, as a share of the range of each state
+
+
+@dataclass(frozen=True, eq=False)
+class PushResponse:
+    """The largest distances over some tasks if the posterior mean is pushed.
+
+    Attributes:
+        states: the states that are pushed: those in which M errs, shape ``(k,)``.
+        residuals: the largest recorded residual of each of them per second, in the system's units, shape ``(k,)``.
+        everywhere, away: the largest distance for each state and each of ``LEVELS``, ``(k, L)``, if the push acts
+            everywhere, and if it acts only where no record is near; infinity if a rollout diverges.
+    """
+
+    states: Rows
+    residuals: Array
+    everywhere: Array
+    away: Array
+
+
+def push_response(planner: LoopPlanner, posterior: DynamicsPosterior, tasks: Array) -> PushResponse:
+    """Return the largest distances over tasks ``(q, d)`` if the posterior mean is pushed in each learned state."""
+    data, planned = posterior.data, planner.plan(tasks)
+    states, n = np.flatnonzero(data.learned), len(data.sizes)
+    residuals = (np.abs(data.outputs).max(axis=0) * data.sizes)[states]
+    pushes = np.zeros((len(states), 2, len(LEVELS), n))
+    pushes[np.arange(len(states)), 0, :, states] = residuals[:, None] * LEVELS
+    pushes[:, 1] = -pushes[:, 0]
+    with single_threaded():
+        visited = np.concatenate([loops.states.reshape(-1, n) for loops in planner.run(posterior.mean, planned)])
+        low, high = np.quantile(visited[np.isfinite(visited).all(axis=1)], [1e-3, 1 - 1e-3], axis=0)
+        widths = np.maximum(high - low, 1e-9)
+        recorded = cKDTree((data.pairs * data.scale + data.shift)[:, :n] / widths)
+        largest = []
+        for records in (None, recorded):
+            mean = posterior.mean
+            pushed = PushedDynamics(
+                model=mean.model,
+                data=data,
+                expansions=mean.expansions,
+                limit=mean.limit,
+                pushes=pushes.reshape(-1, n),
+                widths=widths,
+                recorded=records,
+            )
+            distances = np.nan_to_num(planner.distances(pushed, planned, len(tasks)), nan=0.0, posinf=np.inf)
+            signed = distances.max(axis=1).reshape(pushes.shape[:3])
+            largest.append(np.maximum.accumulate(signed.max(axis=1), axis=1))
+    return PushResponse(states, residuals / planned[0].task.dt, *largest)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class PushedDynamics(DynamicsDraws):
+    """One model, whose next state is moved by several pushes: models that are run together, as draws are.
+
+    Attributes:
+        pushes: what is added to the next state in each step, shape ``(S, n)``.
+        widths: the ranges of the states on rollouts, shape ``(n,)``.
+        recorded: recorded states in units of these ranges; None if the pushes act everywhere.
+    """
+
+    pushes: Array
+    widths: Array
+    recorded: cKDTree | None
+
+    def __len__(self) -> int:
+        return len(self.pushes)
+
+    def __getitem__(self, rows: ArrayLike) -> PushedDynamics:
+        return replace(self, pushes=self.pushes[np.atleast_1d(rows)])
+
+    def step(self, x: Array, u: Array) -> Array:
+        """Return the next states, shapes ``(S, q, n), (S, q, m) -> (S, q, n)``."""
+        pushes = self.pushes[:, None]
+        if self.recorded is not None:
+            scaled = np.clip(np.nan_to_num(x / self.widths), -1e6, 1e6)
+            distance, _ = self.recorded.query(scaled, p=np.inf, distance_upper_bound=NEAR)
+            pushes = pushes * np.isinf(distance)[..., None]
+        together = super().step(x.reshape(1, -1, x.shape[-1]), u.reshape(1, -1, u.shape[-1]))
+        return np.asarray(together.reshape(x.shape) + pushes)
