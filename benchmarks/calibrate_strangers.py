@@ -16,13 +16,14 @@ from calibrate import RESULTS, all_of
 from ctxval import Campaign
 from ctxval._util.arrays import single_threaded
 from ctxval._util.json_lines import JsonLines
+from ctxval.certificates.verdict_sentences import tolerances
 from dynamics_truths import digest
 from strangers_development import DEVELOPMENT
 from strangers_reporting import REPORTING
 from strangers_truths import TRUTHS
 
-RULE = 1
-"""Version of the rule by which campaigns are run: eight tests, and tasks beside a test that failed."""
+RULE = 2
+"""Version of the rule by which campaigns are run: 2 searches fewer tasks on posterior samples, and knows tolerances."""
 
 BUDGET, SEEDS = 25, 2
 FALSE, TRUE = (0.8, 0.95, 0.99), (1.1, 1.25, 1.5)
@@ -41,6 +42,7 @@ def decide(run: tuple[str, int, float]) -> dict[str, Any]:
     with single_threaded():
         campaign = Campaign(entry(seed).validation, seed=seed).run(BUDGET, share * largest)
         verdict = campaign.verdict(share * largest)
+    known = None if verdict.certificate is None else tolerances(verdict.certificate, share * largest)
     return {
         "rule": RULE,
         "entry": name,
@@ -53,6 +55,7 @@ def decide(run: tuple[str, int, float]) -> dict[str, Any]:
         "kind": None if verdict.certificate is None else verdict.certificate.kind,
         "bound": None if verdict.bound is None else verdict.bound / largest,
         "reason": verdict.reason[:300],
+        "tolerances": None if known is None else [tolerance.ratio for tolerance in known],
         "seconds": round(time.process_time() - started, 1),
     }
 

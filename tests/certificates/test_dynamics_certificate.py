@@ -25,6 +25,7 @@ from ctxval.certificates import (
 )
 from ctxval.certificates.dynamics import bound_of
 from ctxval.certificates.dynamics_diagnostics import ACCURATE, GAP, PREDICTIONS
+from ctxval.certificates.dynamics_evidence import PushedDistances
 from ctxval.certificates.verdict import judge, judge_by
 from ctxval.errors import CertificateError
 from rig_evidence import COVERED, GOOD, gap, prediction
@@ -219,3 +220,53 @@ def test_the_text_is_complete_and_json_has_every_prediction() -> None:
     stored = json.loads(json.dumps(found.to_json(), allow_nan=False))["details"]
     assert [one["trial"] for one in stored["checked"]] == [1, 2, 3]
     assert stored["predictions"] == {"made": 3, "stored_beforehand": 3, "last_ones": 3, "held": 3}
+
+
+# What a validation survives
+
+PUSHED = PushedDistances(
+    {"speed [m/s^2]": 2.0, "angle [rad/s]": 0.5},
+    np.array([0.0, 0.5, 1.0, 2.0]),
+    np.array([[1.0, 1.2, 1.5, 2.5], [0.5, 0.5, 0.6, np.inf]]),
+    np.array([[0.5] * 4] * 2),
+)
+
+
+@pytest.mark.parametrize(
+    ("threshold", "state", "push"),
+    [
+        (1.35, "speed [m/s^2]", 1.5),  # half-way between two sizes
+        (1.5, "speed [m/s^2]", 2.0),
+        (0.9, "speed [m/s^2]", 0.0),  # any push may do that
+    ],
+)
+def test_the_tolerance_is_the_smallest_push_in_any_state(threshold: float, state: str, push: float) -> None:
+    tolerance = PUSHED.tolerance(threshold)
+    assert (tolerance.state, tolerance.push) == (state, pytest.approx(push))
+    assert tolerance.ratio == pytest.approx(push / tolerance.residual)
+
+
+def test_a_rollout_that_diverges_exceeds_every_threshold() -> None:
+    assert PUSHED.tolerance(100.0).state == "angle [rad/s]"
+    assert PUSHED.tolerance(100.0).push == pytest.approx(0.5)  # the last size at which none diverged
+
+
+def test_no_push_may_suffice() -> None:
+    assert np.isinf(PUSHED.tolerance(0.9, away=True).push)
+
+
+def test_pushed_distances_survive_json() -> None:
+    evidence = replace(GOOD, pushed=PUSHED)
+    known = DynamicsEvidence.from_json(json.loads(json.dumps(evidence.to_json())))
+    assert known is not None
+    assert known.pushed is not None
+    np.testing.assert_array_equal(known.pushed.everywhere, PUSHED.everywhere)
+    assert known.pushed.residuals == PUSHED.residuals
+
+
+def test_a_validation_says_what_it_survives() -> None:
+    evidence = replace(GOOD, pushed=PUSHED)
+    verdict = judge(trials(), 1.35, CertificateOptions(Dynamics(tests=0)), Provenance(learned=Learned(evidence)))
+    assert verdict.answer == "validated"
+    assert "survives" in verdict.reason
+    assert "1.5 m/s^2 in speed" in verdict.reason

@@ -12,7 +12,7 @@ import numpy as np
 
 from ctxval._util.arrays import Array
 from ctxval._util.progress import stage
-from ctxval._util.texts import reason_of
+from ctxval._util.texts import parted, reason_of
 from ctxval.campaign.history import executed_trials, for_known_values, largest_distance, waiting_points
 from ctxval.campaign.storage.store import Store
 from ctxval.certificates import Provenance
@@ -21,6 +21,7 @@ from ctxval.certificates.dynamics_diagnostics import DENSE, FEWEST, PREDICTIONS,
 from ctxval.certificates.dynamics_evidence import (
     CheckedPrediction,
     DynamicsEvidence,
+    PushedDistances,
     StateInputCoverage,
     StateInputGap,
     UntriedParameter,
@@ -34,6 +35,7 @@ from ctxval.errors import CertificateError
 from ctxval.learning import DynamicsStudy, ExecutionPrediction, LearnedDynamics
 from ctxval.learning.closed_loops import LoopPlanner
 from ctxval.learning.coverage import Coverage, Gap
+from ctxval.learning.tolerance import LEVELS, PushResponse
 from ctxval.learning.vector import Executed
 from ctxval.learning.worst_case import WorstCase
 from ctxval.searches import Prediction
@@ -209,8 +211,11 @@ class CampaignDynamics:
         )
         best = largest_distance(trials)
         bound = bound_of(evidence, best, confidence)
+        if doubt_of(evidence, best, bound):
+            return evidence
         # Many closed loops, which only matter to a bound that nothing else withdraws.
-        return evidence if doubt_of(evidence, best, bound) else _with_jumps(evidence, learned, bound)
+        evidence = _with_jumps(evidence, learned, bound)
+        return replace(evidence, pushed=_pushed(learned.push_response, self._coordinates(learned)))
 
     def _evidence(self, learned: LearnedDynamics, trials: Sequence[Trial], worst: WorstCase) -> DynamicsEvidence:
         names, untried = self._study.validation.space.names, learned.untried_parameter
@@ -363,6 +368,18 @@ def _with_jumps(evidence: DynamicsEvidence, learned: LearnedDynamics, bound: flo
         return evidence
     elites = np.concatenate([points[values.argmax()][None], evidence.elites])
     return replace(evidence, missed=float(high / evidence.highest), highest=float(high), elites=elites)
+
+
+def _pushed(response: PushResponse, names: Sequence[str]) -> PushedDistances:
+    """Return the distances of pushed systems with the rates of change of their states by name and unit."""
+    labels = [parted(names[i]) for i in response.states]
+    rates = [f"{name} [{_per_second(unit)}]" if unit else name for name, unit in labels]
+    residuals = dict(zip(rates, response.residuals.tolist(), strict=True))
+    return PushedDistances(residuals, LEVELS, response.everywhere, response.away)
+
+
+def _per_second(unit: str) -> str:
+    return f"{unit}^2" if unit.endswith("/s") else f"{unit}/s"
 
 
 def _coverage(coverage: Coverage, names: Sequence[str]) -> StateInputCoverage:

@@ -183,6 +183,7 @@ def certify_dynamics(sample: Sample, evidence: DynamicsEvidence, confidence: Pro
             "missed": evidence.missed,
             "disagreement": evidence.disagreement,
             "variance_left_out": evidence.left_out,
+            "pushed": evidence.pushed and evidence.pushed.to_json(),
             "failures": sample.failures,
         },
         doubt=both_outcomes(sample, stochastic=False) or doubt_of(evidence, sample.best, bound),

@@ -111,6 +111,74 @@ class UntriedParameter(ShortRepr):
     task: Array
 
 
+@dataclass(frozen=True)
+class Tolerance:
+    """The smallest push that brings a task above a threshold, in the state in which it takes least.
+
+    Attributes:
+        state: the rate of change of the state, with its units, such as ``speed [m/s^2]``.
+        push: the size of the push; infinity if the largest one that was tried does not suffice.
+        residual: the largest residual that was recorded, in the same units.
+    """
+
+    state: str
+    push: float
+    residual: float
+
+    @property
+    def ratio(self) -> float:
+        """The push as a multiple of the largest recorded residual."""
+        return self.push / self.residual
+
+
+@dataclass(frozen=True, eq=False)
+class PushedDistances(ShortRepr):
+    """The largest distances if something that no record shows pushes a state, on the posterior mean.
+
+    Attributes:
+        residuals: the largest recorded residual of the rate of change of each pushed state, by its label.
+        levels: the sizes of the pushes as multiples of these residuals, ascending from 0, shape ``(L,)``.
+        everywhere: the largest distance for each state and size, shape ``(k, L)``.
+        away: the same if the push acts only where no record is near.
+    """
+
+    residuals: dict[str, float]
+    levels: Array
+    everywhere: Array
+    away: Array
+
+    def to_json(self) -> dict[str, Any]:
+        """Return all attributes, ready for JSON: distances that are not finite are None."""
+        finite = [np.where(np.isfinite(of), of, None).tolist() for of in (self.everywhere, self.away)]
+        names = ("residuals", "levels", "everywhere", "away")
+        return dict(zip(names, (self.residuals, self.levels.tolist(), *finite), strict=True))
+
+    @classmethod
+    def from_json(cls, values: dict[str, Any]) -> Self:
+        """Return the distances that :meth:`to_json` returned."""
+        numbers = {name: np.array(values[name], dtype=np.float64) for name in ("levels", "everywhere", "away")}
+        return cls(
+            values["residuals"], **{name: np.where(np.isnan(array), np.inf, array) for name, array in numbers.items()}
+        )
+
+    def tolerance(self, threshold: float, *, away: bool = False) -> Tolerance:
+        """Return the smallest push that brings a task above the threshold, interpolated between the sizes."""
+        ratios = [self._ratio(row, threshold) for row in (self.away if away else self.everywhere)]
+        (state, residual), ratio = min(zip(self.residuals.items(), ratios, strict=True), key=lambda pair: pair[1])
+        return Tolerance(state, ratio * residual, residual)
+
+    def _ratio(self, distances: Array, threshold: float) -> float:
+        k = int(np.searchsorted(distances > threshold, True))
+        if k == len(distances):
+            return np.inf
+        if k == 0:
+            return 0.0
+        low, below = self.levels[k - 1], distances[k - 1]
+        rise = distances[k] - below
+        share = (threshold - below) / rise if np.isfinite(rise) else 0.0
+        return float(low + share * (self.levels[k] - low))
+
+
 @dataclass(frozen=True, eq=False)
 class DynamicsEvidence(ShortRepr):
     """What draws of the learned dynamics say about the largest distance.
@@ -137,6 +205,7 @@ class DynamicsEvidence(ShortRepr):
         missed: factor by which the largest distance on the mean is larger in two deeper searches; at least 1.
         disagreement: share by which the smaller result of these searches is below the larger one.
         tests: the number of tests that a bound needs; see :mod:`~ctxval.certificates.prediction_tests`.
+        pushed: the largest distances if something pushes the system; None if the bound is withdrawn anyway.
     """
 
     maxima: Array
@@ -159,6 +228,7 @@ class DynamicsEvidence(ShortRepr):
     missed: float = 1.0
     disagreement: float = 0.0
     tests: int = TESTS
+    pushed: PushedDistances | None = None
 
     def rank(self, confidence: float) -> int:
         """Return the row, in ascending order, of the maximum that d* stays below with this probability."""
@@ -193,6 +263,7 @@ class DynamicsEvidence(ShortRepr):
                 ),
                 "coverage": StateInputCoverage(**{**coverage, **gaps, "task": np.array(coverage["task"])}),
                 "untried": untried and UntriedParameter(**{**untried, "task": np.array(untried["task"])}),
+                "pushed": values["pushed"] and PushedDistances.from_json(values["pushed"]),
             }
             return cls(**{**values, **arrays, **parts})
         except (KeyError, TypeError, ValueError):

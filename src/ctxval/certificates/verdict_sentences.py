@@ -13,6 +13,7 @@ from ctxval._util.representation import counted, shown
 from ctxval._util.texts import parted
 from ctxval.certificates.bounds import at_most, of_tasks, percent, with_error, with_units
 from ctxval.certificates.covering import RESOLUTION
+from ctxval.certificates.dynamics_evidence import PushedDistances, Tolerance
 from ctxval.certificates.sample import executions_of
 from ctxval.core.space import TaskSpace
 from ctxval.core.trial import Trial
@@ -124,7 +125,7 @@ def validated(certificate: Certificate, tau: float, quantities: Quantities) -> s
     return (
         f"{untested}every task{quantities.ranges} stays at or below {limit}: the {certificate.kind} bound is {upper}, "
         f"with {level} {_condition(certificate, quantities)}. {counted(certificate.trials, 'execution')}{largest}"
-        f"{_tested(certificate, tau)}."
+        f"{_tested(certificate, tau)}.{_survives(certificate, tau)}"
     )
 
 
@@ -178,6 +179,42 @@ def _tested(certificate: Certificate, tau: float) -> str:
         f"; {tests['drawn']} of them predicted beforehand at tasks drawn over the whole task space, all within "
         f"{within} % of the threshold"
     )
+
+
+def tolerances(certificate: Certificate, tau: float) -> tuple[Tolerance, Tolerance] | None:
+    """Return the smallest pushes, everywhere and away from all records, that bring a task above a threshold.
+
+    Returns None if the certificate does not know them.
+    """
+    pushed = certificate.details.get("pushed")
+    if pushed is None:
+        return None
+    distances = PushedDistances.from_json(pushed)
+    return distances.tolerance(tau), distances.tolerance(tau, away=True)
+
+
+def _survives(certificate: Certificate, tau: float) -> str:
+    """Return what a validation survives: how large an unmodelled push may be, beside the largest residual."""
+    known = tolerances(certificate, tau)
+    if known is None:
+        return ""
+    everywhere, away = known
+    largest = _rate(everywhere.state, everywhere.residual)
+    return (
+        f" It survives an unmodelled {_push(everywhere)} at every step, and {_push(away)} where no record is near; the "
+        f"largest residual seen is {largest}."
+    )
+
+
+def _push(tolerance: Tolerance) -> str:
+    if np.isfinite(tolerance.push):
+        return _rate(tolerance.state, tolerance.push)
+    return "push of more than 8 times the largest residual"
+
+
+def _rate(label: str, value: float) -> str:
+    name, unit = parted(label)
+    return f"{f'{value:.2g} {unit}'.rstrip()} in {name}"
 
 
 # What it rests on

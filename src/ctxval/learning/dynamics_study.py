@@ -29,6 +29,7 @@ from ctxval.learning.dynamics_posterior import (
 from ctxval.learning.execution_prediction import ExecutionPrediction, predict_execution
 from ctxval.learning.prediction import predict_distance
 from ctxval.learning.recorded import closed_loops_on_model, recorded_transitions
+from ctxval.learning.tolerance import PushResponse, push_response
 from ctxval.learning.vector import ErrorVectors, Executed, predict_composed
 from ctxval.learning.worst_case import WorstCase, WorstCaseSearch, WorstCaseSettings
 from ctxval.models.corrected import before_refinement
@@ -259,6 +260,13 @@ class LearnedDynamics(ShortRepr):
     def deeper(self) -> tuple[Array, Array]:
         """The largest distances on the posterior mean ``(2,)`` in two deeper searches, and their points ``(2, d)``."""
         return self.study.search.deeper(self.posterior, self._rng(3))
+
+    @functools.cached_property
+    def push_response(self) -> PushResponse:
+        """The largest distances over large, executed and random tasks if something pushes the posterior mean."""
+        search = self.study.search
+        tasks = [self.worst_of_mean.elites[:16], self.executed, search.pool[:16]]
+        return push_response(self.study.planner, self.posterior, np.concatenate(tasks))
 
     @property
     def untried_parameter(self) -> tuple[int, float, Array] | None:

@@ -17,7 +17,9 @@ from ctxval.learning.closed_loops import LoopPlanner
 from ctxval.learning.draws import DynamicsDraws
 from ctxval.learning.dynamics_posterior import DynamicsPosterior
 
-LEVELS = 2.0 ** np.arange(-4, 4)  # sizes of the pushes, as multiples of the largest recorded residual of a state
+LEVELS = np.array(
+    [0.0, *2.0 ** np.arange(-4, 4)]
+)  # sizes of the pushes, as multiples of the largest recorded residual of a state
 NEAR = 0.05  # largest distance to a recorded state of what it shows, as a share of the range of each state
 
 
