@@ -156,10 +156,8 @@ class PushedDistances(ShortRepr):
     @classmethod
     def from_json(cls, values: dict[str, Any]) -> Self:
         """Return the distances that :meth:`to_json` returned."""
-        numbers = {name: np.array(values[name], dtype=np.float64) for name in ("levels", "everywhere", "away")}
-        return cls(
-            values["residuals"], **{name: np.where(np.isnan(array), np.inf, array) for name, array in numbers.items()}
-        )
+        arrays = (np.array(values[name], dtype=np.float64) for name in ("levels", "everywhere", "away"))
+        return cls(values["residuals"], *(np.where(np.isnan(array), np.inf, array) for array in arrays))
 
     def tolerance(self, threshold: float, *, away: bool = False) -> Tolerance:
         """Return the smallest push that brings a task above the threshold, interpolated between the sizes."""
