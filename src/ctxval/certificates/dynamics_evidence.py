@@ -149,7 +149,8 @@ class PushedDistances(ShortRepr):
 
     def to_json(self) -> dict[str, Any]:
         """Return all attributes, ready for JSON: distances that are not finite are None."""
-        finite = [np.where(np.isfinite(of), of, None).tolist() for of in (self.everywhere, self.away)]
+        rows = [distances.tolist() for distances in (self.everywhere, self.away)]
+        finite = [[[d if np.isfinite(d) else None for d in row] for row in each] for each in rows]
         names = ("residuals", "levels", "everywhere", "away")
         return dict(zip(names, (self.residuals, self.levels.tolist(), *finite), strict=True))
 

@@ -440,7 +440,9 @@ def test_recorded_data_is_read_with_bounds(tmp_path: Path) -> None:
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr("x_next.npy", huge.getvalue())
         archive.writestr("x.npy", huge.getvalue())
-    with pytest.raises(InputError, match=r"steps\.npz cannot be read as recorded data: its array x is not as long as its header"):
+    with pytest.raises(
+        InputError, match=r"steps\.npz cannot be read as recorded data: its array x is not as long as its header"
+    ):
         recorded(str(path))
 
 

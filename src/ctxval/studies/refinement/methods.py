@@ -108,17 +108,17 @@ def correction_of(posterior: DynamicsPosterior) -> Correction:
     # At least 24 centres are kept, if they predict the others with a relative error of 0.005: design on the model is
     # then faster.
     data, mean = posterior.data, posterior.with_few_centres(24, 0.005)
+    (centres,), values = mean.centres, np.exp(mean.thetas[0])
     low, high = data.pairs.min(axis=0), data.pairs.max(axis=0)
-    values = np.exp(mean.hyperparameters.theta)
     scales, constant, slope = values[:-2], values[-2], values[-1]
-    weights = np.zeros((len(mean.centres), len(data.units)))
+    weights = np.zeros((len(centres), len(data.units)))
     weights[:, data.learned] = mean.weights[0]
     weights *= data.units
-    linear = np.concatenate([slope * mean.centres.T @ weights, constant * weights.sum(axis=0, keepdims=True)])
+    linear = np.concatenate([slope * centres.T @ weights, constant * weights.sum(axis=0, keepdims=True)])
     # A coordinate that the residual does not depend on fades the correction within one more range of the records.
     fade = np.minimum(scales, np.maximum(high - low, 1.0))
     limit = posterior.limit * data.units
-    return Correction(data.shift, data.scale, mean.centres, scales, weights, linear, low, high, fade, limit)
+    return Correction(data.shift, data.scale, centres, scales, weights, linear, low, high, fade, limit)
 
 
 class _Replacement(Method):
