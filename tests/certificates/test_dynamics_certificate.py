@@ -268,5 +268,5 @@ def test_a_validation_says_what_it_survives() -> None:
     evidence = replace(GOOD, pushed=PUSHED)
     verdict = judge(trials(), 1.35, CertificateOptions(Dynamics(tests=0)), Provenance(learned=Learned(evidence)))
     assert verdict.answer == "validated"
-    assert "survives" in verdict.reason
-    assert "1.5 m/s^2 in speed" in verdict.reason
+    assert "survives" in str(verdict)
+    assert "1.5 m/s^2 in speed" in str(verdict)

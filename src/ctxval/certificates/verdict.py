@@ -35,7 +35,7 @@ class Verdict:
         witness: the executed trial with d(p) > tau; None if the answer is not "falsified".
         certificate: the certificate that validates or does not suffice; None if there is none.
         expected: a forecast of further executions; None if the answer is decided or nothing can be predicted.
-        rests_on: the conditions of a validation in a sentence, and what holds without them; None if the answer is not
+        rests_on: the evidence for a validation, its conditions, and what holds without them; None if the answer is not
             "validated".
         next_task: the parameters of the task to execute next, if the answer is "undecided" and learned dynamics choose
             it; else None.

@@ -110,7 +110,7 @@ def _bound_and_limit(certificate: Certificate, tau: float, quantities: Quantitie
 
 
 def validated(certificate: Certificate, tau: float, quantities: Quantities) -> str:
-    """Return what is validated: which tasks stay below the threshold, by which bound, and if what holds."""
+    """Return what is validated in one sentence: which tasks stay below the threshold, by which bound, if what holds."""
     upper, limit = _bound_and_limit(certificate, tau, quantities)
     level, tests = percent(certificate.confidence), certificate.details.get("tests")
     untested = "" if tests is None or tests["drawn"] else f"{_UNTESTED}; "
@@ -120,13 +120,20 @@ def validated(certificate: Certificate, tau: float, quantities: Quantities) -> s
             f"{of_tasks(certificate.distribution)}{quantities.ranges} exceed {limit}: the {certificate.kind} bound is "
             f"{upper}, from {counted(certificate.trials, 'independent draw')}."
         )
-    best = certificate.details.get("best")
-    largest = "" if best is None else f", the largest distance {quantities.of(f'{best:.4g}')}"
     return (
         f"{untested}every task{quantities.ranges} stays at or below {limit}: the {certificate.kind} bound is {upper}, "
-        f"with {level} {_condition(certificate, quantities)}. {counted(certificate.trials, 'execution')}{largest}"
-        f"{_tested(certificate, tau)}.{_survives(certificate, tau)}"
+        f"with {level} {_condition(certificate, quantities)}."
     )
+
+
+def evidence(certificate: Certificate, tau: float, quantities: Quantities) -> str:
+    """Return what speaks for a bound on d*: executions, tests of predictions, and what the bound survives."""
+    if certificate.volume:
+        return ""
+    best = certificate.details.get("best")
+    largest = "" if best is None else f", the largest distance {quantities.of(f'{best:.4g}')}"
+    executions = counted(certificate.trials, "execution")
+    return f"{executions}{largest}{_tested(certificate, tau)}.{_survives(certificate, tau)} "
 
 
 _UNTESTED = "no prediction was tested where nobody chose to look (tests = 0)"
@@ -259,7 +266,7 @@ def _posterior_conditions(details: Mapping[str, Any], quantities: Quantities) ->
 def rests_on(
     conditions: Sequence[str], certificate: Certificate, tau: float, quantities: Quantities, remarks: Sequence[str]
 ) -> str:
-    """Return what a validation rests on, and what independent draws say without any of it."""
+    """Return the evidence of a validation, what it rests on, and what independent draws say without any of it."""
     parts = list(conditions)
     made_good = certificate.details.get("failures", {}).get("made_good", [])
     if made_good:
@@ -267,7 +274,8 @@ def rests_on(
         parts.append(f"your word that what made trial {numbers} fail is removed for good")
     parts += [f"your word that {remark}" for remark in remarks]
     parts.append("this campaign not being chosen among several")
-    return f"It rests on {'; on '.join(parts)}.{_without_assumptions(certificate, tau, quantities)}"
+    trials = evidence(certificate, tau, quantities)
+    return f"{trials}It rests on {'; on '.join(parts)}.{_without_assumptions(certificate, tau, quantities)}"
 
 
 def _without_assumptions(certificate: Certificate, tau: float, quantities: Quantities) -> str:

@@ -37,32 +37,13 @@ def verdict(context: ReportContext) -> Markup:
     advice, command = _next(context)
     block = markup.code(command, "Next command") if command else None
     beside = element("div", heading("What next"), paragraph(advice), block, _facts(context), *_remarks(context))
-    stated = element("div", word, paragraph(_sentence(context), class_="sentence"), class_=f"answer {answer}")
-    return joined([stated, element("div", picture, beside, class_="first")])
+    stated = "No threshold was given." if context.verdict is None else markup.sentence(context.verdict.reason)
+    head = element("div", word, paragraph(stated, class_="sentence"), class_=f"answer {answer}")
+    return joined([head, element("div", picture, beside, class_="first")])
 
 
 def _shape(answer: str) -> Markup:
     return element("span", _SHAPES[answer], class_="shape", aria_hidden="true")
-
-
-def _sentence(context: ReportContext) -> str:
-    """Return the verdict in one sentence; remarks on designs and starts follow it."""
-    verdict, certificate, units = context.verdict, context.certificate, context.labels.units
-    if verdict is None:
-        return "No threshold was given."
-    if verdict.answer != "validated" or certificate is None or certificate.kind != "dynamics":
-        return markup.sentence(verdict.reason)
-    drawn = certificate.details["tests"]["drawn"]
-    tested = f"{drawn} tasks that were drawn over the whole task space tested the predictions."
-    if not drawn:
-        tested = "No prediction was tested where nobody chose to look."
-    designs = "" if context.designs is None else f" Note: {context.designs}."
-    return (
-        f"Every task keeps the threshold of {quantity(verdict.threshold, units)}: the largest distance is at most "
-        f"{_bound(context, certificate)} with {percent(certificate.confidence)} confidence, if what M misses depends "
-        f"on the recorded state and input alone, alike in every task. {tested}{designs}"
-        f"{context.provenance.caution(verdict.threshold)}"
-    )
 
 
 def _next(context: ReportContext) -> tuple[str, str]:
