@@ -348,7 +348,8 @@ def test_a_quarter_of_the_diagonal_is_39_percent_of_a_plane() -> None:
 def test_a_validation_names_what_it_rests_on() -> None:
     verdict = judge(trials(), 50.0, posterior(), IN_SPACE)
     assert verdict.rests_on == (
-        "8 executions, the largest distance 0.9897. It rests on the distance being as smooth between the trials as at them, in gaps of up to 0.25 rad in goal, "
+        "8 executions, the largest distance 0.9897. "
+        "It rests on the distance being as smooth between the trials as at them, in gaps of up to 0.25 rad in goal, "
         "25 % of the task space (a peak inside one may be missed); on each task having one distance, however often it "
         "is executed; on this campaign not being chosen among several."
     )
