@@ -208,15 +208,15 @@ def _survives(certificate: Certificate, tau: float) -> str:
     everywhere, away = known
     largest = _rate(everywhere.state, everywhere.residual)
     return (
-        f" It survives an unmodelled {_push(everywhere)} at every step, and {_push(away)} where no record is near; the "
-        f"largest residual seen is {largest}."
+        f" It survives an unknown push of {_push(everywhere)} at every step, and of {_push(away)} where no record is "
+        f"near; the largest residual seen is {largest}."
     )
 
 
 def _push(tolerance: Tolerance) -> str:
     if np.isfinite(tolerance.push):
         return _rate(tolerance.state, tolerance.push)
-    return "push of more than 8 times the largest residual"
+    return "more than 8 times the largest residual"
 
 
 def _rate(label: str, value: float) -> str:

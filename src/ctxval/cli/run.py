@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ctxval._util.progress import also_listening
-from ctxval._util.texts import reason_of, shortened
+from ctxval._util.texts import reason_of
 from ctxval.campaign.interval_search import IntervalSearch
 from ctxval.campaign.storage.other_stores import other_stores
 from ctxval.certificates.verdict import usable_bound
@@ -37,6 +37,7 @@ from ctxval.cli.config.settings import Settings, read_settings
 from ctxval.cli.config.stored_settings import budget_of, limit_of
 from ctxval.cli.hand import web_server
 from ctxval.cli.options import named_values
+from ctxval.core.trajectory import Transitions
 from ctxval.core.trial import designs_sentence
 from ctxval.errors import CertificateError, InputError
 from ctxval.report.context import context_of_campaign
@@ -93,7 +94,9 @@ def run(
     if limit is not None:
         certificate.kind.require_usable(certificate.confidence, total)  # before executions are paid for
     parts = experiment.validation
-    sentence = f": S {type(parts.system).__name__}, M {shortened(repr(parts.model), 60)}, "
+    data = getattr(parts.model, "data", None)
+    learned = f" from {len(data)} transitions" if isinstance(data, Transitions) and len(data) else ""
+    sentence = f": S {type(parts.system).__name__}, M {type(parts.model).__name__}{learned}, "
     sentence += f"controllers {type(parts.synthesizer).__name__}"
     if limit is not None:
         sentence += f", threshold {limit:g} {units}".rstrip()
