@@ -109,12 +109,21 @@ def figures(script: str | Path, *arguments: str, revision: str | None = None) ->
     Raises:
         RuntimeError: if the revision is not in this repository, or the script fails; the message has its output.
     """
-    return _figures(_ROOT if revision is None else Path(_tree(revision).name), script, arguments)
+    return _figures(_ROOT if revision is None else tree_of(revision), script, arguments)
 
 
 def report(figures: Any) -> None:
     """Print the figures of a script for :func:`beside_landed`: anything that JSON can express."""
     print(_MARK + json.dumps(figures), flush=True)
+
+
+def tree_of(revision: str) -> Path:
+    """Return a folder with the package of a revision, which is kept until the process ends.
+
+    Raises:
+        RuntimeError: if the revision is not in this repository.
+    """
+    return Path(_tree(revision).name)
 
 
 @functools.cache
