@@ -28,6 +28,7 @@ from calibrate import (
     stored,
 )
 from calibration_dynamics_part import by_dynamics
+from calibration_strangers_part import of_strangers
 from calibration_verdicts_part import interval, table, until_decided
 from ctxval.certificates import RESOLUTION
 from ctxval.certificates.posterior import LEVEL
@@ -280,6 +281,8 @@ with that value.
 
 {by_dynamics}
 
+{of_strangers}
+
 ## Audits after retraining
 
 {retrained}
@@ -322,6 +325,7 @@ def main() -> None:
             noisy=used_table(noisy),
             until_decided=until_decided(),
             by_dynamics=by_dynamics(),
+            of_strangers=of_strangers(),
             retrained=retrained(),
         )
     )
