@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ctxval._util.representation import counted, shown
-from ctxval._util.texts import parted
+from ctxval._util.texts import enumerated, parted, quoted
 from ctxval.certificates.bounds import at_most, of_tasks, percent, with_error, with_units
 from ctxval.certificates.covering import RESOLUTION
 from ctxval.certificates.sample import executions_of
@@ -180,6 +180,28 @@ def _tested(certificate: Certificate, tau: float) -> str:
     )
 
 
+def looked(known: int, smaller: Sequence[float], largest: float, quantities: Quantities) -> str:
+    """Return that a threshold was stated after distances were known, and which smaller ones before it do not hold."""
+    known_ones = "1 distance was" if known == 1 else f"{known} distances were"
+    parts = [f"the threshold was stated after {known_ones} known"] if known else []
+    falsified_ones = [each for each in smaller if each < largest]
+    for group, how in ((falsified_ones, "falsified"), (smaller[len(falsified_ones) :], "left undecided")):
+        if group:
+            limits = enumerated((quantities.of(f"{each:.6g}") for each in group), 5)
+            word, were, are = ("threshold", "was", "is") if len(group) == 1 else ("thresholds", "were", "are")
+            parts.append(f"the smaller {word} {limits}, which {were} stated before, {are} {how}")
+    return "".join(f"; {part}" for part in parts)
+
+
+def falsified_beside(name: str, worst: Trial, tau: float, quantities: Quantities) -> str:
+    """Return, as a sentence after a space, that an execution in another store exceeds a threshold."""
+    distance, limit = distinguishable(worst.distance or 0.0, tau)
+    return (
+        f" Another store of this experiment falsifies the threshold: trial {worst.number} of {quoted(name)} has the "
+        f"distance {quantities.of(distance)}, more than {quantities.of(limit)}, at {quantities.task(worst)}."
+    )
+
+
 # What it rests on
 
 
@@ -188,10 +210,11 @@ def conditions(certificate: Certificate, space: TaskSpace | None) -> list[str]:
     details = certificate.details
     match certificate.kind:
         case "dynamics":
-            gaps = with_units(details["resolution"])
+            gaps, again = with_units(details["resolution"]), details.get("differing")
+            noise = "" if again is None else f" (trials {again[0]} and {again[1]} of one task differ a little)"
             return [
                 "the recorded state being complete",
-                "the system being deterministic, and its dynamics changing neither with time nor with the task",
+                f"the system being deterministic{noise}, and its dynamics changing neither with time nor with the task",
                 f"its dynamics being, in gaps of the records of up to {gaps}, like what was seen",
             ]
         case "posterior":
@@ -220,7 +243,12 @@ def _posterior_conditions(details: Mapping[str, Any], quantities: Quantities) ->
 
 
 def rests_on(
-    conditions: Sequence[str], certificate: Certificate, tau: float, quantities: Quantities, remarks: Sequence[str]
+    conditions: Sequence[str],
+    certificate: Certificate,
+    tau: float,
+    quantities: Quantities,
+    remarks: Sequence[str],
+    alone: Sequence[str],
 ) -> str:
     """Return what a validation rests on, and what independent draws say without any of it."""
     parts = list(conditions)
@@ -229,8 +257,33 @@ def rests_on(
         numbers = ", ".join(str(failure["trial"]) for failure in made_good)
         parts.append(f"your word that what made trial {numbers} fail is removed for good")
     parts += [f"your word that {remark}" for remark in remarks]
-    parts.append("this campaign not being chosen among several")
+    parts += alone
     return f"It rests on {'; on '.join(parts)}.{_without_assumptions(certificate, tau, quantities)}"
+
+
+def not_fitted(known: int) -> list[str]:
+    """Return that a threshold was not chosen to suit the distances that were known; nothing if none were."""
+    if not known:
+        return []
+    which = "distance that was" if known == 1 else "distances that were"
+    return [f"the threshold not being chosen to suit the {known} {which} known when it was stated"]
+
+
+def not_selected(others: int, falsifying: Sequence[str]) -> str:
+    """Return that a campaign was not selected, with what other stores of the same experiment say of the threshold."""
+    alone = "this campaign not being chosen among several"
+    if not others:
+        return alone
+    lie = "store of this experiment lies" if others == 1 else "stores of this experiment lie"
+    which = "none of them falsifies the threshold" if others > 1 else "it does not falsify the threshold"
+    if falsifying:
+        count = "it falsifies" if others == 1 else f"{len(falsifying)} of them {_do(falsifying, 'falsif')}"
+        which = f"{count} the threshold ({enumerated(map(quoted, falsifying), 5)})"
+    return f"{alone} ({others} other {lie} beside it, and {which})"
+
+
+def _do(those: Sequence[str], verb: str) -> str:
+    return f"{verb}ies" if len(those) == 1 else f"{verb}y"
 
 
 def _without_assumptions(certificate: Certificate, tau: float, quantities: Quantities) -> str:

@@ -56,11 +56,12 @@ def _sentence(context: ReportContext) -> str:
     tested = f"{drawn} tasks that were drawn over the whole task space tested the predictions."
     if not drawn:
         tested = "No prediction was tested where nobody chose to look."
+    looked = context.provenance.looked(certificate, verdict.threshold, context.trials)
     designs = "" if context.designs is None else f" Note: {context.designs}."
     return (
         f"Every task keeps the threshold of {quantity(verdict.threshold, units)}: the largest distance is at most "
         f"{_bound(context, certificate)} with {percent(certificate.confidence)} confidence, if what M misses depends "
-        f"on the recorded state and input alone, alike in every task. {tested}{designs}"
+        f"on the recorded state and input alone, alike in every task. {tested.removesuffix('.')}{looked}.{designs}"
         f"{context.provenance.caution(verdict.threshold)}"
     )
 
@@ -145,7 +146,7 @@ def _remarks(context: ReportContext) -> list[Markup]:
         remarks.append(paragraph(f"The experiment is not loaded: {context.missing}", class_="note"))
     others = [] if context.store.path is None else other_stores(context.store.path)
     if others:
-        count, first = counted(len(others), "other store"), ", ".join(other.name for other in others[:5])
+        count, first = counted(len(others), "other store"), ", ".join(other.path.name for other in others[:5])
         sentence = (
             f"The folder contains {count} of this experiment: {first}. The best result of several campaigns is wrong "
             "more often than its confidence states."
