@@ -82,15 +82,12 @@ class Provenance(ShortRepr):
         These are an execution that started farther from its task than the threshold, and distances above the threshold
         in other stores of the same experiment.
         """
-        cautions = [
-            sentences.falsified_beside(other.path.name, other.worst, threshold, self.quantities)
-            for other in self.beside[:_NAMED_STORES]
-            if other.worst is not None and other.falsifies(threshold)
-        ]
+        above = [(other.path.name, other.worst) for other in self.beside if other.worst and other.falsifies(threshold)]
+        caution = sentences.falsified_beside(above, threshold, self.quantities)
         if self.start is not None and self.start[0] > threshold:
             limit = self.quantities.of(f"{threshold:.6g}")
-            cautions.append(f" The start of an execution was off by {self.start[1]}; the threshold is {limit}.")
-        return "".join(cautions)
+            caution += f" The start of an execution was off by {self.start[1]}; the threshold is {limit}."
+        return caution
 
     def known_before(self, threshold: float, trials: Sequence[Trial]) -> int:
         """Return how many distances were known when a threshold was first stated.
@@ -153,8 +150,6 @@ def remarks_on(changes: Iterable[Change]) -> tuple[str, ...]:
             remarks.append(f"the result of trial {numbers} that was told first is wrong, as you state: {change.why!r}")
     return tuple(remarks)
 
-
-_NAMED_STORES = 50  # most neighbours that a verdict names
 
 REFINED = (
     "the model was learned again from executions of earlier models: these are data of the model and no trials of it, "

@@ -193,13 +193,19 @@ def looked(known: int, smaller: Sequence[float], largest: float, quantities: Qua
     return "".join(f"; {part}" for part in parts)
 
 
-def falsified_beside(name: str, worst: Trial, tau: float, quantities: Quantities) -> str:
-    """Return, as a sentence after a space, that an execution in another store exceeds a threshold."""
-    distance, limit = distinguishable(worst.distance or 0.0, tau)
-    return (
-        f" Another store of this experiment falsifies the threshold: trial {worst.number} of {quoted(name)} has the "
-        f"distance {quantities.of(distance)}, more than {quantities.of(limit)}, at {quantities.task(worst)}."
+def falsified_beside(executed: Sequence[tuple[str, Trial]], tau: float, quantities: Quantities) -> str:
+    """Return, as a sentence after a space, which trials of other stores exceed a threshold; empty if there are none."""
+    if not executed:
+        return ""
+    first = "Another store of this experiment falsifies"
+    if len(executed) > 1:
+        first = f"{len(executed)} other stores of this experiment falsify"
+    trials = (
+        f"trial {trial.number} of {quoted(name)} has the distance "
+        f"{quantities.of(distinguishable(trial.distance or 0.0, tau)[0])}, at {quantities.task(trial)}"
+        for name, trial in executed[:3]
     )
+    return f" {first} {quantities.of(f'{tau:.6g}')}: {'; '.join(trials)}{'; ...' if len(executed) > 3 else ''}."
 
 
 # What it rests on
