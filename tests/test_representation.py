@@ -366,6 +366,7 @@ EXAMPLES: dict[str, Callable[[], object]] = {
     "certificates.CheckedPrediction": lambda: CHECKED,
     "certificates.Dynamics": certificates.Dynamics,
     "certificates.DynamicsEvidence": evidence,
+    "certificates.Neighbour": lambda: certificates.Neighbour(Path("other.sqlite")),
     "certificates.Posterior": certificates.Posterior,
     "certificates.Provenance": lambda: certificates.Provenance(remarks=("fuse replaced",)),
     "certificates.SamplingDiscarding": lambda: certificates.SamplingDiscarding(2),

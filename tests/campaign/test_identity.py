@@ -13,6 +13,7 @@ from conftest import make_validation
 from ctxval import Campaign, Store, TaskSpace, Validation, distances, searches
 from ctxval._util.arrays import Array
 from ctxval._util.describe import describe
+from ctxval.certificates import CertificateOptions, Posterior
 from ctxval.cli import app
 from ctxval.cli.config.settings import read_settings
 from ctxval.errors import DistanceError, InputError, StoreMismatchError
@@ -202,6 +203,31 @@ def test_the_unit_of_a_parameter_is_part_of_the_question(store: Path) -> None:
     other.space = TaskSpace(goal=(-3.0, 3.0, "deg"))
     with pytest.raises(StoreMismatchError, match=r"space\.goal\[2\] was 'rad' and is now 'deg'"):
         campaign(store, other, accept_change="x")
+
+
+@pytest.mark.parametrize(
+    "space",
+    [TaskSpace(goal=(-1.0, 1.0)), TaskSpace(goal=(-3.0, 3.0), load=(0.0, 1.0)), TaskSpace(goal=(-3.0, 4.0))],
+    ids=["a subset of the tasks", "another parameter", "more tasks"],
+)
+def test_other_tasks_need_another_store_whatever_the_reason(store: Path, space: TaskSpace) -> None:
+    other = make_validation()
+    other.space = space
+    with pytest.raises(StoreMismatchError, match=r"validation\.space.*use another store"):
+        campaign(store, other, accept_change="only these tasks matter")
+
+
+def test_a_failure_cannot_be_dropped(store: Path) -> None:
+    made = campaign(store)
+    failed = made.tell(made.ask(), failed="it slipped")
+    with pytest.raises(InputError, match=f"trial {failed.number} is failed"):
+        made.tell(failed.number, distance=0.1)
+    by = CertificateOptions(Posterior(resolution=1.0))
+    assert made.verdict(1e3, certificate=by).answer == "undecided"
+    made.tell(made.ask(failed.parameters), distance=0.1)  # it succeeds for no stated reason
+    verdict = made.verdict(1e3, certificate=by)
+    assert verdict.answer == "undecided"
+    assert f"trial {failed.number} failed and trial {failed.number + 1} executed the same task" in verdict.reason
 
 
 # Without a search

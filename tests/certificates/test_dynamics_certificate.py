@@ -14,6 +14,7 @@ from ctxval import Trial
 from ctxval.certificates import (
     KINDS,
     Automatic,
+    CertificateKind,
     CertificateOptions,
     Dynamics,
     DynamicsEvidence,
@@ -178,6 +179,21 @@ def test_the_verdict_names_its_evidence() -> None:
     assert verdict.rests_on is not None
     assert "changing neither with time nor with the task" in verdict.rests_on
     assert "the recorded state being complete" in verdict.rests_on
+
+
+@pytest.mark.parametrize(("other", "validates"), [(0.0, True), (0.01, True), (0.2, False)])
+@pytest.mark.parametrize("kind", [Dynamics(tests=0), Automatic(tests=0)])
+def test_noise_that_nobody_declared_is_named(other: float, validates: bool, kind: CertificateKind) -> None:
+    executed = trials()
+    again = replace(executed[2], number=len(executed), distance=(executed[2].distance or 0.0) - other)
+    verdict = judge([*executed, again], 1.1, CertificateOptions(kind), Provenance(learned=Learned(GOOD)))
+    assert verdict.answer == ("validated" if validates else "undecided")
+    assert ("trials 2 and 4" in str(verdict)) == bool(other)
+    if not validates:
+        assert "executed one task, and their distances are" in verdict.reason
+        assert "the system is not deterministic in the recorded state" in verdict.reason
+    elif other:
+        assert "the system being deterministic (trials 2 and 4 of one task differ a little)" in str(verdict.rests_on)
 
 
 def test_a_gate_that_passes_only_in_part_is_support_and_no_validation() -> None:

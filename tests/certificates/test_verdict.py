@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
@@ -13,6 +14,7 @@ from ctxval.certificates import (
     Certificate,
     CertificateKind,
     CertificateOptions,
+    Neighbour,
     Provenance,
     Sample,
     certify_audit,
@@ -23,7 +25,7 @@ from ctxval.certificates.covering import resolved_volume
 from ctxval.certificates.provenance import REFINED
 from ctxval.certificates.stopping import StoppingRule
 from ctxval.certificates.verdict import counterexample, judge, judge_by
-from ctxval.core.trial import Origin, State, designs_sentence
+from ctxval.core.trial import Origin, State, StatedThreshold, designs_sentence
 from ctxval.errors import InputError
 
 pytestmark = pytest.mark.usefixtures("few_draws")
@@ -408,6 +410,48 @@ def test_a_validation_rests_on_what_the_user_states() -> None:
     assert verdict.rests_on is not None
     assert "your word that what was changed after 7 trials makes no difference to them" in verdict.rests_on
     assert REFINED not in verdict.rests_on
+
+
+@pytest.mark.parametrize(
+    ("others", "sentence"),
+    [
+        ([], "not being chosen among several."),
+        ([0.4], "(1 other store of this experiment lies beside it, and it does not falsify the threshold)."),
+        ([60.0], "(1 other store of this experiment lies beside it, and it falsifies the threshold (s0.sqlite))."),
+        ([0.4, None], "(2 other stores of this experiment lie beside it, and none of them falsifies the threshold)."),
+        ([60.0, 0.4], "beside it, and 1 of them falsifies the threshold (s0.sqlite))."),
+        ([60.0, 70.0, 1.0], "beside it, and 2 of them falsify the threshold (s0.sqlite, s1.sqlite))."),
+    ],
+)
+def test_a_validation_counts_the_campaigns_of_the_experiment(others: list[float | None], sentence: str) -> None:
+    worst = (None if distance is None else trial(3, 0.5, distance) for distance in others)
+    beside = tuple(Neighbour(Path(f"runs/s{k}.sqlite"), each) for k, each in enumerate(worst))
+    verdict = judge(trials(), 50.0, posterior(), replace(IN_SPACE, beside=beside, units="m"))
+    assert verdict.answer == "validated"
+    assert str(verdict.rests_on).endswith(sentence)
+    above = [k for k, distance in enumerate(others) if (distance or 0.0) > 50]
+    assert ("falsif" in verdict.reason) == bool(above)
+    for k in above:
+        assert f"trial 3 of s{k}.sqlite has the distance {others[k]:g} m, at goal 1 rad" in verdict.reason
+    undecided = judge(trials(3), 50.0, posterior(), replace(IN_SPACE, beside=beside))
+    assert ("falsif" in undecided.reason) == bool(above)
+
+
+def test_a_threshold_chosen_after_looking_is_said_in_the_sentence() -> None:
+    stated = StatedThreshold(0.5, 0), StatedThreshold(0.995, 4), StatedThreshold(50.0, 7), StatedThreshold(0.9, 7)
+    verdict = judge(trials(), 50.0, posterior(), Provenance(thresholds=stated))
+    assert verdict.reason.endswith(
+        "; the threshold was stated after 7 distances were known; the smaller threshold 0.5, which was stated before, "
+        "is falsified; the smaller threshold 0.995, which was stated before, is left undecided."
+    )
+    assert "on the threshold not being chosen to suit the 7 distances that were known" in str(verdict.rests_on)
+    never = judge(trials(), 49.0, posterior(), Provenance(thresholds=stated)).reason
+    assert "after 8 distances were known; the smaller thresholds 0.5, 0.9, which were stated before, are" in never
+    one = judge(trials(), 50.0, posterior(), Provenance(thresholds=(StatedThreshold(50.0, 1),)))
+    assert "after 1 distance was known" in one.reason
+    assert "the 1 distance that was known" in str(one.rests_on)
+    for silent in (None, (StatedThreshold(50.0, 0),)):
+        assert "stated" not in str(judge(trials(), 50.0, posterior(), Provenance(thresholds=silent)))
 
 
 def test_most_kinds_are_handed_countable_draws_only() -> None:

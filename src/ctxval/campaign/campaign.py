@@ -15,11 +15,11 @@ from ctxval._util.progress import stage
 from ctxval._util.progress_display import progress_shown
 from ctxval.campaign import display
 from ctxval.campaign.choices import Choice, Execution, OpenTrial
-from ctxval.campaign.dynamics import provenance_of
 from ctxval.campaign.execution import RetryPolicy, Schedule, execute_schedule
 from ctxval.campaign.identity import description_of, identify, search_of
 from ctxval.campaign.interval_search import IntervalSearch, with_next_task
 from ctxval.campaign.plot import overview
+from ctxval.campaign.provenance import provenance_of
 from ctxval.campaign.storage.store import Store
 from ctxval.campaign.trials import TrialRecorder
 from ctxval.campaign.workers import worker_pool
@@ -217,6 +217,8 @@ class Campaign:
         pool = worker_pool(self.validation.system, workers=workers, executor=executor, timeout=timeout)
         if retry_failures and pool is None:
             raise InputError("retry_failures needs workers, an executor or a timeout.")
+        if threshold is not None:
+            self.state_threshold(threshold)
         predicts = decides is not None and decides.predicts
         with self.recorder.predicting(predicts), progress_shown(progress):
             schedule = Schedule(self.recorder, rule, budget)
@@ -322,6 +324,7 @@ class Campaign:
         with progress_shown(progress), self.store.sole_writer(wait):
             self.refresh()
             search = IntervalSearch(self.recorder, options, budget, threshold)
+            self.state_threshold(threshold)
             waiting = sum(trial.state == "open" for trial in self.trials)
             with self.recorder.predicting(search.predicts):
                 choice = search.choose() if self.executions + waiting < budget else None
@@ -442,6 +445,16 @@ class Campaign:
         return provenance_of(self.store, self.validation, self.trials, self.recorder.dynamics)
 
     @checked
+    def state_threshold(self, threshold: PositiveFloat) -> None:
+        """Record in the store that a threshold was stated, and how many distances were known.
+
+        A verdict says so if the threshold was first stated after distances were known. :meth:`run`,
+        :meth:`ask_for_verdict` and :meth:`verdict` state their thresholds; call this if the trials come from
+        :meth:`ask`, :meth:`audit` or :meth:`add`. A threshold that was stated before is not recorded again.
+        """
+        self.store.state_threshold(float(threshold))
+
+    @checked
     def verdict(
         self,
         threshold: PositiveFloat,
@@ -471,6 +484,7 @@ class Campaign:
             InputError, CertificateError: if an option of the certificate is not valid.
         """
         options = CertificateOptions.or_automatic(certificate, confidence, stochastic, resolution)
+        self.state_threshold(threshold)
         with progress_shown(progress), stage("certifying"):
             return with_next_task(judge(self.trials, threshold, options, self.provenance), self.recorder, options)
 

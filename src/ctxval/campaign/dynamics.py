@@ -15,7 +15,6 @@ from ctxval._util.progress import stage
 from ctxval._util.texts import parted, reason_of
 from ctxval.campaign.history import executed_trials, for_known_values, largest_distance, waiting_points
 from ctxval.campaign.storage.store import Store
-from ctxval.certificates import Provenance
 from ctxval.certificates.dynamics import bound_of, draws_for
 from ctxval.certificates.dynamics_diagnostics import DENSE, FEWEST, PREDICTIONS, doubt_of, jumps
 from ctxval.certificates.dynamics_evidence import (
@@ -27,7 +26,6 @@ from ctxval.certificates.dynamics_evidence import (
     UntriedParameter,
 )
 from ctxval.core.labels import labels_of
-from ctxval.core.preflight import start_offset
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import REDEFINED, Trial
 from ctxval.core.validation import Validation
@@ -333,21 +331,6 @@ class LearnedFromTrials:
         """Return independent draws of tasks, points of the unit cube ``(count, d)``."""
         # This random stream is none of those of trials.
         return self.validation.space.unit_draws(count, np.random.default_rng([seed, 0x7461]))
-
-
-def provenance_of(
-    store: Store, validation: Validation, trials: Sequence[Trial], dynamics: CampaignDynamics
-) -> Provenance:
-    """Return what a certificate needs besides the trials of a campaign."""
-    with store.snapshot():
-        known = Provenance.of(store.description(), store.history())
-    offsets = [
-        (start_offset(validation, validation.space.point(trial.parameters), executed), trial.number)
-        for trial, executed in executed_trials(store, trials)
-    ]
-    start = max(((offset.size, f"{offset.text} (trial {number})") for offset, number in offsets), default=None)
-    learned = LearnedFromTrials(validation, trials, dynamics)
-    return replace(known, space=validation.space, learned=learned, start=start, units=validation.labels.units)
 
 
 def _key(trials: Sequence[Trial], confidence: float) -> str:

@@ -24,7 +24,7 @@ from ctxval.certificates.forecast import Forecast, forecast
 from ctxval.certificates.maxima import Maxima, draw_maxima, settle_maxima
 from ctxval.certificates.options import CertificateOptions
 from ctxval.certificates.posterior import Diagnosis, Posterior, certify_posterior, diagnose, instantaneous_bound
-from ctxval.certificates.provenance import Provenance
+from ctxval.certificates.provenance import Neighbour, Provenance
 from ctxval.certificates.region import Region, certify_region
 from ctxval.certificates.sample import PLANNED, MadeGood, Sample, require_learned
 from ctxval.certificates.scenario import (
@@ -59,6 +59,7 @@ __all__ = [
     "LearnedDistance",
     "MadeGood",
     "Maxima",
+    "Neighbour",
     "Posterior",
     "Provenance",
     "Region",

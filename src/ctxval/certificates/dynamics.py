@@ -23,6 +23,7 @@ from ctxval._util.checked import NonNegativeInt, Probability, checked
 from ctxval._util.registry import part
 from ctxval.certificates.base import Certificate, CertificateKind
 from ctxval.certificates.dynamics_diagnostics import (
+    ACCURATE,
     PREDICTIONS,
     counted,
     doubt_of,
@@ -37,7 +38,13 @@ from ctxval.certificates.dynamics_evidence import DynamicsEvidence
 from ctxval.certificates.forecast import Forecast
 from ctxval.certificates.prediction_tests import DRAWN, TESTS
 from ctxval.certificates.sample import Sample, advice_to_remeasure, listed, require_learned
-from ctxval.certificates.sentences import ONE_CAMPAIGN, both_outcomes, dynamics_assumptions, dynamics_statement
+from ctxval.certificates.sentences import (
+    ONE_CAMPAIGN,
+    both_outcomes,
+    dynamics_assumptions,
+    dynamics_statement,
+    two_distances,
+)
 from ctxval.errors import CertificateError
 
 MOST_DRAWS = 400  # posterior samples of the dynamics, which limit the confidence
@@ -140,6 +147,7 @@ def certify_dynamics(sample: Sample, evidence: DynamicsEvidence, confidence: Pro
     finite, last = evidence.maxima[np.isfinite(evidence.maxima)], counted(evidence, bound)[-PREDICTIONS:]
     drawn = [test for test in tested(evidence.predictions, evidence.tests) if test.origin in DRAWN]
     coverage, worst = evidence.coverage, failed(evidence, bound)
+    differing = sample.differing(1e-6 * bound)
     return Certificate(
         kind="dynamics",
         statement=dynamics_statement(upper, error, confidence),
@@ -185,9 +193,23 @@ def certify_dynamics(sample: Sample, evidence: DynamicsEvidence, confidence: Pro
             "variance_left_out": evidence.left_out,
             "pushed": evidence.pushed and evidence.pushed.to_json(),
             "failures": sample.failures,
+            "differing": None if differing is None else [sample.numbers[row] for row in differing],
         },
-        doubt=both_outcomes(sample, stochastic=False) or doubt_of(evidence, sample.best, bound),
+        doubt=both_outcomes(sample, stochastic=False)
+        or _undeclared_noise(sample, bound)
+        or doubt_of(evidence, sample.best, bound),
         error=error,
+    )
+
+
+def _undeclared_noise(sample: Sample, bound: float) -> str | None:
+    """Return that two executions of one task differ by more than a prediction may be wrong; None if none do."""
+    differing = sample.differing(ACCURATE * bound)
+    if differing is None:
+        return None
+    return (
+        f"{two_distances(sample, differing)} in the recorded state, or was changed in between, so the bound is "
+        "withdrawn; record more states, use --kind posterior with --stochastic, or use a new store after a change"
     )
 
 

@@ -17,6 +17,7 @@ from ctxval._util.progress import advance, stage
 from ctxval._util.representation import ShortRepr
 from ctxval.certificates.bounds import ERRORS
 from ctxval.certificates.sample import Sample, advice_to_remeasure, listed
+from ctxval.certificates.sentences import two_distances
 from ctxval.errors import CertificateError
 from ctxval.gp.hyperposterior import EXACT, Conditioned, Prior, draw_hyperparameters
 from ctxval.gp.sample_paths import draw_paths, maxima
@@ -192,13 +193,8 @@ def _required_data(sample: Sample) -> tuple[Array, Array]:
 
 def _require_one_distance_each(sample: Sample) -> None:
     """Refuse trials of a stochastic system."""
-    y, numbers = sample.distances, sample.numbers
-    _, firsts, tasks = np.unique(sample.points, axis=0, return_index=True, return_inverse=True)
-    first_of = firsts[tasks.ravel()]
-    different = np.flatnonzero(np.abs(y - y[first_of]) > 1e-6 * np.ptp(y))
-    if len(different):
-        row, first = different[0], first_of[different[0]]
+    differing = sample.differing(1e-6 * float(np.ptp(sample.distances)))
+    if differing is not None:
         raise CertificateError(
-            f"trials {numbers[first]} and {numbers[row]} executed one task, and their distances are {y[first]:g} and "
-            f"{y[row]:g}: the system is not deterministic; say --stochastic to bound the largest expected distance."
+            f"{two_distances(sample, differing)}; say --stochastic to bound the largest expected distance."
         )

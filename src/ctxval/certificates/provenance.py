@@ -4,16 +4,31 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 from ctxval._util.representation import ShortRepr
+from ctxval.certificates import verdict_sentences as sentences
+from ctxval.certificates.base import Certificate
 from ctxval.certificates.dynamics_evidence import LearnedDistance
 from ctxval.certificates.sample import Sample
 from ctxval.certificates.verdict_sentences import Quantities
 from ctxval.core.space import DISTRIBUTION, TaskSpace
 from ctxval.core.task_distribution import distribution_text
-from ctxval.core.trial import Change, Trial
+from ctxval.core.trial import Change, StatedThreshold, Trial
 from ctxval.errors import InputError
+
+
+@dataclass(frozen=True, eq=False)
+class Neighbour(ShortRepr):
+    """Another store of the same experiment: its path, and its worst trial; None if it knows no distance."""
+
+    path: Path
+    worst: Trial | None = None
+
+    def falsifies(self, threshold: float) -> bool:
+        """Return whether one of its distances exceeds a threshold."""
+        return self.worst is not None and (self.worst.distance or 0.0) > threshold
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,6 +43,8 @@ class Provenance(ShortRepr):
         units: the units of the distance.
         start: the largest offset of the start of an execution, as the distance measures it, and as a text; None if
             executions were not recorded.
+        thresholds: the thresholds in the order in which they were first stated; None if nobody has recorded them.
+        beside: the other stores of the same experiment beside this one.
     """
 
     space: TaskSpace | None = None
@@ -36,10 +53,18 @@ class Provenance(ShortRepr):
     distribution: str | None = None
     units: str = ""
     start: tuple[float, str] | None = None
+    thresholds: tuple[StatedThreshold, ...] | None = None
+    beside: tuple[Neighbour, ...] = ()
 
     @classmethod
-    def of(cls, description: Mapping[str, Any], changes: Iterable[Change] = ()) -> Provenance:
-        """Return the provenance from a store's description of its experiment and its list of changes."""
+    def of(
+        cls,
+        description: Mapping[str, Any],
+        changes: Iterable[Change] = (),
+        thresholds: tuple[StatedThreshold, ...] | None = None,
+        beside: Iterable[Neighbour] = (),
+    ) -> Provenance:
+        """Return the provenance from what a store says of its experiment, and from the stores beside it."""
         validation = _table(description, "validation")
         described, refined = _table(validation, "space"), _table(validation, "model").get("type") == "Refined"
         distribution = described.get(DISTRIBUTION)
@@ -47,14 +72,51 @@ class Provenance(ShortRepr):
             space=_space_of(described),
             remarks=(*([REFINED] if refined else []), *remarks_on(changes)),
             distribution=None if distribution is None else distribution_text(distribution),
+            thresholds=thresholds,
+            beside=tuple(beside),
         )
 
     def caution(self, threshold: float) -> str:
-        """Return a sentence if an execution started farther from its task than the threshold; empty if none did."""
-        if self.start is None or self.start[0] <= threshold:
-            return ""
-        limit = self.quantities.of(f"{threshold:.6g}")
-        return f" The start of an execution was off by {self.start[1]}; the threshold is {limit}."
+        """Return what speaks against any answer, each as a sentence after a space; empty if nothing does.
+
+        These are an execution that started farther from its task than the threshold, and distances above the threshold
+        in other stores of the same experiment.
+        """
+        above = [(other.path.name, other.worst) for other in self.beside if other.worst and other.falsifies(threshold)]
+        caution = sentences.falsified_beside(above, threshold, self.quantities)
+        if self.start is not None and self.start[0] > threshold:
+            limit = self.quantities.of(f"{threshold:.6g}")
+            caution += f" The start of an execution was off by {self.start[1]}; the threshold is {limit}."
+        return caution
+
+    def known_before(self, threshold: float, trials: Sequence[Trial]) -> int:
+        """Return how many distances were known when a threshold was first stated.
+
+        These are all distances of the trials if it was not stated before. It is 0 if no thresholds were recorded.
+        """
+        if self.thresholds is None:
+            return 0
+        first = (stated.distances for stated in self.thresholds if stated.threshold == threshold)
+        return next(first, sum(trial.distance is not None for trial in trials))
+
+    def looked(self, certificate: Certificate, threshold: float, trials: Sequence[Trial], volume: float = 0.0) -> str:
+        """Return, as the end of a sentence, whether a validated threshold was chosen after looking; empty if not.
+
+        It names the smaller thresholds that were stated before and that are falsified, or not validated either.
+        """
+        stated = [each.threshold for each in self.thresholds or ()]
+        before = stated[: stated.index(threshold)] if threshold in stated else stated
+        smaller = sorted(each for each in before if each < threshold and not certificate.covers(each, volume))
+        largest = max((trial.distance or 0.0 for trial in trials), default=0.0)
+        return sentences.looked(self.known_before(threshold, trials), smaller, largest, self.quantities)
+
+    def alone(self, threshold: float, trials: Sequence[Trial]) -> list[str]:
+        """Return what a validation rests on besides its certificate: that neither tau nor the campaign was selected."""
+        falsifying = [other.path.name for other in self.beside if other.falsifies(threshold)]
+        return [
+            *sentences.not_fitted(self.known_before(threshold, trials)),
+            sentences.not_selected(len(self.beside), falsifying),
+        ]
 
     @property
     def quantities(self) -> Quantities:

@@ -155,6 +155,17 @@ class Sample(ShortRepr):
         """Return the numbers of the trials in a state."""
         return [number for number, each in zip(self.numbers, self.states, strict=True) if each == state]
 
+    def differing(self, tolerance: float) -> tuple[int, int] | None:
+        """Return the rows of two executions of one task whose distances differ by more than a tolerance.
+
+        These are the first execution of a task, and the one that differs most from it. It is None if there are none.
+        """
+        _, firsts, tasks = np.unique(self.points, axis=0, return_index=True, return_inverse=True)
+        first_of = firsts[tasks.ravel()]
+        differences = np.nan_to_num(np.abs(self.distances - self.distances[first_of]), nan=0.0, posinf=0.0)
+        row = int(differences.argmax())
+        return (int(first_of[row]), row) if differences[row] > tolerance else None
+
     @property
     def failures(self) -> dict[str, list[Any]]:
         """The trials that failed, that could not be measured and that were made good, ready for JSON."""

@@ -160,6 +160,15 @@ def both_outcomes(sample: Sample, *, stochastic: bool) -> str | None:
     )
 
 
+def two_distances(sample: Sample, rows: tuple[int, int]) -> str:
+    """Return that two executions of one task, which are rows of a sample, have different distances."""
+    (first, second), (before, after) = ([of[row] for row in rows] for of in (sample.numbers, sample.distances))
+    return (
+        f"trials {first} and {second} executed one task, and their distances are {before:g} and {after:g}: the system "
+        "is not deterministic"
+    )
+
+
 # Learned dynamics
 
 

@@ -128,8 +128,10 @@ def judge_by(
         why_not = sentences.undecided(certificate, tau, volume, quantities)
         return Verdict("undecided", tau, why_not, certificate=certificate)
     conditions = kind.rests_on(certificate, known.space)
-    rests_on = sentences.rests_on(conditions, certificate, tau, quantities, known.stated)
-    reason = sentences.validated(certificate, tau, quantities)
+    alone = known.alone(tau, trials)
+    rests_on = sentences.rests_on(conditions, certificate, tau, quantities, known.stated, alone)
+    looked = known.looked(certificate, tau, trials, volume)
+    reason = f"{sentences.validated(certificate, tau, quantities).removesuffix('.')}{looked}."
     return Verdict("validated", tau, reason, certificate=certificate, rests_on=rests_on)
 
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ctxval._util.representation import counted, shown
-from ctxval._util.texts import parted
+from ctxval._util.texts import enumerated, parted, quoted
 from ctxval.certificates.bounds import at_most, of_tasks, percent, with_error, with_units
 from ctxval.certificates.covering import RESOLUTION
 from ctxval.certificates.dynamics_evidence import PushedDistances, Tolerance
@@ -224,6 +224,34 @@ def _rate(label: str, value: float) -> str:
     return f"{f'{value:.2g} {unit}'.rstrip()} in {name}"
 
 
+def looked(known: int, smaller: Sequence[float], largest: float, quantities: Quantities) -> str:
+    """Return that a threshold was stated after distances were known, and which smaller ones before it do not hold."""
+    known_ones = "1 distance was" if known == 1 else f"{known} distances were"
+    parts = [f"the threshold was stated after {known_ones} known"] if known else []
+    falsified_ones = [each for each in smaller if each < largest]
+    for group, how in ((falsified_ones, "falsified"), (smaller[len(falsified_ones) :], "left undecided")):
+        if group:
+            limits = enumerated((quantities.of(f"{each:.6g}") for each in group), 5)
+            word, were, are = ("threshold", "was", "is") if len(group) == 1 else ("thresholds", "were", "are")
+            parts.append(f"the smaller {word} {limits}, which {were} stated before, {are} {how}")
+    return "".join(f"; {part}" for part in parts)
+
+
+def falsified_beside(executed: Sequence[tuple[str, Trial]], tau: float, quantities: Quantities) -> str:
+    """Return, as a sentence after a space, which trials of other stores exceed a threshold; empty if there are none."""
+    if not executed:
+        return ""
+    first = "Another store of this experiment falsifies"
+    if len(executed) > 1:
+        first = f"{len(executed)} other stores of this experiment falsify"
+    trials = (
+        f"trial {trial.number} of {quoted(name)} has the distance "
+        f"{quantities.of(distinguishable(trial.distance or 0.0, tau)[0])}, at {quantities.task(trial)}"
+        for name, trial in executed[:3]
+    )
+    return f" {first} {quantities.of(f'{tau:.6g}')}: {'; '.join(trials)}{'; ...' if len(executed) > 3 else ''}."
+
+
 # What it rests on
 
 
@@ -232,10 +260,11 @@ def conditions(certificate: Certificate, space: TaskSpace | None) -> list[str]:
     details = certificate.details
     match certificate.kind:
         case "dynamics":
-            gaps = with_units(details["resolution"])
+            gaps, again = with_units(details["resolution"]), details.get("differing")
+            noise = "" if again is None else f" (trials {again[0]} and {again[1]} of one task differ a little)"
             return [
                 "the recorded state being complete",
-                "the system being deterministic, and its dynamics changing neither with time nor with the task",
+                f"the system being deterministic{noise}, and its dynamics changing neither with time nor with the task",
                 f"its dynamics being, in gaps of the records of up to {gaps}, like what was seen",
             ]
         case "posterior":
@@ -264,7 +293,12 @@ def _posterior_conditions(details: Mapping[str, Any], quantities: Quantities) ->
 
 
 def rests_on(
-    conditions: Sequence[str], certificate: Certificate, tau: float, quantities: Quantities, remarks: Sequence[str]
+    conditions: Sequence[str],
+    certificate: Certificate,
+    tau: float,
+    quantities: Quantities,
+    remarks: Sequence[str],
+    alone: Sequence[str],
 ) -> str:
     """Return the evidence of a validation, what it rests on, and what independent draws say without any of it."""
     parts = list(conditions)
@@ -273,9 +307,34 @@ def rests_on(
         numbers = ", ".join(str(failure["trial"]) for failure in made_good)
         parts.append(f"your word that what made trial {numbers} fail is removed for good")
     parts += [f"your word that {remark}" for remark in remarks]
-    parts.append("this campaign not being chosen among several")
+    parts += alone
     trials = evidence(certificate, tau, quantities)
     return f"{trials}It rests on {'; on '.join(parts)}.{_without_assumptions(certificate, tau, quantities)}"
+
+
+def not_fitted(known: int) -> list[str]:
+    """Return that a threshold was not chosen to suit the distances that were known; nothing if none were."""
+    if not known:
+        return []
+    which = "distance that was" if known == 1 else "distances that were"
+    return [f"the threshold not being chosen to suit the {known} {which} known when it was stated"]
+
+
+def not_selected(others: int, falsifying: Sequence[str]) -> str:
+    """Return that a campaign was not selected, with what other stores of the same experiment say of the threshold."""
+    alone = "this campaign not being chosen among several"
+    if not others:
+        return alone
+    lie = "store of this experiment lies" if others == 1 else "stores of this experiment lie"
+    which = "none of them falsifies the threshold" if others > 1 else "it does not falsify the threshold"
+    if falsifying:
+        count = "it falsifies" if others == 1 else f"{len(falsifying)} of them {_do(falsifying, 'falsif')}"
+        which = f"{count} the threshold ({enumerated(map(quoted, falsifying), 5)})"
+    return f"{alone} ({others} other {lie} beside it, and {which})"
+
+
+def _do(those: Sequence[str], verb: str) -> str:
+    return f"{verb}ies" if len(those) == 1 else f"{verb}y"
 
 
 def _without_assumptions(certificate: Certificate, tau: float, quantities: Quantities) -> str:

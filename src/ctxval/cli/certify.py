@@ -11,9 +11,10 @@ from ctxval import report as reports
 from ctxval._util.checked import PositiveFloat, require
 from ctxval._util.files import write_text
 from ctxval._util.progress import stage
+from ctxval.campaign.provenance import provenance_of_store
 from ctxval.campaign.storage.other_stores import other_stores
 from ctxval.campaign.storage.store import Store
-from ctxval.certificates import KINDS, CertificateOptions, Provenance, assess
+from ctxval.certificates import KINDS, CertificateOptions, assess
 from ctxval.cli.base import command, out, print_other_stores, print_verdict, status_of
 from ctxval.cli.config.settings import Settings
 from ctxval.cli.config.stored_settings import budget_of, limit_of, open_store, planned_settings, trusted_settings
@@ -68,12 +69,13 @@ def certify_store(store: Path, asked: Asked, allowed: Allowed, audit: int | None
         options.kind.require_audit_helps([trial.origin for trial in opened.trials()])
     campaign = open_store(store, allowed).campaign if loads else None
     if campaign is not None and audit is not None:
+        if limit is not None:
+            campaign.state_threshold(limit)  # before these draws are executed
         campaign.audit(audit)
-    with opened.snapshot():
-        trials, known = opened.trials(), Provenance.of(opened.description(), opened.history())
     with stage("certifying"):
-        assessment = assess(trials, options, limit, known if campaign is None else campaign.provenance)
-    others, verdict = [str(other) for other in other_stores(store)], assessment.verdict
+        known = provenance_of_store(opened) if campaign is None else campaign.provenance
+        assessment = assess(opened.trials(), options, limit, known)
+    others, verdict = [str(other.path) for other in other_stores(store)], assessment.verdict
     if verdict is not None:
         print_verdict(verdict)
     if assessment.certificate is None:

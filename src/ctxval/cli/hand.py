@@ -66,6 +66,8 @@ def ask(
     opened = open_target(target, overrides, allowed)
     experiment, settings, campaign, path = opened.experiment, opened.settings, opened.campaign, opened.path
     limit = limit_of(experiment, settings, threshold)
+    if trial is None and limit is not None:
+        campaign.state_threshold(limit)
     if trial is not None:
         waiting = campaign.reopen(trial)
     elif limit is not None and not stated and (threshold is not None or not settings.explores):
@@ -229,6 +231,8 @@ def _reopened(settings: Settings, path: Path, threshold: float | None, budget: i
 def _served(opened: Opened, threshold: float | None, budget: int | None) -> ServedCampaign:
     experiment, settings = opened.experiment, opened.settings
     limit, total = limit_of(experiment, settings, threshold), budget_of(experiment, settings, budget)
+    if limit is not None:
+        opened.campaign.state_threshold(limit)
     return ServedCampaign(experiment, opened.campaign, limit, settings.certificate_options, total)
 
 

@@ -139,7 +139,7 @@ def run(
             "certificate": None if bound is None else bound.to_json(),
             "expected": None if expected is None else asdict(expected),
             "store": str(path),
-            "other_stores": [str(other) for other in other_stores(path)],
+            "other_stores": [str(other.path) for other in other_stores(path)],
         }
         if known is not None:
             task = campaign.validation.space.describe_point(known.parameters.points)

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from ctxval._util.files import MADE_BY
+from ctxval._util.representation import counted
 from ctxval.campaign.storage.recovery import export, recover
 from ctxval.campaign.storage.store import Store
 from ctxval.cli.base import RUN, command, failures_of, out, print_failures, print_table, worst_of
@@ -21,6 +22,7 @@ def status(store: Path) -> Any:
     opened = Store.existing(store)
     with opened.snapshot():
         description, trials, changes = opened.description(), opened.trials(), opened.history()
+        thresholds = [asdict(stated) for stated in opened.thresholds() or ()]
         kept = opened.computed(RUN)
     verdict = None
     match kept:
@@ -39,10 +41,14 @@ def status(store: Path) -> Any:
         "open": [trial.number for trial in trials if trial.state == "open"],
         "worst": worst_of(max(measured, key=lambda trial: trial.distance or 0, default=None)),
         "verdict": verdict,
+        "thresholds": thresholds,
         "changes": [asdict(change) for change in changes],
         "store": str(store),
     }
-    print_table({key: value for key, value in report.items() if key not in ("failures", "changes")})
+    print_table({key: value for key, value in report.items() if key not in ("failures", "thresholds", "changes")})
+    for stated in thresholds:
+        known = counted(stated["distances"], "known distance")
+        out.say(f"{stated['at'][:19]} threshold {stated['threshold']:g}: stated after {known}")
     for change in report["changes"]:
         out.say(f"{change['at'][:19]} {change['what']}: {change['why']}")
     print_failures(report["failures"])

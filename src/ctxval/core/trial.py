@@ -111,3 +111,15 @@ class Change(ShortRepr):
     why: str
     content: dict[str, Any]
     at: str = ""
+
+
+@dataclass(frozen=True)
+class StatedThreshold(ShortRepr):
+    """A threshold that was stated to a campaign: its value, and how many distances were known when it was first stated.
+
+    The time is in UTC.
+    """
+
+    threshold: float
+    distances: int
+    at: str = ""

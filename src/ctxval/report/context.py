@@ -14,6 +14,8 @@ from ctxval._util.progress import stage
 from ctxval._util.representation import ShortRepr
 from ctxval.campaign.campaign import Campaign
 from ctxval.campaign.dynamics import NEAR
+from ctxval.campaign.interval_search import with_next_task
+from ctxval.campaign.provenance import provenance_of_store
 from ctxval.campaign.storage.store import Store
 from ctxval.certificates import Certificate, CertificateOptions, Provenance, Verdict, judge
 from ctxval.core.labels import Labels, labels_of
@@ -234,8 +236,12 @@ def context_of_campaign(
 
     Its verdict is ``verdict``, if that was computed before, or else that against ``threshold`` by ``certificate``.
     """
+    known = campaign.provenance
     if verdict is None and threshold is not None:
-        verdict = campaign.verdict(threshold, certificate=certificate)
+        # A report only reads: it does not record that the threshold was stated.
+        options = certificate or CertificateOptions()
+        with stage("certifying"):
+            verdict = with_next_task(judge(campaign.trials, threshold, options, known), campaign.recorder, options)
     return ReportContext(
         campaign.name,
         campaign.validation.space,
@@ -248,7 +254,7 @@ def context_of_campaign(
         settings=campaign.store.settings(),
         description=campaign.store.description(),
         changes=tuple(campaign.store.history()),
-        provenance=campaign.provenance,
+        provenance=known,
     )
 
 
@@ -266,7 +272,7 @@ def context_of_store(
     """
     with store.snapshot():
         description, changes, trials = store.description(), store.history(), store.trials()
-    provenance = Provenance.of(description, changes)
+    provenance = provenance_of_store(store)
     space = provenance.space
     if space is None or any(len(trial.unit_point) != space.dimension for trial in trials):
         raise InputError(f"{store.name} has no readable task space, so there is nothing to report.")

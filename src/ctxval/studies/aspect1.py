@@ -153,6 +153,8 @@ def check(
     on_model = validation.on_model(measured, units=None if distance is None else "")
     # Learned dynamics could not teach the search anything, because M is known.
     campaign = Campaign(on_model, search=by_name("bayesian-optimisation") if search is None else search, seed=seed)
+    if threshold is not None:
+        campaign.state_threshold(threshold)
     with stage("simulating tasks on the model", tasks, "tasks"):
         while (done := len(campaign.trials)) < tasks:  # a task without a closed loop counts, too
             with warnings.catch_warnings(), contextlib.suppress(DesignError, ModelError):  # stored with the reason

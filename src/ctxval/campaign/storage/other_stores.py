@@ -14,32 +14,36 @@ from urllib.parse import quote
 
 from ctxval._util.describe import first_difference
 from ctxval.campaign.storage import schema
-from ctxval.campaign.storage.rows import MOST_CHARACTERS
+from ctxval.campaign.storage.rows import COLUMNS, MOST_CHARACTERS, read_trial
+from ctxval.certificates import Neighbour
+from ctxval.core.trial import Trial
 
 STORE_SUFFIXES = (".sqlite", ".sqlite3", ".db")
 """Suffixes of files that are taken for stores."""
 _UNREADABLE = (sqlite3.Error, OSError, ValueError, TypeError, OverflowError, MemoryError, RecursionError)
 
 
-def other_stores(path: Path) -> list[Path]:
+def other_stores(path: Path) -> list[Neighbour]:
     """Return the other stores in a store's folder with trials of the same validation and model, of any search and seed.
 
-    Nothing is built, run or written. Files that cannot be read are skipped.
+    Each comes with its worst trial. Nothing is built, run or written. Files that cannot be read are skipped.
     """
     others = []
     with suppress(*_UNREADABLE):
-        validation = _validation_of(path)
+        validation, _ = _read(path)
         beside = sorted(file for file in path.absolute().parent.iterdir() if file.suffix in STORE_SUFFIXES)[:500]
         for file in beside:
             with suppress(*_UNREADABLE):
-                same = file.is_file() and first_difference(validation, _validation_of(file)) is None
-                if same and file.name != path.name:
-                    others.append(path.with_name(file.name))
+                if file.name == path.name or not file.is_file():
+                    continue
+                of_file, worst = _read(file)
+                if first_difference(validation, of_file) is None:
+                    others.append(Neighbour(path.with_name(file.name), worst))
     return others
 
 
-def _validation_of(path: Path) -> dict[str, Any]:
-    """Return a store's description of its validation, and the number that depends on its model."""
+def _read(path: Path) -> tuple[dict[str, Any], Trial | None]:
+    """Return a store's description of its validation with the number that depends on its model, and its worst trial."""
     uri = f"file:{quote(str(path.absolute()))}?mode=ro&immutable=1"  # takes no lock and replays no journal
     with closing(sqlite3.connect(uri, uri=True, factory=schema.Guarded)) as connection:
         if schema.difference(connection, schema.TABLES) is not None:
@@ -49,7 +53,13 @@ def _validation_of(path: Path) -> dict[str, Any]:
             (MOST_CHARACTERS,),
         ).fetchall()
         executed = connection.execute("SELECT EXISTS (SELECT 1 FROM trials WHERE executed)").fetchone()[0]
+        row = connection.execute(
+            f"SELECT {COLUMNS}, checksum FROM trials WHERE typeof(distance) = 'real' ORDER BY distance DESC LIMIT 1"
+        ).fetchone()
     experiment = {str(key): json.loads(value) for key, value in rows}
     if not isinstance(experiment.get("validation"), dict) or not executed:
         raise ValueError(f"{path} has no executed trials of an experiment")
-    return experiment
+    worst = None if row is None else read_trial(row[:-1], row[-1])
+    if row is not None and worst is None:
+        raise ValueError(f"the worst trial of {path} cannot be read")
+    return experiment, worst

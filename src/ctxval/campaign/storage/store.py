@@ -8,6 +8,7 @@ import json
 import os
 from collections.abc import Iterable, Sequence
 from contextlib import AbstractContextManager
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -19,10 +20,10 @@ from ctxval.campaign.storage.database import Database, now
 from ctxval.campaign.storage.rows import COLUMNS, checksum_of, read_trial, row_of
 from ctxval.campaign.storage.trajectories import Side, StoredTrajectories
 from ctxval.core.trajectory import Trajectory
-from ctxval.core.trial import Change, Trial
+from ctxval.core.trial import REDEFINED, Change, StatedThreshold, Trial
 from ctxval.errors import CtxvalError, ForeignStoreError, InputError, StoreAccessError, StoreMismatchError
 
-_DRAWS = "draws"  # a key in the table experiment that is not part of the description of the experiment
+_DRAWS, _THRESHOLDS = "draws", "thresholds"  # keys in the table experiment that do not describe the experiment
 
 
 @checked
@@ -84,6 +85,7 @@ class Store:
         with self._database.transaction():
             if not self.description():
                 self._write_description(description)
+                self._insert_pairs("experiment", {_THRESHOLDS: []})
             return self.description()
 
     def describe_anew(self, description: dict[str, Any], change: Change) -> None:
@@ -93,12 +95,13 @@ class Store:
             self._insert_change(change)
 
     def _write_description(self, description: dict[str, Any]) -> None:
-        self._database.execute("DELETE FROM experiment WHERE key != ?", (_DRAWS,))
+        self._database.execute("DELETE FROM experiment WHERE key NOT IN (?, ?)", (_DRAWS, _THRESHOLDS))
         self._insert_pairs("experiment", description)
 
     def description(self) -> dict[str, Any]:
         """Return the stored description of the experiment; empty in a new store."""
-        return {key: value for key, value in self._pairs("experiment").items() if key != _DRAWS}
+        pairs = self._pairs("experiment").items()
+        return {key: value for key, value in pairs if key not in (_DRAWS, _THRESHOLDS)}
 
     def draws(self) -> int | None:
         """Return the number that seeds independent draws together with the seed. Returns None if none is stored."""
@@ -109,6 +112,39 @@ class Store:
         """Store the number that seeds independent draws; a number that is stored already stays."""
         with self._database.transaction():
             self._database.execute("INSERT OR IGNORE INTO experiment VALUES (?, ?)", (_DRAWS, json.dumps(number)))
+
+    def thresholds(self) -> tuple[StatedThreshold, ...] | None:
+        """Return the thresholds in the order in which they were first stated; None if the store does not keep them.
+
+        Those that were stated for another definition of the distance are left out.
+        """
+        stated = self._pairs("experiment").get(_THRESHOLDS)
+        try:
+            return None if stated is None else rows.read_thresholds(stated)
+        except InputError as error:
+            raise self._database.damaged("its thresholds cannot be read") from error
+
+    def state_threshold(self, threshold: float) -> None:
+        """Record a threshold with the number of distances that are known; if it is recorded already, nothing changes.
+
+        A store that keeps no thresholds, because it was made before they were kept, stays as it is: nobody knows which
+        ones were stated.
+        """
+
+        def is_new(stated: tuple[StatedThreshold, ...] | None) -> bool:
+            return stated is not None and all(each.threshold != threshold for each in stated)
+
+        if not is_new(self.thresholds()):
+            return
+        with self._database.transaction():
+            stated = self.thresholds() or ()
+            if is_new(stated):
+                known = self._database.execute("SELECT count(*) FROM trials WHERE state = 'completed'").fetchone()[0]
+                self._write_thresholds((*stated, StatedThreshold(float(threshold), int(known), now())))
+
+    def _write_thresholds(self, stated: Sequence[StatedThreshold]) -> None:
+        _, text = rows.pair_of(_THRESHOLDS, [asdict(each) for each in stated])
+        self._database.execute("UPDATE experiment SET value = ? WHERE key = ?", (text, _THRESHOLDS))
 
     def keep_settings(self, settings: dict[str, Any]) -> None:
         """Store the settings that make the experiment again, for commands that get only the store."""
@@ -165,6 +201,8 @@ class Store:
                 self._update(trial)
             self._write_description(description)
             self._insert_change(change)
+            if change.why == REDEFINED:
+                self._write_thresholds(())  # they were thresholds of another distance
         return True
 
     def _require_unchanged(self, changes: int | None) -> None:
@@ -263,7 +301,7 @@ class Store:
         digest = hashlib.sha256(VERSION.encode())
         with self._database.snapshot():
             for query in (
-                "SELECT key, value FROM experiment ORDER BY key",
+                f"SELECT key, value FROM experiment WHERE key != '{_THRESHOLDS}' ORDER BY key",
                 "SELECT number, checksum FROM trials ORDER BY number",
                 "SELECT trial, side, checksum FROM trajectories ORDER BY trial, side",
                 "SELECT number, what, why, content FROM history ORDER BY number",

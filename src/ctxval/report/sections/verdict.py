@@ -126,7 +126,7 @@ def _remarks(context: ReportContext) -> list[Markup]:
         remarks.append(paragraph(f"The experiment is not loaded: {context.missing}", class_="note"))
     others = [] if context.store.path is None else other_stores(context.store.path)
     if others:
-        count, first = counted(len(others), "other store"), ", ".join(other.name for other in others[:5])
+        count, first = counted(len(others), "other store"), ", ".join(other.path.name for other in others[:5])
         sentence = (
             f"The folder contains {count} of this experiment: {first}. The best result of several campaigns is wrong "
             "more often than its confidence states."

@@ -20,7 +20,7 @@ from ctxval._util.arrays import Array
 from ctxval.campaign.choices import Choice
 from ctxval.campaign.dynamics import NEAR
 from ctxval.campaign.interval_search import IntervalSearch
-from ctxval.certificates import CertificateOptions
+from ctxval.certificates import CertificateOptions, judge
 from ctxval.certificates.automatic import Automatic
 from ctxval.certificates.bounds import ERRORS
 from ctxval.certificates.difference import MeanDifference, PairedDifferences, mean_difference
@@ -139,7 +139,8 @@ class WorstQuestion:
         for other in above:
             if other.largest <= max(better.largest, 0.0):
                 continue
-            verdict = better.campaign.verdict(other.largest, certificate=self.options, progress=False)
+            # Nobody has stated this threshold to the campaign.
+            verdict = judge(better.campaign.trials, other.largest, self.options, better.campaign.provenance)
             if verdict.answer == "validated" and verdict.certificate is not None:
                 names, certificate = (better.name, other.name), verdict.certificate
                 bound, count = certificate.upper_bound + ERRORS * certificate.error, self.executions.count
