@@ -8,7 +8,7 @@ from typing import Any
 from ctxval._util.arrays import as_floats
 from ctxval._util.registry import part
 from ctxval._util.representation import ShortRepr
-from ctxval.core.controller import Controller, started
+from ctxval.core.controller import Controller, Feedback, started
 from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory
 from ctxval.errors import ExecutionError, InputError
@@ -24,7 +24,7 @@ class Function(ShortRepr):
     x_next``, use a :class:`Simulated` system.
     """
 
-    def __init__(self, execute: Callable[[Controller, Task], Any], *, batched: bool = False) -> None:
+    def __init__(self, execute: Callable[[Feedback, Task], Any], *, batched: bool = False) -> None:
         if not callable(execute):
             raise InputError(f"a system must be a function (controller, task) -> trajectory, got {execute!r}.")
         self.function = execute
