@@ -6,7 +6,7 @@ from ctxval._util.registry import Registry
 from ctxval.controllers.ilqr import ILQR, ILQRSolution
 from ctxval.controllers.lqr import LQR, StationaryLQR
 from ctxval.controllers.mpc import MPC, RecedingHorizon
-from ctxval.controllers.onnx_policy import OnnxPolicy
+from ctxval.controllers.onnx_policy import OnnxPolicy, RecurrentPolicy
 from ctxval.controllers.pid import PID, PIDFeedback
 from ctxval.core.controller import (
     AffineFeedback,
@@ -37,6 +37,7 @@ __all__ = [
     "PIDFeedback",
     "Policy",
     "RecedingHorizon",
+    "RecurrentPolicy",
     "StationaryLQR",
     "Synthesizer",
     "by_name",
