@@ -65,7 +65,7 @@ class ControllerRun(ShortRepr):
             raise InputError(f"step of a controller must return the pair (u, memory), got {shown(returned)}.")
         u, self._memory = returned
         self._next += 1
-        return np.asarray(u, dtype=np.float64)
+        return np.array(u, dtype=np.float64)  # a copy, because it may be a part of the memory
 
 
 def is_controller(value: object) -> bool:

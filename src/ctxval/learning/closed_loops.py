@@ -185,7 +185,7 @@ class LoopPlanner:
             start, controller = planned.task.initial_state, planned.controller
             probes = start + 1e-3 * np.arange(draws).reshape(-1, *[1] * start.ndim)
             # The first input may not depend on the memory yet.
-            steps = min(3, planned.task.horizon) if isinstance(controller, ControllerWithMemory) else 1
+            steps = min(10, planned.task.horizon) if isinstance(controller, ControllerWithMemory) else 1
             self._together = False
             with contextlib.suppress(Exception), np.errstate(all="ignore"):  # the user's controller
                 together = _probed(controller, _with_states(planned.task, probes), steps)
