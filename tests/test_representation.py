@@ -80,6 +80,7 @@ pytestmark = pytest.mark.usefixtures("few_loops")
 
 LINEAR = models.Linear([[1, 0.1], [0, 1]], [[0], [0.1]], data=DATA)
 TASK = Task([1.0, 0.0], goal=[0.5, 0.0], horizon=25, dt=0.02)
+PID = controllers.PID(2.0, [0.5], 1.0, limits=3.0)
 BATCH = Task([np.zeros(3), 0.0], horizon=25, dt=0.02)
 SPACE = TaskSpace(goal=(-3.0, np.pi, "rad"), offset=([0, 0], [1, 2], "m"), mass=(1, 2))
 TRAJECTORY = Trajectory(TASK.times, np.linspace(-1, 2, 52).reshape(26, 2), np.zeros((25, 1)))
@@ -324,12 +325,15 @@ EXAMPLES: dict[str, Callable[[], object]] = {
     "controllers.ControllerFile": lambda: controllers.ControllerFile(
         controllers.LQR([1, 1], [1]).design(TASK, LINEAR), 0.02, {"x0": "m", "x1": "m/s"}, {"u0": "N"}
     ),
+    "controllers.ControllerRun": lambda: controllers.started(PID.design(TASK, LINEAR), TASK),
     "controllers.ILQR": lambda: controllers.ILQR([1, 1], [1]),
     "controllers.ILQRSolution": lambda: controllers.ILQR([1, 1], [1]).solve(BATCH, LINEAR),
     "controllers.LQR": lambda: controllers.LQR([1, 0.1], [0.01], limits=controllers.Limits([-1], [2])),
     "controllers.Limits": lambda: controllers.Limits(-np.inf, [1.0, 2.0]),
     "controllers.MPC": mpc,
     "controllers.OnnxPolicy": lambda: controllers.OnnxPolicy(network(), scale=5.0),
+    "controllers.PID": lambda: PID,
+    "controllers.PIDFeedback": lambda: PID.design(TASK, LINEAR),
     "controllers.Policy": lambda: controllers.Policy(policy, limits=2.0),
     "controllers.RecedingHorizon": lambda: mpc().design(TASK, LINEAR),
     "controllers.StationaryLQR": lambda: controllers.StationaryLQR([[2, 1], [1, 2]], [1]),
@@ -398,6 +402,9 @@ EXAMPLES: dict[str, Callable[[], object]] = {
     "data.Table": lambda: data.Table("run.csv", ("t", "x"), lambda names: dict.fromkeys(names, np.arange(9.0))),
     "studies.fitting.Excitation": lambda: fitting.Excitation(make_validation(), "chirp", 0.5, 5.0),
     "studies.fitting.Excited": lambda: fitting.Excited(policy, np.ones((9, 1)), controllers.Limits([-1.0], [1.0])),
+    "studies.fitting.ExcitedWithMemory": lambda: fitting.ExcitedWithMemory(
+        PID.design(TASK, LINEAR), np.ones((9, 1)), controllers.Limits([-1.0], [1.0])
+    ),
     "studies.fitting.FailedFit": lambda: fitting.FailedFit("linear", "too few steps"),
     "studies.fitting.FitReport": fitted,
     "studies.fitting.FittedModel": lambda: fitted().fitted[0],

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 import pytest
@@ -92,6 +93,43 @@ def test_sound_synthesizers_pass_and_one_that_mixes_tasks_is_named() -> None:
 
     with pytest.raises(ConformanceError, match="closed loops of a batch"):
         testing.check_synthesizer(Mixed(), TASKS, MODEL)
+
+
+class Remembering:
+    """A synthesizer of controllers with memory: ``start`` and ``step`` are the functions that it is made with."""
+
+    def __init__(self, start: Any, step: Any) -> None:
+        self.start, self.step = start, step
+
+    def design(self, task: Task, model: models.Model) -> Any:
+        return dataclasses.make_dataclass("Controlled", [])() if self.start is None else self
+
+
+def test_sound_controllers_with_memory_pass_and_others_are_named() -> None:
+    testing.check_synthesizer(controllers.PID(1.0, 0.5, 0.2), TASKS, MODEL)
+    zeros = np.zeros(1)
+
+    def summed(t: int, x: Array, memory: Array) -> tuple[Array, Array]:
+        memory = memory - x[..., :1]
+        return 0.1 * memory, memory
+
+    testing.check_synthesizer(Remembering(lambda task: zeros, summed), TASKS, MODEL)
+    with pytest.raises(
+        ConformanceError, match=r"^step of a controller must return the pair \(u, memory\), got \[0\]\.$"
+    ):
+        testing.check_synthesizer(Remembering(lambda task: zeros, lambda t, x, memory: zeros), TASKS, MODEL)
+    with pytest.raises(ConformanceError, match=r"must be a function \(t, x\) -> u, or have the methods"):
+        testing.check_synthesizer(Remembering(None, None), TASKS, MODEL)
+    with pytest.raises(ConformanceError, match="the controller must return"):
+        testing.check_synthesizer(Remembering(lambda task: zeros, lambda t, x, memory: (1.0, memory)), TASKS, MODEL)
+    calls: list[int] = []
+
+    def hidden(t: int, x: Array, memory: Array) -> tuple[Array, Array]:
+        calls.append(t)
+        return -0.01 * len(calls) * x[..., :1], memory
+
+    with pytest.raises(ConformanceError, match="closed loop of a second run differs from that of the first"):
+        testing.check_synthesizer(Remembering(lambda task: zeros, hidden), TASKS, MODEL)
 
 
 def pair() -> tuple[Trajectory, Trajectory]:

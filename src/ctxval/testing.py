@@ -15,7 +15,7 @@ import numpy as np
 from ctxval._util.arrays import Array, Mask
 from ctxval._util.representation import ShortRepr
 from ctxval.certificates import Certificate, CertificateKind, Sample
-from ctxval.core.controller import Controller, Synthesizer, converged_of
+from ctxval.core.controller import Controller, ControllerWithMemory, Synthesizer, converged_of
 from ctxval.core.distance import Distance
 from ctxval.core.model import Model, central_differences, linearize
 from ctxval.core.rollout import rollout
@@ -84,22 +84,34 @@ def check_system(system: System, controller: Controller, task: Task, *, toleranc
 def check_synthesizer(synthesizer: Synthesizer, task: Task, model: Model) -> None:
     """Check that a synthesizer designs the same controller for a batch of tasks ``(N,)`` as task by task.
 
-    If the controllers have the attribute ``converged``, it must be a boolean of each task, the same in a batch.
+    If the controllers have the attribute ``converged``, it must be a boolean of each task, the same in a batch. If they
+    have memory, each run must repeat itself.
     """
     singles, converged = [], []
     for index in range(task.batch_shape[0]):
         controller = synthesizer.design(task[index], model)
         converged.append(_converged(controller, ()))
-        singles.append(rollout(model.step, controller, task[index]))
+        singles.append(_run(controller, task[index], model))
         _require(bool(singles[-1].finite), f"the closed loop on the model is not finite for task {index}")
+        if isinstance(controller, ControllerWithMemory):
+            again = _run(controller, task[index], model)
+            run = "the closed loop of a second run"
+            _require_close(run, again.states, "that of the first", singles[-1].states, _TOLERANCE)
     if getattr(synthesizer, "batched", False):
         controller = synthesizer.design(task, model)
         together, alone = _converged(controller, task.batch_shape), [each for each in converged if each is not None]
         same = not alone if together is None else np.array_equal(together, alone)
         _require(same, f"converged of a batch is {together}, and one by one it is {converged}")
-        batch = rollout(model.step, controller, task)
+        batch = _run(controller, task, model)
         states = np.stack([single.states for single in singles])
         _require_close("the closed loops of a batch", batch.states, "those one by one", states, 1e-8)
+
+
+def _run(controller: Controller, task: Task, model: Model) -> Trajectory:
+    try:
+        return rollout(model.step, controller, task)
+    except InputError as error:  # the controller returned something else
+        raise ConformanceError(str(error)) from error
 
 
 def _converged(controller: Controller, batch_shape: tuple[int, ...]) -> Mask | None:

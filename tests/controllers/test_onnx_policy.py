@@ -11,7 +11,7 @@ import pytest
 from ctxval import Task, testing
 from ctxval._util.arrays import Array
 from ctxval._util.describe import describe, first_difference
-from ctxval.controllers import OnnxPolicy
+from ctxval.controllers import OnnxPolicy, RecurrentPolicy
 from ctxval.core.rollout import rollout
 from ctxval.errors import InputError, ShapeError
 from ctxval.models import Linear
@@ -84,8 +84,71 @@ def test_it_is_described_by_its_settings() -> None:
     assert describe(OnnxPolicy(policy()))["limits"] is None
 
 
+def recurrent(rows: object = "N", layers: int | None = None, open_width: bool = False) -> bytes:
+    """Return a leaky integrator ``h' = 0.5 h + x[0]``, ``u = -h'[0] - h'[1]``, with a value as its second output."""
+    shape = [rows, 2] if layers is None else [layers, rows, 2]
+    nodes = [
+        helper.make_node("Mul", ["h", "half"], ["a"]),
+        helper.make_node("MatMul", ["x", "W"], ["b"]),
+        helper.make_node("Add", ["a", "b"], ["h_new"]),
+        helper.make_node("MatMul", ["h_new", "minus"], ["c"]),
+        helper.make_node(
+            "Identity" if layers is None else "ReduceSum", ["c"] if layers is None else ["c", "axis"], ["u"]
+        ),
+        helper.make_node("Identity", ["x"], ["value"]),
+    ]
+    if layers is not None:
+        nodes[4].attribute.append(helper.make_attribute("keepdims", 0))
+    graph = helper.make_graph(
+        nodes,
+        "recurrent",
+        [
+            helper.make_tensor_value_info("x", TensorProto.FLOAT, [rows, 2]),
+            helper.make_tensor_value_info("h", TensorProto.FLOAT, [*shape[:-1], "K" if open_width else 2]),
+        ],
+        [
+            helper.make_tensor_value_info("u", TensorProto.FLOAT, [rows, 1]),
+            helper.make_tensor_value_info("value", TensorProto.FLOAT, [rows, 2]),
+            helper.make_tensor_value_info("h_new", TensorProto.FLOAT, shape),
+        ],
+        [
+            numpy_helper.from_array(np.array(0.5, dtype=np.float32), "half"),
+            numpy_helper.from_array(np.array([[1.0, 0.2], [0.0, 0.1]], dtype=np.float32), "W"),
+            numpy_helper.from_array(-np.ones((2, 1), dtype=np.float32), "minus"),
+            numpy_helper.from_array(np.array([0], dtype=np.int64), "axis"),
+        ],
+    )
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
+    return bytes(model.SerializeToString())
+
+
+@pytest.mark.parametrize(("rows", "layers"), [("N", None), (1, None), ("N", 1), ("N", 3), (1, 2)])
+def test_states_of_a_network_are_the_memory_of_its_controller(rows: object, layers: int | None) -> None:
+    synthesizer = OnnxPolicy(recurrent(rows, layers), observe=deviation, scale=0.5, limits=2.0)
+    testing.check_synthesizer(synthesizer, TASKS, Linear(CART.A, np.float64(CART.B)))
+    controller = synthesizer.design(TASKS, CART)
+    assert isinstance(controller, RecurrentPolicy)
+    controller = pickle.loads(pickle.dumps(controller))
+    loop = rollout(CART.step, controller, TASKS)
+    h = np.zeros((4, 2))
+    for t in range(TASKS.horizon):
+        h = 0.5 * h + (loop.states[:, t] - TASKS.goal) @ [[1.0, 0.2], [0.0, 0.1]]
+        u = -0.5 * (layers or 1) * h.sum(axis=1, keepdims=True)
+        np.testing.assert_allclose(loop.inputs[:, t], np.clip(u, -2, 2), atol=1e-5)
+    starts = np.stack([TASKS.initial_state, TASKS.initial_state + 0.1])
+    drawn = Task(starts, horizon=TASKS.horizon, dt=TASKS.dt, reference=TASKS.reference)
+    np.testing.assert_allclose(rollout(CART.step, controller, drawn).states[0], loop.states, atol=1e-6)
+
+
+def test_states_that_do_not_fit_are_refused() -> None:
+    with pytest.raises(InputError, match="the same number of values, got 'h' has None and 'h_new' has"):
+        OnnxPolicy(recurrent(open_width=True))
+
+
 def test_other_networks_and_observations_are_refused() -> None:
-    with pytest.raises(InputError, match="must have one input, the observations, but the network has x, y"):
+    with pytest.raises(
+        InputError, match="return a new state for each input after the first, got the inputs x, y and the outputs u"
+    ):
         OnnxPolicy(policy(inputs=2))
     with pytest.raises(ShapeError, match="input 'x' takes 2 numbers, got 3"):
         OnnxPolicy(policy()).design(Task(np.zeros(3), horizon=2, dt=0.1), CART)(0, np.zeros(3))

@@ -128,6 +128,48 @@ def test_batched_controllers_that_take_no_further_axis_give_the_same_numbers() -
     np.testing.assert_allclose(found, planner.distances(draws, planner.plan(POINTS), len(POINTS)), rtol=1e-8)
 
 
+class ForgetsDraws:
+    """A PID controller whose memory has the axes of its own task only, so that draws are run one after the other."""
+
+    batched = True
+
+    def design(self, task: Task, model: models.Model) -> Controller:
+        made, axes = controllers.PID(2.0, 3.0, 0.5).design(task, model), task.batch_shape
+
+        class Controlled:
+            def start(self, task: Task) -> Any:
+                return made.start(Task(np.zeros((*axes, 2)), horizon=1, dt=0.1))
+
+            def step(self, t: int, x: Array, memory: Any) -> Any:
+                u, new = made.step(t, x, memory)
+                return u, type(memory)(
+                    *(part.reshape(-1, *old.shape)[-1] for part, old in zip(new, memory, strict=True))
+                )
+
+        return Controlled()
+
+
+@pytest.mark.parametrize("single", [False, True])
+def test_draws_have_memories_of_their_own(single: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    pid, draws = controllers.PID(2.0, 3.0, 0.5, limits=4.0), make_draws()
+    monkeypatch.setattr(pid, "batched", not single)
+    validation, lengths = make_validation(pid), list[int]()
+    planner = LoopPlanner(validation)
+    monkeypatch.setattr(closed_loops, "rollout", lambda *loop: lengths.append(1) or rollout(*loop))
+    found = planner.distances(draws, planner.plan(POINTS), len(POINTS))
+    assert len(lengths) == (
+        2 * len(POINTS) if single else 3
+    )  # all draws at once, with one loop of batched tasks to try
+    np.testing.assert_allclose(found, expected(validation), rtol=1e-8)
+
+
+def test_draws_run_one_after_the_other_if_the_memory_has_no_axis_for_them() -> None:
+    draws, planner = make_draws(), LoopPlanner(make_validation(ForgetsDraws()))
+    usual = LoopPlanner(make_validation(controllers.PID(2.0, 3.0, 0.5)))
+    found = planner.distances(draws, planner.plan(POINTS), len(POINTS))
+    np.testing.assert_allclose(found, usual.distances(draws, usual.plan(POINTS), len(POINTS)), rtol=1e-8)
+
+
 @pytest.mark.parametrize("together", [1, 4, 512])
 def test_the_size_of_batches_does_not_matter(together: int) -> None:
     draws, planner = make_draws(), LoopPlanner(make_validation())

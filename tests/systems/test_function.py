@@ -7,7 +7,7 @@ import pytest
 
 from ctxval import Task, Trajectory, systems, testing
 from ctxval._util.arrays import Array
-from ctxval.core.controller import Controller
+from ctxval.core.controller import Feedback
 from ctxval.errors import ExecutionError, InputError
 
 TASK = Task([1.0, -0.5], horizon=8, dt=0.1)
@@ -21,7 +21,7 @@ def slide(x: Array, u: Array) -> Array:
     return x + 0.1 * np.concatenate([x[..., 1:], u], axis=-1)
 
 
-def run(controller: Controller, task: Task) -> tuple[list[Array], list[Array]]:
+def run(controller: Feedback, task: Task) -> tuple[list[Array], list[Array]]:
     """Run the loop that a user would write."""
     x, states, inputs = task.initial_state, [task.initial_state], []
     for t in range(task.horizon):
@@ -31,7 +31,7 @@ def run(controller: Controller, task: Task) -> tuple[list[Array], list[Array]]:
     return states, inputs
 
 
-def run_batch(controller: Controller, task: Task) -> Trajectory:
+def run_batch(controller: Feedback, task: Task) -> Trajectory:
     states, inputs = run(controller, task)
     return Trajectory(task.times, np.stack(states, axis=-2), np.stack(inputs, axis=-2))
 

@@ -134,6 +134,15 @@ def test_any_environment_with_a_getter_and_a_setter_will_do() -> None:
     np.testing.assert_allclose(states[1:, 0], states[:-1, 0] + 0.05 * speed, atol=1e-12)
 
 
+def test_a_controller_with_memory_begins_anew_in_every_execution() -> None:
+    task = Task([0.3, 0.0], horizon=30, dt=0.05)
+    controller = controllers.PID(8.0, 4.0, 1.0, limits=2.0).design(task, models.Linear(np.eye(2), np.ones((2, 1))))
+    testing.check_system(swing(), controller, task, tolerance=0)
+    executed = swing().execute(controller, task)
+    pi = controllers.started(controller, task)
+    np.testing.assert_array_equal(executed.inputs, [pi(t, x) for t, x in enumerate(executed.states[:-1])])
+
+
 def test_the_trajectory_keeps_what_was_asked_for_where_the_environment_clips() -> None:
     task = Task([2.0, 0.5], horizon=3, dt=0.05)
     beyond = swing().execute(lambda t, x: np.array([50.0]), task)

@@ -145,6 +145,17 @@ def test_it_keeps_the_contract_of_a_system(arm: systems.MuJoCo) -> None:
     testing.check_system(arm, feedback, arm_task(arm)[0])
 
 
+def test_a_controller_with_memory_begins_anew_in_every_execution(arm: systems.MuJoCo) -> None:
+    tasks = arm_task(arm)
+    pid = controllers.PID([1.0, 1.0], [0.5, 0.5], [0.1, 0.1], components=(0, 1), limits=0.5)
+    model = models.Linear(np.eye(6), np.zeros((6, 2)))
+    testing.check_system(arm, pid.design(tasks[0], model), tasks[0])
+    batch = arm.execute(pid.design(tasks, model), tasks)
+    for index in range(5):
+        alone = arm.execute(pid.design(tasks[index], model), tasks[index])
+        np.testing.assert_allclose(batch[index].states, alone.states, rtol=0, atol=1e-12)
+
+
 # Kinematics and physics
 
 

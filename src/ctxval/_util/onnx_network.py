@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -25,32 +26,49 @@ class OnnxNetwork(ShortRepr):
     Its inputs and its output have one row for each task, shapes ``(N, k)``. If the file fixes N to 1, or the shapes are
     ``(k,)``, the network is called row by row. Its widths are the numbers of values in a row of each input and of the
     output, None if the file leaves them open; its precision is its relative rounding.
+
+    A recurrent network has states: all inputs after the first, and the new states as its last outputs in the same
+    order. They may also have the shape ``(L, N, k)``, as those of L layers; a row then has ``L k`` values.
     """
 
-    def __init__(self, source: str | Path | bytes) -> None:
+    def __init__(self, source: str | Path | bytes, recurrent: bool = False) -> None:
         contents = [source] if isinstance(source, bytes) else _contents(Path(source))
         # A single file goes to other processes as its bytes. Weights in a second file are found only by the path.
         self._source: bytes | str = contents[0] if len(contents) == 1 else str(Path(str(source)).absolute())
         self._digest = hashlib.sha256(b"".join(contents)).hexdigest()[:16]
         self._session = _session(self._source)
-        self.names = tuple(node.name for node in self._session.get_inputs())
-        nodes = [*self._session.get_inputs(), self._session.get_outputs()[0]]
-        rows = [_rows(node) for node in nodes]
-        self._types = [_TYPES[node.type] for node in nodes[:-1]]
-        self._flat = [row[0] for row in rows[:-1]]
-        self.widths: tuple[Width, ...] = tuple(row[2] for row in rows[:-1])
-        self.width: Width = rows[-1][2]
-        self._looped = any(flat or count is not None for flat, count, _ in rows)
-        fixed = {count for _, count, _ in rows if count is not None}
+        self._recurrent = recurrent
+        given, returned = self._session.get_inputs(), self._session.get_outputs()
+        self.names = tuple(node.name for node in given)
+        states = len(given) - 1 if recurrent else 0
+        if states >= len(returned):
+            got = f"the inputs {', '.join(self.names)} and the outputs {', '.join(node.name for node in returned)}"
+            raise InputError(f"the network must return a new state for each input after the first, got {got}.")
+        self._inputs = [_port(node, recurrent and i > 0) for i, node in enumerate(given)]
+        self._outputs = [_port(returned[0])]
+        self._outputs += [_port(node, True) for node in returned[len(returned) - states :]]
+        for old, new in zip(self._inputs[1:], self._outputs[1:], strict=False):
+            if None in (old.width, new.width) or old.width != new.width or old.layers != new.layers:
+                pair = f"{old.name!r} has {old.width} and {new.name!r} has {new.width}"
+                raise InputError(f"a state and the new state must have the same number of values, got {pair}.")
+        self.widths: tuple[Width, ...] = tuple(port.width for port in self._inputs)
+        self.width: Width = self._outputs[0].width
+        ports = [*self._inputs, *self._outputs]
+        self._looped = any(port.flat or port.count is not None for port in ports)
+        fixed = {port.count for port in ports if port.count is not None}
         if fixed - {1}:
             raise InputError(f"the network must take any number of rows or one row, got {max(fixed)} rows.")
-        self.precision = max(float(np.finfo(_TYPES[node.type]).eps) for node in nodes)
+        self.precision = max(float(np.finfo(port.kind).eps) for port in ports)
 
     def describe(self) -> dict[str, Any]:
         return {"onnx": self._digest}
 
     def __call__(self, *inputs: Array) -> Array:
         """Return the first output ``(..., l)`` of the network for one array ``(..., k)`` for each of its inputs."""
+        return self.outputs(*inputs)[0]
+
+    def outputs(self, *inputs: Array) -> list[Array]:
+        """Return the first output ``(..., l)`` and the new states of a recurrent network, each ``(..., k)``."""
         if len(inputs) != len(self.widths):
             raise ShapeError(f"the network has {len(self.widths)} inputs, {', '.join(self.names)}, got {len(inputs)}.")
         for name, width, array in zip(self.names, self.widths, inputs, strict=True):
@@ -60,25 +78,51 @@ class OnnxNetwork(ShortRepr):
         rows = [rows_of(np.broadcast_to(array, (*batch, array.shape[-1]))) for array in inputs]
         count = len(rows[0])
         if not self._looped:
-            output = self._run(rows)
+            outputs = self._run(rows)
         else:
-            output = np.array([self._run([row[i : i + 1] for row in rows]).reshape(-1) for i in range(count)])
-        if output.ndim != 2 or len(output) != count:
-            raise ShapeError(f"the network must return one row for each of {count} rows, got shape {output.shape}.")
-        return output.reshape(*batch, -1)
+            each = [self._run([row[i : i + 1] for row in rows]) for i in range(count)]
+            outputs = [np.array([one[k].reshape(-1) for one in each]) for k in range(len(self._outputs))]
+        for output in outputs:
+            if output.ndim != 2 or len(output) != count:
+                raise ShapeError(f"the network must return one row for each of {count} rows, got shape {output.shape}.")
+        return [output.reshape(*batch, -1) for output in outputs]
 
-    def _run(self, rows: list[Array]) -> Array:
-        feeds = {
-            name: np.ascontiguousarray(row.reshape(-1) if flat else row, dtype=kind)
-            for name, row, flat, kind in zip(self.names, rows, self._flat, self._types, strict=True)
-        }
+    def _run(self, rows: list[Array]) -> list[Array]:
+        feeds = {port.name: port.fed(row) for port, row in zip(self._inputs, rows, strict=True)}
         try:
-            return np.asarray(self._session.run(None, feeds)[0], dtype=np.float64)
+            outputs = self._session.run([port.name for port in self._outputs], feeds)
         except Exception as error:  # onnxruntime's exceptions have no base class of their own
             raise ModelError(f"the network cannot be evaluated: {error}") from error
+        return [port.read(output) for port, output in zip(self._outputs, outputs, strict=True)]
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return OnnxNetwork, (self._source,)
+        return OnnxNetwork, (self._source, self._recurrent)
+
+
+@dataclass(frozen=True)
+class _Port:
+    """An input or output: one flat row, rows, or the rows of L layers; counts and widths are None if they are open."""
+
+    name: str
+    kind: type[np.float32] | type[np.float64]
+    flat: bool
+    layers: int | None
+    count: int | None
+    width: Width
+
+    def fed(self, rows: Array) -> Array:
+        """Return rows ``(N, k)`` in the shape of the port."""
+        shaped = rows.reshape(-1) if self.flat else rows
+        if self.layers is not None:
+            shaped = np.moveaxis(rows.reshape(len(rows), self.layers, -1), 1, 0)
+        return np.ascontiguousarray(shaped, dtype=self.kind)
+
+    def read(self, values: Any) -> Array:
+        """Return what the network returned as rows ``(N, k)``."""
+        array = np.asarray(values, dtype=np.float64)
+        if self.layers is None or array.ndim != 3:
+            return array
+        return np.moveaxis(array, 0, 1).reshape(array.shape[1], -1)
 
 
 def _contents(path: Path) -> list[bytes]:
@@ -103,10 +147,17 @@ def _session(source: bytes | str) -> Any:
         raise InputError(f"the file cannot be read as an ONNX network: {error}") from error
 
 
-def _rows(node: Any) -> tuple[bool, Width, Width]:
-    """Return whether an input or output is one flat row, and its numbers of rows and of values in a row, if fixed."""
-    if node.type not in _TYPES or not isinstance(node.shape, list) or len(node.shape) not in (1, 2):
-        got = f"{node.type} of shape {node.shape}"
-        raise InputError(f"the network's {node.name!r} must be real numbers (N, k) or (k,), got {got}.")
-    *count, width = (size if isinstance(size, int) else None for size in node.shape)
-    return not count, count[0] if count else None, width
+def _port(node: Any, layered: bool = False) -> _Port:
+    """Return an input or output of a network; a layered one may have the shape ``(L, N, k)``."""
+    shape = node.shape if isinstance(node.shape, list) else []
+    sizes = [size if isinstance(size, int) else None for size in shape]
+    layers = sizes[0] if layered and len(sizes) == 3 else None
+    if node.type not in _TYPES or (len(sizes) not in (1, 2) and layers is None):
+        wanted = "(N, k), (k,) or (L, N, k) with a fixed L" if layered else "(N, k) or (k,)"
+        raise InputError(
+            f"the network's {node.name!r} must be real numbers {wanted}, got {node.type} of shape {node.shape}."
+        )
+    *count, width = sizes if layers is None else sizes[1:]
+    if layers is not None and width is not None:
+        width *= layers
+    return _Port(node.name, _TYPES[node.type], not count, layers, count[0] if count else None, width)

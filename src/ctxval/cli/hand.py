@@ -96,7 +96,11 @@ def ask(
     out.say(f"trial {waiting.number}: {task}")
     out.say(f"{', '.join(files)} in {folder}")
     if "controller.json" not in files:
-        out.say("the controller cannot be written to a file: this is possible only for affine feedback (LQR and iLQR).")
+        out.say(
+            "the controller cannot be written to a file: this is possible only for affine feedback (LQR and iLQR). Run "
+            f"its loop in Python: `plan = campaign.reopen({waiting.number}).plan`, then `pi = controllers.started("
+            "plan.controller, plan.task)` and `u = pi(t, x)` at each step."
+        )
     if (waiting.trial.note or {}).get(CONVERGED) is False:
         out.say("the design of the controller did not converge: nearly the same task may have another controller.")
     if others:

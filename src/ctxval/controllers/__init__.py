@@ -6,27 +6,43 @@ from ctxval._util.registry import Registry
 from ctxval.controllers.ilqr import ILQR, ILQRSolution
 from ctxval.controllers.lqr import LQR, StationaryLQR
 from ctxval.controllers.mpc import MPC, RecedingHorizon
-from ctxval.controllers.onnx_policy import OnnxPolicy
-from ctxval.core.controller import AffineFeedback, BoundPolicy, Limits, Policy, Synthesizer
+from ctxval.controllers.onnx_policy import OnnxPolicy, RecurrentPolicy
+from ctxval.controllers.pid import PID, PIDFeedback
+from ctxval.core.controller import (
+    AffineFeedback,
+    BoundPolicy,
+    ControllerRun,
+    ControllerWithMemory,
+    Limits,
+    Policy,
+    Synthesizer,
+    started,
+)
 from ctxval.core.exchange import ControllerFile, read_controller, write_controller
 
 __all__ = [
     "ILQR",
     "LQR",
     "MPC",
+    "PID",
     "REGISTRY",
     "AffineFeedback",
     "BoundPolicy",
     "ControllerFile",
+    "ControllerRun",
+    "ControllerWithMemory",
     "ILQRSolution",
     "Limits",
     "OnnxPolicy",
+    "PIDFeedback",
     "Policy",
     "RecedingHorizon",
+    "RecurrentPolicy",
     "StationaryLQR",
     "Synthesizer",
     "by_name",
     "read_controller",
+    "started",
     "write_controller",
 ]
 

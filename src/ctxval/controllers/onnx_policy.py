@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,6 @@ from ctxval._util.representation import ShortRepr
 from ctxval.core.controller import BoundPolicy, Limits, LimitsLike
 from ctxval.core.model import Model
 from ctxval.core.task import Task
-from ctxval.errors import InputError
 
 Observe = Callable[[int, Array, Task], Array]
 
@@ -26,6 +26,10 @@ class OnnxPolicy(ShortRepr):
 
     The network takes one row of observations for each task and returns the inputs as its first output, such as the
     means of a stochastic policy. Nothing in the file is executed as code.
+
+    A recurrent network has states besides: they are all inputs after the observations, and the new states are the last
+    outputs, in the same order. They are 0 at the first step, and the controller remembers them. Their shapes are
+    ``(N, k)``, or ``(L, N, k)`` for L layers.
 
     Args:
         source: the file, or its bytes.
@@ -46,21 +50,51 @@ class OnnxPolicy(ShortRepr):
         scale: float | Array = 1.0,
         limits: LimitsLike | None = None,
     ) -> None:
-        self.network = OnnxNetwork(source)
+        self.network = OnnxNetwork(source, recurrent=True)
         self.observe = observe
         self.scale = scale
         self.limits = None if limits is None else Limits.of(limits)
-        if len(self.network.widths) != 1:
-            names = ", ".join(self.network.names)
-            raise InputError(f"a policy must have one input, the observations, but the network has {names}.")
 
     def inputs(self, t: int, x: Array, task: Task) -> Array:
-        """Return the inputs ``(..., m)`` at step t before they are clipped."""
-        observations: Any = x if self.observe is None else self.observe(t, x, task)
-        return self.network(np.asarray(observations, dtype=np.float64)) * self.scale
+        """Return the inputs ``(..., m)`` at step t before they are clipped, of a network without states."""
+        return self.network(self.observations(t, x, task)) * self.scale
 
-    def design(self, task: Task, model: Model) -> BoundPolicy:
+    def observations(self, t: int, x: Array, task: Task) -> Array:
+        """Return what the network observes at step t, ``(..., k)``."""
+        observed: Any = x if self.observe is None else self.observe(t, x, task)
+        return np.asarray(observed, dtype=np.float64)
+
+    def design(self, task: Task, model: Model) -> BoundPolicy | RecurrentPolicy:
+        if len(self.network.widths) > 1:
+            return RecurrentPolicy(self, task)
         return BoundPolicy(self.inputs, task, self.limits)
 
     def describe(self) -> dict[str, Any]:
         return {name: getattr(self, name) for name in ("network", "observe", "scale", "limits")}
+
+
+@dataclass(frozen=True, eq=False)
+class RecurrentPolicy(ShortRepr):
+    """The controller of a recurrent network for one task or a batch; its memory are the states of the network."""
+
+    policy: OnnxPolicy
+    task: Task
+
+    @property
+    def limits(self) -> Limits | None:
+        """The limits of the inputs; None if there are none."""
+        return self.policy.limits
+
+    def start(self, task: Task) -> tuple[Array, ...]:
+        """Return states ``(..., k)`` of the network that are 0."""
+        return tuple(np.zeros((*task.batch_shape, width or 0)) for width in self.policy.network.widths[1:])
+
+    def step(self, t: int, x: Array, memory: tuple[Array, ...]) -> tuple[Array, tuple[Array, ...]]:
+        """Return the inputs ``(..., m)`` at step t, within the limits, and the new states of the network."""
+        u, *new = self.policy.network.outputs(self.policy.observations(t, x, self.task), *memory)
+        u = u * self.policy.scale
+        return (u if self.limits is None else Limits.of(self.limits, u.shape[-1]).clip(u)), tuple(new)
+
+    def __getitem__(self, index: int) -> RecurrentPolicy:
+        """Return the controller of one task of the batch."""
+        return RecurrentPolicy(self.policy, self.task[index])

@@ -1,7 +1,8 @@
-"""Controllers, the synthesizers that design them, and limits of inputs."""
+"""Controllers with and without memory, the synthesizers that design them, and limits of inputs."""
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
@@ -10,13 +11,80 @@ import numpy as np
 
 from ctxval._util.arrays import Array, ArrayLike, Mask, as_floats
 from ctxval._util.registry import part
-from ctxval._util.representation import ShortRepr
+from ctxval._util.representation import ShortRepr, shown
 from ctxval.core.model import Model
 from ctxval.core.task import Task
 from ctxval.errors import InputError, ShapeError
 
-Controller = Callable[[int, Array], Array]
+Feedback = Callable[[int, Array], Array]
 """A function ``u = pi(t, x)`` from the index t of the step and the state ``(..., n)`` to the input ``(..., m)``."""
+
+
+@runtime_checkable
+class ControllerWithMemory(Protocol):
+    """A controller whose input depends on earlier steps too, such as a PID controller, an estimator or a filter.
+
+    The memory c is an array or any tree of arrays, with the batch axes of the task in front. Each run has a memory of
+    its own, which the closed loop holds. The controller itself never changes, so one controller runs on M, on S, on
+    many draws at once and in several processes.
+    """
+
+    def start(self, task: Task) -> Any:
+        """Return the memory before the first step, for one task or for a batch ``(...)``."""
+
+    def step(self, t: int, x: Array, memory: Any) -> tuple[Array, Any]:
+        """Return the pair of the inputs ``(..., m)`` in the states ``(..., n)`` at step t and the new memory."""
+
+
+Controller = Feedback | ControllerWithMemory
+"""A function ``u = pi(t, x)``, or an object with ``start`` and ``step``; :func:`started` runs both in the same way."""
+
+
+class ControllerRun(ShortRepr):
+    """One run of a controller with memory, as a function ``u = pi(t, x)`` that is called once for each step.
+
+    Attributes:
+        controller: the controller, of which this is one run.
+    """
+
+    def __init__(self, controller: ControllerWithMemory, task: Task) -> None:
+        self.controller = controller
+        # A copy, because a step may change the arrays of its memory, and they may be those of the controller.
+        self._memory = copy.deepcopy(controller.start(task))
+        self._next = 0
+
+    def __call__(self, t: int, x: Array) -> Array:
+        """Return the inputs ``(..., m)`` in the states ``(..., n)`` at the next step t."""
+        if t != self._next:
+            raise InputError(
+                f"a run of a controller with memory must be called once for each step in order, got step {t} in the "
+                f"place of step {self._next}; controllers.started(controller, task) starts another run."
+            )
+        returned = self.controller.step(t, x, self._memory)
+        if not (isinstance(returned, tuple) and len(returned) == 2):
+            raise InputError(f"step of a controller must return the pair (u, memory), got {shown(returned)}.")
+        u, self._memory = returned
+        self._next += 1
+        return np.array(u, dtype=np.float64)  # a copy, because it may be a part of the memory
+
+
+def is_controller(value: object) -> bool:
+    """Return whether an object is a function or has the methods of a controller with memory."""
+    return callable(value) or isinstance(value, ControllerWithMemory)
+
+
+def started(controller: Controller, task: Task) -> Feedback:
+    """Return a controller as the function ``u = pi(t, x)`` of one run of a task, or of a batch of tasks.
+
+    A controller without memory is that function. One with memory gets a :class:`ControllerRun`, which begins with the
+    memory of the task; call it once for each step, in order.
+    """
+    if isinstance(controller, ControllerWithMemory):
+        return ControllerRun(controller, task)
+    if not callable(controller):
+        wanted = "a function (t, x) -> u, or have the methods start(task) and step(t, x, memory)"
+        raise InputError(f"a controller must be {wanted}, got {shown(controller)}.")
+    return controller
 
 
 @runtime_checkable
@@ -186,7 +254,7 @@ class Policy(ShortRepr):
         self.batched = vectorized
         self.limits = None if limits is None else Limits.of(limits)
 
-    def design(self, task: Task, model: Model) -> Controller:
+    def design(self, task: Task, model: Model) -> BoundPolicy:
         """Return the policy bound to the task; the model is not used."""
         return BoundPolicy(self.policy, task, self.limits)
 

@@ -17,8 +17,8 @@ import numpy as np
 from ctxval._util.arrays import Array, as_finite, as_floats
 from ctxval._util.files import read_bytes, read_json, written_whole
 from ctxval._util.npz import Archive
-from ctxval._util.representation import ShortRepr
-from ctxval.core.controller import AffineFeedback, Limits
+from ctxval._util.representation import ShortRepr, shown
+from ctxval.core.controller import AffineFeedback, ControllerWithMemory, Limits
 from ctxval.core.task import Task
 from ctxval.errors import InputError, ShapeError
 
@@ -49,6 +49,9 @@ def write_controller(
     States and inputs are names and units of the components; ``x0, x1, ...`` and ``u0, u1, ...`` by default.
     """
     if not isinstance(controller, AffineFeedback):
+        if isinstance(controller, ControllerWithMemory):
+            loop = "run it step by step in Python, as controllers.started(controller, task)"
+            raise InputError(f"a controller with memory cannot be written to a file, got {shown(controller)}: {loop}.")
         raise InputError(f"only affine feedback, as of LQR and iLQR, can be written to a file, got {controller!r}.")
     if controller.gains.ndim != 3 or controller.inputs.ndim != 2:
         raise ShapeError(f"the controller must be for one task, with gains (H, m, n), got {controller.gains.shape}.")

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ctxval._util.representation import ShortRepr
-from ctxval.core.controller import Controller
+from ctxval.core.controller import Controller, started
 from ctxval.core.space import Parameters
 from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory, require_times
@@ -71,8 +71,9 @@ def require_execution(plan: Plan, trajectory: Trajectory, start_tolerance: float
 def gives_inputs(plan: Plan, trajectory: Trajectory, tolerance: float) -> bool:
     """Return whether the controller of a plan gives the recorded inputs at the recorded states.
 
-    The execution is then also one of this controller: a deterministic system cannot tell the two apart. The tolerance
-    is a share of the largest magnitude of each input.
+    The execution is then also one of this controller: a deterministic system cannot tell the two apart. A controller
+    with memory runs along the recorded states from the first one. The tolerance is a share of the largest magnitude of
+    each input.
     """
     states, inputs = trajectory.states, trajectory.inputs
     if plan.model_trajectory.states.shape != states.shape or plan.model_trajectory.inputs.shape != inputs.shape:
@@ -80,9 +81,9 @@ def gives_inputs(plan: Plan, trajectory: Trajectory, tolerance: float) -> bool:
     nearest = tolerance * np.maximum(np.abs(inputs).max(axis=0, initial=0.0), 1e-300)
     try:
         with np.errstate(all="ignore"):
+            pi = started(plan.controller, plan.task)
             return all(
-                bool((np.abs(np.asarray(plan.controller(t, states[t])) - inputs[t]) <= nearest).all())
-                for t in range(len(inputs))
+                bool((np.abs(np.asarray(pi(t, states[t])) - inputs[t]) <= nearest).all()) for t in range(len(inputs))
             )
     except Exception:  # the user's controller, at states that it never reached by itself
         return False

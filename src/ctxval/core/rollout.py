@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ctxval.core.controller import Controller
+from ctxval.core.controller import Controller, started
 from ctxval.core.model import Step
 from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory
@@ -20,7 +20,8 @@ def rollout(step: Step, controller: Controller, task: Task) -> Trajectory:
     """
     with np.errstate(all="ignore"):
         x = np.array(task.initial_state)
-        u = np.asarray(controller(0, x), dtype=np.float64)
+        pi = started(controller, task)
+        u = np.asarray(pi(0, x), dtype=np.float64)
         if u.shape[:-1] != x.shape[:-1] or u.ndim != x.ndim:
             raise ShapeError(f"the controller must return inputs of shape {(*x.shape[:-1], 'm')}, got {u.shape}.")
         states = np.empty((task.horizon + 1, *x.shape))
@@ -28,7 +29,7 @@ def rollout(step: Step, controller: Controller, task: Task) -> Trajectory:
         states[0], of_states, of_inputs = x, x.shape, u.shape
         for t in range(task.horizon):
             if t:
-                u = controller(t, x)
+                u = pi(t, x)
             # An attribute is looked at first, because other checks take as long as a small step.
             if getattr(u, "shape", None) != of_inputs and np.shape(u) != of_inputs:
                 wanted = f"inputs of shape {of_inputs} at every step"

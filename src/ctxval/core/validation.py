@@ -18,7 +18,7 @@ from ctxval._util.interrupts import raised_by_signal
 from ctxval._util.progress import advance
 from ctxval._util.representation import call, lines, shown
 from ctxval._util.texts import reason_of, text_of
-from ctxval.core.controller import Synthesizer
+from ctxval.core.controller import Synthesizer, is_controller
 from ctxval.core.distance import Distance
 from ctxval.core.labels import Labels
 from ctxval.core.model import Model, Step, as_model, require_time_step
@@ -229,7 +229,7 @@ class Validation:
             plans = [whole.of(k, self.space.parameters(point)) for k, point in enumerate(points)]
         except Exception:  # the user's own parts, which need not take a batch
             return None
-        return plans if all(callable(plan.controller) for plan in plans) else None
+        return plans if all(is_controller(plan.controller) for plan in plans) else None
 
     def distances(self, points: ArrayLike) -> Array:
         """Return d at points ``(N, d)``, shape ``(N,)``; NaN if the execution fails. Executes S N times.

@@ -13,7 +13,7 @@ import numpy as np
 
 from ctxval._util.arrays import Array, Mask, Rows
 from ctxval._util.progress import advance
-from ctxval.core.controller import Controller
+from ctxval.core.controller import Controller, ControllerWithMemory, started
 from ctxval.core.model import Step
 from ctxval.core.rollout import rollout
 from ctxval.core.task import Task
@@ -167,7 +167,7 @@ class LoopPlanner:
                 return np.asarray(draws.step(x[:, None], u[:, None])[:, 0])
 
             step: Step = draws.step if task.batch_shape else of_one_task
-            together = rollout(step, planned.controller, Task(start, horizon=task.horizon, dt=task.dt))
+            together = rollout(step, planned.controller, _with_states(task, start))
             loops = [Trajectory(together.times, together.states[s], together.inputs[s]) for s in range(S)]
         else:
             loops = [rollout(draws.model_of(s).step, planned.controller, task) for s in range(S)]
@@ -183,11 +183,14 @@ class LoopPlanner:
         """Return whether controllers take draws as another first axis; if not, one loop is run after the other."""
         if draws > 1 and self._together is None:
             start, controller = planned.task.initial_state, planned.controller
-            probe = start + 1e-3 * np.arange(draws).reshape(-1, *[1] * start.ndim)
+            probes = start + 1e-3 * np.arange(draws).reshape(-1, *[1] * start.ndim)
+            # The first input may not depend on the memory yet.
+            steps = min(10, planned.task.horizon) if isinstance(controller, ControllerWithMemory) else 1
             self._together = False
             with contextlib.suppress(Exception), np.errstate(all="ignore"):  # the user's controller
-                together = np.asarray(controller(0, probe))
-                one_by_one = np.stack([np.asarray(controller(0, row), dtype=np.float64) for row in probe])
+                together = _probed(controller, _with_states(planned.task, probes), steps)
+                each = (_probed(controller, _with_states(planned.task, probe), steps) for probe in probes)
+                one_by_one = np.stack(list(each), axis=1)
                 self._together = together.shape == one_by_one.shape and np.allclose(
                     together, one_by_one, equal_nan=True
                 )
@@ -218,6 +221,18 @@ class LoopPlanner:
             return np.array(np.inf)
         each = (self.measured(task[k], model[k], system[k]) for k in range(model.batch_shape[0]))
         return np.array([float(one) for one in each])
+
+
+def _with_states(task: Task, states: Array) -> Task:
+    """Return a task from other initial states ``(..., n)``, which may have further axes in front."""
+    reference = task.reference if task.has_goal else None
+    return Task(states, horizon=task.horizon, dt=task.dt, reference=reference)
+
+
+def _probed(controller: Controller, task: Task, steps: int) -> Array:
+    """Return the inputs ``(steps, ..., m)`` of a controller along states that change from step to step."""
+    pi, x = started(controller, task), np.array(task.initial_state)
+    return np.stack([np.asarray(pi(t, x * (1 + 0.1 * t)), dtype=np.float64) for t in range(steps)])
 
 
 def halved(function: Callable[[Rows], T], count: int) -> list[tuple[Rows, T | None]]:

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from ctxval._util.arrays import Array
-from ctxval.core.controller import Controller
+from ctxval.core.controller import Controller, started
 from ctxval.core.task import Task
 from ctxval.core.trajectory import COMPLETE, Trajectory
 from ctxval.errors import InputError, ShapeError
@@ -22,11 +22,11 @@ def run_episode(advance: Advance, controller: Controller, task: Task, inputs: in
     All values after that step are NaN, and the reason is the trajectory's ``ended``. An episode that ends with the last
     step of the horizon is complete.
     """
-    x = np.array(task.initial_state)
+    pi, x = started(controller, task), np.array(task.initial_state)
     states, applied = np.full((task.horizon + 1, len(x)), np.nan), np.full((task.horizon, inputs), np.nan)
     states[0] = x
     for t in range(task.horizon):
-        u = np.asarray(controller(t, x), dtype=np.float64)
+        u = np.asarray(pi(t, x), dtype=np.float64)
         if u.shape != (inputs,):
             wanted = f"the system's {inputs} inputs, shape ({inputs},)"
             raise ShapeError(f"the controller must return {wanted}, got {u.shape}.")

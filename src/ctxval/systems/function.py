@@ -8,7 +8,7 @@ from typing import Any
 from ctxval._util.arrays import as_floats
 from ctxval._util.registry import part
 from ctxval._util.representation import ShortRepr
-from ctxval.core.controller import Controller
+from ctxval.core.controller import Controller, Feedback, started
 from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory
 from ctxval.errors import ExecutionError, InputError
@@ -18,19 +18,20 @@ from ctxval.errors import ExecutionError, InputError
 class Function(ShortRepr):
     """A plain function ``(controller, task) -> trajectory`` as the true system: a robot's own driver, a simulator.
 
+    The function calls ``controller(t, x)`` for the inputs, once for each step in order if the controller has memory.
     It returns a trajectory, or the states ``(H + 1, n)`` and the inputs ``(H, m)``; a batched one takes a batch of
     tasks. If it raises an exception, the execution has failed for that reason. For a function of one step, ``(x, u) ->
     x_next``, use a :class:`Simulated` system.
     """
 
-    def __init__(self, execute: Callable[[Controller, Task], Any], *, batched: bool = False) -> None:
+    def __init__(self, execute: Callable[[Feedback, Task], Any], *, batched: bool = False) -> None:
         if not callable(execute):
             raise InputError(f"a system must be a function (controller, task) -> trajectory, got {execute!r}.")
         self.function = execute
         self.batched = batched
 
     def execute(self, controller: Controller, task: Task) -> Trajectory:
-        returned = self.function(controller, task)
+        returned = self.function(started(controller, task), task)
         if isinstance(returned, Trajectory):
             return returned
         try:

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from conftest import make_validation
-from ctxval import systems
+from ctxval import controllers, systems
 from ctxval.errors import InputError, ShapeError, UnknownNameError
 from ctxval.studies.fitting import Excitation, excitation
 
@@ -46,6 +46,20 @@ def test_runs_excite_the_system_within_limits_and_depend_on_seed_and_number() ->
     plain = validation.execute(plan)
     assert np.abs(first.inputs).max() <= 3.0 + 1e-12
     assert np.abs(first.inputs - plain.inputs).max() > 0.1
+
+
+def test_a_controller_with_memory_is_excited_too() -> None:
+    validation = make_validation()
+    validation.synthesizer = controllers.PID(-5.0, -1.0, -0.5, limits=3.0)
+    made = Excitation(validation, "random", 2.0, seed=4)
+    first, plan = made.run(0), made.plan(0)
+    np.testing.assert_array_equal(first.states, made.run(0).states)
+    np.testing.assert_array_equal(made.limits.high, [3.0])
+    # Its memory is that of the states that the excited system took.
+    pi = controllers.started(plan.controller, plan.task)
+    inputs = np.stack([pi(t, x) for t, x in enumerate(first.states[:-1])])
+    signal = excitation("random", plan.task.horizon, np.array([2.0]), np.random.default_rng([4, 0, 1]))
+    np.testing.assert_allclose(first.inputs, np.clip(inputs + signal, -3, 3), atol=1e-12)
 
 
 @pytest.mark.parametrize(
