@@ -189,7 +189,7 @@ def ranks(design: str, states: int, seed: int) -> dict[str, Any]:
         "transitions": len(transitions),
         "residual": ranked(truth.missed(x, u)[of_state], residuals, rng),
         "distance": ranked(d, planner.distances(draws, planned, RANKED)[one_each], rng),
-        "left_out": max(draws.left_out),
+        "left_out": draws.left_out,
         "noise": posterior.noise,
         "seconds": seconds,
     }

@@ -323,14 +323,13 @@ def test_the_report_of_very_many_trials_stays_small(tmp_path: Path) -> None:
     store.describe_first({"name": "many", "validation": {"space": space}})
     rng = np.random.default_rng(0)
     model = Trajectory(np.arange(201.0), np.zeros((201, 3)), np.zeros((200, 2)))
-    with store._database.transaction():  # one transaction, because each waits for the disk
-        for number, point in enumerate(rng.random((3000, 2))):
-            named = {"a": float(point[0]), "b": float(point[1])}
-            trial = Trial(number, "iid", "completed", point, named, 1, True, float(point.sum()))
-            store._insert(trial)
-            if number % 5 == 0:
-                store._trajectories.write(number, "model", model)
-                store._trajectories.write(number, "system", Trajectory(model.times, rng.random((201, 3)), model.inputs))
+    new: list[tuple[Trial, Trajectory | None, Trajectory | None]] = []
+    for number, point in enumerate(rng.random((3000, 2))):
+        named = {"a": float(point[0]), "b": float(point[1])}
+        trial = Trial(number, "iid", "completed", point, named, 1, True, float(point.sum()))
+        executed = Trajectory(model.times, rng.random((201, 3)), model.inputs)
+        new.append((trial, None, None) if number % 5 else (trial, model, executed))
+    store.add(new)
     path = report.write_page(context_of_store(store, 1.9, certificate=POSTERIOR), tmp_path / "many.html")
     assert path.stat().st_size < 1_500_000
     assert "cannot be shown" not in path.read_text(encoding="utf-8")
