@@ -108,7 +108,7 @@ def test_the_new_kind_is_found_by_name_and_judges(recipe: ModuleType) -> None:
     assert verdict.answer == "validated"
     assert "the lipschitz bound is " in verdict.reason
     assert verdict.rests_on is not None
-    assert verdict.rests_on.startswith("It rests on the slope that you stated; on this campaign")
+    assert "It rests on the slope that you stated; on the threshold not being chosen" in verdict.rests_on
     missing = campaign.verdict(1e3, certificate=CertificateOptions(recipe.Lipschitz()))
     assert (missing.answer, missing.reason[:23]) == ("undecided", "a lipschitz bound needs")
     assert campaign.verdict(1e-6, certificate=CertificateOptions(kind)).answer == "falsified"

@@ -497,7 +497,7 @@ def test_a_run_names_what_its_verdict_rests_on_and_the_other_campaigns(invoke) -
     assert "the folder contains 1 other store of this experiment: runs/short-gp-ucb-seed0.sqlite" in again.stdout
     report = json.loads(invoke(*arguments, "--seed", "1", "--json").stdout)
     assert report["other_stores"] == ["runs/short-gp-ucb-seed0.sqlite"]
-    assert report["rests_on"].startswith("It rests on")
+    assert "It rests on" in report["rests_on"]
 
 
 @pytest.mark.slow
