@@ -193,3 +193,14 @@ def test_what_depends_on_the_task_is_found_by_tests_where_nobody_chose_to_look(n
     campaign = Campaign(DEVELOPMENT[name](seed).validation, seed=seed).run(25, 0.95 * largest)
     assert campaign.verdict(0.95 * largest).answer == "falsified"
     assert any(trial.origin == "spread" for trial in campaign.trials)
+
+
+def test_the_first_page_of_the_manual_has_the_numbers_of_the_stored_campaigns() -> None:
+    from calibrate_strangers import RULE
+    from calibrate_strangers import STORED as CAMPAIGNS
+
+    below = [line for line in CAMPAIGNS.select(rule=RULE, share=0.95) if line["entry"] in REPORTING]
+    false = sum(line["answer"] == "validated" for line in below)
+    page = " ".join((Path(__file__).parents[2] / "docs" / "index.md").read_text(encoding="utf-8").split())
+    assert f"Of {len(below)} campaigns on systems that break these assumptions" in page
+    assert f"{false} {'was' if false == 1 else 'were'} validated, which is false" in page
