@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from test_by_hand import MODULE
 from typer.testing import CliRunner
 
 from ctxval import Campaign, Task, TaskSpace, Trajectory, Validation, controllers, distances, models, systems
@@ -88,29 +89,16 @@ def test_a_person_runs_the_loop_step_by_step() -> None:
         rig.execute(plan.controller, plan.task)
 
 
-MODULE = """
-from ctxval import Experiment, Task, TaskSpace, Validation, controllers, distances, models, systems
-
-
-def experiment(seed):
-    rig = systems.Manual(states={"position": "m", "speed": "m/s"}, inputs={"force": "N"}, dt=0.1)
-    validation = Validation(
-        space=TaskSpace(goal=(0.5, 2.0, "m")),
-        task=lambda p: Task([0, 0], goal=[p.goal, 0], horizon=20, dt=rig.dt),
-        system=rig,
-        model=models.Linear([[1, 0.1], [0, 1]], [[0], [0.1]]),
-        synthesizer=controllers.PID(3.0, 1.0, 2.0, limits=3.0),
-        distance=distances.FinalState(components=[0]),
-    )
-    return Experiment("rig", validation, threshold=2.0, units="m")
-"""
+PID_RIG = MODULE.replace("LQR([10, 1], [0.1], limits=3.0)", "PID(3.0, 1.0, 2.0, limits=3.0)").replace(
+    "weights=(1, 1)", "components=[0]"
+)
 
 
 def test_the_files_of_a_trial_lack_the_controller_and_ask_tells_how_to_run_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "pid_rig.py").write_text(MODULE)
+    (tmp_path / "pid_rig.py").write_text(PID_RIG)
     monkeypatch.delitem(sys.modules, "pid_rig", raising=False)
     spoken = CliRunner().invoke(app, ["ask", "pid_rig:experiment", "--store", "rig.sqlite"])
     assert spoken.exit_code == 0, spoken.stderr

@@ -328,13 +328,10 @@ def not_selected(others: int, falsifying: Sequence[str]) -> str:
     lie = "store of this experiment lies" if others == 1 else "stores of this experiment lie"
     which = "none of them falsifies the threshold" if others > 1 else "it does not falsify the threshold"
     if falsifying:
-        count = "it falsifies" if others == 1 else f"{len(falsifying)} of them {_do(falsifying, 'falsif')}"
+        verb = "falsifies" if len(falsifying) == 1 else "falsify"
+        count = "it falsifies" if others == 1 else f"{len(falsifying)} of them {verb}"
         which = f"{count} the threshold ({enumerated(map(quoted, falsifying), 5)})"
     return f"{alone} ({others} other {lie} beside it, and {which})"
-
-
-def _do(those: Sequence[str], verb: str) -> str:
-    return f"{verb}ies" if len(those) == 1 else f"{verb}y"
 
 
 def _without_assumptions(certificate: Certificate, tau: float, quantities: Quantities) -> str:

@@ -12,7 +12,6 @@ from ctxval._util.checked import PositiveFloat, require
 from ctxval._util.files import write_text
 from ctxval._util.progress import stage
 from ctxval.campaign.provenance import provenance_of_store
-from ctxval.campaign.storage.other_stores import other_stores
 from ctxval.campaign.storage.store import Store
 from ctxval.certificates import KINDS, CertificateOptions, assess
 from ctxval.cli.base import command, out, print_other_stores, print_verdict, status_of
@@ -75,7 +74,7 @@ def certify_store(store: Path, asked: Asked, allowed: Allowed, audit: int | None
     with stage("certifying"):
         known = provenance_of_store(opened) if campaign is None else campaign.provenance
         assessment = assess(opened.trials(), options, limit, known)
-    others, verdict = [str(other.path) for other in other_stores(store)], assessment.verdict
+    others, verdict = [str(other.path) for other in known.beside], assessment.verdict
     if verdict is not None:
         print_verdict(verdict)
     if assessment.certificate is None:

@@ -17,9 +17,7 @@ from ctxval.learning.closed_loops import LoopPlanner
 from ctxval.learning.draws import DynamicsDraws
 from ctxval.learning.dynamics_posterior import DynamicsPosterior
 
-LEVELS = np.array(
-    [0.0, *2.0 ** np.arange(-4, 4)]
-)  # sizes of the pushes, as multiples of the largest recorded residual of a state
+LEVELS = np.array([0.0, *2.0 ** np.arange(-4, 4)])  # sizes of pushes, as multiples of the largest recorded residual
 NEAR = 0.05  # largest distance to a recorded state of what it shows, as a share of the range of each state
 
 
@@ -53,18 +51,16 @@ def push_response(planner: LoopPlanner, posterior: DynamicsPosterior, tasks: Arr
         low, high = np.quantile(visited[np.isfinite(visited).all(axis=1)], [1e-3, 1 - 1e-3], axis=0)
         widths = np.maximum(high - low, 1e-9)
         recorded = cKDTree((data.pairs * data.scale + data.shift)[:, :n] / widths)
+        everywhere = PushedDynamics(
+            model=posterior.model,
+            data=data,
+            expansions=posterior.mean.expansions,
+            limit=posterior.mean.limit,
+            pushes=pushes.reshape(-1, n),
+            widths=widths,
+        )
         largest = []
-        for records in (None, recorded):
-            mean = posterior.mean
-            pushed = PushedDynamics(
-                model=mean.model,
-                data=data,
-                expansions=mean.expansions,
-                limit=mean.limit,
-                pushes=pushes.reshape(-1, n),
-                widths=widths,
-                recorded=records,
-            )
+        for pushed in (everywhere, replace(everywhere, recorded=recorded)):
             distances = np.nan_to_num(planner.distances(pushed, planned, len(tasks)), nan=0.0, posinf=np.inf)
             signed = distances.max(axis=1).reshape(pushes.shape[:3])
             largest.append(np.maximum.accumulate(signed.max(axis=1), axis=1))
@@ -83,7 +79,7 @@ class PushedDynamics(DynamicsDraws):
 
     pushes: Array
     widths: Array
-    recorded: cKDTree | None
+    recorded: cKDTree | None = None
 
     def __len__(self) -> int:
         return len(self.pushes)

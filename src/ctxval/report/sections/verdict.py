@@ -7,7 +7,6 @@ import shlex
 from markupsafe import Markup
 
 from ctxval._util.representation import counted
-from ctxval.campaign.storage.other_stores import other_stores
 from ctxval.certificates import Certificate
 from ctxval.certificates.bounds import as_text, at_most, with_error
 from ctxval.report import markup
@@ -124,7 +123,7 @@ def _remarks(context: ReportContext) -> list[Markup]:
             remarks.append(paragraph(word, f" {'; '.join(names)} (below)"))
     if context.missing:
         remarks.append(paragraph(f"The experiment is not loaded: {context.missing}", class_="note"))
-    others = [] if context.store.path is None else other_stores(context.store.path)
+    others = context.provenance.beside
     if others:
         count, first = counted(len(others), "other store"), ", ".join(other.path.name for other in others[:5])
         sentence = (
