@@ -38,11 +38,13 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 pytest_plugins = ["browser"]
 """Fixtures that tests of several folders use."""
 
-settings.register_profile("ctxval", deadline=None, derandomize=True)
-settings.load_profile("ctxval")
+settings.register_profile("short", deadline=None, derandomize=True, max_examples=20)
+settings.register_profile("thorough", deadline=None, derandomize=True, max_examples=300)
+settings.load_profile("short")
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--thorough", action="store_true", help="what `make thorough` runs: more seeds and sizes")
     parser.addoption("--kills", type=int, default=10, help="how many campaigns are killed and resumed")
     parser.addoption("--switches", type=int, default=1, help="how often two processes on one store are switched")
 
@@ -56,6 +58,15 @@ def pytest_configure(config: pytest.Config) -> None:
     folder = tempfile.TemporaryDirectory()
     os.environ[STATE] = folder.name
     config.add_cleanup(folder.cleanup)
+    settings.load_profile("thorough" if config.getoption("thorough") else "short")
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Leave out the tests that only `make thorough` runs."""
+    if not config.getoption("thorough"):
+        left_out = [item for item in items if item.get_closest_marker("thorough")]
+        config.hook.pytest_deselected(items=left_out)
+        items[:] = [item for item in items if not item.get_closest_marker("thorough")]
 
 
 def make_validation(

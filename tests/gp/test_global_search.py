@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from ctxval._util.arrays import Array
@@ -135,7 +135,6 @@ def test_a_constant_function_is_searched_without_a_warning() -> None:
     assert search(lambda X: np.ones(len(X)), 4, evaluations=500).values[0] == 1.0
 
 
-@settings(max_examples=25, deadline=None)
 @given(st.integers(1, 12), st.integers(1, 700), st.integers(0, 40), st.integers(0, 2**32 - 1))
 def test_it_keeps_its_budget_and_stays_in_the_cube(dimension: int, evaluations: int, starts: int, seed: int) -> None:
     asked: list[Array] = []
