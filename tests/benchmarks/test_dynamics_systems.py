@@ -121,6 +121,7 @@ def test_stored_repeats_agree() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.thorough
 def test_a_dense_grid_finds_the_same_maximum(tmp_path: Path) -> None:
     entry, file = ENTRIES["drawn-smooth"], JsonLines(tmp_path / "truths.jsonl", STORED.key)
     record = dynamics_truths.truth(entry, 3, file)

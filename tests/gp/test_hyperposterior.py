@@ -36,7 +36,7 @@ def log_scales(draws: list[Conditioned]) -> np.ndarray:
 
 def quadrature(prior: Prior, X: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The posterior of one length-scale's logarithm: a grid, and its weights for each smoothness, shape ``(k, m)``."""
-    grid = np.linspace(-9.0, 7.0, 1601)
+    grid = np.linspace(-9.0, 7.0, 401)
     logs = np.empty((len(prior.smoothness), len(grid)))
     for row, nu in enumerate(prior.smoothness):
         for column, value in enumerate(grid):
