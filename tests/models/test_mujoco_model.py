@@ -33,7 +33,7 @@ def mjcf(damping: float) -> str:
     <sensor><jointpos name="angle" joint="hinge"/></sensor></mujoco>"""
 
 
-def recorded(seed: int = 0, steps: int = 150, damping: float = 0.08) -> Trajectory:
+def recorded(seed: int = 0, steps: int = 80, damping: float = 0.08) -> Trajectory:
     """Return a run of the true pendulum, recorded every 0.02 s."""
     model = mujoco.MjModel.from_xml_string(mjcf(damping))
     data, rng = mujoco.MjData(model), np.random.default_rng(seed)
@@ -94,6 +94,7 @@ def test_a_state_that_is_not_finite_or_at_which_mujoco_warns_has_no_next_state(
     assert np.isfinite(reached).all(axis=1).tolist() == [True, False, False]
 
 
+@pytest.mark.usefixtures("few_loops")
 def test_it_is_the_model_of_a_campaign_and_repeats_itself_in_a_store(tmp_path: Path) -> None:
     validation = Validation(
         space=TaskSpace(goal=(-1.0, 1.0, "rad")),
