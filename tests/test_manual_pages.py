@@ -101,7 +101,6 @@ def pages_left_out(manual: Path) -> Iterator[Path]:
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("few_loops")
 @pytest.mark.filterwarnings("ignore:FigureCanvasAgg:UserWarning")
 @pytest.mark.parametrize(
     "script",

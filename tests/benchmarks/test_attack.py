@@ -28,7 +28,6 @@ import attack  # noqa: E402
 import reliability  # noqa: E402
 from hostile import cage, clothes, doors, experiments, oracles  # noqa: E402
 from hostile.cage import Case, carry_out  # noqa: E402
-from small_searches import run_few_loops, take_few_draws  # noqa: E402
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="inputs are tried in forks")
 
@@ -41,10 +40,7 @@ NAMES = {module.__name__: module for module in (base64, ctypes, os, sqlite3, sys
 @pytest.fixture(scope="module")
 def base(tmp_path_factory: pytest.TempPathFactory) -> Path:
     attack._warm()
-    with pytest.MonkeyPatch.context() as monkeypatch:
-        take_few_draws(monkeypatch.setattr)
-        run_few_loops(monkeypatch.setattr)
-        return attack.prepare(tmp_path_factory.mktemp("attack") / "base")
+    return attack.prepare(tmp_path_factory.mktemp("attack") / "base")
 
 
 @pytest.mark.slow

@@ -38,7 +38,6 @@ def test_designs_that_rounding_stops_are_like_those_next_to_them(seed: int) -> N
 
 @pytest.mark.slow
 @pytest.mark.thorough
-@pytest.mark.usefixtures("few_loops")
 def test_verdicts_on_the_crane_are_true_and_its_worst_task_can_be_typed_again() -> None:
     validation = experiment(0).validation
     largest = truth(validation, 600)

@@ -77,7 +77,6 @@ def test_what_is_said_of_the_functions_is_so(case: str) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("few_loops")
 @pytest.mark.parametrize("name", HERE)
 def test_methods_stop_with_the_budget_and_repeat_themselves(name: str) -> None:
     first, again = (

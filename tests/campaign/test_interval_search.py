@@ -44,6 +44,7 @@ def linear(dim: int = 1, seed: int = 0):  # type: ignore[no-untyped-def]
 
 
 @pytest.mark.slow
+@pytest.mark.in_full
 def test_a_linear_system_is_validated_in_few_executions_by_a_bound_that_is_true() -> None:
     validation, largest = linear(2)
     campaign = Campaign(validation).run(16, 1.1 * largest)
@@ -60,7 +61,6 @@ def test_a_linear_system_is_validated_in_few_executions_by_a_bound_that_is_true(
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("few_draws")
 def test_an_undecided_verdict_names_the_task_that_is_executed_next() -> None:
     validation, largest = linear(2)
     campaign = Campaign(validation).run(3, 1.1 * largest)
@@ -174,7 +174,6 @@ def test_eight_drawn_tasks_are_executed_before_a_model_is_validated() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("few_draws")
 def test_the_posterior_bound_predicts_nothing() -> None:
     campaign = Campaign(make_validation(), seed=1)
     campaign.run(20, 1e3, certificate=CertificateOptions(Posterior()))

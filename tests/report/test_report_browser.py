@@ -28,7 +28,7 @@ POINT_AT_THE_END = """(chart) => {
   chart.dispatchEvent(new PointerEvent("pointermove", { clientX: box.right - 1, clientY: box.top + 1 }));
 }"""
 
-pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("few_loops")]
+pytestmark = pytest.mark.slow
 
 
 def case(name: str, executions: int) -> ReportContext:

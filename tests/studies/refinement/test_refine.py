@@ -23,9 +23,7 @@ from ctxval.studies.refinement.methods import method_of
 from ctxval.studies.refinement.refine import confidence_of_round
 from ctxval.studies.refinement.rounds import write_refined
 from rig_refine import BUDGET, FIRST, THRESHOLD, campaign, cart, make_cart, memory, refined
-from small_searches import run_few_loops, take_few_draws
 
-pytestmark = pytest.mark.usefixtures("few_loops")
 RIG = Path(__file__).parents[2] / "rig_refine.py"
 
 
@@ -37,10 +35,7 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def found(store: Path) -> Refinement:
-    with pytest.MonkeyPatch.context() as patch:
-        take_few_draws(patch.setattr)
-        run_few_loops(patch.setattr)
-        return refined(store)
+    return refined(store)
 
 
 @pytest.mark.slow
