@@ -193,7 +193,7 @@ child = subprocess.Popen([sys.executable, "-S", "-c", "import time; time.sleep(6
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("workers", [1, 2])
+@pytest.mark.parametrize("workers", [pytest.param(1, marks=pytest.mark.thorough), 2])
 def test_a_command_ends_with_a_campaign_that_is_killed(workers: int, tmp_path: Path) -> None:
     campaign = rig_command.start(tmp_path, seconds=60, workers=workers)
     deadline = time.monotonic() + 30
