@@ -10,11 +10,12 @@ from ctxval._util.arrays import Array
 from ctxval.errors import InputError
 from ctxval.searches import BayesianOptimisation, Random, Search, by_name
 from ctxval.testing import check_search
+from rig_thorough import more
 
 Function = Callable[[Array], Array]
 
 
-SEEDS = [0, *(pytest.param(seed, marks=pytest.mark.thorough) for seed in (1, 2))]
+SEEDS = [0, *more(1, 2)]
 
 
 def peak(X: Array) -> Array:
@@ -171,7 +172,7 @@ def test_it_keeps_the_contract_of_a_search() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("told", [21, *(pytest.param(told, marks=pytest.mark.thorough) for told in (1, 30, 43))])
+@pytest.mark.parametrize("told", [21, *more(1, 30, 43)])
 def test_told_its_history_late_and_in_another_order_it_asks_for_the_same_point(told: int) -> None:
     whole = BayesianOptimisation()
     values = run(whole, fold, 44, 5)

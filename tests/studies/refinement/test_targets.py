@@ -10,6 +10,7 @@ from ctxval.certificates import CertificateOptions
 from ctxval.paper.cases import pendulum
 from ctxval.studies.fitting import FittedParameter
 from ctxval.studies.refinement import ParameterFit, Records
+from rig_thorough import more
 
 CHEAP = CertificateOptions.posterior()
 """The certificate by which tasks are chosen; it costs less than the dynamics bound."""
@@ -20,7 +21,7 @@ def campaign(validation: Validation, seed: int) -> Campaign:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.thorough) for seed in (1, 2))])
+@pytest.mark.parametrize("seed", [0, *more(1, 2)])
 def test_a_linear_model_of_the_pendulum_is_brought_to_a_tenth(seed: int) -> None:
     validation = cases.by_name("pendulum", seed=seed).validation
     goals = validation.space.grid(101)
