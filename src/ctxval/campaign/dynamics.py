@@ -33,6 +33,7 @@ from ctxval.errors import CertificateError
 from ctxval.learning import DynamicsStudy, ExecutionPrediction, LearnedDynamics
 from ctxval.learning.closed_loops import LoopPlanner
 from ctxval.learning.coverage import Coverage, Gap
+from ctxval.learning.noisy_draws import GROUPS
 from ctxval.learning.tolerance import LEVELS, PushResponse
 from ctxval.learning.vector import Executed
 from ctxval.learning.worst_case import WorstCase
@@ -201,10 +202,12 @@ class CampaignDynamics:
         self, learned: LearnedDynamics, trials: Sequence[Trial], draws: int, confidence: float
     ) -> DynamicsEvidence:
         evidence = self._evidence(learned, trials, learned.worst_case_of(draws))
+        noisy = learned.noisy
+        groups = GROUPS if noisy is not None else len(learned.posterior.components)
         evidence = replace(
             evidence,
-            noise=learned.posterior.noise,
-            groups=len(evidence.maxima) // len(learned.posterior.components),
+            noise=learned.posterior.noise if noisy is None else noisy.noise,
+            groups=len(evidence.maxima) // groups,
             without_model=learned.posterior.covariances.without_model,
         )
         best = largest_distance(trials)
@@ -213,10 +216,12 @@ class CampaignDynamics:
             return evidence
         # Many closed loops, which only matter to a bound that nothing else withdraws.
         evidence = _with_jumps(evidence, learned, bound)
+        if noisy is not None:
+            return evidence  # a push is compared with residuals of state and input, which do not hold here
         return replace(evidence, pushed=_pushed(learned.push_response, self._coordinates(learned)))
 
     def _evidence(self, learned: LearnedDynamics, trials: Sequence[Trial], worst: WorstCase) -> DynamicsEvidence:
-        names, untried = self._study.validation.space.names, learned.untried_parameter
+        names, untried, noisy = self._study.validation.space.names, learned.untried_parameter, learned.noisy
         return DynamicsEvidence(
             worst.maxima,
             worst.points,
@@ -232,6 +237,8 @@ class CampaignDynamics:
             untried=None if untried is None else UntriedParameter(names[untried[0]], *untried[1:]),
             sharpness=worst.sharpness,
             dense=worst.points.shape[1] <= DENSE and self._study.planner.batched,
+            quantile=noisy.quantile if noisy is not None and noisy.is_noisy else None,
+            lags=0 if noisy is None else noisy.fit.history.structure.lags,
         )
 
     def _coordinates(self, learned: LearnedDynamics) -> tuple[str, ...]:
@@ -280,6 +287,9 @@ class CampaignDynamics:
         trajectory = self._store.trajectory(trial.number, "system")
         score = None if trajectory is None else prediction.score(trajectory, distance)
         z2, rank = (np.nan, np.nan) if score is None else (score.z2, score.rank)
+        if prediction.noise is not None and score is not None:
+            noise = prediction.noise
+            how |= {"quantiles": noise.distances, "runs": noise.runs, "p_values": score.p_values}
         return CheckedPrediction(trial.number, rank, prediction.median, prediction.upper, distance, z2, **how)
 
     def stored_prediction(self, trial: Trial) -> ExecutionPrediction | None:

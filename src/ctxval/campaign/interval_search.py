@@ -22,6 +22,7 @@ from ctxval.campaign.trials import TrialRecorder
 from ctxval.certificates import CertificateOptions, CheckedPrediction, DynamicsEvidence, Sample, StoppingRule, Verdict
 from ctxval.certificates.anytime import AnytimeAudit
 from ctxval.certificates.automatic import Automatic
+from ctxval.certificates.bets import bets_against
 from ctxval.certificates.bounds import with_units
 from ctxval.certificates.covering import RESOLUTION, covering
 from ctxval.certificates.dynamics import Dynamics, bound_of, certify_dynamics
@@ -40,6 +41,8 @@ from ctxval.certificates.dynamics_diagnostics import (
 from ctxval.certificates.options import WITHIN
 from ctxval.certificates.posterior import Posterior
 from ctxval.certificates.prediction_tests import DRAWN, fewest_spread_tests, next_spread_test
+from ctxval.certificates.verdict import counterexample, quantile_of
+from ctxval.certificates.verdict_sentences import NO_UNITS
 from ctxval.core.trial import Trial
 from ctxval.errors import CertificateError, InputError
 
@@ -99,7 +102,10 @@ class IntervalSearch:
     def choose(self) -> Choice | None:
         """Return the next task; None if the interval decides."""
         if self.best > self.limit:
-            return None
+            if (repeated := self._against_noise()) is not None:
+                return repeated
+            if self._is_falsified:
+                return None
         if isinstance(self.options.kind, AnytimeAudit):
             return self._by_draws(self.options.kind)
         if (test := self._next_test()) is not None:
@@ -107,7 +113,8 @@ class IntervalSearch:
         evidence = self._evidence()
         if evidence is not None and (task := self._beside_a_failed_test(evidence)) is not None:
             return Choice(task, "covering", planned_draws=0, rejected=0)
-        if evidence is None or self._fails(evidence):
+        noisy = evidence is not None and evidence.quantile is not None
+        if evidence is None or (self._fails(evidence) and not noisy):
             return self._by_distance()
         if self._may_decide(evidence):
             whole = self.recorder.dynamics.evidence(self.recorder.trials, self.options.confidence, keep=self.keeps)
@@ -116,7 +123,7 @@ class IntervalSearch:
             evidence = replace(whole, tests=self.tests)
             if self._decides(evidence):
                 return None
-        if isinstance(self.options.kind, Automatic):
+        if isinstance(self.options.kind, Automatic) and not noisy:
             known = self._points(self.recorder.trials)
             patient = sum(trial.origin not in DRAWN for trial in self.recorder.trials) < _PATIENCE
             # In few dimensions, executions soon cover the tasks, and the posterior bound of the distance may decide.
@@ -125,6 +132,36 @@ class IntervalSearch:
                 if not patient or choice is None:
                     return choice
         return self._by_evidence(evidence)
+
+    @property
+    def _is_falsified(self) -> bool:
+        """Whether the executed distances falsify the limit; of a noisy system, one above it may not suffice."""
+        kind, confidence = self.options.kind, self.options.confidence
+        return counterexample(self.recorder.trials, self.limit, NO_UNITS, confidence, quantile_of(kind)) is not None
+
+    def _against_noise(self) -> Choice | None:
+        """Return a task whose execution tells whether noise explains a distance above the limit.
+
+        It is None if the system is not noisy, if the limit is falsified, or if no task is predicted to exceed it.
+        """
+        trials, quantile = self.recorder.trials, quantile_of(self.options.kind)
+        bets = bets_against(trials, self.limit, quantile)
+        if not self.predicts or (bets is not None and bets.falsify(self.options.confidence)):
+            return None
+        learned = self.recorder.dynamics.learned(trials)
+        if learned is None or learned.noisy is None or not learned.noisy.is_noisy:
+            return None
+        worst = max((trial for trial in trials if trial.distance is not None), key=lambda trial: trial.distance or 0.0)
+        tasks = [worst.unit_point, learned.worst_of_mean.elites[0]]
+        chances = []
+        for task in tasks:
+            predicted = learned.predict(task)
+            noise = None if predicted is None else predicted.noise
+            chances.append(0.0 if noise is None else noise.chance_of_more(self.limit))
+        best = int(np.argmax(chances))
+        if chances[best] <= 1 - quantile:
+            return None
+        return Choice(tasks[best], "covering", planned_draws=0, rejected=0)
 
     def _by_evidence(self, evidence: DynamicsEvidence) -> Choice:
         """Return the task that the learned dynamics choose, or a test if nothing else is missing."""

@@ -72,8 +72,8 @@ class Automatic(CertificateKind):
         if self.uses_dynamics(sample):
             with suppress(CertificateError):
                 by_dynamics = _certified(Dynamics(tests=self.tests), sample, threshold, confidence)
-        if by_dynamics is not None and _decides(by_dynamics[0], threshold):
-            return by_dynamics
+        if by_dynamics is not None and (_decides(by_dynamics[0], threshold) or _is_noisy(by_dynamics[0])):
+            return by_dynamics  # the posterior bound of the distance is about systems without noise
         try:
             by_distance = self._tested(_certified(self.posterior, sample, threshold, confidence), sample)
         except CertificateError:
@@ -119,3 +119,7 @@ def _decides(certificate: Certificate, threshold: float | None) -> bool:
 def _is_sound(certificate: Certificate) -> bool:
     """Return whether a certificate is not withdrawn, and no prediction failed that raises its bound."""
     return certificate.doubt is None and certificate.details.get("raised_from") is None
+
+
+def _is_noisy(certificate: Certificate) -> bool:
+    return certificate.details.get("quantile") is not None

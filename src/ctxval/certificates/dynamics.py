@@ -150,7 +150,7 @@ def certify_dynamics(sample: Sample, evidence: DynamicsEvidence, confidence: Pro
     differing = sample.differing(1e-6 * bound)
     return Certificate(
         kind="dynamics",
-        statement=dynamics_statement(upper, error, confidence),
+        statement=dynamics_statement(upper, error, confidence, evidence.quantile),
         upper_bound=upper,
         confidence=confidence,
         volume=0.0,
@@ -185,6 +185,8 @@ def certify_dynamics(sample: Sample, evidence: DynamicsEvidence, confidence: Pro
             "largest_gap_at": coverage.marginal.place,
             "resolution": coverage.resolution,
             "noise": evidence.noise,
+            "quantile": evidence.quantile,
+            "lags": evidence.lags,
             "without_model": evidence.without_model,
             "sharpness": evidence.sharpness,
             "jump": evidence.jump,
@@ -196,7 +198,7 @@ def certify_dynamics(sample: Sample, evidence: DynamicsEvidence, confidence: Pro
             "differing": None if differing is None else [sample.numbers[row] for row in differing],
         },
         doubt=both_outcomes(sample, stochastic=False)
-        or _undeclared_noise(sample, bound)
+        or (None if evidence.quantile is not None else _undeclared_noise(sample, bound))
         or doubt_of(evidence, sample.best, bound),
         error=error,
     )
@@ -226,4 +228,6 @@ def bound_of(evidence: DynamicsEvidence, best: float, confidence: float) -> floa
     If predictions failed, the bound is much higher: see :func:`~ctxval.certificates.dynamics_diagnostics.raised`.
     """
     excess = max((prediction.excess for prediction in evidence.predictions[-PREDICTIONS:]), default=0.0)
-    return max(evidence.upper(confidence) * evidence.missed, best) + 0.5 * excess
+    upper = evidence.upper(confidence) * evidence.missed
+    # A noisy execution may exceed the quantile that is bounded.
+    return (max(upper, best) if evidence.quantile is None else upper) + 0.5 * excess

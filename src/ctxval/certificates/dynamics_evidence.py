@@ -11,6 +11,7 @@ import numpy as np
 from ctxval._util.arrays import Array
 from ctxval._util.representation import ShortRepr
 from ctxval.certificates.prediction_tests import TESTS
+from ctxval.core.quantiles import LEVELS, chance_of_more
 from ctxval.core.trial import Origin
 
 
@@ -29,6 +30,9 @@ class CheckedPrediction(ShortRepr):
         new: whether the task differs from those that were executed before.
         origin: the reason why the task was chosen.
         point: the task, a point of the unit cube ``(d,)``.
+        quantiles: quantiles of the predicted distances at ``quantiles.LEVELS`` if the system is noisy; else empty.
+        runs: the number of predicted distances that these are of.
+        p_values: predicted probabilities of more than what statistics of the trajectory are; empty without noise.
     """
 
     trial: int
@@ -41,10 +45,27 @@ class CheckedPrediction(ShortRepr):
     new: bool = True
     origin: Origin = "acquisition"
     point: tuple[float, ...] = ()
+    quantiles: tuple[float, ...] = ()
+    runs: int = 0
+    p_values: tuple[float, ...] = ()
+
+    @property
+    def is_noisy(self) -> bool:
+        """Whether it predicts what noise does."""
+        return len(self.quantiles) > 0
+
+    def chance_of_more(self, distance: float) -> float:
+        """Return the predicted probability that an execution exceeds a distance; it is never 0."""
+        return chance_of_more(self.quantiles, distance, self.runs)
 
     @property
     def excess(self) -> float:
-        """How far the distance exceeds the prediction's median; infinity if nothing was predicted."""
+        """How far the distance exceeds the prediction's median, or its 0.9 quantile if the system is noisy.
+
+        It is infinity if nothing was predicted.
+        """
+        if self.is_noisy:
+            return max(self.distance - float(np.interp(0.9, LEVELS, self.quantiles)), 0.0)
         return max(self.distance - self.median, 0.0) if np.isfinite(self.median) else np.inf
 
     @property
@@ -54,10 +75,12 @@ class CheckedPrediction(ShortRepr):
 
     def to_json(self) -> dict[str, Any]:
         """Return all attributes, ready for JSON: numbers that are not finite are None."""
-        return {
+        plain = {
             name: None if isinstance(value, float) and not np.isfinite(value) else value
             for name, value in asdict(self).items()
         }
+        del plain["quantiles"], plain["runs"]
+        return plain
 
 
 @dataclass(frozen=True, eq=False)
@@ -205,6 +228,9 @@ class DynamicsEvidence(ShortRepr):
         disagreement: share by which the smaller result of these searches is below the larger one.
         tests: the number of tests that a bound needs; see :mod:`~ctxval.certificates.prediction_tests`.
         pushed: the largest distances if something pushes the system; None if the bound is withdrawn anyway.
+        quantile: the share of the executions of a task whose distances are below the maxima; None if the system is not
+            noisy, so that all are alike.
+        lags: number of earlier records and inputs that the learned dynamics depend on.
     """
 
     maxima: Array
@@ -228,6 +254,8 @@ class DynamicsEvidence(ShortRepr):
     disagreement: float = 0.0
     tests: int = TESTS
     pushed: PushedDistances | None = None
+    quantile: float | None = None
+    lags: int = 0
 
     def rank(self, confidence: float) -> int:
         """Return the row, in ascending order, of the maximum that d* stays below with this probability."""
@@ -258,7 +286,8 @@ class DynamicsEvidence(ShortRepr):
             arrays = {name: np.array(values[name], dtype=np.float64) for name in ("maxima", "points", "elites")}
             parts = {
                 "predictions": tuple(
-                    CheckedPrediction(**{**each, "point": tuple(each["point"])}) for each in values["predictions"]
+                    CheckedPrediction(**{**each, **{name: tuple(each[name]) for name in _TUPLES}})
+                    for each in values["predictions"]
                 ),
                 "coverage": StateInputCoverage(**{**coverage, **gaps, "task": np.array(coverage["task"])}),
                 "untried": untried and UntriedParameter(**{**untried, "task": np.array(untried["task"])}),
@@ -267,6 +296,9 @@ class DynamicsEvidence(ShortRepr):
             return cls(**{**values, **arrays, **parts})
         except (KeyError, TypeError, ValueError):
             return None
+
+
+_TUPLES = ("point", "quantiles", "p_values")
 
 
 def _gap(values: Any) -> Any:

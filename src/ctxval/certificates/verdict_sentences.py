@@ -11,6 +11,7 @@ import numpy as np
 
 from ctxval._util.representation import counted, shown
 from ctxval._util.texts import enumerated, parted, quoted
+from ctxval.certificates.bets import Bets
 from ctxval.certificates.bounds import at_most, of_tasks, percent, with_error, with_units
 from ctxval.certificates.covering import RESOLUTION
 from ctxval.certificates.dynamics_evidence import PushedDistances, Tolerance
@@ -73,8 +74,13 @@ NO_UNITS = Quantities()
 # Falsified
 
 
-def falsified(worst: Trial, trials: Sequence[Trial], tau: float, quantities: Quantities) -> str:
-    """Return which executed task exceeds a threshold, and how often an execution of the same task reproduced it."""
+def falsified(
+    worst: Trial, trials: Sequence[Trial], tau: float, quantities: Quantities, bets: Bets | None = None
+) -> str:
+    """Return which executed task exceeds a threshold, and how often an execution of the same task reproduced it.
+
+    ``bets`` are those of a noisy system.
+    """
     distance, limit = distinguishable(worst.distance or 0.0, tau)
     again = [(trial.distance or 0.0) > tau for trial in executions_of(worst, trials) if trial is not worst]
     reproduced = ""
@@ -85,7 +91,25 @@ def falsified(worst: Trial, trials: Sequence[Trial], tau: float, quantities: Qua
             reproduced += f" ({len(again) - sum(again)} of {len(again)} repetitions of the task did not exceed it)"
     return (
         f"trial {worst.number} was executed and its distance {quantities.of(distance)} exceeds {quantities.of(limit)}, "
-        f"at {quantities.task(worst)}{reproduced}."
+        f"at {quantities.task(worst)}{reproduced}{_beyond_noise(bets)}."
+    )
+
+
+def _beyond_noise(bets: Bets | None) -> str:
+    if bets is None:
+        return ""
+    return (
+        f"; {bets.above} of {counted(bets.executions, 'execution')} exceed it, more than noise explains if a share of "
+        f"the executions as stated stays below in every task (evidence {bets.wealth:.3g})"
+    )
+
+
+def noise_may_explain(bets: Bets, tau: float, quantities: Quantities) -> str:
+    """Return that executions exceed a threshold, and that noise may be the cause."""
+    exceed = "exceeds" if bets.above == 1 else "exceed"
+    return (
+        f"{bets.above} of {counted(bets.executions, 'execution')} {exceed} {quantities.of(f'{tau:.6g}')}, which noise "
+        f"may explain (evidence {bets.wealth:.3g} against the threshold)"
     )
 
 
@@ -121,7 +145,7 @@ def validated(certificate: Certificate, tau: float, quantities: Quantities) -> s
             f"{upper}, from {counted(certificate.trials, 'independent draw')}."
         )
     return (
-        f"{untested}every task{quantities.ranges} stays at or below {limit}: the {certificate.kind} bound is {upper}, "
+        f"{untested}{_which(certificate)}every task{quantities.ranges} stays at or below {limit}: the {certificate.kind} bound is {upper}, "
         f"with {level} {_condition(certificate, quantities)}."
     )
 
@@ -142,6 +166,12 @@ _UNTESTED = "no prediction was tested where nobody chose to look (tests = 0)"
 def _condition(certificate: Certificate, quantities: Quantities) -> str:
     """Return what the confidence of a bound on d* is, and the condition under which it holds."""
     if certificate.kind == "dynamics":
+        if certificate.details["quantile"] is not None:
+            return (
+                "probability under a Gaussian process with noise, if what M misses is a smooth function of recorded "
+                f"states and inputs{_of_lags(certificate)}, the same in every task and over time, and noise is "
+                "independent from step to step"
+            )
         missed = "the system" if certificate.details["without_model"] else "what M misses"
         return (
             f"probability under a Gaussian process, if {missed} is one smooth function of recorded state and input, "
@@ -154,6 +184,17 @@ def _condition(certificate: Certificate, quantities: Quantities) -> str:
             f"them{_unusual(certificate, quantities)}"
         )
     return "confidence, if its assumptions hold"
+
+
+def _which(certificate: Certificate) -> str:
+    """Return of which executions a bound holds, before "every task"; empty if all are alike."""
+    quantile = certificate.details.get("quantile")
+    return "" if quantile is None else f"in at least {100 * quantile:g} % of its executions, "
+
+
+def _of_lags(certificate: Certificate) -> str:
+    lags = certificate.details["lags"]
+    return "" if not lags else f" of the last {lags + 1} steps"
 
 
 def _unusual(certificate: Certificate, quantities: Quantities) -> str:
