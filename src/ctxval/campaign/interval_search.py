@@ -17,9 +17,9 @@ from ctxval._util.arrays import Array
 from ctxval.campaign.choices import Choice
 from ctxval.campaign.dynamics import NEAR
 from ctxval.campaign.history import largest_distance, waiting_points
-from ctxval.campaign.proposals import Steadiness
+from ctxval.campaign.proposals import Steadiness, spread_tests
 from ctxval.campaign.trials import TrialRecorder
-from ctxval.certificates import CertificateOptions, CheckedPrediction, DynamicsEvidence, Sample, StoppingRule, Verdict
+from ctxval.certificates import CertificateOptions, DynamicsEvidence, Sample, StoppingRule, Verdict
 from ctxval.certificates.anytime import AnytimeAudit
 from ctxval.certificates.automatic import Automatic
 from ctxval.certificates.bets import bets_against
@@ -34,13 +34,12 @@ from ctxval.certificates.dynamics_diagnostics import (
     missing_tests,
     only_tests_missing,
     raised,
-    tested,
     uncovered,
     untested,
 )
 from ctxval.certificates.options import WITHIN
 from ctxval.certificates.posterior import Posterior
-from ctxval.certificates.prediction_tests import DRAWN, fewest_spread_tests, next_spread_test
+from ctxval.certificates.prediction_tests import DRAWN, MANY, TESTS
 from ctxval.certificates.verdict import counterexample, quantile_of
 from ctxval.certificates.verdict_sentences import NO_UNITS
 from ctxval.core.trial import Trial
@@ -168,7 +167,7 @@ class IntervalSearch:
         best, limit, confidence, trials = self.best, self.limit, self.options.confidence, self.recorder.trials
         bound = self._bound(evidence)
         if max(bound, evidence.highest) <= limit and only_tests_missing(evidence, best, bound):
-            return self._test(evidence.predictions)
+            return self._test()
         learned = self.recorder.dynamics.learned(trials)
         steady = Steadiness(self.recorder.dynamics.planner, None if learned is None else learned.expected)
         point = next_task(evidence, self._points(self._ended), best, limit, confidence, steady)
@@ -251,7 +250,7 @@ class IntervalSearch:
         predictions = self.recorder.dynamics.checked(trials)
         if not predictions or not held(predictions[-1], self.best):
             return None
-        return self._test(predictions) if missing_tests(predictions, self.tests) else None
+        return self._test() if missing_tests(predictions, self.tests) else None
 
     def _beside_a_failed_test(self, evidence: DynamicsEvidence) -> Array | None:
         """Return a task where a test that failed may be worst; None if there is no such test, or all are executed.
@@ -276,21 +275,14 @@ class IntervalSearch:
                 return task
         return None
 
-    def _test(self, predictions: Sequence[CheckedPrediction] | None) -> Choice:
+    def _test(self) -> Choice:
         """Return the next task that tests predictions where nobody chose to look; see ``prediction_tests``."""
         trials = self.recorder.trials
-        if predictions is None:
-            tests = [(trial.unit_point, trial.origin) for trial in trials if trial.distance is not None]
-        else:
-            tests = [(np.array(test.point), test.origin) for test in tested(predictions, self.tests)]
-        tests += [(trial.unit_point, trial.origin) for trial in trials if trial.state == "open"]
-        points = np.array([point for point, _ in tests]).reshape(-1, self.recorder.validation.space.dimension)
-        drawn = sum(origin in DRAWN for _, origin in tests)
-        if self.tests - drawn > fewest_spread_tests(points):
-            # The results decide when the campaign ends, so the number of independent draws is not planned.
-            return Choice(self.recorder.draw(), "iid", planned_draws=0, rejected=0)
-        task = next_spread_test(points, self.recorder.draws.generator(trials))
-        return Choice(task, "spread", planned_draws=0, rejected=0)
+        # A hypercube that was begun is completed, because what a part of it shows must not decide that it is left.
+        if self.tests < MANY or spread_tests(trials) % TESTS:
+            return Choice(self.recorder.draws.test(trials), "spread", planned_draws=0, rejected=0)
+        # The results decide when the campaign ends, so the number of independent draws is not planned.
+        return Choice(self.recorder.draw(), "iid", planned_draws=0, rejected=0)
 
     def _by_draws(self, kind: AnytimeAudit) -> Choice | None:
         """Return the next independent draw of an anytime audit, which may end whenever its bound suffices."""
@@ -312,7 +304,7 @@ class IntervalSearch:
         if not now.decided:
             return Choice(now.next_point, "covering", planned_draws=0)
         missing = isinstance(kind, Automatic) and kind.missing_tests(Sample.of(self._ended))
-        return self._test(None) if missing else None
+        return self._test() if missing else None
 
 
 def is_decisive(options: CertificateOptions) -> bool:

@@ -16,7 +16,7 @@ from ctxval.certificates.dynamics import Dynamics
 from ctxval.certificates.dynamics_diagnostics import FEWEST
 from ctxval.certificates.forecast import Forecast
 from ctxval.certificates.posterior import Posterior
-from ctxval.certificates.prediction_tests import DRAWN, TESTS, fewest_missing_tests
+from ctxval.certificates.prediction_tests import DRAWN, TESTS, shown_by_tests
 from ctxval.certificates.sample import Sample
 from ctxval.certificates.verdict_sentences import supported as supported_by
 from ctxval.errors import CertificateError
@@ -86,16 +86,18 @@ class Automatic(CertificateKind):
         return by_dynamics if _is_sound(by_dynamics[0]) or supported else by_distance
 
     def missing_tests(self, sample: Sample) -> int:
-        """Return the fewest executions after which the posterior bound has seen tasks of the whole space."""
+        """Return the number of executions after which the posterior bound has seen tasks of the whole space."""
         known = np.isfinite(sample.distances)
         drawn = sum(origin in DRAWN for origin, is_known in zip(sample.origins, known, strict=True) if is_known)
-        return fewest_missing_tests(sample.points[known], drawn, self.tests)
+        return max(self.tests - drawn, 0)
 
     def _tested(self, outcome: _Outcome, sample: Sample) -> _Outcome:
         """Return the posterior bound, withdrawn if tasks of the whole space have not been executed."""
         certificate, expected = outcome
         origins = [origin for origin in sample.origins if self.tests and origin in DRAWN]
-        tests = {"drawn": len(origins), "independent": origins.count("iid"), "largest_error": None}
+        uniform, dimension = sample.distribution is None, sample.points.shape[1]
+        shown = shown_by_tests(origins, dimension, certificate.confidence, uniform=uniform)
+        tests = {**shown, "largest_error": None}
         doubt, missing = certificate.doubt, self.missing_tests(sample)
         if doubt is None and missing:
             doubt = (

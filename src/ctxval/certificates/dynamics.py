@@ -36,7 +36,7 @@ from ctxval.certificates.dynamics_diagnostics import (
 )
 from ctxval.certificates.dynamics_evidence import DynamicsEvidence
 from ctxval.certificates.forecast import Forecast
-from ctxval.certificates.prediction_tests import DRAWN, TESTS
+from ctxval.certificates.prediction_tests import DRAWN, TESTS, shown_by_tests
 from ctxval.certificates.sample import Sample, advice_to_remeasure, listed, require_learned
 from ctxval.certificates.sentences import (
     ONE_CAMPAIGN,
@@ -146,6 +146,7 @@ def certify_dynamics(sample: Sample, evidence: DynamicsEvidence, confidence: Pro
         )
     finite, last = evidence.maxima[np.isfinite(evidence.maxima)], counted(evidence, bound)[-PREDICTIONS:]
     drawn = [test for test in tested(evidence.predictions, evidence.tests) if test.origin in DRAWN]
+    origins = [test.origin for test in drawn]
     coverage, worst = evidence.coverage, failed(evidence, bound)
     differing = sample.differing(1e-6 * bound)
     return Certificate(
@@ -174,8 +175,7 @@ def certify_dynamics(sample: Sample, evidence: DynamicsEvidence, confidence: Pro
                 "held": sum(held(prediction, bound) for prediction in last),
             },
             "tests": {
-                "drawn": len(drawn),
-                "independent": sum(test.origin == "iid" for test in drawn),
+                **shown_by_tests(origins, sample.points.shape[1], confidence, uniform=sample.distribution is None),
                 "largest_error": max((test.error for test in drawn), default=None),
             },
             "checked": [{**each.to_json(), "held": bool(held(each, bound))} for each in evidence.predictions],

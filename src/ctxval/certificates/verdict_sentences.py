@@ -376,17 +376,19 @@ def not_selected(others: int, falsifying: Sequence[str]) -> str:
 
 
 def _without_assumptions(certificate: Certificate, tau: float, quantities: Quantities) -> str:
-    """Return what independent draws say whatever the system is: none of them exceeds the threshold.
+    """Return what drawn tests say whatever the system is: none of them exceeds the threshold.
 
-    This holds at any time: a share of v is missed by the first n draws with probability (1 - v)^n.
+    This holds at any time: see :func:`~ctxval.certificates.prediction_tests.share_missed`.
     """
-    draws = certificate.details.get("tests", {}).get("independent", 0)
-    if not draws:
+    tests = certificate.details.get("tests", {})
+    if tests.get("share_missed") is None:
         return ""
-    share = at_most(100 * (1 - (1 - certificate.confidence) ** (1 / draws)), 2)
+    draws = [f"{counted(tests['spread'], 'test')} drawn as a Latin hypercube"] if tests["spread"] else []
+    draws += [counted(tests["independent"], "independent draw")] if tests["independent"] else []
     return (
-        f" Without assumptions: at most {share} % {of_tasks(certificate.distribution)} exceed "
-        f"{quantities.of(f'{tau:.6g}')} ({counted(draws, 'independent draw')}, {percent(certificate.confidence)})."
+        f" Without assumptions: at most {at_most(100 * tests['share_missed'], 2)} % "
+        f"{of_tasks(certificate.distribution)} exceed {quantities.of(f'{tau:.6g}')} "
+        f"({' and '.join(draws)}, {percent(certificate.confidence)})."
     )
 
 
