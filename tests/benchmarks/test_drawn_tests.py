@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
-from study_drawn_tests import DESIGNS, LIFTS, POSTS, STORED, WIDEST, power_table, without_gaps  # noqa: E402
-
-from ctxval.certificates.prediction_tests import TESTS  # noqa: E402
+from ctxval.certificates.prediction_tests import TESTS
+from study_drawn_tests import DESIGNS, LIFTS, POSTS, STORED, WIDEST, power_table, without_gaps
 
 
 @pytest.mark.parametrize("design", DESIGNS)
