@@ -23,6 +23,7 @@ from ctxval.certificates.dynamics_evidence import (
     PushedDistances,
     StateInputCoverage,
     StateInputGap,
+    StatePocket,
     UntriedParameter,
 )
 from ctxval.core.labels import labels_of
@@ -216,6 +217,7 @@ class CampaignDynamics:
             return evidence
         # Many closed loops, which only matter to a bound that nothing else withdraws.
         evidence = _with_jumps(evidence, learned, bound)
+        evidence = replace(evidence, pocket=self._pocket(learned))
         if noisy is not None:
             return evidence  # a push is compared with residuals of state and input, which do not hold here
         return replace(evidence, pushed=_pushed(learned.push_response, self._coordinates(learned)))
@@ -240,6 +242,16 @@ class CampaignDynamics:
             quantile=noisy.quantile if noisy is not None and noisy.is_noisy else None,
             lags=0 if noisy is None else noisy.fit.history.structure.lags,
         )
+
+    def _pocket(self, learned: LearnedDynamics) -> StatePocket | None:
+        """Return the largest region that no execution has entered, by the names of its states."""
+        labels = self._coordinates(learned)[: len(learned.posterior.data.sizes)]
+        pocket = learned.pocket([parted(label)[1] for label in labels])
+        if pocket is None:
+            return None
+        names = [labels[i] for i in pocket.states]
+        place, within = (dict(zip(names, each.tolist(), strict=True)) for each in (pocket.place, pocket.within))
+        return StatePocket(pocket.size, place, within)
 
     def _coordinates(self, learned: LearnedDynamics) -> tuple[str, ...]:
         """Return the labels of the states and inputs, with units; ``x[0], ..., u[0], ...`` for those without names."""

@@ -14,7 +14,7 @@ predictions, and by far more if one of these predictions failed.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import ClassVar
 
 import numpy as np
@@ -193,6 +193,7 @@ def certify_dynamics(sample: Sample, evidence: DynamicsEvidence, confidence: Pro
             "missed": evidence.missed,
             "disagreement": evidence.disagreement,
             "variance_left_out": evidence.left_out,
+            "pocket": evidence.pocket and asdict(evidence.pocket),
             "pushed": evidence.pushed and evidence.pushed.to_json(),
             "failures": sample.failures,
             "differing": None if differing is None else [sample.numbers[row] for row in differing],

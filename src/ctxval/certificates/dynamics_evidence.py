@@ -119,6 +119,21 @@ class StateInputCoverage(ShortRepr):
     tasks: int
 
 
+@dataclass(frozen=True)
+class StatePocket:
+    """The largest region of two states that closed loops of tasks enter, and that no execution has entered.
+
+    Attributes:
+        size: its radius, as a share of the visited ranges.
+        place: its centre, by the labels of the states, in their units.
+        within: its radius in each of the two states; they are equal if both are places.
+    """
+
+    size: float
+    place: dict[str, float]
+    within: dict[str, float]
+
+
 @dataclass(frozen=True, eq=False)
 class UntriedParameter(ShortRepr):
     """A task parameter that hardly changes the closed loops of M.
@@ -231,6 +246,7 @@ class DynamicsEvidence(ShortRepr):
         quantile: the share of the executions of a task whose distances are below the maxima; None if the system is not
             noisy, so that all are alike.
         lags: number of earlier records and inputs that the learned dynamics depend on.
+        pocket: the largest region that no execution has entered; None if it is not known.
     """
 
     maxima: Array
@@ -256,6 +272,7 @@ class DynamicsEvidence(ShortRepr):
     pushed: PushedDistances | None = None
     quantile: float | None = None
     lags: int = 0
+    pocket: StatePocket | None = None
 
     def rank(self, confidence: float) -> int:
         """Return the row, in ascending order, of the maximum that d* stays below with this probability."""
@@ -292,6 +309,7 @@ class DynamicsEvidence(ShortRepr):
                 "coverage": StateInputCoverage(**{**coverage, **gaps, "task": np.array(coverage["task"])}),
                 "untried": untried and UntriedParameter(**{**untried, "task": np.array(untried["task"])}),
                 "pushed": values["pushed"] and PushedDistances.from_json(values["pushed"]),
+                "pocket": values["pocket"] and StatePocket(**values["pocket"]),
             }
             return cls(**{**values, **arrays, **parts})
         except (KeyError, TypeError, ValueError):

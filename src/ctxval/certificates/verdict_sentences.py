@@ -157,7 +157,8 @@ def evidence(certificate: Certificate, tau: float, quantities: Quantities) -> st
     best = certificate.details.get("best")
     largest = "" if best is None else f", the largest distance {quantities.of(f'{best:.4g}')}"
     executions = counted(certificate.trials, "execution")
-    return f"{executions}{largest}{_tested(certificate, tau)}.{_survives(certificate, tau)} "
+    shown = f"{executions}{largest}{_tested(certificate, tau)}"
+    return f"{shown}.{_survives(certificate, tau)}{_not_entered(certificate)} "
 
 
 _UNTESTED = "no prediction was tested where nobody chose to look (tests = 0)"
@@ -252,6 +253,19 @@ def _survives(certificate: Certificate, tau: float) -> str:
         f" It survives an unknown push of {_push(everywhere)} at every step, and of {_push(away)} where no record is "
         f"near; the largest residual seen is {largest}."
     )
+
+
+def _not_entered(certificate: Certificate) -> str:
+    """Return, as a sentence after a space, the largest region of two states that loops enter and no execution has."""
+    pocket = certificate.details.get("pocket")
+    if pocket is None:
+        return ""
+    radii = [(*parted(label), radius) for label, radius in pocket["within"].items()]
+    within = " and ".join(f"{f'{radius:.2g} {unit}'.rstrip()} in {name}" for name, unit, radius in radii)
+    if len({(unit, radius) for _, unit, radius in radii}) == 1:
+        _, unit, radius = radii[0]
+        within = f"{radius:.2g} {unit}".rstrip()
+    return f" No execution came within {within} of {with_units(pocket['place'])}, where predicted runs lead."
 
 
 def _push(tolerance: Tolerance) -> str:

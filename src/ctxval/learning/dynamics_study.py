@@ -21,7 +21,7 @@ from ctxval.core.trajectory import Trajectory, Transitions
 from ctxval.core.validation import Validation
 from ctxval.errors import InputError
 from ctxval.learning.closed_loops import LoopPlanner, distances_of, loop_pairs
-from ctxval.learning.coverage import Coverage, coverage
+from ctxval.learning.coverage import Coverage, Pocket, coverage, largest_pocket
 from ctxval.learning.dynamics_posterior import (
     DynamicsPosterior,
     LearnedCovariances,
@@ -342,6 +342,14 @@ class LearnedDynamics(ShortRepr):
         search = self.study.search
         tasks = [self.worst_of_mean.elites[:16], self.executed, search.pool[:16]]
         return push_response(self.study.planner, self.posterior, np.concatenate(tasks))
+
+    def pocket(self, units: Sequence[str]) -> Pocket | None:
+        """Return the largest region of two states, with these units, that loops enter and no execution has entered."""
+        planner = self.study.planner
+        with single_threaded():
+            loops = planner.run(self.posterior.mean, planner.plan(self.study.search.pool[:256]))
+        visited = np.concatenate([each.states.reshape(-1, len(units)) for each in loops])
+        return largest_pocket(visited[np.isfinite(visited).all(axis=1)], self.trajectories_of_system, units)
 
     @property
     def untried_parameter(self) -> tuple[int, float, Array] | None:
