@@ -299,8 +299,8 @@ def test_a_validation_says_what_it_survives() -> None:
             "No execution came within 0.2 m of x 0.55 m, y -0.35 m, where predicted runs lead.",
         ),
         (
-            StatePocket(0.1, {"angle [rad]": 1.0, "x[3]": 2.0}, {"angle [rad]": 0.3, "x[3]": 4.0}),
-            "No execution came within 0.3 rad in angle and 4 in x[3] of angle 1 rad, x[3] 2, where predicted runs lead.",
+            StatePocket(0.1, {"angle [rad]": 1.0, "z": 2.0}, {"angle [rad]": 0.3, "z": 4.0}),
+            "No execution came within 0.3 rad in angle and 4 in z of angle 1 rad, z 2, where predicted runs lead.",
         ),
     ],
 )
