@@ -32,7 +32,7 @@ def _cart(seed: int, system: Any) -> Experiment:
         model=models.Linear([[1, 0.05], [0, 1 - 0.3 * 0.05]], [[0], [0.05]]),
         synthesizer=controllers.LQR([1.0, 0.1], [0.1]),
         distance=distances.MaximumDeviation(components=(0,)),
-        start_tolerance=0.2,
+        start_tolerance=5.0,
     )  # fmt: skip
 
 
@@ -53,7 +53,7 @@ def _pendulum(seed: int, system: Any) -> Experiment:
         model=models.Linear([[1, 0.05], [0.05 * GRAVITY, 1]], [[0], [0.05]]),
         synthesizer=controllers.LQR([20.0, 2.0], [0.05]),
         distance=distances.MaximumDeviation(components=(0,)),
-        start_tolerance=0.2,
+        start_tolerance=5.0,
     )  # fmt: skip
 
 

@@ -27,6 +27,7 @@ from ctxval.certificates.dynamics_evidence import (
     UntriedParameter,
 )
 from ctxval.core.labels import labels_of
+from ctxval.core.quantiles import QUANTILE
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import REDEFINED, Trial
 from ctxval.core.validation import Validation
@@ -72,6 +73,12 @@ class CampaignDynamics:
         self.failure: str | None = None
         self._learned: dict[tuple[object, ...], tuple[Sequence[Trajectory], LearnedDynamics | None, str | None]] = {}
 
+    def use_quantile(self, quantile: float) -> None:
+        """State the share of the executions of a task that distances are about, if the system is noisy."""
+        if quantile != self._study.quantile:
+            self._study = DynamicsStudy(self._study.validation, self._study.seed, quantile)
+            self._learned = {}
+
     @property
     def planner(self) -> LoopPlanner:
         """Designs controllers and runs closed loops."""
@@ -86,7 +93,7 @@ class CampaignDynamics:
     ) -> LearnedDynamics | None:
         """Return what executed trials and other recordings teach; the latest are kept."""
         if not self._study.is_current:
-            self._study, self._learned = DynamicsStudy(self._study.validation, self._study.seed), {}
+            self._study, self._learned = self._study.anew(), {}
         # The other recordings are kept with what they taught, so that their identities stay theirs. A result may be
         # replaced, and then has another distance.
         key = (*((trial.number, trial.distance) for trial, _ in executed), *map(id, others))
@@ -192,12 +199,21 @@ class CampaignDynamics:
             except Exception as error:  # users' parts
                 self.failure, evidence = reason_of(error), None
         if keep and evidence is not None and not self.elsewhere():
-            self._store.keep_computed(_key(trials, confidence), evidence.to_json(), digest)
+            self._store.keep_computed(self._key(trials, confidence), evidence.to_json(), digest)
         return evidence
 
     def kept_evidence(self, trials: Sequence[Trial], confidence: float) -> DynamicsEvidence | None:
         """Return :meth:`evidence` that the store keeps for these trials; None if there is none."""
-        return None if self.elsewhere() else DynamicsEvidence.from_json(self._store.computed(_key(trials, confidence)))
+        return (
+            None
+            if self.elsewhere()
+            else DynamicsEvidence.from_json(self._store.computed(self._key(trials, confidence)))
+        )
+
+    def _key(self, trials: Sequence[Trial], confidence: float) -> str:
+        """Return the key of the evidence of some trials in the store."""
+        text = json.dumps([(trial.number, trial.state, trial.distance, trial.note) for trial in trials])
+        return f"evidence {confidence} {self._study.quantile} {hashlib.sha256(text.encode()).hexdigest()}"
 
     def _whole(
         self, learned: LearnedDynamics, trials: Sequence[Trial], draws: int, confidence: float
@@ -342,8 +358,9 @@ class LearnedFromTrials:
         prediction = self._predictions[before]
         return np.full(len(points), np.nan) if prediction is None else prediction.expected(points)[0]
 
-    def dynamics(self, confidence: float) -> DynamicsEvidence | None:
+    def dynamics(self, confidence: float, quantile: float = QUANTILE) -> DynamicsEvidence | None:
         """Return what the dynamics learned from all trials say about d*; None if nothing can be learned."""
+        self.study.use_quantile(quantile)
         evidence = self.study.evidence(self.trials, confidence)
         if evidence is None and self.study.failure is not None:
             raise CertificateError(f"no dynamics can be learned: {self.study.failure.rstrip('.')}.")
@@ -353,12 +370,6 @@ class LearnedFromTrials:
         """Return independent draws of tasks, points of the unit cube ``(count, d)``."""
         # This random stream is none of those of trials.
         return self.validation.space.unit_draws(count, np.random.default_rng([seed, 0x7461]))
-
-
-def _key(trials: Sequence[Trial], confidence: float) -> str:
-    """Return the key of the evidence of some trials in the store."""
-    text = json.dumps([(trial.number, trial.state, trial.distance, trial.note) for trial in trials])
-    return f"evidence {confidence} {hashlib.sha256(text.encode()).hexdigest()}"
 
 
 def _with_jumps(evidence: DynamicsEvidence, learned: LearnedDynamics, bound: float) -> DynamicsEvidence:

@@ -75,6 +75,7 @@ class IntervalSearch:
         if self.threshold is None and isinstance(self.options.kind, AnytimeAudit):
             raise InputError("an anytime audit ends by its threshold; state one, or run another certificate.")
         self.options.kind.require_usable(self.options.confidence, self.budget)
+        self.recorder.dynamics.use_quantile(quantile_of(self.options.kind))
 
     @property
     def limit(self) -> float:
@@ -112,8 +113,9 @@ class IntervalSearch:
         evidence = self._evidence()
         if evidence is not None and (task := self._beside_a_failed_test(evidence)) is not None:
             return Choice(task, "covering", planned_draws=0, rejected=0)
-        noisy = evidence is not None and evidence.quantile is not None
-        if evidence is None or (self._fails(evidence) and not noisy):
+        # Earlier predictions may have failed before it was known that a history or noise matters.
+        history = evidence is not None and (evidence.quantile is not None or evidence.lags > 0)
+        if evidence is None or (self._fails(evidence) and not history):
             return self._by_distance()
         if self._may_decide(evidence):
             whole = self.recorder.dynamics.evidence(self.recorder.trials, self.options.confidence, keep=self.keeps)
@@ -122,7 +124,7 @@ class IntervalSearch:
             evidence = replace(whole, tests=self.tests)
             if self._decides(evidence):
                 return None
-        if isinstance(self.options.kind, Automatic) and not noisy:
+        if isinstance(self.options.kind, Automatic) and evidence.quantile is None:
             known = self._points(self.recorder.trials)
             patient = sum(trial.origin not in DRAWN for trial in self.recorder.trials) < _PATIENCE
             # In few dimensions, executions soon cover the tasks, and the posterior bound of the distance may decide.

@@ -8,7 +8,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from ctxval._util.checked import NonNegativeInt, PositiveFloat
+from ctxval._util.checked import NonNegativeInt, PositiveFloat, Probability
 from ctxval._util.registry import part
 from ctxval.certificates.base import Certificate, CertificateKind
 from ctxval.certificates.covering import RESOLUTION
@@ -19,6 +19,7 @@ from ctxval.certificates.posterior import Posterior
 from ctxval.certificates.prediction_tests import DRAWN, TESTS, shown_by_tests
 from ctxval.certificates.sample import Sample
 from ctxval.certificates.verdict_sentences import supported as supported_by
+from ctxval.core.quantiles import QUANTILE
 from ctxval.errors import CertificateError
 
 _Outcome = tuple[Certificate, Forecast | None]
@@ -37,6 +38,7 @@ class Automatic(CertificateKind):
         stochastic, resolution: as for the posterior bound.
         tests: the number of executions at tasks drawn over the task space, which must be predicted beforehand if the
             bound is from learned dynamics.
+        quantile: the share of the executions of each task that the bound is about, if they differ by noise.
     """
 
     name: ClassVar[str] = "auto"
@@ -46,6 +48,7 @@ class Automatic(CertificateKind):
     stochastic: bool = False
     resolution: PositiveFloat = RESOLUTION
     tests: NonNegativeInt = TESTS
+    quantile: Probability = QUANTILE
 
     @property
     def posterior(self) -> Posterior:
@@ -71,7 +74,9 @@ class Automatic(CertificateKind):
         by_dynamics = None
         if self.uses_dynamics(sample):
             with suppress(CertificateError):
-                by_dynamics = _certified(Dynamics(tests=self.tests), sample, threshold, confidence)
+                by_dynamics = _certified(
+                    Dynamics(tests=self.tests, quantile=self.quantile), sample, threshold, confidence
+                )
         if by_dynamics is not None and (_decides(by_dynamics[0], threshold) or _is_noisy(by_dynamics[0])):
             return by_dynamics  # the posterior bound of the distance is about systems without noise
         try:

@@ -45,6 +45,7 @@ from ctxval.certificates.sentences import (
     dynamics_statement,
     two_distances,
 )
+from ctxval.core.quantiles import QUANTILE
 from ctxval.errors import CertificateError
 
 MOST_DRAWS = 400  # posterior samples of the dynamics, which limit the confidence
@@ -58,6 +59,7 @@ class Dynamics(CertificateKind):
     Attributes:
         stochastic: whether two executions of one task may differ; it must be False.
         tests: the number of executions that must have been predicted beforehand at tasks drawn over the task space.
+        quantile: the share of the executions of each task that the bound is about, if they differ by noise.
 
     Raises:
         CertificateError: if the system is declared stochastic.
@@ -68,6 +70,7 @@ class Dynamics(CertificateKind):
 
     stochastic: bool = False
     tests: NonNegativeInt = TESTS
+    quantile: Probability = QUANTILE
 
     def __post_init__(self) -> None:
         if self.stochastic:
@@ -101,7 +104,7 @@ class Dynamics(CertificateKind):
     def _evidence(self, sample: Sample, confidence: float) -> DynamicsEvidence:
         learned = require_learned(sample, self.name)
         _require_distances(sample)
-        evidence = learned.dynamics(confidence)
+        evidence = learned.dynamics(confidence, self.quantile)
         if evidence is None:
             raise CertificateError(
                 "no dynamics can be learned: there are no recorded trajectories, or M explains all of them, or no "

@@ -37,6 +37,7 @@ SHARP = 0.05  # share by which a large predicted distance may exceed the median 
 JUMP = 0.01  # jump of the predicted distance between nearly equal tasks, as a share of the bound
 DENSE = 2  # task parameters in which deeper searches may find the largest distance in spite of jumps
 NOISY_FEWEST = 5  # executions for a bound if the system is noisy
+NOISY_BEYOND = 0.06  # the same as BEYOND: noise leads a little beyond what a few executions have recorded
 NOISY_TESTED = 0.75  # the same as TESTED, of the median posterior sample, which has the noise of all executions
 TOLERATED = 0.02  # share of the bound by which a distance may exceed its prediction without being an excess
 UNLIKELY = 0.01  # least predicted probability of a distance as large as the executed one
@@ -221,7 +222,7 @@ def _uncovered(evidence: DynamicsEvidence) -> Iterator[str]:
     """Yield what the records and executions do not cover."""
     coverage, pair, untried = evidence.coverage, evidence.coverage.pair, evidence.untried
     goes_there = "`ctxval run` executes a task that goes there"
-    if coverage.beyond.size > (GAP if pair is None else BEYOND):
+    if coverage.beyond.size > (GAP if pair is None else BEYOND if evidence.quantile is None else NOISY_BEYOND):
         yield f"predicted runs leave the recorded range of {_at(coverage.beyond)}; {goes_there}"
     if coverage.marginal.size > GAP:
         yield f"predicted runs enter a gap in the records of {_at(coverage.marginal)}; {goes_there}"

@@ -11,7 +11,7 @@ import numpy as np
 from ctxval._util.arrays import Array
 from ctxval._util.representation import ShortRepr
 from ctxval.certificates.prediction_tests import TESTS
-from ctxval.core.quantiles import LEVELS, chance_of_more
+from ctxval.core.quantiles import LEVELS, QUANTILE, chance_of_more
 from ctxval.core.trial import Origin
 
 
@@ -333,10 +333,11 @@ class LearnedDistance(Protocol):
         They are learned from trials with numbers below ``before`` only.
         """
 
-    def dynamics(self, confidence: float) -> DynamicsEvidence | None:
+    def dynamics(self, confidence: float, quantile: float = QUANTILE) -> DynamicsEvidence | None:
         """Return what the dynamics learned from all trials say about d*; None if nothing can be learned.
 
-        The confidence sets the least number of posterior samples. Users' code raises a CertificateError.
+        If the system is noisy, it is about a quantile of the distance. The confidence
+        sets the least number of posterior samples. Users' code raises a CertificateError.
         """
 
     def tasks(self, count: int, seed: int) -> Array:

@@ -145,7 +145,8 @@ def validated(certificate: Certificate, tau: float, quantities: Quantities) -> s
             f"{upper}, from {counted(certificate.trials, 'independent draw')}."
         )
     return (
-        f"{untested}{_which(certificate)}every task{quantities.ranges} stays at or below {limit}: the {certificate.kind} bound is {upper}, "
+        f"{untested}every task{quantities.ranges} stays at or below {limit}{_which(certificate)}: the "
+        f"{certificate.kind} bound is {upper}, "
         f"with {level} {_condition(certificate, quantities)}."
     )
 
@@ -188,9 +189,9 @@ def _condition(certificate: Certificate, quantities: Quantities) -> str:
 
 
 def _which(certificate: Certificate) -> str:
-    """Return of which executions a bound holds, before "every task"; empty if all are alike."""
+    """Return in how many executions of a task a bound holds; empty if all of them are alike."""
     quantile = certificate.details.get("quantile")
-    return "" if quantile is None else f"in at least {100 * quantile:g} % of its executions, "
+    return "" if quantile is None else f" in at least {100 * quantile:g} % of its executions"
 
 
 def _of_lags(certificate: Certificate) -> str:

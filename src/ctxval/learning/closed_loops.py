@@ -174,7 +174,7 @@ class LoopPlanner:
             advance(R * len(one.rows))
         return draws.reduced(found.reshape(R, S, q).swapaxes(0, 1).reshape(S * R, q))
 
-    def _noisy_loops(self, draws: NoisyDraws, planned: PlannedTasks, of_draw: Array, replicates: Rows) -> Loops:
+    def _noisy_loops(self, draws: NoisyDraws, planned: PlannedTasks, of_draw: Rows, replicates: Rows) -> Loops:
         """Return closed loops of draws ``(L, q)`` with a sequence of noise for each row, ``(L,)``."""
         task, L = planned.task, len(replicates)
         of_replicate = np.broadcast_to(replicates[:, None], of_draw.shape)

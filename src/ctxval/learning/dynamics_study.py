@@ -61,6 +61,10 @@ class DynamicsStudy(ShortRepr):
         self._structures: OrderedDict[bytes, ChosenStructure] = OrderedDict()
         self._parts: tuple[str, bytes] | None = None
 
+    def anew(self) -> DynamicsStudy:
+        """Return a study of the same experiment that has learned nothing yet."""
+        return DynamicsStudy(self.validation, self.seed, self.quantile)
+
     @property
     def is_current(self) -> bool:
         """Whether M and the synthesizer are as they were; fitting M again in place would change what is kept."""
@@ -312,7 +316,9 @@ class LearnedDynamics(ShortRepr):
     @functools.cached_property
     def worst_of_mean(self) -> WorstCase:
         """The largest distance over some tasks on the posterior mean alone, as if it were the only draw."""
-        return self.study.search.on_mean(self._drawn_from, self._on_pool[0], self.executed, self._rng(4), globally=False)
+        return self.study.search.on_mean(
+            self._drawn_from, self._on_pool[0], self.executed, self._rng(4), globally=False
+        )
 
     def worst_case_of(self, draws: int) -> WorstCase:
         """Return the largest distance over all tasks, for each of at least so many draws of the dynamics."""

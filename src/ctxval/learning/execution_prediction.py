@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from itertools import pairwise
 from typing import Any, Self
@@ -46,7 +46,10 @@ class NoisePrediction(ShortRepr):
 
     def p_values(self, executed: Trajectory, deviation: float) -> tuple[float, ...]:
         """Return the predicted probabilities that the statistics exceed those of an execution."""
-        values = (deviation, *(float(each[0]) for each in _differences(executed.states[None], np.array(self.roughness))))
+        values = (
+            deviation,
+            *(float(each[0]) for each in _differences(executed.states[None], np.array(self.roughness))),
+        )
         chances = zip(self.statistics, values, strict=True)
         return tuple(chance_of_more(quantiles, value, self.runs) for quantiles, value in chances)
 
@@ -57,7 +60,6 @@ def _differences(states: Array, roughness: Array) -> tuple[Array, Array]:
         return np.zeros(len(states)), np.zeros(len(states))
     scaled = np.diff(states, 2, axis=1) / np.maximum(roughness, 1e-12)
     return (scaled**2).mean(axis=(1, 2)), np.abs(scaled).max(axis=(1, 2))
-
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ Innovations are drawn from those that were recorded, all states of a step togeth
 
 from __future__ import annotations
 
+import contextlib
 import functools
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -17,7 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import logsumexp
 
-from ctxval._util.arrays import Array
+from ctxval._util.arrays import Array, Mask
 from ctxval.core.model import Model
 from ctxval.learning.dynamics_posterior import DynamicsPosterior
 from ctxval.learning.features import Features, spread_rows
@@ -32,7 +33,7 @@ _AMPLITUDES = np.logspace(-4, 2, 19)  # of the residual, in root mean squares
 _NOISES = np.logspace(-3.3, 0.3, 18)  # standard deviations of the noise, in root mean squares of the residual
 
 DrawnWeights = tuple[Features, Array, Array]
-"""Features, weights ``(k, F, n)`` and standard deviations of the noise ``(k, n)`` of k draws, in the units of states."""
+"""Features, and weights ``(k, F, n)`` and standard deviations of the noise ``(k, n)`` of k draws."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +70,7 @@ class Scaled:
     @property
     def states(self) -> int:
         """The number n of states."""
-        return self.E.shape[1]
+        return int(self.E.shape[1])
 
     @functools.cached_property
     def centres(self) -> Array:
@@ -102,7 +103,7 @@ class InnovationsFit(ABC):
     history: History
     scaled: Scaled
     theta: Array
-    live: Array
+    live: Mask
     features: Features
     weights: Array
     noise: Array
@@ -140,6 +141,7 @@ class LaggedFit(InnovationsFit):
     rows: Array  # weights of the transitions, (N, 1)
 
     def draw(self, groups: int, each: int, rng: np.random.Generator) -> list[DrawnWeights]:
+        """Return draws in groups of the same hyperparameters."""
         theta, n = self.theta, self.scaled.states
         others = theta + 0.35 * rng.standard_normal((2 * groups, len(theta)))
         heights = np.array([_height(self.scaled, one, self.live, self.rows) for one in others])
@@ -192,7 +194,7 @@ class _WeightPosterior:
     sizes: Array
 
     @classmethod
-    def of(cls, features: Features, scaled: Scaled, live: Array, rows: Array) -> _WeightPosterior:
+    def of(cls, features: Features, scaled: Scaled, live: Mask, rows: Array) -> _WeightPosterior:
         sizes = scaled.sizes[live]
         spectrum = _Spectrum.of(features(scaled.Z) * rows, scaled.E[:, live] / sizes * rows)
         width, grids = min(0.3, 3 / np.sqrt(spectrum.count)), []
@@ -213,7 +215,7 @@ class _WeightPosterior:
         weights, noises = [], []
         for i, (heights, amplitudes, sds) in enumerate(self.grids):
             if rng is None:
-                j, k = np.unravel_index(int(heights.argmax()), heights.shape)
+                j, k = divmod(int(heights.argmax()), len(sds))
             else:
                 chances = np.exp(heights - heights.max()).ravel()
                 j, k = divmod(int(rng.choice(chances.size, p=chances / chances.sum())), len(sds))
@@ -226,7 +228,7 @@ class _WeightPosterior:
         return np.stack(weights, axis=1) * self.sizes, np.array(noises) * self.sizes
 
 
-def _height(scaled: Scaled, theta: Array, live: Array, rows: Array) -> float:
+def _height(scaled: Scaled, theta: Array, live: Mask, rows: Array) -> float:
     """Return the log posterior of hyperparameters, with amplitudes and noises integrated out on a grid."""
     try:
         features = scaled.features(theta)
@@ -238,7 +240,7 @@ def _height(scaled: Scaled, theta: Array, live: Array, rows: Array) -> float:
     return float(sum(logsumexp(each) - np.log(each.size) for each in heights) + prior)
 
 
-def learn_theta(scaled: Scaled, live: Array, lags: int) -> Array:
+def learn_theta(scaled: Scaled, live: Mask, lags: int) -> Array:
     """Return likely hyperparameters, by moves of one coordinate at a time."""
     theta = np.full(scaled.states + scaled.inputs + 2, _LENGTH)
     rows = np.ones((len(scaled.Z), 1))
@@ -256,7 +258,7 @@ def learn_theta(scaled: Scaled, live: Array, lags: int) -> Array:
     return theta
 
 
-def fit_lagged(history: History, records: Sequence[Record], pairs: Array, theta: Array | None, live: Array) -> LaggedFit:
+def fit_lagged(history: History, records: Sequence[Record], pairs: Array, theta: Array | None, live: Mask) -> LaggedFit:
     """Return the posterior if records are the state; hyperparameters are learned if they are not given."""
     Z, E, _ = history.along(records)
     scaled = Scaled.of(Z, E, pairs, records[0].inputs.shape[1])
@@ -270,7 +272,7 @@ def fit_lagged(history: History, records: Sequence[Record], pairs: Array, theta:
 
 
 def _conditioned(
-    history: History, scaled: Scaled, theta: Array, live: Array, rows: Array, local: LocalNoise | None
+    history: History, scaled: Scaled, theta: Array, live: Mask, rows: Array, local: LocalNoise | None
 ) -> LaggedFit:
     features = scaled.features(theta)
     posterior = _WeightPosterior.of(features, scaled, live, rows)
@@ -282,7 +284,7 @@ def _conditioned(
     return LaggedFit(history, scaled, theta, live, features, weights, noise, evidence, innovations, local, rows)
 
 
-def _unit(innovations: Array, live: Array) -> Array:
+def _unit(innovations: Array, live: Mask) -> Array:
     """Return innovations with a root mean square of 1 for each state, and 0 where the error of M is negligible."""
     sizes = np.sqrt((innovations**2).mean(axis=0))
     return np.where(live & (sizes > 0), innovations / np.maximum(sizes, 1e-300), 0.0)
@@ -298,6 +300,7 @@ class FilterFit(InnovationsFit):
     root: Array  # of the covariance of the weights, (F n, F n)
 
     def draw(self, groups: int, each: int, rng: np.random.Generator) -> list[DrawnWeights]:
+        """Return draws in one group: their hyperparameters are the same."""
         count, (F, n) = groups * each, self.weights.shape
         moved = (rng.standard_normal((count, F * n)) @ self.root.T).reshape(count, F, n) * self.live
         factors = np.exp(0.8 / np.sqrt(len(self.innovations)) * rng.standard_normal((count, n)))
@@ -327,14 +330,15 @@ def fit_filter(
     centres = scaled.centres[spread_rows(scaled.centres, FILTER_CENTRES)]
     features, sizes = scaled.features(theta, centres), np.maximum(plain.scaled.sizes, 1e-12)
     F, N = features(scaled.Z[:1]).shape[1], len(scaled.Z)
-    weights, noise, amplitudes = np.zeros((F, n)), np.maximum(0.8 * plain.noise, 1e-3 * sizes), 0.5 * sizes
+    weights: Array = np.zeros((F, n))
+    noise, amplitudes = np.maximum(0.8 * plain.noise, 1e-3 * sizes), 0.5 * sizes
     for _ in range(steps):
         innovations, G = _sensitivities(history, records, features, scaled, weights)
         Gw = (G / noise[:, None]).reshape(-1, F * n)
         prior = np.tile(1 / amplitudes**2, F)
         A = Gw.T @ Gw + np.diag(prior)
         target = (innovations / noise).ravel() + Gw @ weights.ravel()
-        weights = np.linalg.solve(A, Gw.T @ target).reshape(F, n)
+        weights = np.asarray(np.linalg.solve(A, Gw.T @ target)).reshape(F, n)
         left = (target - Gw @ weights.ravel()).reshape(-1, n) * noise
         covariance = np.linalg.inv(A)
         determined = np.maximum(F - (np.diag(covariance) * prior).reshape(F, n).sum(axis=0), 0.5)
@@ -346,7 +350,7 @@ def fit_filter(
     weights, noise = weights * live, noise * live
     fit = FilterFit(
         history, scaled, theta, live, features, weights, noise, 0.0, np.zeros((N, n)), None,
-        np.linalg.cholesky(0.5 * (covariance + covariance.T) + 1e-18 * np.eye(len(A))),
+        np.asarray(np.linalg.cholesky(0.5 * (covariance + covariance.T) + 1e-18 * np.eye(len(A)))),
     )  # fmt: skip
     innovations = history.along(records, fit.residual)[2]
     kept = np.tile(live, F)
@@ -400,6 +404,7 @@ STRUCTURES = (
 EXACT = 1e-3  # share of noise below which records with lags determine the next one
 NOISY = 0.01  # share of noise from which executions of one task differ
 _BETTER, _GOOD = 0.1, 0.02  # share of the error without a history, and of the residual, that a history leaves
+_UNEXPLAINED = 0.05  # share of the residual that nothing predicts if there is noise
 
 
 @dataclass(frozen=True, eq=False)
@@ -412,13 +417,14 @@ class ChosenStructure:
 
 
 def fit_structures(
-    model: Model, records: Sequence[Record], pairs: Array, live: Array, chosen: ChosenStructure | None = None
+    model: Model, records: Sequence[Record], pairs: Array, live: Mask, chosen: ChosenStructure | None = None
 ) -> tuple[InnovationsFit, ChosenStructure]:
     """Return the posterior of the most probable structure, or of a structure that was chosen before.
 
     Fewer lags are preferred: the fewest that determine the next record, or else those with the largest evidence.
     Measurement noise is considered if no lags determine it.
     """
+
     def lagged(structure: Structure, theta: Array | None) -> LaggedFit:
         history = History(model, structure, np.eye(len(live)))
         return fit_lagged(history, records, pairs, theta, live)
@@ -432,29 +438,29 @@ def fit_structures(
         plain = lagged(Structure(0 if chosen.structure.ratio else chosen.structure.lags), chosen.theta_of_states)
         return (filtered(chosen.structure, plain) if chosen.structure.ratio else plain), chosen
     longest = max(1, len(records))
-    plain = [lagged(s, None) for s in STRUCTURES if not s.ratio and s.lags <= longest]
-    exact = [fit for fit in plain if fit.share <= EXACT]
-    best: InnovationsFit = min(exact, key=_lags) if exact else max(plain, key=_preference)
+    fits: list[InnovationsFit] = [
+        lagged(structure, None) for structure in STRUCTURES if not structure.ratio and structure.lags <= longest
+    ]
+    of_states = fits[0]
+    least = min(fit.share for fit in fits)
+    exact = [fit for fit in fits if fit.share <= max(10 * least, 1e-6)] if least <= EXACT else []
+    best = min(exact, key=_lags) if exact else max(fits, key=_preference)
     if best.share > NOISY:
-        fits: list[InnovationsFit] = [best]
         for structure in STRUCTURES:
             if structure.ratio and structure.lags <= longest:
-                try:
-                    fits.append(filtered(structure, plain[0]))
-                except np.linalg.LinAlgError:
-                    continue
+                with contextlib.suppress(np.linalg.LinAlgError):
+                    fits.append(filtered(structure, of_states))
         best = max(fits, key=_preference)
     structure = best.history.structure
-    of_states = plain[0] if structure.ratio else best
-    return best, ChosenStructure(structure, best.theta, of_states.theta)
+    return best, ChosenStructure(structure, best.theta, (of_states if structure.ratio else best).theta)
 
 
 def predicted_by_history(
     posterior: DynamicsPosterior, records: Sequence[Record], pairs: Array, without_history: Array
 ) -> bool:
-    """Return whether a history predicts the last record far better than state and input do, which were left out.
+    """Return whether a history predicts the last record far better than state and input do, or neither predicts it.
 
-    ``without_history`` has the predictions ``(H, n)`` of its states without a history, learned from the other records.
+    The last record is left out. ``without_history`` has the predictions ``(H, n)`` of its states without a history, learned from the other records.
     """
     last, sizes, live = records[-1], posterior.data.sizes, posterior.data.learned
 
@@ -464,7 +470,8 @@ def predicted_by_history(
     without = share(last.states[1:] - without_history)
     if without < EXACT:
         return False
-    for lags in (1, 2):
+    shares = []
+    for lags in (1, 2, 3):
         history = History(posterior.model, Structure(lags), np.eye(len(live)))
         Z, E, _ = history.along(records[:-1])
         scaled = Scaled.of(Z, E, pairs, last.inputs.shape[1])
@@ -473,7 +480,8 @@ def predicted_by_history(
         with_history = share(history.along([last], fit.residual)[2])
         if with_history < min(_BETTER * without, _GOOD):
             return True
-    return False
+        shares += [with_history, fit.share]
+    return min(without, *shares) > _UNEXPLAINED  # noise
 
 
 def _lags(fit: InnovationsFit) -> int:

@@ -1,5 +1,7 @@
-"""Noisy dynamics: their posterior, and draws of it. A draw has a residual and sequences of noise, and its distance
-is a quantile over these."""
+"""Noisy dynamics: their posterior, and draws of it.
+
+A draw has a residual and sequences of noise, and its distance is a quantile over these.
+"""
 
 from __future__ import annotations
 
@@ -65,7 +67,7 @@ class NoisyDraws(ShortRepr):
     @property
     def replicates(self) -> int:
         """The number R of sequences of noise."""
-        return self.rows.shape[1]
+        return int(self.rows.shape[1])
 
     def with_replicates(self, count: int, rng: np.random.Generator) -> NoisyDraws:
         """Return the same residuals with other sequences of noise."""
@@ -203,7 +205,11 @@ class NoisyPosterior(ShortRepr):
         return self.mean.without_noise()
 
     def draw(
-        self, relevant: Array, rng: np.random.Generator, functions: int | None = None, hyperparameters: int | None = None
+        self,
+        relevant: Array,
+        rng: np.random.Generator,
+        functions: int | None = None,
+        hyperparameters: int | None = None,
     ) -> NoisyDraws:
         """Return draws; see :meth:`DynamicsPosterior.draw`. Nothing depends on ``relevant``."""
         groups, each = GROUPS, EACH if functions is None else functions
