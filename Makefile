@@ -8,7 +8,7 @@ CAMPAIGNS ?= 120
 # Small dense algebra is faster on one thread.
 export OMP_NUM_THREADS = 1
 
-.PHONY: demo test quick check docs reliability interleavings crash-states attack lowest bench bench-peers study study-refine reproduce search global-search calibrate drawn-tests parts pictures posterior-ranks clean
+.PHONY: demo test quick thorough check docs reliability interleavings crash-states attack lowest bench bench-peers study study-refine reproduce search global-search calibrate drawn-tests parts pictures posterior-ranks clean
 
 demo: .venv/.installed
 	$(BIN)/ctxval run pendulum
@@ -18,6 +18,9 @@ test: check
 
 quick: .venv/.test  ## everything that takes less than half a second, on all cores, for daily work
 	$(BIN)/python -m pytest -q -m "not slow" --numprocesses auto --dist worksteal
+
+thorough: .venv/.test  ## `make test` with more seeds, sizes and examples; takes about an hour
+	$(BIN)/python -m pytest --thorough --numprocesses auto --dist worksteal
 
 check: .venv/.test
 	$(BIN)/ruff check .

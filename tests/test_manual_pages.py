@@ -95,7 +95,6 @@ def pages_left_out(manual: Path) -> Iterator[Path]:
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("few_loops")
 @pytest.mark.filterwarnings("ignore:FigureCanvasAgg:UserWarning")
 @pytest.mark.parametrize("script", GALLERY, ids=lambda path: path.stem)
 def test_a_script_of_the_gallery_runs(

@@ -444,7 +444,6 @@ def test_a_campaign_stops_before_the_execution_that_is_not_needed(validation: Va
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("few_draws")
 def test_a_campaign_executes_what_nothing_came_near_to_before_it_validates(tmp_path: Path) -> None:
     def campaign(name: str) -> Campaign:
         return Campaign(make_validation(), search=OneCorner(), seed=1, store=tmp_path / name)
@@ -474,7 +473,6 @@ def test_a_campaign_ends_at_its_counterexample(validation: Validation) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("few_draws")
 def test_workers_decide_together(validation: Validation) -> None:
     class InOrder(cf.Executor):
         """Executes each task as soon as it is submitted, so that results come in the same order on any machine."""

@@ -54,9 +54,6 @@ number = 3
 """
 
 
-pytestmark = pytest.mark.usefixtures("few_loops")
-
-
 @pytest.fixture
 def invoke(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):  # type: ignore[no-untyped-def]
     """Run the command line in an empty folder with one module in it."""

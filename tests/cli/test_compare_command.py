@@ -45,7 +45,6 @@ name = "gp-ucb"
 [synthesizer]
 type = "LQR"
 """
-pytestmark = pytest.mark.usefixtures("few_loops")
 
 STEP = """
 def step(x, u):

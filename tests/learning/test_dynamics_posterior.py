@@ -114,6 +114,7 @@ def test_draws_have_the_moments_of_the_posterior_at_pivots(family: tuple[float, 
 
 
 @pytest.mark.slow
+@pytest.mark.thorough
 def test_between_many_pivots_draws_have_the_moments_of_the_posterior_too() -> None:
     rng, one = np.random.default_rng(1), component()
     relevant, between = rng.uniform(-2, 2, (400, 2)), rng.uniform(-1.9, 1.9, (12, 2))
@@ -218,13 +219,13 @@ def test_too_few_transitions_leave_a_linear_system_uncertain_where_they_do_not_l
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, *(pytest.param(other, marks=pytest.mark.thorough) for other in (1, 2))])
 @pytest.mark.parametrize("deviation", [0.01, 0.05])
-def test_noise_is_learned_within_a_factor_of_two(deviation: float) -> None:
-    for seed in range(3):
-        transitions = record(250, truth=models.Function(rough, vectorized=True), noise=deviation, seed=seed)
-        posterior = learn(transitions, seed)
-        expected = (deviation / posterior.data.sizes.min()) ** 2
-        assert 0.5 < posterior.noise / expected < 2
+def test_noise_is_learned_within_a_factor_of_two(deviation: float, seed: int) -> None:
+    transitions = record(250, truth=models.Function(rough, vectorized=True), noise=deviation, seed=seed)
+    posterior = learn(transitions, seed)
+    expected = (deviation / posterior.data.sizes.min()) ** 2
+    assert 0.5 < posterior.noise / expected < 2
 
 
 @pytest.mark.slow

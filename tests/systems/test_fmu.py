@@ -553,7 +553,6 @@ name = "gp-ucb"
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("few_loops")
 def test_an_experiment_file_validates_a_learned_model_on_an_fmu(
     path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -18,7 +18,7 @@ from ctxval.core.trial import Trial
 from ctxval.web.security import HEADERS, MOST_UPLOAD
 from rig_page import Response, Server, ctxval, new_store, record, serving
 
-pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("few_loops")]
+pytestmark = pytest.mark.slow
 
 SHORT = b"t,position,speed,force\n0,0,0,1\n0.1,0,0,1\n"
 """A recording of two times."""

@@ -192,7 +192,7 @@ def test_the_gaussian_process_does_the_tasks_and_the_linear_model_does_not(aspec
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.thorough)])
 def test_the_gaussian_process_mimics_the_arm_best_and_the_linear_model_worst(seed: int) -> None:
     settings = replace(arm.Settings(), restarts=1, training=300)
     largest = {}

@@ -32,8 +32,6 @@ from ctxval.errors import InputError
 from ctxval.studies.comparison import CandidateResult, PairResult
 from ctxval.studies.comparison.candidates import TrialNote
 
-pytestmark = pytest.mark.usefixtures("few_loops")
-
 
 def plant(x: np.ndarray, u: np.ndarray) -> np.ndarray:
     drag = 0.3 * x[..., 1] * np.abs(x[..., 1])

@@ -31,7 +31,6 @@ def test_a_linear_model_of_the_pendulum_is_brought_to_a_tenth(seed: int) -> None
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("few_loops")
 def test_executions_alone_teach_a_model_without_data() -> None:
     validation = cases.by_name("pendulum", seed=0).validation
     given = validation.model
