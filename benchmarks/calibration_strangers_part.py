@@ -7,6 +7,8 @@ from typing import Any
 
 from calibrate_strangers import BUDGET, ENTRIES, FALSE, HALVES, RULE, STORED
 from calibration_verdicts_part import interval, table
+from strangers_diagnostics import caught
+from study_drawn_tests import STORED as DRAWN_TESTS
 
 TEXT = """## Systems of strangers
 
@@ -21,7 +23,18 @@ share of d*. {count} campaigns are stored.
 
 {families}
 
-{listed}"""
+{listed}
+
+{diagnostics}"""
+
+DIAGNOSTICS = """### What each diagnostic caught
+
+At {steps} steps of {campaigns} campaigns with a threshold below d*, the bound from learned dynamics was below the
+threshold, and diagnostics alone stopped a validation. A diagnostic caught a step alone if no other one spoke. (The
+campaigns are those of both halves and of `make drawn-tests` of which it is stored what spoke. Whether other systems
+need a diagnostic that caught nothing here is not known.)
+
+{table}"""
 
 
 def of_strangers() -> str:
@@ -43,7 +56,19 @@ def of_strangers() -> str:
         high=high,
         families=by_family(results),
         listed=false_verdicts([line for line in results if line["share"] in FALSE and line["answer"] == "validated"]),
-    )
+        diagnostics=of_diagnostics(),
+    ).rstrip()
+
+
+def of_diagnostics() -> str:
+    """Return what each diagnostic caught in the stored campaigns of all strangers; empty if none know it."""
+    results = [line for line in STORED.select(rule=RULE) if line["share"] < 1]
+    results = [line for line in [*results, *DRAWN_TESTS.select(what="campaign")] if "stopped" in line]
+    if not results:
+        return ""
+    steps = sum(len(by) > 0 for line in results for _, by in line["stopped"])
+    header = ["diagnostic", "steps at which it spoke", "steps at which it alone spoke", "campaigns with such a step"]
+    return DIAGNOSTICS.format(steps=steps, campaigns=len(results), table=table(header, caught(results)))
 
 
 def at(results: list[dict[str, Any]], share: float) -> list[dict[str, Any]]:
