@@ -6,9 +6,8 @@ from collections import Counter
 from typing import Any
 
 from calibrate_strangers import BUDGET, ENTRIES, FALSE, HALVES, RULE, STORED
+from calibration_drawn_tests_part import of_rules
 from calibration_verdicts_part import interval, table
-from strangers_diagnostics import caught
-from study_drawn_tests import STORED as DRAWN_TESTS
 
 TEXT = """## Systems of strangers
 
@@ -25,16 +24,7 @@ share of d*. {count} campaigns are stored.
 
 {listed}
 
-{diagnostics}"""
-
-DIAGNOSTICS = """### What each diagnostic caught
-
-At {steps} steps of {campaigns} campaigns with a threshold below d*, the bound from learned dynamics was below the
-threshold, and diagnostics alone stopped a validation. A diagnostic caught a step alone if no other one spoke. (The
-campaigns are those of both halves and of `make drawn-tests` of which it is stored what spoke. Whether other systems
-need a diagnostic that caught nothing here is not known.)
-
-{table}"""
+{rules}"""
 
 
 def of_strangers() -> str:
@@ -56,19 +46,8 @@ def of_strangers() -> str:
         high=high,
         families=by_family(results),
         listed=false_verdicts([line for line in results if line["share"] in FALSE and line["answer"] == "validated"]),
-        diagnostics=of_diagnostics(),
+        rules=of_rules([line for line in STORED.select(rule=RULE) if line["share"] < 1]),
     ).rstrip()
-
-
-def of_diagnostics() -> str:
-    """Return what each diagnostic caught in the stored campaigns of all strangers; empty if none know it."""
-    results = [line for line in STORED.select(rule=RULE) if line["share"] < 1]
-    results = [line for line in [*results, *DRAWN_TESTS.select(what="campaign")] if "stopped" in line]
-    if not results:
-        return ""
-    steps = sum(len(by) > 0 for line in results for _, by in line["stopped"])
-    header = ["diagnostic", "steps at which it spoke", "steps at which it alone spoke", "campaigns with such a step"]
-    return DIAGNOSTICS.format(steps=steps, campaigns=len(results), table=table(header, caught(results)))
 
 
 def at(results: list[dict[str, Any]], share: float) -> list[dict[str, Any]]:

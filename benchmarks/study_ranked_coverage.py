@@ -32,6 +32,7 @@ from study_drawn_tests import truth
 
 NAMES = ("heavy-bin", "wet-surface", "reverse-gear", "salt-bath", "spinning-tracks", "far-manipulator", "hidden-post")
 SHARES, SEEDS, CANDIDATES = (0.95, 1.25), 2, 16
+CONCLUSION = ""
 STORED = JsonLines(RESULTS / "ranked_coverage.jsonl", ("entry", "seed", "share", "ranked"))
 
 
