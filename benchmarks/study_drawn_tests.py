@@ -28,6 +28,7 @@ from ctxval.certificates.prediction_tests import TESTS, hypercube
 from dynamics_truths import digest
 from strangers import Stranger
 from strangers_development import DEVELOPMENT
+from strangers_diagnostics import JudgedRun
 from strangers_truths import TOUCHED, TRUTHS
 
 LIFTS = ("heavy-bin", "wet-surface", "shelf-and-size", "reverse-gear")
@@ -51,7 +52,8 @@ def decide(run: tuple[str, int]) -> dict[str, Any]:
     started, entry = time.process_time(), DEVELOPMENT[name]
     validation, largest = entry(seed % 2).validation, truth(entry, seed % 2)
     with single_threaded():
-        campaign = Campaign(validation, seed=seed).run(BUDGET, SHARE * largest)
+        campaign = Campaign(validation, seed=seed)
+        stopped = JudgedRun(campaign, SHARE * largest).run(BUDGET)
         verdict = campaign.verdict(SHARE * largest)
     return {
         "entry": name,
@@ -62,6 +64,7 @@ def decide(run: tuple[str, int]) -> dict[str, Any]:
         "origins": [trial.origin for trial in campaign.trials],
         "largest": max(trial.distance or 0.0 for trial in campaign.trials) / largest,
         "reason": verdict.reason[:300],
+        "stopped": stopped,
         "seconds": round(time.process_time() - started, 1),
     }
 

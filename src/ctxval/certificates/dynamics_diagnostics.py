@@ -51,14 +51,16 @@ def doubt_of(evidence: DynamicsEvidence, best: float, bound: float) -> str | Non
 
     ``best`` is the largest executed distance, ``bound`` the bound before failed predictions raise it.
     """
-    reasons = chain(
-        _unlearned(evidence, bound),
-        _uncovered(evidence),
-        _untested(evidence, best, bound, raised(evidence, bound)),
-        _missing(evidence),
-        _unsearched(evidence, bound),
-    )
-    return next(reasons, None)
+    return next(doubts(evidence, best, bound), None)
+
+
+def doubts(evidence: DynamicsEvidence, best: float, bound: float) -> Iterator[str]:
+    """Yield all reasons to withdraw the bound, as :func:`doubt_of` returns the first one."""
+    yield from _unlearned(evidence, bound)
+    yield from _uncovered(evidence)
+    yield from _untested(evidence, best, bound, raised(evidence, bound))
+    yield from _missing(evidence)
+    yield from _unsearched(evidence, bound)
 
 
 def uncovered(evidence: DynamicsEvidence) -> str | None:
