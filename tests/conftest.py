@@ -45,6 +45,7 @@ settings.load_profile("short")
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--thorough", action="store_true", help="what `make thorough` runs: more seeds and sizes")
+    parser.addoption("--manual", help="a folder with the built manual, whose pages are checked")
     parser.addoption("--kills", type=int, default=4, help="how many campaigns are killed and resumed")
     parser.addoption("--switches", type=int, default=1, help="how often two processes on one store are switched")
 

@@ -8,6 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from rig_thorough import more
+
 pytest.importorskip("onnx")
 pytest.importorskip("onnxruntime")
 pytest.importorskip("sklearn")
@@ -22,7 +24,7 @@ from study_crane import truth, typed
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.thorough)])
+@pytest.mark.parametrize("seed", [0, *more(1)])
 def test_designs_that_rounding_stops_are_like_those_next_to_them(seed: int) -> None:
     validation = experiment(seed).validation
     points = validation.space.iid(30, np.random.default_rng(3))

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from ctxval import Campaign, Task
+from rig_thorough import more, some
 
 BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
 sys.path.insert(0, str(BENCHMARKS))
@@ -75,7 +76,7 @@ def test_they_spread_over_dimensions() -> None:
     assert sum(count >= 6 for count in states) >= 4
 
 
-@pytest.mark.parametrize("name", ENTRIES)
+@pytest.mark.parametrize("name", some(ENTRIES))
 def test_an_entry_builds_and_runs_tasks_in_batches_as_alone(name: str) -> None:
     found = experiment(name, 0)
     validation = found.validation
@@ -88,7 +89,7 @@ def test_an_entry_builds_and_runs_tasks_in_batches_as_alone(name: str) -> None:
     assert 20 <= validation.plan(points[0]).task.horizon <= 80
 
 
-@pytest.mark.parametrize("name", [name for name, entry in ENTRIES.items() if entry.without is not None])
+@pytest.mark.parametrize("name", some(name for name, entry in ENTRIES.items() if entry.without is not None))
 def test_the_model_does_not_know_the_mechanism(name: str) -> None:
     entry = ENTRIES[name]
     assert entry.without is not None
@@ -104,8 +105,8 @@ def test_the_model_does_not_know_the_mechanism(name: str) -> None:
 # Maxima
 
 
-@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.thorough)])
-@pytest.mark.parametrize("name", ENTRIES)
+@pytest.mark.parametrize("seed", [0, *more(1)])
+@pytest.mark.parametrize("name", some(ENTRIES))
 def test_the_stored_maximum_belongs_to_the_system_as_it_is(name: str, seed: int) -> None:
     record, found = record_of(name, seed), experiment(name, seed)
     if not dynamics_truths.belongs(record, found):

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from ctxval._util.arrays import Array
 from ctxval.gp.global_search import GlobalMaximum, search_globally
+from rig_thorough import more
 
 Values = Callable[[Array], Array]
 
@@ -57,7 +58,7 @@ def rastrigin(points: Array) -> Array:
         (rastrigin, 3, 0.0, 1e-2),
     ],
 )
-@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.thorough) for seed in (1, 2))])
+@pytest.mark.parametrize("seed", [0, *more(1, 2)])
 def test_it_finds_the_maxima_of_reference_functions(
     function: Values, dimension: int, maximum: float, error: float, seed: int
 ) -> None:
@@ -96,7 +97,7 @@ def cliff(dimension: int, seed: int, share: float = 1.5e-4) -> Values:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("dimension", [3, *(pytest.param(other, marks=pytest.mark.thorough) for other in (2, 4))])
+@pytest.mark.parametrize("dimension", [3, *more(2, 4)])
 def test_it_finds_rare_cliffs(dimension: int) -> None:
     found = [search(cliff(dimension, seed), dimension, seed, 9000).values[0] for seed in range(5)]
     assert sum(value >= 0.99 for value in found) >= 4

@@ -12,6 +12,7 @@ from ctxval import searches
 from ctxval._util.arrays import Array
 from ctxval.gp.kernels import Matern
 from ctxval.gp.subset import LONG, kept_rows, pivoted_cholesky, pivoted_rows
+from rig_thorough import more
 
 UNCUT = [("gp-ucb", 1), ("gp-ucb", 20), ("scalar", 1), ("scalar", 2)]
 
@@ -53,7 +54,7 @@ def test_copies_of_one_point_are_no_reason_to_stop() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "dimension"),
-    [("gp-ucb", 2), ("scalar", 20), *(pytest.param(*case, marks=pytest.mark.thorough) for case in UNCUT)],
+    [("gp-ucb", 2), ("scalar", 20), *more(*UNCUT)],
 )
 def test_a_search_goes_on_over_a_long_history_as_one_never_stopped(name: str, dimension: int) -> None:
     points, values = long_history(LONG + 3, dimension, failed=50)

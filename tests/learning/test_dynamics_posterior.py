@@ -11,6 +11,7 @@ from ctxval.gp.cholesky import factorise
 from ctxval.learning.component import Component, draw_functions
 from ctxval.learning.dynamics_posterior import DynamicsPosterior, PosteriorSettings, learn_posterior
 from ctxval.learning.hyperparameters import FAMILIES, Hyperparameters, ResidualKernel
+from rig_thorough import more
 
 MODEL = models.Linear([[1.0, 0.1], [0.0, 0.9]], [[0.0], [0.1]])
 OTHER = models.Linear([[1.02, 0.05], [0.1, 0.9]], [[0.05], [0.08]], [0.01, -0.02])
@@ -219,7 +220,7 @@ def test_too_few_transitions_leave_a_linear_system_uncertain_where_they_do_not_l
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [0, *(pytest.param(other, marks=pytest.mark.thorough) for other in (1, 2))])
+@pytest.mark.parametrize("seed", [0, *more(1, 2)])
 @pytest.mark.parametrize("deviation", [0.01, 0.05])
 def test_noise_is_learned_within_a_factor_of_two(deviation: float, seed: int) -> None:
     transitions = record(250, truth=models.Function(rough, vectorized=True), noise=deviation, seed=seed)

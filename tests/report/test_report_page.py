@@ -22,6 +22,7 @@ from ctxval.report import ReportContext, context_of_campaign, context_of_store, 
 from ctxval.report.sections import appendix
 from ctxval.report.sections.repeat import command_of, identity, python_snippet
 from ctxval.report.sections.trials import packed, recorded_lines
+from rig_thorough import more
 
 POSTERIOR = CertificateOptions.posterior()
 
@@ -303,7 +304,7 @@ def test_the_snippet_executes_the_task_again(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("dimension", [2, *(pytest.param(other, marks=pytest.mark.thorough) for other in (1, 3))])
+@pytest.mark.parametrize("dimension", [2, *more(1, 3)])
 def test_the_map_of_the_region_certificate_is_drawn(dimension: int) -> None:
     campaign = pendulum(executions=6) if dimension == 1 else plane(dimension, 6, {})
     campaign.audit(20)

@@ -179,7 +179,7 @@ def executions(store: Path) -> int:
 def test_a_killed_refinement_resumes_with_the_same_choices(
     found: Refinement, store: Path, tmp_path: Path, request: pytest.FixtureRequest
 ) -> None:
-    kills = max(2, request.config.getoption("--kills") // 5)
+    kills = max(1, request.config.getoption("--kills") // 5)
     expected, rng = content(store), np.random.default_rng(7)
     for number in range(kills):
         killed = tmp_path / f"{number}.sqlite"
