@@ -142,7 +142,7 @@ class Predicted:
         self.asked.append(before)
         return self.function(points)
 
-    def dynamics(self, confidence: float) -> DynamicsEvidence:
+    def dynamics(self, confidence: float, quantile: float = 0.9) -> DynamicsEvidence:
         """Return evidence against which no diagnostic speaks, with 2000 draws of d* between 2 and 3."""
         rng = np.random.default_rng(4)
         gap = StateInputGap(0.01, ("x[0]",), {"x[0]": 0.0})
