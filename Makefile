@@ -8,7 +8,7 @@ CAMPAIGNS ?= 120
 # Small dense algebra is faster on one thread.
 export OMP_NUM_THREADS = 1
 
-.PHONY: demo test quick thorough check docs reliability interleavings crash-states attack lowest bench bench-peers study study-refine reproduce search global-search calibrate parts pictures posterior-ranks clean
+.PHONY: demo test quick thorough check docs reliability interleavings crash-states attack lowest bench bench-peers study study-refine reproduce search global-search calibrate drawn-tests parts pictures posterior-ranks clean
 
 demo: .venv/.installed
 	$(BIN)/ctxval run pendulum
@@ -105,6 +105,9 @@ search: .venv/.test  ## how many executions the searches need; writes docs/searc
 global-search: .venv/.test  ## what a global search of the true systems finds; writes docs/searches.md, and resumes
 	$(BIN)/python benchmarks/study_global_search.py
 	$(BIN)/python benchmarks/search_page.py
+
+drawn-tests: .venv/.test  ## do tests at drawn tasks keep verdicts from lifts and posts? Resumes
+	$(BIN)/python benchmarks/study_drawn_tests.py
 
 parts: .venv/.test  ## the parts and the commands; writes docs/parts.md and docs/reference/command-line.md
 	$(BIN)/python benchmarks/parts_page.py

@@ -19,6 +19,7 @@ from ctxval._util.json_lines import JsonLines
 from ctxval.certificates.verdict_sentences import tolerances
 from dynamics_truths import digest
 from strangers_development import DEVELOPMENT
+from strangers_diagnostics import JudgedRun
 from strangers_reporting import REPORTING
 from strangers_truths import TRUTHS
 
@@ -40,7 +41,8 @@ def decide(run: tuple[str, int, float]) -> dict[str, Any]:
     started, entry = time.process_time(), ENTRIES[name]
     largest = TRUTHS[name, seed, digest(entry.make)]["distance"]
     with single_threaded():
-        campaign = Campaign(entry(seed).validation, seed=seed).run(BUDGET, share * largest)
+        campaign = Campaign(entry(seed).validation, seed=seed)
+        stopped = JudgedRun(campaign, share * largest).run(BUDGET)
         verdict = campaign.verdict(share * largest)
     known = None if verdict.certificate is None else tolerances(verdict.certificate, share * largest)
     return {
@@ -55,6 +57,7 @@ def decide(run: tuple[str, int, float]) -> dict[str, Any]:
         "kind": None if verdict.certificate is None else verdict.certificate.kind,
         "bound": None if verdict.bound is None else verdict.bound / largest,
         "reason": verdict.reason[:300],
+        "stopped": stopped,
         "tolerances": None if known is None else [tolerance.ratio for tolerance in known],
         "seconds": round(time.process_time() - started, 1),
     }

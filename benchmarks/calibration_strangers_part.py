@@ -6,6 +6,7 @@ from collections import Counter
 from typing import Any
 
 from calibrate_strangers import BUDGET, ENTRIES, FALSE, HALVES, RULE, STORED
+from calibration_drawn_tests_part import of_rules
 from calibration_verdicts_part import interval, table
 
 TEXT = """## Systems of strangers
@@ -21,7 +22,9 @@ share of d*. {count} campaigns are stored.
 
 {families}
 
-{listed}"""
+{listed}
+
+{rules}"""
 
 
 def of_strangers() -> str:
@@ -43,7 +46,8 @@ def of_strangers() -> str:
         high=high,
         families=by_family(results),
         listed=false_verdicts([line for line in results if line["share"] in FALSE and line["answer"] == "validated"]),
-    )
+        rules=of_rules([line for line in STORED.select(rule=RULE) if line["share"] < 1]),
+    ).rstrip()
 
 
 def at(results: list[dict[str, Any]], share: float) -> list[dict[str, Any]]:

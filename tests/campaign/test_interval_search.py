@@ -174,6 +174,41 @@ def test_eight_drawn_tasks_are_executed_before_a_model_is_validated() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(
+    ("tests", "origin", "sentence"),
+    [
+        (8, "spread", "at most 39 % of the tasks exceed 1000 (8 tests drawn as a Latin hypercube, 95 %)"),
+        (22, "iid", "at most 13 % of the tasks exceed 1000 (22 independent draws, 95 %)"),
+    ],
+)
+def test_the_tests_bound_the_share_of_the_tasks_that_exceed_the_threshold(
+    tests: int, origin: str, sentence: str
+) -> None:
+    options = CertificateOptions(Automatic(tests=tests))
+    campaign = Campaign(linear()[0], seed=2).run(90, 1e3, certificate=options)
+    assert [trial.origin for trial in campaign.trials if trial.origin in DRAWN] == [origin] * tests
+    verdict = campaign.verdict(1e3, certificate=options)
+    assert verdict.answer == "validated"
+    assert verdict.rests_on is not None
+    assert sentence in verdict.rests_on
+
+
+@pytest.mark.slow
+def test_a_hypercube_that_was_begun_is_completed_before_tests_are_independent_draws() -> None:
+    campaign = Campaign(linear()[0], seed=2)
+    executions = 0
+    while sum(trial.origin == "spread" for trial in campaign.trials) < 3:
+        executions += 1
+        campaign.run(executions, 1e3)
+    options = CertificateOptions(Automatic(tests=22))
+    campaign.run(60, 1e3, certificate=options)
+    drawn = [trial for trial in campaign.trials if trial.origin in DRAWN]
+    assert [trial.origin for trial in drawn] == ["spread"] * TESTS + ["iid"] * (22 - TESTS)
+    parts = sorted(int(TESTS * trial.unit_point[0]) for trial in drawn[:TESTS])
+    assert parts == list(range(TESTS))
+
+
+@pytest.mark.slow
 def test_the_posterior_bound_predicts_nothing() -> None:
     campaign = Campaign(make_validation(), seed=1)
     campaign.run(20, 1e3, certificate=CertificateOptions(Posterior()))

@@ -26,7 +26,7 @@ from ctxval.certificates import (
 )
 from ctxval.certificates.dynamics import bound_of
 from ctxval.certificates.dynamics_diagnostics import ACCURATE, GAP, PREDICTIONS
-from ctxval.certificates.dynamics_evidence import PushedDistances
+from ctxval.certificates.dynamics_evidence import PushedDistances, StatePocket
 from ctxval.certificates.verdict import judge, judge_by
 from ctxval.errors import CertificateError
 from rig_evidence import COVERED, GOOD, gap, prediction
@@ -46,7 +46,7 @@ class Learned:
     def __init__(self, evidence: DynamicsEvidence | None) -> None:
         self.evidence = evidence
 
-    def dynamics(self, confidence: float) -> DynamicsEvidence | None:
+    def dynamics(self, confidence: float, quantile: float = 0.9) -> DynamicsEvidence | None:
         return self.evidence
 
     def expected(self, points: np.ndarray, before: int) -> np.ndarray:
@@ -286,3 +286,37 @@ def test_a_validation_says_what_it_survives() -> None:
     assert verdict.answer == "validated"
     assert "survives" in str(verdict)
     assert "1.5 m/s^2 in speed" in str(verdict)
+
+
+# Where no execution has been
+
+
+@pytest.mark.parametrize(
+    ("pocket", "sentence"),
+    [
+        (
+            StatePocket(0.2, {"x [m]": 0.55, "y [m]": -0.35}, {"x [m]": 0.2, "y [m]": 0.2}),
+            "No execution came within 0.2 m of x 0.55 m, y -0.35 m, where predicted runs lead.",
+        ),
+        (
+            StatePocket(0.1, {"angle [rad]": 1.0, "z": 2.0}, {"angle [rad]": 0.3, "z": 4.0}),
+            "No execution came within 0.3 rad in angle and 4 in z of angle 1 rad, z 2, where predicted runs lead.",
+        ),
+    ],
+)
+def test_a_validation_names_the_largest_region_that_no_execution_has_entered(
+    pocket: StatePocket, sentence: str
+) -> None:
+    evidence = replace(GOOD, pocket=pocket)
+    known = DynamicsEvidence.from_json(json.loads(json.dumps(evidence.to_json())))
+    assert known is not None
+    assert known.pocket == pocket
+    verdict = judge(trials(), 1.35, CertificateOptions(Dynamics(tests=0)), Provenance(learned=Learned(known)))
+    assert verdict.certificate is not None
+    assert verdict.certificate.details["pocket"]["within"] == pocket.within
+    assert sentence in str(verdict)
+
+
+def test_without_a_pocket_nothing_is_said_of_one() -> None:
+    verdict = judge(trials(), 1.35, CertificateOptions(Dynamics(tests=0)), Provenance(learned=Learned(GOOD)))
+    assert "No execution" not in str(verdict)

@@ -155,7 +155,7 @@ def test_only_tests_matter_for_so_long() -> None:
     assert raised(replace(GOOD, tests=7, predictions=(chosen, *TESTS[1:])), BOUND) == BOUND
 
 
-def test_a_chosen_task_fills_a_gap_but_counts_as_no_test() -> None:
+def test_a_chosen_task_counts_as_no_test() -> None:
     chosen = (replace(TESTS[0], origin="covering"), *TESTS[1:])
     assert missing_tests(chosen, 8) == 1
     assert missing_tests(chosen, 7) == 0

@@ -4,11 +4,13 @@ from itertools import combinations
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from ctxval import Task, TaskSpace, Transitions, Validation, controllers, distances, models, systems
+from ctxval import Task, TaskSpace, Trajectory, Transitions, Validation, controllers, distances, models, systems
 from ctxval._util.arrays import Array
 from ctxval.learning.closed_loops import LoopPlanner
-from ctxval.learning.coverage import MOST_COORDINATES, Coverage
+from ctxval.learning.coverage import MOST_COORDINATES, Coverage, largest_pocket
 from ctxval.learning.coverage import coverage as coverage_of
 from ctxval.learning.dynamics_posterior import DynamicsPosterior, PosteriorSettings, learn_posterior
 
@@ -143,3 +145,50 @@ def test_tasks_that_cannot_be_planned_are_not_counted() -> None:
     found = coverage(planner, posterior, TASKS)
     assert found.tasks == left.sum()
     assert (found.task == TASKS[left]).all(axis=1).any()
+
+
+# Pockets
+
+
+def trajectory(*states: list[float]) -> Trajectory:
+    times = 0.1 * np.arange(len(states))
+    return Trajectory(times, np.array(states), np.zeros((len(states) - 1, 1)))
+
+
+def test_the_largest_pocket_of_a_plane_is_a_circle_around_a_place_that_loops_visit() -> None:
+    rng = np.random.default_rng(4)
+    visited = np.column_stack([rng.uniform([-1, -0.5], [1, 0.5], (3000, 2)), 0.1 * rng.normal(size=(3000, 2))])
+    around = [[-1.0, -0.5, 0, 0], [1.0, -0.5, 0, 0], [1.0, 0.5, 0, 0], [-1.0, 0.5, 0, 0], [-1.0, -0.5, 0, 0]]
+    found = largest_pocket(visited, [trajectory(*around)], ["m", "m", "m/s", "m/s"])
+    assert found is not None
+    assert found.states == (0, 1)
+    assert found.within[0] == found.within[1]
+    assert found.within[0] == pytest.approx(0.5, abs=0.03)  # half of the shorter side
+    assert abs(found.place[1]) < 0.02
+    assert (visited[:, :2] == found.place).all(axis=1).any()
+
+
+@given(st.integers(0, 2**32 - 1), st.sampled_from([["m"] * 3, ["", "", ""], ["m", "rad", "m/s"], ["m/s", "m/s", "m"]]))
+def test_no_execution_came_nearer_to_a_pocket(seed: int, units: list[str]) -> None:
+    rng = np.random.default_rng(seed)
+    visited = rng.normal(size=(500, 3)) * [1, 20, 300]
+    executed = [trajectory(*(rng.normal(size=(6, 3)) * [1, 20, 300]).tolist()) for _ in range(3)]
+    found = largest_pocket(visited, executed, units)
+    assert found is not None
+    recorded = np.concatenate([each.states for each in executed])[:, list(found.states)]
+    nearest = np.sqrt((((recorded - found.place) / found.within) ** 2).sum(axis=1)).min()
+    assert nearest >= 1 - 1e-9
+    assert nearest <= 20
+    assert (found.within > 0).all()
+
+
+def test_where_an_execution_moves_in_one_step_there_is_no_pocket() -> None:
+    visited = np.column_stack([np.linspace(-1, 1, 400), np.zeros(400)])
+    found = largest_pocket(visited, [trajectory([-1.0, 0.0], [1.0, 0.0])], ["m", "m"])
+    assert found is not None
+    assert found.size < 0.2
+
+
+def test_one_state_has_no_pocket_and_neither_has_what_was_not_executed() -> None:
+    assert largest_pocket(np.zeros((9, 1)), [trajectory([0.0], [1.0])], ["m"]) is None
+    assert largest_pocket(np.zeros((9, 2)), [], ["m", "m"]) is None

@@ -23,9 +23,11 @@ from ctxval.certificates.dynamics_evidence import (
     PushedDistances,
     StateInputCoverage,
     StateInputGap,
+    StatePocket,
     UntriedParameter,
 )
 from ctxval.core.labels import labels_of
+from ctxval.core.quantiles import QUANTILE
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import REDEFINED, Trial
 from ctxval.core.validation import Validation
@@ -33,6 +35,7 @@ from ctxval.errors import CertificateError
 from ctxval.learning import DynamicsStudy, ExecutionPrediction, LearnedDynamics
 from ctxval.learning.closed_loops import LoopPlanner
 from ctxval.learning.coverage import Coverage, Gap
+from ctxval.learning.noisy_draws import GROUPS
 from ctxval.learning.tolerance import LEVELS, PushResponse
 from ctxval.learning.vector import Executed
 from ctxval.learning.worst_case import WorstCase
@@ -70,6 +73,12 @@ class CampaignDynamics:
         self.failure: str | None = None
         self._learned: dict[tuple[object, ...], tuple[Sequence[Trajectory], LearnedDynamics | None, str | None]] = {}
 
+    def use_quantile(self, quantile: float) -> None:
+        """State the share of the executions of a task that distances are about, if the system is noisy."""
+        if quantile != self._study.quantile:
+            self._study = DynamicsStudy(self._study.validation, self._study.seed, quantile)
+            self._learned = {}
+
     @property
     def planner(self) -> LoopPlanner:
         """Designs controllers and runs closed loops."""
@@ -84,7 +93,7 @@ class CampaignDynamics:
     ) -> LearnedDynamics | None:
         """Return what executed trials and other recordings teach; the latest are kept."""
         if not self._study.is_current:
-            self._study, self._learned = DynamicsStudy(self._study.validation, self._study.seed), {}
+            self._study, self._learned = self._study.anew(), {}
         # The other recordings are kept with what they taught, so that their identities stay theirs. A result may be
         # replaced, and then has another distance.
         key = (*((trial.number, trial.distance) for trial, _ in executed), *map(id, others))
@@ -190,21 +199,32 @@ class CampaignDynamics:
             except Exception as error:  # users' parts
                 self.failure, evidence = reason_of(error), None
         if keep and evidence is not None and not self.elsewhere():
-            self._store.keep_computed(_key(trials, confidence), evidence.to_json(), digest)
+            self._store.keep_computed(self._key(trials, confidence), evidence.to_json(), digest)
         return evidence
 
     def kept_evidence(self, trials: Sequence[Trial], confidence: float) -> DynamicsEvidence | None:
         """Return :meth:`evidence` that the store keeps for these trials; None if there is none."""
-        return None if self.elsewhere() else DynamicsEvidence.from_json(self._store.computed(_key(trials, confidence)))
+        return (
+            None
+            if self.elsewhere()
+            else DynamicsEvidence.from_json(self._store.computed(self._key(trials, confidence)))
+        )
+
+    def _key(self, trials: Sequence[Trial], confidence: float) -> str:
+        """Return the key of the evidence of some trials in the store."""
+        text = json.dumps([(trial.number, trial.state, trial.distance, trial.note) for trial in trials])
+        return f"evidence {confidence} {self._study.quantile} {hashlib.sha256(text.encode()).hexdigest()}"
 
     def _whole(
         self, learned: LearnedDynamics, trials: Sequence[Trial], draws: int, confidence: float
     ) -> DynamicsEvidence:
         evidence = self._evidence(learned, trials, learned.worst_case_of(draws))
+        noisy = learned.noisy
+        groups = GROUPS if noisy is not None else len(learned.posterior.components)
         evidence = replace(
             evidence,
-            noise=learned.posterior.noise,
-            groups=len(evidence.maxima) // len(learned.posterior.components),
+            noise=learned.posterior.noise if noisy is None else noisy.noise,
+            groups=len(evidence.maxima) // groups,
             without_model=learned.posterior.covariances.without_model,
         )
         best = largest_distance(trials)
@@ -213,10 +233,13 @@ class CampaignDynamics:
             return evidence
         # Many closed loops, which only matter to a bound that nothing else withdraws.
         evidence = _with_jumps(evidence, learned, bound)
+        evidence = replace(evidence, pocket=self._pocket(learned))
+        if noisy is not None:
+            return evidence  # a push is compared with residuals of state and input, which do not hold here
         return replace(evidence, pushed=_pushed(learned.push_response, self._coordinates(learned)))
 
     def _evidence(self, learned: LearnedDynamics, trials: Sequence[Trial], worst: WorstCase) -> DynamicsEvidence:
-        names, untried = self._study.validation.space.names, learned.untried_parameter
+        names, untried, noisy = self._study.validation.space.names, learned.untried_parameter, learned.noisy
         return DynamicsEvidence(
             worst.maxima,
             worst.points,
@@ -232,7 +255,19 @@ class CampaignDynamics:
             untried=None if untried is None else UntriedParameter(names[untried[0]], *untried[1:]),
             sharpness=worst.sharpness,
             dense=worst.points.shape[1] <= DENSE and self._study.planner.batched,
+            quantile=noisy.quantile if noisy is not None and noisy.is_noisy else None,
+            lags=0 if noisy is None else noisy.fit.history.structure.lags,
         )
+
+    def _pocket(self, learned: LearnedDynamics) -> StatePocket | None:
+        """Return the largest region that no execution has entered, by the names of its states."""
+        labels = self._coordinates(learned)[: len(learned.posterior.data.sizes)]
+        pocket = learned.pocket([parted(label)[1] for label in labels])
+        if pocket is None:
+            return None
+        names = [labels[i] for i in pocket.states]
+        place, within = (dict(zip(names, each.tolist(), strict=True)) for each in (pocket.place, pocket.within))
+        return StatePocket(pocket.size, place, within)
 
     def _coordinates(self, learned: LearnedDynamics) -> tuple[str, ...]:
         """Return the labels of the states and inputs, with units; ``x[0], ..., u[0], ...`` for those without names."""
@@ -280,6 +315,9 @@ class CampaignDynamics:
         trajectory = self._store.trajectory(trial.number, "system")
         score = None if trajectory is None else prediction.score(trajectory, distance)
         z2, rank = (np.nan, np.nan) if score is None else (score.z2, score.rank)
+        if prediction.noise is not None and score is not None:
+            noise = prediction.noise
+            how |= {"quantiles": noise.distances, "runs": noise.runs, "p_values": score.p_values}
         return CheckedPrediction(trial.number, rank, prediction.median, prediction.upper, distance, z2, **how)
 
     def stored_prediction(self, trial: Trial) -> ExecutionPrediction | None:
@@ -320,8 +358,9 @@ class LearnedFromTrials:
         prediction = self._predictions[before]
         return np.full(len(points), np.nan) if prediction is None else prediction.expected(points)[0]
 
-    def dynamics(self, confidence: float) -> DynamicsEvidence | None:
+    def dynamics(self, confidence: float, quantile: float = QUANTILE) -> DynamicsEvidence | None:
         """Return what the dynamics learned from all trials say about d*; None if nothing can be learned."""
+        self.study.use_quantile(quantile)
         evidence = self.study.evidence(self.trials, confidence)
         if evidence is None and self.study.failure is not None:
             raise CertificateError(f"no dynamics can be learned: {self.study.failure.rstrip('.')}.")
@@ -331,12 +370,6 @@ class LearnedFromTrials:
         """Return independent draws of tasks, points of the unit cube ``(count, d)``."""
         # This random stream is none of those of trials.
         return self.validation.space.unit_draws(count, np.random.default_rng([seed, 0x7461]))
-
-
-def _key(trials: Sequence[Trial], confidence: float) -> str:
-    """Return the key of the evidence of some trials in the store."""
-    text = json.dumps([(trial.number, trial.state, trial.distance, trial.note) for trial in trials])
-    return f"evidence {confidence} {hashlib.sha256(text.encode()).hexdigest()}"
 
 
 def _with_jumps(evidence: DynamicsEvidence, learned: LearnedDynamics, bound: float) -> DynamicsEvidence:

@@ -17,11 +17,12 @@ from ctxval._util.arrays import Array
 from ctxval.campaign.choices import Choice
 from ctxval.campaign.dynamics import NEAR
 from ctxval.campaign.history import largest_distance, waiting_points
-from ctxval.campaign.proposals import Steadiness
+from ctxval.campaign.proposals import Steadiness, spread_tests
 from ctxval.campaign.trials import TrialRecorder
-from ctxval.certificates import CertificateOptions, CheckedPrediction, DynamicsEvidence, Sample, StoppingRule, Verdict
+from ctxval.certificates import CertificateOptions, DynamicsEvidence, Sample, StoppingRule, Verdict
 from ctxval.certificates.anytime import AnytimeAudit
 from ctxval.certificates.automatic import Automatic
+from ctxval.certificates.bets import bets_against
 from ctxval.certificates.bounds import with_units
 from ctxval.certificates.covering import RESOLUTION, covering
 from ctxval.certificates.dynamics import Dynamics, bound_of, certify_dynamics
@@ -33,13 +34,14 @@ from ctxval.certificates.dynamics_diagnostics import (
     missing_tests,
     only_tests_missing,
     raised,
-    tested,
     uncovered,
     untested,
 )
 from ctxval.certificates.options import WITHIN
 from ctxval.certificates.posterior import Posterior
-from ctxval.certificates.prediction_tests import DRAWN, fewest_spread_tests, next_spread_test
+from ctxval.certificates.prediction_tests import DRAWN, MANY, TESTS
+from ctxval.certificates.verdict import counterexample, quantile_of
+from ctxval.certificates.verdict_sentences import NO_UNITS
 from ctxval.core.trial import Trial
 from ctxval.errors import CertificateError, InputError
 
@@ -73,6 +75,7 @@ class IntervalSearch:
         if self.threshold is None and isinstance(self.options.kind, AnytimeAudit):
             raise InputError("an anytime audit ends by its threshold; state one, or run another certificate.")
         self.options.kind.require_usable(self.options.confidence, self.budget)
+        self.recorder.dynamics.use_quantile(quantile_of(self.options.kind))
 
     @property
     def limit(self) -> float:
@@ -99,7 +102,10 @@ class IntervalSearch:
     def choose(self) -> Choice | None:
         """Return the next task; None if the interval decides."""
         if self.best > self.limit:
-            return None
+            if (repeated := self._against_noise()) is not None:
+                return repeated
+            if self._is_falsified:
+                return None
         if isinstance(self.options.kind, AnytimeAudit):
             return self._by_draws(self.options.kind)
         if (test := self._next_test()) is not None:
@@ -107,7 +113,9 @@ class IntervalSearch:
         evidence = self._evidence()
         if evidence is not None and (task := self._beside_a_failed_test(evidence)) is not None:
             return Choice(task, "covering", planned_draws=0, rejected=0)
-        if evidence is None or self._fails(evidence):
+        # Earlier predictions may have failed before it was known that a history or noise matters.
+        history = evidence is not None and (evidence.quantile is not None or evidence.lags > 0)
+        if evidence is None or (self._fails(evidence) and not history):
             return self._by_distance()
         if self._may_decide(evidence):
             whole = self.recorder.dynamics.evidence(self.recorder.trials, self.options.confidence, keep=self.keeps)
@@ -116,7 +124,7 @@ class IntervalSearch:
             evidence = replace(whole, tests=self.tests)
             if self._decides(evidence):
                 return None
-        if isinstance(self.options.kind, Automatic):
+        if isinstance(self.options.kind, Automatic) and evidence.quantile is None:
             known = self._points(self.recorder.trials)
             patient = sum(trial.origin not in DRAWN for trial in self.recorder.trials) < _PATIENCE
             # In few dimensions, executions soon cover the tasks, and the posterior bound of the distance may decide.
@@ -126,12 +134,42 @@ class IntervalSearch:
                     return choice
         return self._by_evidence(evidence)
 
+    @property
+    def _is_falsified(self) -> bool:
+        """Whether the executed distances falsify the limit; of a noisy system, one above it may not suffice."""
+        kind, confidence = self.options.kind, self.options.confidence
+        return counterexample(self.recorder.trials, self.limit, NO_UNITS, confidence, quantile_of(kind)) is not None
+
+    def _against_noise(self) -> Choice | None:
+        """Return a task whose execution tells whether noise explains a distance above the limit.
+
+        It is None if the system is not noisy, if the limit is falsified, or if no task is predicted to exceed it.
+        """
+        trials, quantile = self.recorder.trials, quantile_of(self.options.kind)
+        bets = bets_against(trials, self.limit, quantile)
+        if not self.predicts or (bets is not None and bets.falsify(self.options.confidence)):
+            return None
+        learned = self.recorder.dynamics.learned(trials)
+        if learned is None or learned.noisy is None or not learned.noisy.is_noisy:
+            return None
+        worst = max((trial for trial in trials if trial.distance is not None), key=lambda trial: trial.distance or 0.0)
+        tasks = [worst.unit_point, learned.worst_of_mean.elites[0]]
+        chances = []
+        for task in tasks:
+            predicted = learned.predict(task)
+            noise = None if predicted is None else predicted.noise
+            chances.append(0.0 if noise is None else noise.chance_of_more(self.limit))
+        best = int(np.argmax(chances))
+        if chances[best] <= 1 - quantile:
+            return None
+        return Choice(tasks[best], "covering", planned_draws=0, rejected=0)
+
     def _by_evidence(self, evidence: DynamicsEvidence) -> Choice:
         """Return the task that the learned dynamics choose, or a test if nothing else is missing."""
         best, limit, confidence, trials = self.best, self.limit, self.options.confidence, self.recorder.trials
         bound = self._bound(evidence)
         if max(bound, evidence.highest) <= limit and only_tests_missing(evidence, best, bound):
-            return self._test(evidence.predictions)
+            return self._test()
         learned = self.recorder.dynamics.learned(trials)
         steady = Steadiness(self.recorder.dynamics.planner, None if learned is None else learned.expected)
         point = next_task(evidence, self._points(self._ended), best, limit, confidence, steady)
@@ -214,7 +252,7 @@ class IntervalSearch:
         predictions = self.recorder.dynamics.checked(trials)
         if not predictions or not held(predictions[-1], self.best):
             return None
-        return self._test(predictions) if missing_tests(predictions, self.tests) else None
+        return self._test() if missing_tests(predictions, self.tests) else None
 
     def _beside_a_failed_test(self, evidence: DynamicsEvidence) -> Array | None:
         """Return a task where a test that failed may be worst; None if there is no such test, or all are executed.
@@ -239,21 +277,14 @@ class IntervalSearch:
                 return task
         return None
 
-    def _test(self, predictions: Sequence[CheckedPrediction] | None) -> Choice:
+    def _test(self) -> Choice:
         """Return the next task that tests predictions where nobody chose to look; see ``prediction_tests``."""
         trials = self.recorder.trials
-        if predictions is None:
-            tests = [(trial.unit_point, trial.origin) for trial in trials if trial.distance is not None]
-        else:
-            tests = [(np.array(test.point), test.origin) for test in tested(predictions, self.tests)]
-        tests += [(trial.unit_point, trial.origin) for trial in trials if trial.state == "open"]
-        points = np.array([point for point, _ in tests]).reshape(-1, self.recorder.validation.space.dimension)
-        drawn = sum(origin in DRAWN for _, origin in tests)
-        if self.tests - drawn > fewest_spread_tests(points):
-            # The results decide when the campaign ends, so the number of independent draws is not planned.
-            return Choice(self.recorder.draw(), "iid", planned_draws=0, rejected=0)
-        task = next_spread_test(points, self.recorder.draws.generator(trials))
-        return Choice(task, "spread", planned_draws=0, rejected=0)
+        # A hypercube that was begun is completed, because what a part of it shows must not decide that it is left.
+        if self.tests < MANY or spread_tests(trials) % TESTS:
+            return Choice(self.recorder.draws.test(trials), "spread", planned_draws=0, rejected=0)
+        # The results decide when the campaign ends, so the number of independent draws is not planned.
+        return Choice(self.recorder.draw(), "iid", planned_draws=0, rejected=0)
 
     def _by_draws(self, kind: AnytimeAudit) -> Choice | None:
         """Return the next independent draw of an anytime audit, which may end whenever its bound suffices."""
@@ -275,7 +306,7 @@ class IntervalSearch:
         if not now.decided:
             return Choice(now.next_point, "covering", planned_draws=0)
         missing = isinstance(kind, Automatic) and kind.missing_tests(Sample.of(self._ended))
-        return self._test(None) if missing else None
+        return self._test() if missing else None
 
 
 def is_decisive(options: CertificateOptions) -> bool:

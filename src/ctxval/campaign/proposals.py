@@ -25,6 +25,7 @@ from ctxval.campaign.costs import costs_of
 from ctxval.campaign.dynamics import PREDICTION, CampaignDynamics
 from ctxval.campaign.history import waiting_points
 from ctxval.campaign.storage.store import Store
+from ctxval.certificates.prediction_tests import TESTS, hypercube
 from ctxval.core.model import Model
 from ctxval.core.rollout import rollout
 from ctxval.core.trial import CONVERGED, UNSTEADY, Trial
@@ -34,6 +35,7 @@ from ctxval.learning.closed_loops import LoopPlanner
 from ctxval.searches import BaseSearch, SequentialSearch
 
 _MOVED = 0x6D6F  # identifies the random stream of moves away from tasks that are not steady
+_DRAW, _HYPERCUBE = 0x6175, 0x6879  # those of independent draws, and of Latin hypercubes
 
 
 @dataclass(frozen=True, eq=False)
@@ -234,18 +236,27 @@ class IndependentDraws:
     def point(self, trials: Sequence[Trial]) -> Array:
         """Return the next draw from the distribution of tasks, a point of the unit cube ``(d,)``."""
         space = self._validation.space
-        return space.rounded(space.unit_draws(1, self.generator(trials))[0])
+        return space.rounded(space.unit_draws(1, self._generator(len(trials), _DRAW))[0])
 
-    def generator(self, trials: Sequence[Trial]) -> np.random.Generator:
-        """Return the random numbers of the next draw; the streams of searches have smaller numbers."""
-        entropy = [self._seed, len(trials), 0x6175, self.of_model()]
-        return np.random.default_rng(np.random.SeedSequence(entropy))
+    def test(self, trials: Sequence[Trial]) -> Array:
+        """Return the next point ``(d,)`` of the Latin hypercubes of tests; it depends on no result."""
+        block, row = divmod(spread_tests(trials), TESTS)
+        return np.asarray(hypercube(self._validation.space.dimension, self._generator(block, _HYPERCUBE))[row])
+
+    def _generator(self, number: int, stream: int) -> np.random.Generator:
+        """Return the random numbers of a draw; the streams of searches have smaller numbers."""
+        return np.random.default_rng(np.random.SeedSequence([self._seed, number, stream, self.of_model()]))
 
     def of_model(self) -> int:
         """Return the number of the model, which the store keeps, because another processor rounds differently."""
         if self._store.draws() is None:
             self._store.keep_draws(_number_of_model(self._validation))
         return self._store.draws() or 0
+
+
+def spread_tests(trials: Sequence[Trial]) -> int:
+    """Return how many points of the Latin hypercubes of tests were taken."""
+    return sum(trial.origin == "spread" for trial in trials)
 
 
 def _number_of_model(validation: Validation) -> int:

@@ -8,7 +8,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from ctxval._util.checked import NonNegativeInt, PositiveFloat
+from ctxval._util.checked import NonNegativeInt, PositiveFloat, Probability
 from ctxval._util.registry import part
 from ctxval.certificates.base import Certificate, CertificateKind
 from ctxval.certificates.covering import RESOLUTION
@@ -16,9 +16,10 @@ from ctxval.certificates.dynamics import Dynamics
 from ctxval.certificates.dynamics_diagnostics import FEWEST
 from ctxval.certificates.forecast import Forecast
 from ctxval.certificates.posterior import Posterior
-from ctxval.certificates.prediction_tests import DRAWN, TESTS, fewest_missing_tests
+from ctxval.certificates.prediction_tests import DRAWN, TESTS, shown_by_tests
 from ctxval.certificates.sample import Sample
 from ctxval.certificates.verdict_sentences import supported as supported_by
+from ctxval.core.quantiles import QUANTILE
 from ctxval.errors import CertificateError
 
 _Outcome = tuple[Certificate, Forecast | None]
@@ -37,6 +38,7 @@ class Automatic(CertificateKind):
         stochastic, resolution: as for the posterior bound.
         tests: the number of executions at tasks drawn over the task space, which must be predicted beforehand if the
             bound is from learned dynamics.
+        quantile: the share of the executions of each task that the bound is about, if they differ by noise.
     """
 
     name: ClassVar[str] = "auto"
@@ -46,6 +48,7 @@ class Automatic(CertificateKind):
     stochastic: bool = False
     resolution: PositiveFloat = RESOLUTION
     tests: NonNegativeInt = TESTS
+    quantile: Probability = QUANTILE
 
     @property
     def posterior(self) -> Posterior:
@@ -71,9 +74,11 @@ class Automatic(CertificateKind):
         by_dynamics = None
         if self.uses_dynamics(sample):
             with suppress(CertificateError):
-                by_dynamics = _certified(Dynamics(tests=self.tests), sample, threshold, confidence)
-        if by_dynamics is not None and _decides(by_dynamics[0], threshold):
-            return by_dynamics
+                by_dynamics = _certified(
+                    Dynamics(tests=self.tests, quantile=self.quantile), sample, threshold, confidence
+                )
+        if by_dynamics is not None and (_decides(by_dynamics[0], threshold) or _is_noisy(by_dynamics[0])):
+            return by_dynamics  # the posterior bound of the distance is about systems without noise
         try:
             by_distance = self._tested(_certified(self.posterior, sample, threshold, confidence), sample)
         except CertificateError:
@@ -86,16 +91,18 @@ class Automatic(CertificateKind):
         return by_dynamics if _is_sound(by_dynamics[0]) or supported else by_distance
 
     def missing_tests(self, sample: Sample) -> int:
-        """Return the fewest executions after which the posterior bound has seen tasks of the whole space."""
+        """Return the number of executions after which the posterior bound has seen tasks of the whole space."""
         known = np.isfinite(sample.distances)
         drawn = sum(origin in DRAWN for origin, is_known in zip(sample.origins, known, strict=True) if is_known)
-        return fewest_missing_tests(sample.points[known], drawn, self.tests)
+        return max(self.tests - drawn, 0)
 
     def _tested(self, outcome: _Outcome, sample: Sample) -> _Outcome:
         """Return the posterior bound, withdrawn if tasks of the whole space have not been executed."""
         certificate, expected = outcome
         origins = [origin for origin in sample.origins if self.tests and origin in DRAWN]
-        tests = {"drawn": len(origins), "independent": origins.count("iid"), "largest_error": None}
+        uniform, dimension = sample.distribution is None, sample.points.shape[1]
+        shown = shown_by_tests(origins, dimension, certificate.confidence, uniform=uniform)
+        tests = {**shown, "largest_error": None}
         doubt, missing = certificate.doubt, self.missing_tests(sample)
         if doubt is None and missing:
             doubt = (
@@ -119,3 +126,7 @@ def _decides(certificate: Certificate, threshold: float | None) -> bool:
 def _is_sound(certificate: Certificate) -> bool:
     """Return whether a certificate is not withdrawn, and no prediction failed that raises its bound."""
     return certificate.doubt is None and certificate.details.get("raised_from") is None
+
+
+def _is_noisy(certificate: Certificate) -> bool:
+    return certificate.details.get("quantile") is not None

@@ -14,7 +14,7 @@ predictions, and by far more if one of these predictions failed.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import ClassVar
 
 import numpy as np
@@ -36,7 +36,7 @@ from ctxval.certificates.dynamics_diagnostics import (
 )
 from ctxval.certificates.dynamics_evidence import DynamicsEvidence
 from ctxval.certificates.forecast import Forecast
-from ctxval.certificates.prediction_tests import DRAWN, TESTS
+from ctxval.certificates.prediction_tests import DRAWN, TESTS, shown_by_tests
 from ctxval.certificates.sample import Sample, advice_to_remeasure, listed, require_learned
 from ctxval.certificates.sentences import (
     ONE_CAMPAIGN,
@@ -45,6 +45,7 @@ from ctxval.certificates.sentences import (
     dynamics_statement,
     two_distances,
 )
+from ctxval.core.quantiles import QUANTILE
 from ctxval.errors import CertificateError
 
 MOST_DRAWS = 400  # posterior samples of the dynamics, which limit the confidence
@@ -58,6 +59,7 @@ class Dynamics(CertificateKind):
     Attributes:
         stochastic: whether two executions of one task may differ; it must be False.
         tests: the number of executions that must have been predicted beforehand at tasks drawn over the task space.
+        quantile: the share of the executions of each task that the bound is about, if they differ by noise.
 
     Raises:
         CertificateError: if the system is declared stochastic.
@@ -68,6 +70,7 @@ class Dynamics(CertificateKind):
 
     stochastic: bool = False
     tests: NonNegativeInt = TESTS
+    quantile: Probability = QUANTILE
 
     def __post_init__(self) -> None:
         if self.stochastic:
@@ -101,7 +104,7 @@ class Dynamics(CertificateKind):
     def _evidence(self, sample: Sample, confidence: float) -> DynamicsEvidence:
         learned = require_learned(sample, self.name)
         _require_distances(sample)
-        evidence = learned.dynamics(confidence)
+        evidence = learned.dynamics(confidence, self.quantile)
         if evidence is None:
             raise CertificateError(
                 "no dynamics can be learned: there are no recorded trajectories, or M explains all of them, or no "
@@ -146,11 +149,12 @@ def certify_dynamics(sample: Sample, evidence: DynamicsEvidence, confidence: Pro
         )
     finite, last = evidence.maxima[np.isfinite(evidence.maxima)], counted(evidence, bound)[-PREDICTIONS:]
     drawn = [test for test in tested(evidence.predictions, evidence.tests) if test.origin in DRAWN]
+    origins = [test.origin for test in drawn]
     coverage, worst = evidence.coverage, failed(evidence, bound)
     differing = sample.differing(1e-6 * bound)
     return Certificate(
         kind="dynamics",
-        statement=dynamics_statement(upper, error, confidence),
+        statement=dynamics_statement(upper, error, confidence, evidence.quantile),
         upper_bound=upper,
         confidence=confidence,
         volume=0.0,
@@ -174,8 +178,7 @@ def certify_dynamics(sample: Sample, evidence: DynamicsEvidence, confidence: Pro
                 "held": sum(held(prediction, bound) for prediction in last),
             },
             "tests": {
-                "drawn": len(drawn),
-                "independent": sum(test.origin == "iid" for test in drawn),
+                **shown_by_tests(origins, sample.points.shape[1], confidence, uniform=sample.distribution is None),
                 "largest_error": max((test.error for test in drawn), default=None),
             },
             "checked": [{**each.to_json(), "held": bool(held(each, bound))} for each in evidence.predictions],
@@ -185,18 +188,21 @@ def certify_dynamics(sample: Sample, evidence: DynamicsEvidence, confidence: Pro
             "largest_gap_at": coverage.marginal.place,
             "resolution": coverage.resolution,
             "noise": evidence.noise,
+            "quantile": evidence.quantile,
+            "lags": evidence.lags,
             "without_model": evidence.without_model,
             "sharpness": evidence.sharpness,
             "jump": evidence.jump,
             "missed": evidence.missed,
             "disagreement": evidence.disagreement,
             "variance_left_out": evidence.left_out,
+            "pocket": evidence.pocket and asdict(evidence.pocket),
             "pushed": evidence.pushed and evidence.pushed.to_json(),
             "failures": sample.failures,
             "differing": None if differing is None else [sample.numbers[row] for row in differing],
         },
         doubt=both_outcomes(sample, stochastic=False)
-        or _undeclared_noise(sample, bound)
+        or (None if evidence.quantile is not None else _undeclared_noise(sample, bound))
         or doubt_of(evidence, sample.best, bound),
         error=error,
     )
@@ -226,4 +232,6 @@ def bound_of(evidence: DynamicsEvidence, best: float, confidence: float) -> floa
     If predictions failed, the bound is much higher: see :func:`~ctxval.certificates.dynamics_diagnostics.raised`.
     """
     excess = max((prediction.excess for prediction in evidence.predictions[-PREDICTIONS:]), default=0.0)
-    return max(evidence.upper(confidence) * evidence.missed, best) + 0.5 * excess
+    upper = evidence.upper(confidence) * evidence.missed
+    # A noisy execution may exceed the quantile that is bounded.
+    return (max(upper, best) if evidence.quantile is None else upper) + 0.5 * excess

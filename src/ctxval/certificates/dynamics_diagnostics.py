@@ -14,7 +14,7 @@ import numpy as np
 
 from ctxval.certificates.bounds import with_units
 from ctxval.certificates.dynamics_evidence import CheckedPrediction, DynamicsEvidence, StateInputGap
-from ctxval.certificates.prediction_tests import DRAWN, fewest_missing_tests
+from ctxval.certificates.prediction_tests import DRAWN
 
 # Limits; docs/theory.md has the reason for each.
 
@@ -36,6 +36,13 @@ MATTERS = 0.3  # least distance, as a share of the bound, at which a prediction 
 SHARP = 0.05  # share by which a large predicted distance may exceed the median of those of nearly the same tasks
 JUMP = 0.01  # jump of the predicted distance between nearly equal tasks, as a share of the bound
 DENSE = 2  # task parameters in which deeper searches may find the largest distance in spite of jumps
+NOISY_FEWEST = 5  # executions for a bound if the system is noisy
+NOISY_BEYOND = 0.06  # the same as BEYOND: noise leads a little beyond what a few executions have recorded
+NOISY_TESTED = 0.75  # the same as TESTED, of the median posterior sample, which has the noise of all executions
+TOLERATED = 0.02  # share of the bound by which a distance may exceed its prediction without being an excess
+UNLIKELY = 0.01  # least predicted probability of a distance as large as the executed one
+EVIDENCE = 20.0  # e-value of the last predictions of a noisy system at which they are rejected
+EVIDENCE_OF = 6  # number of these predictions
 AGREE = 0.05  # share by which two deeper searches may differ, and by which they may exceed the usual one
 
 
@@ -44,14 +51,16 @@ def doubt_of(evidence: DynamicsEvidence, best: float, bound: float) -> str | Non
 
     ``best`` is the largest executed distance, ``bound`` the bound before failed predictions raise it.
     """
-    reasons = chain(
-        _unlearned(evidence, bound),
-        _uncovered(evidence),
-        _untested(evidence, best, bound, raised(evidence, bound)),
-        _missing(evidence),
-        _unsearched(evidence, bound),
-    )
-    return next(reasons, None)
+    return next(doubts(evidence, best, bound), None)
+
+
+def doubts(evidence: DynamicsEvidence, best: float, bound: float) -> Iterator[str]:
+    """Yield all reasons to withdraw the bound, as :func:`doubt_of` returns the first one."""
+    yield from _unlearned(evidence, bound)
+    yield from _uncovered(evidence)
+    yield from _untested(evidence, best, bound, raised(evidence, bound))
+    yield from _missing(evidence)
+    yield from _unsearched(evidence, bound)
 
 
 def uncovered(evidence: DynamicsEvidence) -> str | None:
@@ -67,7 +76,8 @@ def untested(evidence: DynamicsEvidence, best: float, bound: float) -> str | Non
 
 def only_tests_missing(evidence: DynamicsEvidence, best: float, bound: float) -> bool:
     """Return whether tests are missing, and executions of other tasks would not help."""
-    needed = evidence.executions >= FEWEST and tests_missing(evidence) is not None
+    fewest = FEWEST if evidence.quantile is None else NOISY_FEWEST
+    needed = evidence.executions >= fewest and tests_missing(evidence) is not None
     return needed and uncovered(evidence) is None and untested(evidence, best, bound) is None
 
 
@@ -82,7 +92,8 @@ def fewest_missing(evidence: DynamicsEvidence, best: float, bound: float) -> int
     in_a_row = next((k for k, last in enumerate(reversed(checked)) if not held(last, bound)), len(checked))
     each_takes_one = chain(_uncovered(evidence), _untested(evidence, best, bound, raised(evidence, bound)))
     tests = missing_tests(evidence.predictions, evidence.tests)
-    return max(FEWEST - evidence.executions, PREDICTIONS - in_a_row, len(list(each_takes_one)), tests, 1)
+    fewest = FEWEST if evidence.quantile is None else NOISY_FEWEST
+    return max(fewest - evidence.executions, PREDICTIONS - in_a_row, len(list(each_takes_one)), tests, 1)
 
 
 def agrees(distance: float, predicted: float, bound: float) -> bool:
@@ -94,7 +105,12 @@ def agrees(distance: float, predicted: float, bound: float) -> bool:
 
 
 def held(prediction: CheckedPrediction, bound: float) -> bool:
-    """Return whether an execution agrees with its prediction; see :func:`agrees`."""
+    """Return whether an execution agrees with its prediction; see :func:`agrees`.
+
+    If the system is noisy, the distance must not be improbably large.
+    """
+    if prediction.is_noisy:
+        return prediction.chance_of_more(prediction.distance - TOLERATED * bound) >= UNLIKELY
     return agrees(prediction.distance, prediction.median, bound)
 
 
@@ -122,10 +138,8 @@ def tested(predictions: Sequence[CheckedPrediction], tests: int) -> list[Checked
 
 
 def missing_tests(predictions: Sequence[CheckedPrediction], tests: int) -> int:
-    """Return the fewest executions that complete the tests; those that were stored beforehand count."""
-    stored = [prediction for prediction in predictions if prediction.stored and prediction.point]
-    points = np.array([prediction.point for prediction in stored]) if stored else np.empty((0, 1))
-    return fewest_missing_tests(points, sum(prediction.origin in DRAWN for prediction in stored), tests)
+    """Return the number of executions that complete the tests; those that were predicted beforehand count."""
+    return max(tests - sum(each.stored and each.origin in DRAWN for each in predictions), 0)
 
 
 def failed(evidence: DynamicsEvidence, bound: float) -> CheckedPrediction | None:
@@ -146,6 +160,20 @@ def raised(evidence: DynamicsEvidence, bound: float) -> float:
     return bound if worst is None else bound + worst.error / ACCURATE
 
 
+def e_value(evidence: DynamicsEvidence) -> float:
+    """Return the evidence of the last predictions against the learned noise, a product of e-values; 1 without noise.
+
+    Each prediction has p-values of the distance and of statistics of the trajectory. The mean of ``p^-1/2 / 2`` over
+    them is an e-value (Vovk and Wang 2021), so it is large with a small probability if the predictions are right.
+    """
+    noisy = [prediction for prediction in evidence.predictions if prediction.is_noisy][-EVIDENCE_OF:]
+    product = 1.0
+    for prediction in noisy:
+        p = np.array([prediction.chance_of_more(prediction.distance), *prediction.p_values])
+        product *= float((0.5 / np.sqrt(p)).mean())
+    return product
+
+
 def jumps(evidence: DynamicsEvidence, bound: float) -> bool:
     """Return whether the distance is no smooth function of the task, so that a search may miss the largest one."""
     return evidence.sharpness > SHARP or evidence.jump > JUMP * bound
@@ -156,10 +184,11 @@ def jumps(evidence: DynamicsEvidence, bound: float) -> bool:
 
 def _unlearned(evidence: DynamicsEvidence, bound: float) -> Iterator[str]:
     """Yield why too little is known of the dynamics."""
-    if evidence.executions < FEWEST:
+    fewest = FEWEST if evidence.quantile is None else NOISY_FEWEST
+    if evidence.executions < fewest:
         yield (
             f"the dynamics are learned from {evidence.executions} executed trajectories, and the bound needs at least "
-            f"{FEWEST}; execute more tasks"
+            f"{fewest}; execute more tasks"
         )
     if evidence.unplanned:
         yield (
@@ -172,11 +201,17 @@ def _unlearned(evidence: DynamicsEvidence, bound: float) -> Iterator[str]:
             f"{checked} executions of different tasks were predicted from earlier ones, and the bound needs "
             f"{PREDICTIONS} predictions that hold; execute more tasks"
         )
-    if evidence.noise > NOISE:
+    if evidence.quantile is None and evidence.noise > NOISE:
         yield (
             f"noise is learned with {100 * evidence.noise:.2g} % of the variance of the residual, and at most "
             f"{100 * NOISE:g} % is allowed: the system is not deterministic in the recorded state and input; record "
             "more states or reduce the noise, or use --kind posterior with --stochastic"
+        )
+    if (against := e_value(evidence)) > EVIDENCE:
+        yield (
+            f"the last executions contradict the learned noise (evidence {against:.0f}, and at most {EVIDENCE:g} is "
+            "allowed): it may be correlated, rare, or larger in some tasks, or a state that is not recorded acts; "
+            "execute more tasks, or record more states"
         )
     if evidence.left_out > LEFT_OUT:
         yield (
@@ -189,7 +224,7 @@ def _uncovered(evidence: DynamicsEvidence) -> Iterator[str]:
     """Yield what the records and executions do not cover."""
     coverage, pair, untried = evidence.coverage, evidence.coverage.pair, evidence.untried
     goes_there = "`ctxval run` executes a task that goes there"
-    if coverage.beyond.size > (GAP if pair is None else BEYOND):
+    if coverage.beyond.size > (GAP if pair is None else BEYOND if evidence.quantile is None else NOISY_BEYOND):
         yield f"predicted runs leave the recorded range of {_at(coverage.beyond)}; {goes_there}"
     if coverage.marginal.size > GAP:
         yield f"predicted runs enter a gap in the records of {_at(coverage.marginal)}; {goes_there}"
@@ -211,7 +246,10 @@ def _at(gap: StateInputGap) -> str:
 
 def _untested(evidence: DynamicsEvidence, best: float, bound: float, allowed: float) -> Iterator[str]:
     """Yield why predictions are not tested where they matter, with errors as a bound of ``allowed`` permits."""
-    if best < TESTED * evidence.highest:
+    least = TESTED * evidence.highest
+    if evidence.quantile is not None:
+        least = NOISY_TESTED * min(evidence.highest, float(np.median(evidence.maxima)))
+    if best < least:
         yield (
             f"the largest distance is predicted to be {evidence.highest:.4g}, but the largest executed one is "
             f"{best:.4g}: the prediction is not tested where it matters; an execution of that task helps "

@@ -11,6 +11,7 @@ import numpy as np
 from ctxval._util.arrays import Array
 from ctxval._util.representation import ShortRepr
 from ctxval.certificates.prediction_tests import TESTS
+from ctxval.core.quantiles import LEVELS, QUANTILE, chance_of_more
 from ctxval.core.trial import Origin
 
 
@@ -29,6 +30,9 @@ class CheckedPrediction(ShortRepr):
         new: whether the task differs from those that were executed before.
         origin: the reason why the task was chosen.
         point: the task, a point of the unit cube ``(d,)``.
+        quantiles: quantiles of the predicted distances at ``quantiles.LEVELS`` if the system is noisy; else empty.
+        runs: the number of predicted distances that these are of.
+        p_values: predicted probabilities of more than what statistics of the trajectory are; empty without noise.
     """
 
     trial: int
@@ -41,10 +45,27 @@ class CheckedPrediction(ShortRepr):
     new: bool = True
     origin: Origin = "acquisition"
     point: tuple[float, ...] = ()
+    quantiles: tuple[float, ...] = ()
+    runs: int = 0
+    p_values: tuple[float, ...] = ()
+
+    @property
+    def is_noisy(self) -> bool:
+        """Whether it predicts what noise does."""
+        return len(self.quantiles) > 0
+
+    def chance_of_more(self, distance: float) -> float:
+        """Return the predicted probability that an execution exceeds a distance; it is never 0."""
+        return chance_of_more(self.quantiles, distance, self.runs)
 
     @property
     def excess(self) -> float:
-        """How far the distance exceeds the prediction's median; infinity if nothing was predicted."""
+        """How far the distance exceeds the prediction's median, or its 0.9 quantile if the system is noisy.
+
+        It is infinity if nothing was predicted.
+        """
+        if self.is_noisy:
+            return max(self.distance - float(np.interp(0.9, LEVELS, self.quantiles)), 0.0)
         return max(self.distance - self.median, 0.0) if np.isfinite(self.median) else np.inf
 
     @property
@@ -54,10 +75,12 @@ class CheckedPrediction(ShortRepr):
 
     def to_json(self) -> dict[str, Any]:
         """Return all attributes, ready for JSON: numbers that are not finite are None."""
-        return {
+        plain = {
             name: None if isinstance(value, float) and not np.isfinite(value) else value
             for name, value in asdict(self).items()
         }
+        del plain["quantiles"], plain["runs"]
+        return plain
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,6 +117,21 @@ class StateInputCoverage(ShortRepr):
     resolution: dict[str, float]
     task: Array
     tasks: int
+
+
+@dataclass(frozen=True)
+class StatePocket:
+    """The largest region of two states that closed loops of tasks enter, and that no execution has entered.
+
+    Attributes:
+        size: its radius, as a share of the visited ranges.
+        place: its centre, by the labels of the states, in their units.
+        within: its radius in each of the two states; they are equal if both are places.
+    """
+
+    size: float
+    place: dict[str, float]
+    within: dict[str, float]
 
 
 @dataclass(frozen=True, eq=False)
@@ -205,6 +243,10 @@ class DynamicsEvidence(ShortRepr):
         disagreement: share by which the smaller result of these searches is below the larger one.
         tests: the number of tests that a bound needs; see :mod:`~ctxval.certificates.prediction_tests`.
         pushed: the largest distances if something pushes the system; None if the bound is withdrawn anyway.
+        quantile: the share of the executions of a task whose distances are below the maxima; None if the system is not
+            noisy, so that all are alike.
+        lags: number of earlier records and inputs that the learned dynamics depend on.
+        pocket: the largest region that no execution has entered; None if it is not known.
     """
 
     maxima: Array
@@ -228,6 +270,9 @@ class DynamicsEvidence(ShortRepr):
     disagreement: float = 0.0
     tests: int = TESTS
     pushed: PushedDistances | None = None
+    quantile: float | None = None
+    lags: int = 0
+    pocket: StatePocket | None = None
 
     def rank(self, confidence: float) -> int:
         """Return the row, in ascending order, of the maximum that d* stays below with this probability."""
@@ -258,15 +303,20 @@ class DynamicsEvidence(ShortRepr):
             arrays = {name: np.array(values[name], dtype=np.float64) for name in ("maxima", "points", "elites")}
             parts = {
                 "predictions": tuple(
-                    CheckedPrediction(**{**each, "point": tuple(each["point"])}) for each in values["predictions"]
+                    CheckedPrediction(**{**each, **{name: tuple(each[name]) for name in _TUPLES}})
+                    for each in values["predictions"]
                 ),
                 "coverage": StateInputCoverage(**{**coverage, **gaps, "task": np.array(coverage["task"])}),
                 "untried": untried and UntriedParameter(**{**untried, "task": np.array(untried["task"])}),
                 "pushed": values["pushed"] and PushedDistances.from_json(values["pushed"]),
+                "pocket": values["pocket"] and StatePocket(**values["pocket"]),
             }
             return cls(**{**values, **arrays, **parts})
         except (KeyError, TypeError, ValueError):
             return None
+
+
+_TUPLES = ("point", "quantiles", "p_values")
 
 
 def _gap(values: Any) -> Any:
@@ -283,10 +333,11 @@ class LearnedDistance(Protocol):
         They are learned from trials with numbers below ``before`` only.
         """
 
-    def dynamics(self, confidence: float) -> DynamicsEvidence | None:
+    def dynamics(self, confidence: float, quantile: float = QUANTILE) -> DynamicsEvidence | None:
         """Return what the dynamics learned from all trials say about d*; None if nothing can be learned.
 
-        The confidence sets the least number of posterior samples. Users' code raises a CertificateError.
+        If the system is noisy, it is about a quantile of the distance. The confidence
+        sets the least number of posterior samples. Users' code raises a CertificateError.
         """
 
     def tasks(self, count: int, seed: int) -> Array:

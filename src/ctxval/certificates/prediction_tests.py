@@ -1,67 +1,84 @@
-"""Tests that could have failed: executions that are predicted beforehand at tasks where nobody chose to look.
+r"""Tests that could have failed: executions that are predicted beforehand at tasks where nobody chose to look.
 
 A search looks where distances are large, so it may never see that the dynamics are other in some tasks. Before a bound
-is believed, executions must have been predicted at a number of tasks that are drawn for this: tasks that leave no
-interval of a task parameter without a test if it is wider than ``WIDEST``, and independent draws from the
-distribution of tasks. What is other in one of eight equal parts of a parameter's range is met with certainty by the
-former; eight independent draws meet it with a probability of 66 %. Other executions fill intervals too, if they were
-predicted beforehand.
+is believed, executions must have been predicted at a number of tasks that are drawn for this. They are the points of
+Latin hypercubes of ``TESTS`` points: each of ``TESTS`` equal parts of each parameter's range has a test, so what is
+other in one of these parts is met with certainty. Independent draws meet it with a probability of 66 %.
+
+The tests also tell how many tasks exceed a threshold, whatever the system is, if none of them exceeds it. A set of a
+share v of the tasks is missed by n independent draws with probability ``(1 - v)^n``. No design that has a test in each
+part of two parameters keeps this: n such points fill one of n! arrangements of n cells. One of these has a probability
+of at least ``1 / n!``, and then all points miss the tasks outside of it, whose share is ``1 - 1 / n``. This is more
+than ``n^-n``. For m points of a hypercube in d parameters, in random order, the probability is at most
+
+.. math:: G^{(d-1)}(1 - v)^m, \qquad G(x) = \varphi(n x) / \varphi(n), \qquad \varphi(r) = (r!)^{1/r},
+
+with linear interpolation of :math:`\varphi` between integers and :math:`\varphi(0) = 0`. With two parameters, the
+probability is a permanent over n!, and Bregman's theorem bounds it by a product of G over the rows; fractions of cells
+are mixtures of whole ones, because a permanent is linear in each row. Each further parameter applies G once more,
+because G is concave, and the inequalities of Maclaurin bound the mean over the order of the rows. It is
+``(1 - v)^m`` in one parameter. From ``MANY`` tests on, tests are independent draws instead: these meet one part of
+``TESTS`` with a probability of 95 %.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from itertools import pairwise
+import math
+from collections.abc import Sequence
 
 import numpy as np
 
 from ctxval._util.arrays import Array
 from ctxval.core.trial import Origin
 
-TESTS = 8  # default number
-WIDEST = 0.12  # widest interval of a task parameter without a test, as a share of its range
-DRAWN: tuple[Origin, ...] = ("iid", "spread")  # origins of the tasks that are drawn
+TESTS = 8  # default number, and number of points of a hypercube
+MANY = 22  # number of tests from which on they are independent draws
+DRAWN: tuple[Origin, ...] = ("iid", "spread")  # origins of tests: independent draws, and points of hypercubes
 
 
-def fewest_missing_tests(points: Array, drawn: int, tests: int) -> int:
-    """Return the fewest executions that complete the tests; 0 if they are complete, or no tests are asked for.
+def hypercube(dimension: int, rng: np.random.Generator, points: int = TESTS) -> Array:
+    """Return a Latin hypercube, points ``(n, d)`` in random order: each n-th of each parameter's range has one."""
+    parts = rng.permuted(np.tile(np.arange(points), (dimension, 1)), axis=1).T
+    return np.asarray((parts + rng.random((points, dimension))) / points)
 
-    The points ``(n, d)`` are tasks that were predicted beforehand and executed; some of them were drawn as tests.
+
+def share_missed(spread: int, independent: int, dimension: int, confidence: float) -> float:
+    """Return the share of tasks that so many tests meet with a probability of at least ``confidence``.
+
+    Args:
+        spread: the number of points of hypercubes, one after the other, of which only the last may be incomplete.
+        independent: the number of independent draws.
+        dimension: the number of task parameters, which are uniform.
+        confidence: the probability that a larger share is met. It holds at any time.
     """
-    return max(tests - drawn, fewest_spread_tests(points)) if tests else 0
+    low, high = 0.0, 1.0  # shares of the tasks that are not missed with certainty, and with this probability
+    for _ in range(60):
+        kept = (low + high) / 2
+        missed = probability_missed(kept, dimension) ** spread * kept**independent
+        low, high = (kept, high) if missed <= 1 - confidence else (low, kept)
+    return 1 - low
 
 
-def fewest_spread_tests(points: Array) -> int:
-    """Return the fewest tasks that leave no task parameter a wide interval without one of the points ``(n, d)``."""
-    return max((sum(_needed(low, high) for low, high in _gaps(values)) for values in points.T), default=0)
+def probability_missed(kept: float, dimension: int, points: int = TESTS) -> float:
+    """Return G^(d-1) of the share of tasks outside of a set.
 
-
-def next_spread_test(points: Array, rng: np.random.Generator) -> Array:
-    """Return a task in the widest gaps of all task parameters, ``(d,)``; see :func:`fewest_spread_tests`.
-
-    A parameter without a wide gap is at one of its bounds with probability 1/2: contacts and limits lie there most
-    often.
+    The first m points of a hypercube miss the set with at most its m-th power.
     """
-    return np.array([_value_in_a_gap(values, rng) for values in points.T])
+    roots = np.array([0.0, *(math.factorial(r) ** (1 / r) for r in range(1, points + 1))])
+    for _ in range(dimension - 1):
+        kept = float(np.interp(points * kept, np.arange(points + 1), roots) / roots[-1])
+    return kept
 
 
-def _value_in_a_gap(values: Array, rng: np.random.Generator) -> float:
-    gaps = [(low, high) for low, high in _gaps(values) if _needed(low, high)]
-    if not gaps:
-        return float(rng.integers(2)) if rng.random() < 0.5 else rng.random()
-    low, high = gaps[rng.integers(len(gaps))]
-    needed = _needed(low, high)
-    # The value of the k-th of so many tests, with as much chance as leaves the others enough.
-    k = int(rng.integers(1, needed + 1))
-    least, most = high - (needed + 1 - k) * WIDEST, low + k * WIDEST
-    return float(rng.uniform(max(least, low), min(most, high)))
+def shown_by_tests(
+    origins: Sequence[Origin], dimension: int, confidence: float, *, uniform: bool
+) -> dict[str, int | float | None]:
+    """Return the number of tests with these origins, and which share of the tasks exceeds what no test exceeds.
 
-
-def _gaps(values: Array) -> Iterator[tuple[float, float]]:
-    """Yield the intervals between neighbouring values and the bounds 0 and 1."""
-    return pairwise([0.0, *np.sort(values).tolist(), 1.0])
-
-
-def _needed(low: float, high: float) -> int:
-    """Return the fewest values between two others that leave no wide gap."""
-    return max(0, int(np.ceil((high - low) / WIDEST - 1e-9)) - 1)
+    Points of hypercubes show nothing of tasks with a distribution, because they are uniform. The share is None if no
+    test shows anything.
+    """
+    independent = origins.count("iid")
+    spread = origins.count("spread") if uniform else 0
+    share = share_missed(spread, independent, dimension, confidence) if spread or independent else None
+    return {"drawn": len(origins), "independent": independent, "spread": spread, "share_missed": share}

@@ -172,8 +172,13 @@ def two_distances(sample: Sample, rows: tuple[int, int]) -> str:
 # Learned dynamics
 
 
-def dynamics_statement(upper: float, error: float, confidence: float) -> str:
-    """Return the bound on d* from learned dynamics."""
+def dynamics_statement(upper: float, error: float, confidence: float, quantile: float | None = None) -> str:
+    """Return the bound on d*, or on the quantile of the distance at the worst task, from learned dynamics."""
+    if quantile is not None:
+        return (
+            f"With {percent(confidence)} probability under a Gaussian process of the residual dynamics with noise, the "
+            f"{quantile:g} quantile of the distance is at most {with_error(upper, error)} in every task."
+        )
     return (
         f"With {percent(confidence)} probability under a Gaussian process of the residual dynamics, d* is at most "
         f"{with_error(upper, error)}."
@@ -200,9 +205,19 @@ def dynamics_assumptions(evidence: DynamicsEvidence) -> tuple[str, ...]:
             "combinations: what happens only at a combination that was never visited, such as a contact in a corner, "
             "is not covered"
         )
+    steps = "the last record" if not evidence.lags else f"the last {evidence.lags + 1} records"
+    complete = "the recorded state is complete: the next state depends on it and on the input alone"
+    if evidence.lags or evidence.quantile is not None:
+        complete = f"the next record depends on {steps} and inputs alone, up to noise"
+    alike = "the system is deterministic, and its dynamics do not change with time or with the task"
+    if evidence.quantile is not None:
+        alike = (
+            "noise is independent from step to step, like that of the records, and the dynamics do not change with "
+            "time or with the task"
+        )
     return (
-        "the recorded state is complete: the next state depends on it and on the input alone",
-        "the system is deterministic, and its dynamics do not change with time or with the task",
+        complete,
+        alike,
         f"{prior}; its hyperparameters are unknown and integrated over",
         "in gaps of the records, the residual is like what was seen beside them; the largest gaps of states and inputs "
         f"are {with_units(evidence.coverage.resolution)}",

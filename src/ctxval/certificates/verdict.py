@@ -12,10 +12,12 @@ from ctxval._util.checked import PositiveFloat, checked
 from ctxval._util.representation import ShortRepr, call, line, lines, shown, table
 from ctxval.certificates import verdict_sentences as sentences
 from ctxval.certificates.base import KINDS, Certificate
+from ctxval.certificates.bets import bets_against
 from ctxval.certificates.forecast import Forecast
-from ctxval.certificates.options import CertificateOptions, require_confidence, require_volume
+from ctxval.certificates.options import CONFIDENCE, CertificateOptions, require_confidence, require_volume
 from ctxval.certificates.provenance import Provenance
 from ctxval.certificates.verdict_sentences import Quantities
+from ctxval.core.quantiles import QUANTILE
 from ctxval.core.trial import Trial, designs_sentence
 from ctxval.errors import CertificateError
 
@@ -82,6 +84,11 @@ class Verdict:
         }
 
 
+def quantile_of(kind: object) -> float:
+    """Return the share of the executions of a task that a threshold is about, for a kind of certificate."""
+    return float(getattr(kind, "quantile", QUANTILE))
+
+
 def usable_bound(certificate: Certificate | None) -> float | None:
     """Return the bound on d* of a certificate; None if there is none, it is withdrawn, or it leaves out a volume."""
     if certificate is None or certificate.doubt is not None or certificate.volume:
@@ -91,15 +98,25 @@ def usable_bound(certificate: Certificate | None) -> float | None:
 
 @checked
 def counterexample(
-    trials: Sequence[Trial], threshold: PositiveFloat, quantities: Quantities = sentences.NO_UNITS
+    trials: Sequence[Trial],
+    threshold: PositiveFloat,
+    quantities: Quantities = sentences.NO_UNITS,
+    confidence: float = CONFIDENCE,
+    quantile: float = QUANTILE,
 ) -> Verdict | None:
-    """Return the verdict "falsified" by the largest distance above the threshold; None if no distance is above it."""
-    tau = float(threshold)
+    """Return the verdict "falsified" by the largest distance above the threshold; None if no distance is above it.
+
+    If executions were predicted to be noisy, a single one above it does not suffice: see
+    :mod:`ctxval.certificates.bets`.
+    """
+    tau, bets = float(threshold), bets_against(trials, float(threshold), quantile)
+    if bets is not None and not bets.falsify(confidence):
+        return None
     above = [trial for trial in trials if trial.distance is not None and trial.distance > tau]
     if not above:
         return None
     worst = max(above, key=lambda trial: trial.distance or 0.0)
-    return Verdict("falsified", tau, sentences.falsified(worst, trials, tau, quantities), worst)
+    return Verdict("falsified", tau, sentences.falsified(worst, trials, tau, quantities, bets), worst)
 
 
 @checked
@@ -121,7 +138,7 @@ def judge_by(
     tau, known = float(threshold), provenance or Provenance()
     require_confidence(certificate.confidence)
     kind, quantities = KINDS.of(certificate), known.quantities
-    falsified = counterexample(trials, tau, quantities)
+    falsified = counterexample(trials, tau, quantities, certificate.confidence, quantile_of(kind))
     if falsified is not None:
         return replace(falsified, certificate=certificate)
     if not certificate.covers(tau, require_volume(volume)):
@@ -153,12 +170,15 @@ def judge(
     known = provenance or Provenance()
     verdict = _judged(trials, threshold, options or CertificateOptions(), known)
     parts = [verdict.reason.removesuffix("."), verdict.expected, designs_sentence(trials)]
+    bets = bets_against(trials, float(threshold), quantile_of((options or CertificateOptions()).kind))
+    if verdict.answer != "falsified" and bets is not None and bets.above:
+        parts.append(sentences.noise_may_explain(bets, float(threshold), known.quantities))
     reason = "; ".join(str(part) for part in parts if part is not None)
     return replace(verdict, reason=f"{reason}.{known.caution(threshold)}")
 
 
 def _judged(trials: Sequence[Trial], threshold: float, options: CertificateOptions, known: Provenance) -> Verdict:
-    falsified = counterexample(trials, threshold, known.quantities)
+    falsified = counterexample(trials, threshold, known.quantities, options.confidence, quantile_of(options.kind))
     if falsified is not None:
         return falsified
     try:
@@ -226,7 +246,9 @@ def assess(
         InputError: if the threshold is not a positive number.
     """
     known, kind = provenance or Provenance(), options.kind
-    falsified = None if threshold is None else counterexample(trials, threshold, known.quantities)
+    falsified = None
+    if threshold is not None:
+        falsified = counterexample(trials, threshold, known.quantities, options.confidence, quantile_of(kind))
     if threshold is not None and falsified is None:
         verdict = judge(trials, threshold, options, known)
         if verdict.certificate is None:

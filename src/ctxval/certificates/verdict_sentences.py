@@ -11,6 +11,7 @@ import numpy as np
 
 from ctxval._util.representation import counted, shown
 from ctxval._util.texts import enumerated, parted, quoted
+from ctxval.certificates.bets import Bets
 from ctxval.certificates.bounds import at_most, of_tasks, percent, with_error, with_units
 from ctxval.certificates.covering import RESOLUTION
 from ctxval.certificates.dynamics_evidence import PushedDistances, Tolerance
@@ -73,8 +74,13 @@ NO_UNITS = Quantities()
 # Falsified
 
 
-def falsified(worst: Trial, trials: Sequence[Trial], tau: float, quantities: Quantities) -> str:
-    """Return which executed task exceeds a threshold, and how often an execution of the same task reproduced it."""
+def falsified(
+    worst: Trial, trials: Sequence[Trial], tau: float, quantities: Quantities, bets: Bets | None = None
+) -> str:
+    """Return which executed task exceeds a threshold, and how often an execution of the same task reproduced it.
+
+    ``bets`` are those of a noisy system.
+    """
     distance, limit = distinguishable(worst.distance or 0.0, tau)
     again = [(trial.distance or 0.0) > tau for trial in executions_of(worst, trials) if trial is not worst]
     reproduced = ""
@@ -85,7 +91,25 @@ def falsified(worst: Trial, trials: Sequence[Trial], tau: float, quantities: Qua
             reproduced += f" ({len(again) - sum(again)} of {len(again)} repetitions of the task did not exceed it)"
     return (
         f"trial {worst.number} was executed and its distance {quantities.of(distance)} exceeds {quantities.of(limit)}, "
-        f"at {quantities.task(worst)}{reproduced}."
+        f"at {quantities.task(worst)}{reproduced}{_beyond_noise(bets)}."
+    )
+
+
+def _beyond_noise(bets: Bets | None) -> str:
+    if bets is None:
+        return ""
+    return (
+        f"; {bets.above} of {counted(bets.executions, 'execution')} exceed it, more than noise explains if a share of "
+        f"the executions as stated stays below in every task (evidence {bets.wealth:.3g})"
+    )
+
+
+def noise_may_explain(bets: Bets, tau: float, quantities: Quantities) -> str:
+    """Return that executions exceed a threshold, and that noise may be the cause."""
+    exceed = "exceeds" if bets.above == 1 else "exceed"
+    return (
+        f"{bets.above} of {counted(bets.executions, 'execution')} {exceed} {quantities.of(f'{tau:.6g}')}, which noise "
+        f"may explain (evidence {bets.wealth:.3g} against the threshold)"
     )
 
 
@@ -121,7 +145,8 @@ def validated(certificate: Certificate, tau: float, quantities: Quantities) -> s
             f"{upper}, from {counted(certificate.trials, 'independent draw')}."
         )
     return (
-        f"{untested}every task{quantities.ranges} stays at or below {limit}: the {certificate.kind} bound is {upper}, "
+        f"{untested}every task{quantities.ranges} stays at or below {limit}{_which(certificate)}: the "
+        f"{certificate.kind} bound is {upper}, "
         f"with {level} {_condition(certificate, quantities)}."
     )
 
@@ -133,7 +158,8 @@ def evidence(certificate: Certificate, tau: float, quantities: Quantities) -> st
     best = certificate.details.get("best")
     largest = "" if best is None else f", the largest distance {quantities.of(f'{best:.4g}')}"
     executions = counted(certificate.trials, "execution")
-    return f"{executions}{largest}{_tested(certificate, tau)}.{_survives(certificate, tau)} "
+    shown = f"{executions}{largest}{_tested(certificate, tau)}"
+    return f"{shown}.{_survives(certificate, tau)}{_not_entered(certificate)} "
 
 
 _UNTESTED = "no prediction was tested where nobody chose to look (tests = 0)"
@@ -142,9 +168,20 @@ _UNTESTED = "no prediction was tested where nobody chose to look (tests = 0)"
 def _condition(certificate: Certificate, quantities: Quantities) -> str:
     """Return what the confidence of a bound on d* is, and the condition under which it holds."""
     if certificate.kind == "dynamics":
+        if certificate.details["quantile"] is not None:
+            return (
+                "probability under a Gaussian process with noise, if what M misses is a smooth function of recorded "
+                f"states and inputs{_of_lags(certificate)}, the same in every task and over time, and noise is "
+                "independent from step to step"
+            )
         missed = "the system" if certificate.details["without_model"] else "what M misses"
+        of = (
+            f"recorded states and inputs{_of_lags(certificate)}"
+            if certificate.details["lags"]
+            else "recorded state and input"
+        )
         return (
-            f"probability under a Gaussian process, if {missed} is one smooth function of recorded state and input, "
+            f"probability under a Gaussian process, if {missed} is one smooth function of {of}, "
             "the same in every task and over time"
         )
     if certificate.kind == "posterior":
@@ -154,6 +191,17 @@ def _condition(certificate: Certificate, quantities: Quantities) -> str:
             f"them{_unusual(certificate, quantities)}"
         )
     return "confidence, if its assumptions hold"
+
+
+def _which(certificate: Certificate) -> str:
+    """Return in how many executions of a task a bound holds; empty if all of them are alike."""
+    quantile = certificate.details.get("quantile")
+    return "" if quantile is None else f" in at least {100 * quantile:g} % of its executions"
+
+
+def _of_lags(certificate: Certificate) -> str:
+    lags = certificate.details["lags"]
+    return "" if not lags else f" of the last {lags + 1} steps"
 
 
 def _unusual(certificate: Certificate, quantities: Quantities) -> str:
@@ -213,6 +261,19 @@ def _survives(certificate: Certificate, tau: float) -> str:
     )
 
 
+def _not_entered(certificate: Certificate) -> str:
+    """Return, as a sentence after a space, the largest region of two states that loops enter and no execution has."""
+    pocket = certificate.details.get("pocket")
+    if pocket is None:
+        return ""
+    radii = [(*parted(label), radius) for label, radius in pocket["within"].items()]
+    within = " and ".join(f"{f'{radius:.2g} {unit}'.rstrip()} in {name}" for name, unit, radius in radii)
+    if len({(unit, radius) for _, unit, radius in radii}) == 1:
+        _, unit, radius = radii[0]
+        within = f"{radius:.2g} {unit}".rstrip()
+    return f" No execution came within {within} of {with_units(pocket['place'])}, where predicted runs lead."
+
+
 def _push(tolerance: Tolerance) -> str:
     if np.isfinite(tolerance.push):
         return _rate(tolerance.state, tolerance.push)
@@ -262,9 +323,19 @@ def conditions(certificate: Certificate, space: TaskSpace | None) -> list[str]:
         case "dynamics":
             gaps, again = with_units(details["resolution"]), details.get("differing")
             noise = "" if again is None else f" (trials {again[0]} and {again[1]} of one task differ a little)"
+            unchanging = "its dynamics changing neither with time nor with the task"
+            steps = f"the last {details['lags'] + 1} records and inputs"
+            if details["quantile"] is not None:
+                complete = f"{steps} determining the next record up to noise"
+                alike = f"noise being independent from step to step and like that of the records, and {unchanging}"
+            else:
+                complete = (
+                    f"{steps} determining the next record" if details["lags"] else "the recorded state being complete"
+                )
+                alike = f"the system being deterministic{noise}, and {unchanging}"
             return [
-                "the recorded state being complete",
-                f"the system being deterministic{noise}, and its dynamics changing neither with time nor with the task",
+                complete,
+                alike,
                 f"its dynamics being, in gaps of the records of up to {gaps}, like what was seen",
             ]
         case "posterior":
@@ -335,17 +406,19 @@ def not_selected(others: int, falsifying: Sequence[str]) -> str:
 
 
 def _without_assumptions(certificate: Certificate, tau: float, quantities: Quantities) -> str:
-    """Return what independent draws say whatever the system is: none of them exceeds the threshold.
+    """Return what drawn tests say whatever the system is: none of them exceeds the threshold.
 
-    This holds at any time: a share of v is missed by the first n draws with probability (1 - v)^n.
+    This holds at any time: see :func:`~ctxval.certificates.prediction_tests.share_missed`.
     """
-    draws = certificate.details.get("tests", {}).get("independent", 0)
-    if not draws:
+    tests = certificate.details.get("tests", {})
+    if tests.get("share_missed") is None:
         return ""
-    share = at_most(100 * (1 - (1 - certificate.confidence) ** (1 / draws)), 2)
+    draws = [f"{counted(tests['spread'], 'test')} drawn as a Latin hypercube"] if tests["spread"] else []
+    draws += [counted(tests["independent"], "independent draw")] if tests["independent"] else []
     return (
-        f" Without assumptions: at most {share} % {of_tasks(certificate.distribution)} exceed "
-        f"{quantities.of(f'{tau:.6g}')} ({counted(draws, 'independent draw')}, {percent(certificate.confidence)})."
+        f" Without assumptions: at most {at_most(100 * tests['share_missed'], 2)} % "
+        f"{of_tasks(certificate.distribution)} exceed {quantities.of(f'{tau:.6g}')} "
+        f"({' and '.join(draws)}, {percent(certificate.confidence)})."
     )
 
 

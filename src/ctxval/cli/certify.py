@@ -34,11 +34,13 @@ class Asked:
     stochastic: bool | None = None
     resolution: float | None = None
     tests: int | None = None
+    quantile: float | None = None
     option: list[str] | None = None
 
     def options(self, settings: Settings, kind: str | None) -> CertificateOptions:
         """Return the kind, the options and the confidence of the certificate."""
-        given = {name: getattr(self, name) for name in ("discard", "volume", "stochastic", "resolution", "tests")}
+        names = ("discard", "volume", "stochastic", "resolution", "tests", "quantile")
+        given = {name: getattr(self, name) for name in names}
         level = settings.confidence if self.confidence is None else self.confidence
         return settings.certificate.options(level, kind=kind, stated=named_values(self.option, **given))
 

@@ -58,6 +58,7 @@ def run(
     explore: bool | None = None,
     within: float | None = None,
     tests: int | None = None,
+    quantile: float | None = None,
     stochastic: bool | None = None,
     resolution: float | None = None,
     seed: int | None = None,
@@ -81,7 +82,8 @@ def run(
     }
     stated |= {"explore": explore, "within": within, "store": store, "options": named_values(option)}
     settings = read_settings(target, stated)
-    settings = settings.certified_as({"stochastic": stochastic, "resolution": resolution, "tests": tests})
+    certified = {"stochastic": stochastic, "resolution": resolution, "tests": tests, "quantile": quantile}
+    settings = settings.certified_as(certified)
     experiment = settings.load()
     certificate = settings.certificate_options
     if truth and experiment.truth is None:

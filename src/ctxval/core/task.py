@@ -76,6 +76,10 @@ class Task:
         reference = self.reference[index] if self.has_goal else None
         return Task(self.initial_state[index], horizon=self.horizon, dt=self.dt, reference=reference)
 
+    def starting_at(self, states: Array) -> Task:
+        """Return the task from other initial states ``(..., n)``, which may have further axes in front."""
+        return Task(states, horizon=self.horizon, dt=self.dt, reference=self.reference if self.has_goal else None)
+
     def describe(self) -> dict[str, Any]:
         """Return what identifies one task in a store."""
         start = self.initial_state.tolist()

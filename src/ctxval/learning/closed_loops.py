@@ -21,8 +21,12 @@ from ctxval.core.trajectory import Trajectory
 from ctxval.core.validation import Validation
 from ctxval.learning.draws import DynamicsDraws
 from ctxval.learning.dynamics_posterior import DynamicsPosterior
+from ctxval.learning.noisy_draws import NoisyDraws
 
 T = TypeVar("T")
+
+AnyDraws = DynamicsDraws | NoisyDraws
+"""Draws of dynamics without and with noise."""
 
 _REMEMBERED = 64_000_000  # largest size of the plans that are kept, in bytes, approximately
 
@@ -43,7 +47,7 @@ class PlannedTasks:
 
 @dataclass(frozen=True, eq=False)
 class Loops:
-    """Closed loops of S drawn systems on q tasks.
+    """Closed loops of S drawn systems on q tasks; noisy ones have S R, with R sequences of noise for each draw.
 
     Attributes:
         distances: d, shape ``(S, q)``; NaN if the loop of M diverges, infinity if that of a drawn system does.
@@ -137,19 +141,21 @@ class LoopPlanner:
             raise ValueError("the task function did not return one task for each point")
         return PlannedTasks(rows, task, controller, promised)
 
-    def run(self, draws: DynamicsDraws, planned: Sequence[PlannedTasks]) -> list[Loops]:
+    def run(self, draws: AnyDraws, planned: Sequence[PlannedTasks]) -> list[Loops]:
         """Return the closed loops of all draws on the same tasks."""
         return [self._run(draws, one) for one in planned]
 
-    def distances(self, draws: DynamicsDraws, planned: Sequence[PlannedTasks], tasks: int) -> Array:
+    def distances(self, draws: AnyDraws, planned: Sequence[PlannedTasks], tasks: int) -> Array:
         """Return the distances ``(S, q)`` of all draws on the same q tasks; NaN for a task without a finite plan."""
-        found = distances_of(self.run(draws, planned), planned, len(draws), tasks)
+        found = distances_of(draws, self.run(draws, planned), planned, tasks)
         advance(len(draws) * sum(len(one.rows) for one in planned))
         return found
 
-    def own_distances(self, draws: DynamicsDraws, points: Array) -> Array:
+    def own_distances(self, draws: AnyDraws, points: Array) -> Array:
         """Return the distances ``(S, q)`` of each draw on tasks of its own, at points ``(S, q, d)``."""
         S, q, d = points.shape
+        if isinstance(draws, NoisyDraws):
+            return self._own_noisy_distances(draws, points)
         found = np.full(S * q, np.nan)
         for one in self.plan(points.reshape(S * q, d), together=S * q):
             alone = draws.model_of(int(one.rows[0]) // q).step
@@ -158,8 +164,47 @@ class LoopPlanner:
             advance(len(one.rows))
         return found.reshape(S, q)
 
-    def _run(self, draws: DynamicsDraws, planned: PlannedTasks) -> Loops:
+    def _own_noisy_distances(self, draws: NoisyDraws, points: Array) -> Array:
+        S, q, d = points.shape
+        R = draws.replicates
+        found = np.full((R, S * q), np.nan)
+        for one in self.plan(points.reshape(S * q, d), together=S * q):
+            of_draw = np.broadcast_to(one.rows // q, (R, len(one.rows)))
+            found[:, one.rows] = self._noisy_loops(draws, one, of_draw, np.arange(R)).distances
+            advance(R * len(one.rows))
+        return draws.reduced(found.reshape(R, S, q).swapaxes(0, 1).reshape(S * R, q))
+
+    def _noisy_loops(self, draws: NoisyDraws, planned: PlannedTasks, of_draw: Rows, replicates: Rows) -> Loops:
+        """Return closed loops of draws ``(L, q)`` with a sequence of noise for each row, ``(L,)``."""
+        task, L = planned.task, len(replicates)
+        of_replicate = np.broadcast_to(replicates[:, None], of_draw.shape)
+        if self._takes_draws_together(planned, L):
+            start = np.repeat(task.initial_state[None], L, axis=0)
+            runs = draws.runs(of_draw, of_replicate, start)
+            together = rollout(runs.step, planned.controller, task.starting_at(runs.first))
+            loops = [Trajectory(together.times, together.states[k], together.inputs[k]) for k in range(L)]
+        else:
+            loops = []
+            for k in range(L):
+                runs = draws.runs(of_draw[k], of_replicate[k], task.initial_state)
+                loops.append(rollout(runs.step, planned.controller, task.starting_at(runs.first)))
+        return self._stacked(planned, loops)
+
+    def _stacked(self, planned: PlannedTasks, loops: Sequence[Trajectory]) -> Loops:
+        states, inputs = np.stack([one.states for one in loops]), np.stack([one.inputs for one in loops])
+        shape = (len(loops), len(planned.rows))
+        return Loops(
+            np.array([self.compared(planned, one) for one in loops]).reshape(shape),
+            states.reshape(*shape, *states.shape[-2:]),
+            inputs.reshape(*shape, *inputs.shape[-2:]),
+        )
+
+    def _run(self, draws: AnyDraws, planned: PlannedTasks) -> Loops:
         task, S = planned.task, len(draws)
+        if isinstance(draws, NoisyDraws):
+            of_run, replicates = np.divmod(np.arange(S * draws.replicates), draws.replicates)
+            of_draw = np.broadcast_to(of_run[:, None], (len(of_run), len(planned.rows)))
+            return self._noisy_loops(draws, planned, of_draw, replicates)
         if self._takes_draws_together(planned, S):
             start = np.repeat(task.initial_state[None], S, axis=0)
 
@@ -167,17 +212,11 @@ class LoopPlanner:
                 return np.asarray(draws.step(x[:, None], u[:, None])[:, 0])
 
             step: Step = draws.step if task.batch_shape else of_one_task
-            together = rollout(step, planned.controller, _with_states(task, start))
+            together = rollout(step, planned.controller, task.starting_at(start))
             loops = [Trajectory(together.times, together.states[s], together.inputs[s]) for s in range(S)]
         else:
             loops = [rollout(draws.model_of(s).step, planned.controller, task) for s in range(S)]
-        states, inputs = np.stack([one.states for one in loops]), np.stack([one.inputs for one in loops])
-        shape = (S, len(planned.rows))
-        return Loops(
-            np.array([self.compared(planned, one) for one in loops]).reshape(shape),
-            states.reshape(*shape, *states.shape[-2:]),
-            inputs.reshape(*shape, *inputs.shape[-2:]),
-        )
+        return self._stacked(planned, loops)
 
     def _takes_draws_together(self, planned: PlannedTasks, draws: int) -> bool:
         """Return whether controllers take draws as another first axis; if not, one loop is run after the other."""
@@ -188,8 +227,8 @@ class LoopPlanner:
             steps = min(10, planned.task.horizon) if isinstance(controller, ControllerWithMemory) else 1
             self._together = False
             with contextlib.suppress(Exception), np.errstate(all="ignore"):  # the user's controller
-                together = _probed(controller, _with_states(planned.task, probes), steps)
-                each = (_probed(controller, _with_states(planned.task, probe), steps) for probe in probes)
+                together = _probed(controller, planned.task.starting_at(probes), steps)
+                each = (_probed(controller, planned.task.starting_at(probe), steps) for probe in probes)
                 one_by_one = np.stack(list(each), axis=1)
                 self._together = together.shape == one_by_one.shape and np.allclose(
                     together, one_by_one, equal_nan=True
@@ -223,12 +262,6 @@ class LoopPlanner:
         return np.array([float(one) for one in each])
 
 
-def _with_states(task: Task, states: Array) -> Task:
-    """Return a task from other initial states ``(..., n)``, which may have further axes in front."""
-    reference = task.reference if task.has_goal else None
-    return Task(states, horizon=task.horizon, dt=task.dt, reference=reference)
-
-
 def _probed(controller: Controller, task: Task, steps: int) -> Array:
     """Return the inputs ``(steps, ..., m)`` of a controller along states that change from step to step."""
     pi, x = started(controller, task), np.array(task.initial_state)
@@ -254,11 +287,12 @@ def halved(function: Callable[[Rows], T], count: int) -> list[tuple[Rows, T | No
     return results
 
 
-def distances_of(loops: Sequence[Loops], planned: Sequence[PlannedTasks], draws: int, tasks: int) -> Array:
+def distances_of(draws: AnyDraws, loops: Sequence[Loops], planned: Sequence[PlannedTasks], tasks: int) -> Array:
     """Return the distances ``(S, q)`` of closed loops of S draws on planned tasks; NaN for a task without a plan."""
-    found = np.full((draws, tasks), np.nan)
+    found = np.full((len(draws), tasks), np.nan)
     for one, of_batch in zip(planned, loops, strict=True):
-        found[:, one.rows] = of_batch.distances
+        reduced = draws.reduced(of_batch.distances) if isinstance(draws, NoisyDraws) else of_batch.distances
+        found[:, one.rows] = reduced
     return found
 
 

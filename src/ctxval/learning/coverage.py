@@ -1,4 +1,8 @@
-"""How far the closed loops of the tasks lead from all recorded transitions, in states and inputs."""
+"""How far the closed loops of the tasks lead from all recorded transitions, in states and inputs.
+
+Gaps are those between the loops and all records. A pocket is a region of two states that loops enter and no execution
+has entered: a post could stand there.
+"""
 
 from __future__ import annotations
 
@@ -11,12 +15,17 @@ from scipy.spatial import cKDTree
 
 from ctxval._util.arrays import Array, Rows
 from ctxval._util.representation import ShortRepr
+from ctxval.core.trajectory import Trajectory
 from ctxval.learning.closed_loops import Loops, PlannedTasks
 from ctxval.learning.dynamics_posterior import DynamicsPosterior
 
 MOST_COORDINATES = 6
 """Largest number of state-input coordinates for which pairs of coordinates are compared."""
 _FARTHEST = 1e3  # standardised coordinates are limited to this magnitude
+
+
+_BETWEEN = 8
+"""Number of points of an execution for each of its steps, between which it is a straight line."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,3 +127,59 @@ def _pair_gaps(recorded: Array, visited: Array) -> Array | None:
         return None
     trees = {two: cKDTree(recorded[:, list(two)]) for two in combinations(range(k), 2)}
     return np.stack([tree.query(visited[..., list(two)], p=np.inf)[0] for two, tree in trees.items()], axis=-1)
+
+
+# Pockets
+
+
+@dataclass(frozen=True, eq=False)
+class Pocket(ShortRepr):
+    """The largest region of two states that closed loops of tasks enter, and that no execution has entered.
+
+    Attributes:
+        size: its radius, as a share of the visited ranges.
+        states: the indices of the two states.
+        place: its centre, which a loop visits, in the system's units, shape ``(2,)``.
+        within: its radius in each of the two states, in the system's units, shape ``(2,)``; they are equal if the
+            states are places with one unit.
+    """
+
+    size: float
+    states: tuple[int, int]
+    place: Array
+    within: Array
+
+
+def largest_pocket(visited: Array, executed: Sequence[Trajectory], units: Sequence[str]) -> Pocket | None:
+    """Return the largest pocket; None if there are no two states, or nothing was executed.
+
+    Two states with one unit that is no rate are places, and distances in their plane mean something. If there are such
+    states, only they are compared; otherwise all are, each as a share of its range.
+
+    Args:
+        visited: states that closed loops of tasks visit, in the system's units, shape ``(N, n)``.
+        executed: the executed trajectories.
+        units: the unit of each state; empty if it is not known.
+    """
+    low, high = np.quantile(visited, [1e-3, 1 - 1e-3], axis=0)
+    usual = visited[((visited >= low) & (visited <= high)).all(axis=1)]
+    if not executed or not len(usual):
+        return None
+    entered, some = np.concatenate([_along(one.states) for one in executed]), usual[_some(len(usual), 4000)]
+    widths, couples = np.maximum(high - low, 1e-9), list(combinations(range(len(units)), 2))
+    places = [(i, j) for i, j in couples if units[i] == units[j] and units[i] and "/" not in units[i]]
+    pockets = []
+    for i, j in places or couples:
+        width = widths[[i, j]]
+        scale = np.full(2, width.max()) if places else width
+        away, _ = cKDTree(entered[:, [i, j]] / scale).query(some[:, [i, j]] / scale)
+        at = int(away.argmax())
+        pockets.append(Pocket(float(away[at]), (i, j), some[at, [i, j]], away[at] * scale))
+    return max(pockets, key=lambda pocket: pocket.size, default=None)
+
+
+def _along(states: Array) -> Array:
+    """Return points along the straight lines between states ``(H + 1, n)``."""
+    steps = np.arange(len(states))
+    fine = np.linspace(0, steps[-1], _BETWEEN * int(steps[-1]) + 1)
+    return np.stack([np.interp(fine, steps, column) for column in states.T], axis=-1)

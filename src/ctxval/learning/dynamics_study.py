@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import time
 from collections import OrderedDict
@@ -15,10 +16,12 @@ from ctxval._util.boxes import moves_to_bounds
 from ctxval._util.describe import describe
 from ctxval._util.representation import ShortRepr
 from ctxval.core.distance import ComposedDistance
+from ctxval.core.quantiles import QUANTILE
 from ctxval.core.trajectory import Trajectory, Transitions
 from ctxval.core.validation import Validation
+from ctxval.errors import InputError
 from ctxval.learning.closed_loops import LoopPlanner, distances_of, loop_pairs
-from ctxval.learning.coverage import Coverage, coverage
+from ctxval.learning.coverage import Coverage, Pocket, coverage, largest_pocket
 from ctxval.learning.dynamics_posterior import (
     DynamicsPosterior,
     LearnedCovariances,
@@ -27,6 +30,10 @@ from ctxval.learning.dynamics_posterior import (
     learn_covariances,
 )
 from ctxval.learning.execution_prediction import ExecutionPrediction, predict_execution
+from ctxval.learning.histories import Record
+from ctxval.learning.innovations import NOISY, ChosenStructure, predicted_by_history
+from ctxval.learning.noise_effect import effect_of_noise
+from ctxval.learning.noisy_draws import EACH, GROUPS, MATTERS, REPLICATES, NoisyPosterior, learn_noisy
 from ctxval.learning.prediction import predict_distance
 from ctxval.learning.recorded import closed_loops_on_model, recorded_transitions
 from ctxval.learning.tolerance import PushResponse, push_response
@@ -35,6 +42,7 @@ from ctxval.learning.worst_case import WorstCase, WorstCaseSearch, WorstCaseSett
 from ctxval.models.corrected import before_refinement
 from ctxval.searches import Prediction
 
+_TRIED = 32  # tasks of the pool among which those with the largest distances show what noise does
 _SLOW = 0.02  # seconds: if a single closed loop on M takes longer, closed loops are distributed over the cores
 
 
@@ -42,14 +50,22 @@ class DynamicsStudy(ShortRepr):
     """Learns the dynamics of one experiment from growing sets of executions.
 
     Everything is a function of the executions and the seed. Controllers that are designed are kept.
+
+    Attributes:
+        quantile: the share of the executions of a task that a distance is about, if the system is noisy.
     """
 
-    def __init__(self, validation: Validation, seed: int = 0) -> None:
-        self.validation, self.seed = validation, seed
+    def __init__(self, validation: Validation, seed: int = 0, quantile: float = QUANTILE) -> None:
+        self.validation, self.seed, self.quantile = validation, seed, quantile
         self.planner = LoopPlanner(validation)
         self._errors = ErrorVectors(self.planner)
         self._covariances: OrderedDict[bytes, LearnedCovariances | None] = OrderedDict()
+        self._structures: OrderedDict[bytes, ChosenStructure] = OrderedDict()
         self._parts: tuple[str, bytes] | None = None
+
+    def anew(self) -> DynamicsStudy:
+        """Return a study of the same experiment that has learned nothing yet."""
+        return DynamicsStudy(self.validation, self.seed, self.quantile)
 
     @property
     def is_current(self) -> bool:
@@ -143,7 +159,61 @@ class DynamicsStudy(ShortRepr):
         if posterior is None or not np.isfinite(posterior.most_probable.weights).all():
             return None
         points = np.array([point for point, _ in executed]).reshape(-1, self.validation.space.dimension)
-        return LearnedDynamics(self, posterior, points)
+        return LearnedDynamics(self, posterior, points, [trajectory for _, trajectory in executed])
+
+    def noisy(self, learned: LearnedDynamics) -> NoisyPosterior | None:
+        """Return dynamics with noise and histories, learned from the executions.
+
+        It is None if the next state follows from state and input, or if they cannot be learned.
+        """
+        if self._loops is None or not len(learned.executed):
+            return None
+        space, posterior = self.validation.space, learned.posterior
+        tasks = (self.validation.task(space.parameters(space.from_unit(point))) for point in learned.executed)
+        records = [
+            Record(trajectory.states, trajectory.inputs, np.asarray(task.initial_state, dtype=np.float64))
+            for trajectory, task in zip(learned.trajectories_of_system, tasks, strict=True)
+        ]
+        pairs = np.concatenate([self._loops.states[..., :-1, :], self._loops.inputs], axis=-1)
+        pairs = pairs.reshape(-1, pairs.shape[-1])
+        pairs = pairs[np.isfinite(pairs).all(axis=1)]
+        pairs = pairs[:: max(1, len(pairs) // 600)]
+        if not self._needs_history(posterior, records, pairs):
+            return None
+        some = _scheduled(len(records))
+        key = b"".join(part.tobytes() for record in records[:some] for part in (record.states, record.inputs))
+        # There are fewer sequences of noise if each closed loop is designed and run on its own.
+        replicates = REPLICATES if self.planner.batched else 4
+        learn = functools.partial(learn_noisy, posterior, pairs=pairs, replicates=replicates, quantile=self.quantile)
+        if key not in self._structures:
+            first = learn(records[:some], seed=(self.seed, some))
+            if first is None:
+                return None
+            self._structures[key] = first[1]
+            while len(self._structures) > 8:
+                self._structures.popitem(last=False)
+            if some == len(records):
+                return self._with_effect(first[0])
+        again = learn(records, chosen=self._structures[key], seed=(self.seed, len(records)))
+        return None if again is None else self._with_effect(again[0])
+
+    def _with_effect(self, noisy: NoisyPosterior) -> NoisyPosterior:
+        return noisy.with_effect(effect_of_noise(self.planner, noisy, self.search.pool[:_TRIED]))
+
+    def _needs_history(self, posterior: DynamicsPosterior, records: Sequence[Record], pairs: Array) -> bool:
+        """Return whether the next state is no function of state and input: noise, or what is not recorded, acts."""
+        if float((posterior.most_probable.noise**2).max()) > NOISY:
+            return True
+        if effect_of_noise(self.planner, posterior, self.search.pool[:_TRIED]) > MATTERS:
+            return True
+        if len(records) < 3:
+            return False
+        last = records[-1]
+        with contextlib.suppress(np.linalg.LinAlgError, InputError, ValueError), np.errstate(all="ignore"):
+            mean = posterior.means_without([[len(records) - 1]])
+            predicted = mean.step(last.states[None, :-1], last.inputs[None])[0]
+            return predicted_by_history(posterior, records, pairs, predicted)
+        return False
 
     def _learned_covariances(
         self, executed: Executed, logged: Sequence[Trajectory], recorded: tuple[Transitions, Rows] | None
@@ -201,19 +271,32 @@ class LearnedDynamics(ShortRepr):
 
     Attributes:
         executed: the executed tasks, points of the unit cube ``(n, d)``.
+        trajectories_of_system: their trajectories.
     """
 
     study: DynamicsStudy
     posterior: DynamicsPosterior
     executed: Array
+    trajectories_of_system: Sequence[Trajectory]
 
     _worst_cases: dict[int, WorstCase] = field(default_factory=dict, init=False)
+
+    @functools.cached_property
+    def noisy(self) -> NoisyPosterior | None:
+        """The dynamics with noise and histories, if the next state does not follow from state and input; else None."""
+        with single_threaded():
+            return self.study.noisy(self)
+
+    @property
+    def _drawn_from(self) -> DynamicsPosterior | NoisyPosterior:
+        """The posterior of which draws bound d*."""
+        return self.noisy or self.posterior
 
     def expected(self, points: Array) -> Array:
         """Return the distances ``(m,)`` on the posterior mean at points ``(m, d)``; infinity if a loop diverges."""
         planner = self.study.planner
         with single_threaded():
-            return np.asarray(planner.distances(self.posterior.mean, planner.plan(points), len(points))[0])
+            return np.asarray(planner.distances(self._drawn_from.mean, planner.plan(points), len(points))[0])
 
     def trajectories(self, points: Array) -> list[tuple[Array, Trajectory]]:
         """Return tasks ``(m, d)`` with their closed loops on the posterior mean, without those that diverge."""
@@ -230,36 +313,41 @@ class LearnedDynamics(ShortRepr):
     @property
     def worst_case(self) -> WorstCase:
         """The largest distance over all tasks, for each of the usual number of draws."""
-        return self.worst_case_of(self.posterior.settings.functions * len(self.posterior.components))
+        return self.worst_case_of(1)
 
     @functools.cached_property
     def screened(self) -> WorstCase:
         """The largest distance over some tasks, for each of a few draws of the dynamics: a quick lower bound."""
-        return self.study.search.screened(self.posterior, self.worst_of_mean, self.executed, self._rng(5))
+        return self.study.search.screened(self._drawn_from, self.worst_of_mean, self.executed, self._rng(5))
 
     @functools.cached_property
     def worst_of_mean(self) -> WorstCase:
         """The largest distance over some tasks on the posterior mean alone, as if it were the only draw."""
-        return self.study.search.on_mean(self.posterior, self._on_pool[0], self.executed, self._rng(4), globally=False)
+        return self.study.search.on_mean(
+            self._drawn_from, self._on_pool[0], self.executed, self._rng(4), globally=False
+        )
 
     def worst_case_of(self, draws: int) -> WorstCase:
         """Return the largest distance over all tasks, for each of at least so many draws of the dynamics."""
-        functions = max(self.posterior.settings.functions, -(-draws // len(self.posterior.components)))
+        if self.noisy is not None:
+            functions = max(EACH, -(-draws // GROUPS))
+        else:
+            functions = max(self.posterior.settings.functions, -(-draws // len(self.posterior.components)))
         if functions not in self._worst_cases:
             search, known, rng = self.study.search, self.executed, self._rng(1)
-            of_mean = search.on_mean(self.posterior, self._on_pool[0], known, rng)
-            self._worst_cases[functions] = search.maxima(self.posterior, of_mean, known, rng, functions)
+            of_mean = search.on_mean(self._drawn_from, self._on_pool[0], known, rng)
+            self._worst_cases[functions] = search.maxima(self._drawn_from, of_mean, known, rng, functions)
         return self._worst_cases[functions]
 
     @functools.cached_property
     def largest_jump(self) -> float:
         """The largest jump of the distance on the posterior mean between nearly equal tasks."""
-        return self.study.search.largest_jump(self.posterior)
+        return self.study.search.largest_jump(self._drawn_from)
 
     @functools.cached_property
     def deeper(self) -> tuple[Array, Array]:
         """The largest distances on the posterior mean ``(2,)`` in two deeper searches, and their points ``(2, d)``."""
-        return self.study.search.deeper(self.posterior, self._rng(3))
+        return self.study.search.deeper(self._drawn_from, self._rng(3))
 
     @functools.cached_property
     def push_response(self) -> PushResponse:
@@ -267,6 +355,14 @@ class LearnedDynamics(ShortRepr):
         search = self.study.search
         tasks = [self.worst_of_mean.elites[:16], self.executed, search.pool[:16]]
         return push_response(self.study.planner, self.posterior, np.concatenate(tasks))
+
+    def pocket(self, units: Sequence[str]) -> Pocket | None:
+        """Return the largest region of two states, with these units, that loops enter and no execution has entered."""
+        planner = self.study.planner
+        with single_threaded():
+            loops = planner.run(self.posterior.mean, planner.plan(self.study.search.pool[:256]))
+        visited = np.concatenate([each.states.reshape(-1, len(units)) for each in loops])
+        return largest_pocket(visited[np.isfinite(visited).all(axis=1)], self.trajectories_of_system, units)
 
     @property
     def untried_parameter(self) -> tuple[int, float, Array] | None:
@@ -290,16 +386,24 @@ class LearnedDynamics(ShortRepr):
     @functools.cached_property
     def _on_pool(self) -> tuple[Array, Coverage]:
         """The distances of the pool's tasks on the posterior mean, and the coverage of their closed loops."""
-        search = self.study.search
+        search, planner = self.study.search, self.study.planner
         with single_threaded():
-            loops = self.study.planner.run(self.posterior.mean, search.plans)
-            (distances,) = distances_of(loops, search.plans, 1, len(search.pool))
+            if self.noisy is not None:
+                loops = planner.run(self.noisy.silent, search.plans)
+                (distances,) = planner.distances(self.noisy.mean, search.plans, len(search.pool))
+            else:
+                loops = planner.run(self.posterior.mean, search.plans)
+                (distances,) = distances_of(self.posterior.mean, loops, search.plans, len(search.pool))
             return distances, coverage(self.posterior, search.pool, search.plans, loops)
 
     def predict(self, point: Array) -> ExecutionPrediction | None:
         """Return the prediction of the execution of a task, a point ``(d,)``; None if it cannot be planned."""
         rng = self._rng(2)
         with single_threaded():
+            if self.noisy is not None:
+                drawn = self.noisy.draw(np.empty((0, 0)), rng)
+                is_noisy = self.noisy.is_noisy
+                return predict_execution(self.study.planner, drawn, point, len(self.executed), noisy=is_noisy)
             pairs = loop_pairs(self.study.planner, self.posterior, point[None])
             if not len(pairs):
                 return None

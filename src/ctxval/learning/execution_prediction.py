@@ -11,11 +11,55 @@ import numpy as np
 
 from ctxval._util.arrays import Array, ArrayLike
 from ctxval._util.representation import ShortRepr
+from ctxval.core.quantiles import LEVELS, chance_of_more
 from ctxval.core.trajectory import Trajectory
-from ctxval.learning.closed_loops import LoopPlanner
-from ctxval.learning.draws import DynamicsDraws
+from ctxval.learning.closed_loops import AnyDraws, LoopPlanner
 
 _QUANTILES = np.linspace(0.0, 1.0, 21)  # levels of the stored quantiles of the distance
+
+
+@dataclass(frozen=True)
+class NoisePrediction(ShortRepr):
+    """What the executions of one task are predicted to be if the system is noisy, as quantiles at ``LEVELS``.
+
+    Attributes:
+        runs: the number of closed loops that the quantiles are of.
+        distances: those of the distance.
+        roughness: root mean squares of the second differences of each state from step to step.
+        statistics: those of statistics of the trajectory: its mean squared deviation from the median, and the mean
+            square and the largest magnitude of its second differences, relative to ``roughness``.
+    """
+
+    runs: int
+    distances: tuple[float, ...]
+    roughness: tuple[float, ...]
+    statistics: tuple[tuple[float, ...], ...]
+
+    def to_json(self) -> dict[str, Any]:
+        """Return all attributes, ready for JSON: infinity is None."""
+        distances = [None if np.isinf(one) else one for one in self.distances]
+        return {**asdict(self), "distances": distances}
+
+    def chance_of_more(self, distance: float) -> float:
+        """Return the predicted probability that the distance of an execution exceeds a value."""
+        return chance_of_more(self.distances, distance, self.runs)
+
+    def p_values(self, executed: Trajectory, deviation: float) -> tuple[float, ...]:
+        """Return the predicted probabilities that the statistics exceed those of an execution."""
+        values = (
+            deviation,
+            *(float(each[0]) for each in _differences(executed.states[None], np.array(self.roughness))),
+        )
+        chances = zip(self.statistics, values, strict=True)
+        return tuple(chance_of_more(quantiles, value, self.runs) for quantiles, value in chances)
+
+
+def _differences(states: Array, roughness: Array) -> tuple[Array, Array]:
+    """Return the mean square and the largest magnitude of the second differences of states ``(L, H + 1, n)``."""
+    if states.shape[1] < 3:
+        return np.zeros(len(states)), np.zeros(len(states))
+    scaled = np.diff(states, 2, axis=1) / np.maximum(roughness, 1e-12)
+    return (scaled**2).mean(axis=(1, 2)), np.abs(scaled).max(axis=(1, 2))
 
 
 @dataclass(frozen=True)
@@ -29,6 +73,7 @@ class ExecutionPrediction(ShortRepr):
         states: medians of the states at these steps, one row for each.
         deviations: standard deviations of the states at these steps, one row for each.
         diverged: share of the draws that diverge.
+        noise: what noise does to the execution; None if the system is not noisy.
     """
 
     learned_from: int
@@ -38,6 +83,7 @@ class ExecutionPrediction(ShortRepr):
     states: tuple[tuple[float, ...], ...]
     deviations: tuple[tuple[float, ...], ...]
     diverged: float
+    noise: NoisePrediction | None = None
 
     @property
     def median(self) -> float:
@@ -57,6 +103,7 @@ class ExecutionPrediction(ShortRepr):
             "steps": list(self.steps),
             "states": [list(row) for row in self.states],
             "deviations": [list(row) for row in self.deviations],
+            "noise": self.noise and self.noise.to_json(),
         }
 
     @classmethod
@@ -71,6 +118,7 @@ class ExecutionPrediction(ShortRepr):
                 _rows(values["states"]),
                 _rows(values["deviations"]),
                 float(values["diverged"]),
+                _noise(values.get("noise")),
             )
         except (KeyError, TypeError, ValueError, OverflowError):
             return None
@@ -88,15 +136,15 @@ class ExecutionPrediction(ShortRepr):
         rank = float(np.interp(distance, np.nan_to_num(self.quantiles, posinf=1e300), _QUANTILES))
         if self.diverged > 0.5:
             # Nothing is predicted, so nothing can be contradicted, and nothing is confirmed.
-            return PredictionScore(np.inf, rank, 0.0)
-        ranges = np.maximum(np.ptp(executed.states, axis=0), 1e-9)
-        errors = (executed.states[list(self.steps)] - states) / ranges
+            return PredictionScore(np.inf, rank, 0.0, (1.0,) * 3 if self.noise else ())
+        ranges = np.maximum(np.ptp(states if self.noise else executed.states, axis=0), 1e-9)
         # Deviations of a state below 1e-4 of its range and of the distance below 0.2 % of it are no errors.
-        variances = (np.array(self.deviations) / ranges) ** 2 + 1e-4**2
-        of_states = float((errors**2).sum() / variances.sum())
+        reached = executed.states[list(self.steps)]
+        of_states = float(_deviation(reached[None], states, np.array(self.deviations), ranges)[0])
         scale2 = self.deviation**2 + (2e-3 * max(distance, self.median)) ** 2
         of_distance = (distance - self.median) ** 2 / max(scale2, 1e-300)
-        return PredictionScore(max(of_states, of_distance), rank, distance / max(self.median, 1e-300))
+        p_values = () if self.noise is None else self.noise.p_values(executed, of_states)
+        return PredictionScore(max(of_states, of_distance), rank, distance / max(self.median, 1e-300), p_values)
 
 
 @dataclass(frozen=True)
@@ -108,15 +156,23 @@ class PredictionScore:
             diverged.
         rank: share of the draws whose distance is below the executed one.
         ratio: the executed distance, divided by the median of the draws.
+        p_values: predicted probabilities of more than what statistics of the trajectory are; empty without noise.
     """
 
     z2: float
     rank: float
     ratio: float
+    p_values: tuple[float, ...] = ()
+
+
+def _deviation(states: Array, medians: Array, deviations: Array, ranges: Array) -> Array:
+    """Return squared deviations ``(L,)`` of states ``(L, k, n)`` from medians, relative to their variances."""
+    variances = (deviations / ranges) ** 2 + 1e-4**2
+    return np.asarray((((states - medians) / ranges) ** 2).sum(axis=(1, 2)) / variances.sum())
 
 
 def predict_execution(
-    planner: LoopPlanner, draws: DynamicsDraws, point: Array, learned_from: int
+    planner: LoopPlanner, draws: AnyDraws, point: Array, learned_from: int, *, noisy: bool = False
 ) -> ExecutionPrediction | None:
     """Return the prediction of the execution of a task ``(d,)``; None if it cannot be planned."""
     found = planner.run(draws, planner.plan(point[None]))
@@ -129,15 +185,40 @@ def predict_execution(
     with np.errstate(all="ignore"):  # what is far beyond the states of all other draws has diverged
         kept = np.isfinite(distances) & (np.abs(states) < 1e6 * size).all(axis=(1, 2))
     good, values = (states[kept], distances[kept]) if kept.any() else (np.zeros_like(states), np.zeros(len(states)))
+    medians, deviations = np.median(good, axis=0), good.std(axis=0)
+    noise = None
+    if noisy and kept.any():
+        whole = found[0].states[:, 0][kept]
+        roughness = np.sqrt((np.diff(whole, 2, axis=1) ** 2).mean(axis=(0, 1)))
+        ranges = np.maximum(np.ptp(medians, axis=0), 1e-9)
+        of_runs = (_deviation(good, medians, deviations, ranges), *_differences(whole, roughness))
+        noise = NoisePrediction(
+            len(kept),
+            tuple(_rounded(np.quantile(np.where(kept, distances, np.inf), LEVELS, method="higher"))),
+            tuple(_rounded(roughness)),
+            tuple(tuple(_rounded(np.quantile(values, LEVELS))) for values in of_runs),
+        )
     return ExecutionPrediction(
         learned_from,
         tuple(_rounded(np.quantile(np.where(kept, distances, np.inf), _QUANTILES, method="higher"))),
         _rounded(values.std())[0],
         tuple(steps.tolist()),
-        tuple(tuple(_rounded(row)) for row in np.median(good, axis=0)),
-        tuple(tuple(_rounded(row)) for row in good.std(axis=0)),
+        tuple(tuple(_rounded(row)) for row in medians),
+        tuple(tuple(_rounded(row)) for row in deviations),
         float(1 - kept.mean()),
+        noise,
     )
+
+
+def _noise(values: Mapping[str, Any] | None) -> NoisePrediction | None:
+    if values is None:
+        return None
+    distances = tuple(np.inf if one is None else float(one) for one in values["distances"])
+    roughness = tuple(float(value) for value in values["roughness"])
+    noise = NoisePrediction(int(values["runs"]), distances, roughness, _rows(values["statistics"]))
+    if {len(row) for row in (noise.distances, *noise.statistics)} != {len(LEVELS)} or len(noise.statistics) != 3:
+        raise ValueError("other numbers of quantiles")
+    return noise
 
 
 def _rows(listed: Iterable[Iterable[Any]]) -> tuple[tuple[float, ...], ...]:

@@ -19,9 +19,12 @@ from ctxval._util.arrays import Array, Rows, single_threaded
 from ctxval._util.boxes import moves_to_bounds, separated_rows
 from ctxval.gp.ascent import Ascent
 from ctxval.gp.global_search import search_globally
-from ctxval.learning.closed_loops import LoopPlanner, PlannedTasks, loop_pairs
-from ctxval.learning.draws import DynamicsDraws
+from ctxval.learning.closed_loops import AnyDraws, LoopPlanner, PlannedTasks, loop_pairs
 from ctxval.learning.dynamics_posterior import DynamicsPosterior
+from ctxval.learning.noisy_draws import SETTLED, NoisyDraws, NoisyPosterior
+
+AnyPosterior = DynamicsPosterior | NoisyPosterior
+"""The posterior of dynamics without and with noise."""
 
 _DIVERGED = 1e30  # the distance of a loop that diverges, in searches: larger than all others, and finite
 _EVALUATIONS = (512, 2048, 4096, 6000, 6000, 6000, 12000)
@@ -144,7 +147,7 @@ class WorstCaseSearch:
         tasks = self.pool[:, None] + steps
         return tasks, self.planner.plan(tasks.reshape(-1, self.dimension))
 
-    def largest_jump(self, posterior: DynamicsPosterior) -> float:
+    def largest_jump(self, posterior: AnyPosterior) -> float:
         """Return by how much the mean's distance of a task differs at most from the middle of those on both sides.
 
         The tasks are those of the pool. If the distance is a smooth function of the task, this is hardly anything.
@@ -156,7 +159,7 @@ class WorstCaseSearch:
         jumps = np.abs(middle - 0.5 * (first + last))
         return float(jumps[np.isfinite(jumps)].max(initial=0.0))
 
-    def deeper(self, posterior: DynamicsPosterior, rng: np.random.Generator) -> tuple[Array, Array]:
+    def deeper(self, posterior: AnyPosterior, rng: np.random.Generator) -> tuple[Array, Array]:
         """Return the largest distances on the mean ``(2,)`` in two separate searches, and their points ``(2, d)``.
 
         Each of them has four times as many tasks as the usual one, and none of its tasks.
@@ -175,7 +178,7 @@ class WorstCaseSearch:
 
     def on_mean(
         self,
-        posterior: DynamicsPosterior,
+        posterior: AnyPosterior,
         of_pool: Array,
         known: Array,
         rng: np.random.Generator,
@@ -212,7 +215,7 @@ class WorstCaseSearch:
         return WorstCase(maxima, elites[:1], highest, elites, loops, 0.0, self.unplanned)
 
     def screened(
-        self, posterior: DynamicsPosterior, of_mean: WorstCase, known: Array, rng: np.random.Generator
+        self, posterior: AnyPosterior, of_mean: WorstCase, known: Array, rng: np.random.Generator
     ) -> WorstCase:
         """Return the largest distances of a few draws over the elites, known tasks and random ones: a lower bound."""
         with single_threaded():
@@ -224,7 +227,7 @@ class WorstCaseSearch:
 
     def maxima(
         self,
-        posterior: DynamicsPosterior,
+        posterior: AnyPosterior,
         of_mean: WorstCase,
         known: Array,
         rng: np.random.Generator,
@@ -235,6 +238,10 @@ class WorstCaseSearch:
             tasks = self._shared_tasks(of_mean, known, self.settings.shared, rng)
             draws = posterior.draw(self._relevant(posterior, tasks, rng), rng, functions)
             points, maxima, loops = self._search_draws(draws, tasks, rng)
+            if isinstance(draws, NoisyDraws):
+                # The search has chosen tasks with few sequences of noise, which its own maxima exaggerate.
+                settled = draws.with_replicates(SETTLED, rng)
+                maxima = _finite(self.planner.own_distances(settled, points[:, None]))[:, 0]
             sharpness = self._sharpness(posterior.mean, of_mean.elites, rng)
         return self._worst_case(of_mean, draws, maxima, points, loops, sharpness)
 
@@ -244,7 +251,7 @@ class WorstCaseSearch:
         return np.concatenate([of_mean.elites, known, random])
 
     def _worst_case(
-        self, of_mean: WorstCase, draws: DynamicsDraws, maxima: Array, points: Array, loops: int, sharpness: float
+        self, of_mean: WorstCase, draws: AnyDraws, maxima: Array, points: Array, loops: int, sharpness: float
     ) -> WorstCase:
         return replace(
             of_mean,
@@ -255,11 +262,11 @@ class WorstCaseSearch:
             sharpness=sharpness,
         )
 
-    def _distances(self, mean: DynamicsDraws, points: Array) -> Array:
+    def _distances(self, mean: AnyDraws, points: Array) -> Array:
         """Return the distances ``(m,)`` on one draw, such as the posterior mean, as a search takes them."""
         return np.asarray(_finite(self.planner.distances(mean, self.planner.plan(points), len(points)))[0])
 
-    def _sharpness(self, mean: DynamicsDraws, elites: Array, rng: np.random.Generator) -> float:
+    def _sharpness(self, mean: AnyDraws, elites: Array, rng: np.random.Generator) -> float:
         """Return the largest share that the distance of an elite loses at the median of the tasks next to it.
 
         If controllers jump from task to task, the largest distance is a needle that a search finds by chance.
@@ -273,12 +280,14 @@ class WorstCaseSearch:
         lost = np.divide(peak - next_to_it, peak, out=np.zeros(len(peak)), where=peak > 0)
         return float(max(lost.max(initial=0.0), 0.0))
 
-    def _relevant(self, posterior: DynamicsPosterior, tasks: Array, rng: np.random.Generator) -> Array:
-        """Return standardised pairs on the mean's closed loops, from which pivots are chosen."""
+    def _relevant(self, posterior: AnyPosterior, tasks: Array, rng: np.random.Generator) -> Array:
+        """Return standardised pairs on the mean's closed loops, from which pivots are chosen; noisy draws have none."""
+        if isinstance(posterior, NoisyPosterior):
+            return np.empty((0, 0))
         pairs = loop_pairs(self.planner, posterior, tasks)
         return pairs[rng.permutation(len(pairs))[: self.settings.relevant]]
 
-    def _search_draws(self, draws: DynamicsDraws, tasks: Array, rng: np.random.Generator) -> tuple[Array, Array, int]:
+    def _search_draws(self, draws: AnyDraws, tasks: Array, rng: np.random.Generator) -> tuple[Array, Array, int]:
         """Return the best points ``(S, d)`` of draws and their distances, and the number of all loops."""
         values, loops = self._on_shared(draws, tasks)
         order = np.argsort(-values, axis=1, kind="stable")
@@ -309,7 +318,7 @@ class WorstCaseSearch:
             searched = np.flatnonzero(best + 3 * (best - before).max() >= np.median(best))
         return points, best, loops
 
-    def _on_shared(self, draws: DynamicsDraws, tasks: Array) -> tuple[Array, int]:
+    def _on_shared(self, draws: AnyDraws, tasks: Array) -> tuple[Array, int]:
         """Return the distances ``(S, q)`` of draws on tasks that they share, and the number of loops.
 
         After some draws, tasks that are far below the worst one of a draw, compared with how much draws differ there,

@@ -7,6 +7,7 @@ from ctxval.core.system import Simulated, System
 from ctxval.systems.fmu import FMU
 from ctxval.systems.function import Function
 from ctxval.systems.gymnasium import Gymnasium
+from ctxval.systems.imperfect import Imperfect
 from ctxval.systems.integrate import rk4
 from ctxval.systems.manual import Manual
 from ctxval.systems.mujoco import MuJoCo
@@ -17,6 +18,7 @@ __all__ = [
     "REGISTRY",
     "Function",
     "Gymnasium",
+    "Imperfect",
     "Manual",
     "MuJoCo",
     "Simulated",

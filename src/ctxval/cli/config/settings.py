@@ -34,6 +34,7 @@ from ctxval.cli.config.parts import (
 from ctxval.cli.config.signatures import code_named, signed
 from ctxval.core.experiment import Experiment
 from ctxval.core.labels import Labels, labels_of
+from ctxval.core.quantiles import QUANTILE
 from ctxval.core.space import TaskSpace
 from ctxval.core.validation import Validation
 from ctxval.data import LogMapping
@@ -48,6 +49,9 @@ Part = str | dict[str, Any]
 """``module:attr``, or a table with a type and its arguments."""
 
 
+_COMMON = {"stochastic", "resolution", "volume", "tests", "quantile"}
+
+
 class CertificateTable(BaseModel):
     """The table ``[certificate]``: the certificate for the verdict, chosen before the campaign is run.
 
@@ -56,6 +60,7 @@ class CertificateTable(BaseModel):
     Attributes:
         volume: the share of the task space that may exceed the threshold.
         tests: the number of executions that must have been predicted beforehand at tasks drawn over the task space.
+        quantile: the share of the executions of each task that the verdict is about, if they differ by noise.
         resolution: the largest distance between a task and its nearest trial, in diagonals of the task space.
         discard: the number of largest distances to discard, for ``sampling-discarding``.
     """
@@ -66,6 +71,7 @@ class CertificateTable(BaseModel):
     stochastic: bool = False
     volume: float = Field(default=0.0, ge=0, le=MOST_VOLUME, strict=True)
     tests: int = Field(default=TESTS, ge=0, strict=True)
+    quantile: float = Field(default=QUANTILE, ge=0.5, lt=1, strict=True)
     resolution: float = Field(default=RESOLUTION, gt=0, allow_inf_nan=False, strict=True)
     discard: int | None = Field(default=None, ge=0)
 
@@ -93,7 +99,7 @@ class CertificateTable(BaseModel):
         planned_kind = kind is None or kind == self.kind
         require_use(chosen.name, given)
         # For another kind than the planned one, only those settings of the file hold that are not about one kind.
-        planned = self.model_dump(include=None if planned_kind else {"stochastic", "resolution", "volume", "tests"})
+        planned = self.model_dump(include=None if planned_kind else _COMMON)
         own = {**(self.model_extra or {}), **given} if planned_kind else given
         merged = {**planned, **require_types(f"certificate {chosen.name!r}", chosen, own)}
         return CertificateOptions(chosen.of(merged), confidence, merged["volume"])

@@ -18,6 +18,7 @@ from ctxval._util.version import VERSION
 from ctxval.certificates import RESOLUTION
 from ctxval.certificates.options import CONFIDENCE, WITHIN
 from ctxval.certificates.prediction_tests import TESTS
+from ctxval.core.quantiles import QUANTILE
 from ctxval.core.trial import Trial
 from ctxval.report.context import ReportContext
 from ctxval.report.distance_model import distance_of
@@ -109,6 +110,7 @@ def command_of(context: ReportContext, budget: int | None = None, *others: str) 
         "--confidence": (settings.get("confidence"), CONFIDENCE),
         "--resolution": (certificate.get("resolution"), RESOLUTION),
         "--tests": (certificate.get("tests"), TESTS),
+        "--quantile": (certificate.get("quantile"), QUANTILE),
         "--within": (settings.get("within"), WITHIN),
     }
     for option, (value, default) in values.items():

@@ -1,0 +1,73 @@
+"""Bets against a threshold: what executed distances prove of a noisy system, whatever its model.
+
+If in every task a share q of the executions stays below tau, then each execution exceeds tau with probability at most
+1 - q, whatever its task and whatever came before. Before each execution, a probability pi of an excess is predicted.
+The product of ``pi / (1 - q)`` for each excess and ``(1 - pi) / q`` for each other execution is then a nonnegative
+supermartingale with the first value 1. It reaches ``1 / (1 - confidence)`` with probability at most 1 - confidence
+(Ville 1939), at any time. So tau is falsified there, without any assumption on the system.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ctxval.core.quantiles import QUANTILE, chance_of_more
+from ctxval.core.trial import Trial
+
+_BOLDEST = 0.9  # largest predicted probability that is bet on; an execution that stays below must not ruin the bets
+_UNKNOWN = 0.5  # probability of an excess if nothing was predicted
+
+
+@dataclass(frozen=True)
+class Bets:
+    """The bets of the trials of a noisy system against a threshold.
+
+    Attributes:
+        wealth: the product.
+        above, executions: numbers of executions above the threshold, and of all.
+    """
+
+    wealth: float
+    above: int
+    executions: int
+
+    def falsify(self, confidence: float) -> bool:
+        """Return whether the threshold is falsified with a confidence."""
+        return self.above > 0 and self.wealth >= 1 / (1 - confidence)
+
+
+def bets_against(trials: Sequence[Trial], threshold: float, quantile: float = QUANTILE) -> Bets | None:
+    """Return the bets of trials against a threshold; None if no execution was predicted to be noisy."""
+    if not any(_prediction(trial).get("noise") for trial in trials):
+        return None
+    wealth, above, known = 1.0, 0, [trial for trial in trials if trial.distance is not None]
+    for trial in known:
+        chance = float(np.clip(_predicted_chance(trial, threshold), 1 - quantile, _BOLDEST))
+        exceeds = (trial.distance or 0.0) > threshold
+        above += exceeds
+        wealth *= chance / (1 - quantile) if exceeds else (1 - chance) / quantile
+    return Bets(wealth, above, len(known))
+
+
+def _prediction(trial: Trial) -> dict[str, object]:
+    note = (trial.note or {}).get("prediction")
+    return note if isinstance(note, dict) else {}
+
+
+def _predicted_chance(trial: Trial, threshold: float) -> float:
+    """Return the probability of an excess that was predicted before an execution."""
+    stored = _prediction(trial)
+    noise = stored.get("noise")
+    try:
+        if isinstance(noise, dict):
+            quantiles = [np.inf if each is None else float(each) for each in noise["distances"]]
+            return chance_of_more(quantiles, threshold, int(noise["runs"]))
+        listed = stored.get("quantiles")
+        if isinstance(listed, list):
+            return float(np.mean([each is None or float(each) > threshold for each in listed]))
+    except (KeyError, TypeError, ValueError):
+        pass
+    return _UNKNOWN

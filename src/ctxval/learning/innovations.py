@@ -1,0 +1,494 @@
+"""Residual dynamics with noise: ``y' = M(x^, u) + r(z) + eps`` with regressors z of a history, and innovations eps.
+
+r is linear in features (:mod:`ctxval.learning.features`), with shared length-scales and, for each state, an amplitude
+and a noise of its own. If records are the state, the evidence is known in closed form from one eigendecomposition
+(MacKay 1992), and all transitions are used. With measurement noise, r is inside the filter: Gauss-Newton steps on the
+innovations, with their sensitivities to the weights, and MacKay's updates of amplitudes and noise (Ljung 1999, Sec. 7).
+Innovations are drawn from those that were recorded, all states of a step together.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.special import logsumexp
+
+from ctxval._util.arrays import Array, Mask
+from ctxval.core.model import Model
+from ctxval.learning.dynamics_posterior import DynamicsPosterior
+from ctxval.learning.features import Features, spread_rows
+from ctxval.learning.histories import History, Memory, Record, Structure, jacobian, of_one_horizon
+from ctxval.learning.local_noise import LocalNoise, local_noise
+
+CENTRES = 64
+FILTER_CENTRES = 32
+_CANDIDATES = 600  # regressors from which centres are chosen
+_LENGTH = np.log(3.0)  # median of the length-scales in standard deviations of the data; their logarithms deviate by 1
+_AMPLITUDES = np.logspace(-4, 2, 19)  # of the residual, in root mean squares
+_NOISES = np.logspace(-3.3, 0.3, 18)  # standard deviations of the noise, in root mean squares of the residual
+
+DrawnWeights = tuple[Features, Array, Array]
+"""Features, and weights ``(k, F, n)`` and standard deviations of the noise ``(k, n)`` of k draws."""
+
+
+@dataclass(frozen=True, eq=False)
+class Scaled:
+    """Regressors and errors of M, with the constants that standardise them.
+
+    Attributes:
+        Z: standardised regressors, shape ``(N, D)``.
+        E: errors of M, shape ``(N, n)``.
+        visited: standardised regressors of closed loops on M, from which centres are chosen too, shape ``(V, D)``.
+        shift, scale: shapes ``(D,)``.
+        inputs: the number m of inputs.
+    """
+
+    Z: Array
+    E: Array
+    visited: Array
+    shift: Array
+    scale: Array
+    inputs: int
+
+    @classmethod
+    def of(cls, Z: Array, E: Array, pairs: Array, inputs: int) -> Scaled:
+        """Return regressors of records; those of closed loops on M, ``(V, n + m)``, have no errors of M as lags."""
+        shift, scale = Z.mean(axis=0), np.maximum(Z.std(axis=0), 1e-9 + 1e-6 * np.abs(Z).max(axis=0))
+        visited = np.pad(pairs, ((0, 0), (0, Z.shape[1] - pairs.shape[1])))
+        return cls((Z - shift) / scale, E, (visited - shift) / scale, shift, scale, inputs)
+
+    @functools.cached_property
+    def sizes(self) -> Array:
+        """Root mean squares of the errors of M, shape ``(n,)``."""
+        return np.asarray(np.sqrt((self.E**2).mean(axis=0)))
+
+    @property
+    def states(self) -> int:
+        """The number n of states."""
+        return int(self.E.shape[1])
+
+    @functools.cached_property
+    def centres(self) -> Array:
+        """Well-spread regressors, shape ``(M, D)``."""
+        together = np.concatenate([self.Z, np.clip(self.visited, -5.0, 5.0)])
+        some = np.random.default_rng(len(together)).permutation(len(together))[:_CANDIDATES]
+        return np.asarray(together[some][spread_rows(together[some], CENTRES)])
+
+    def features(self, theta: Array, centres: Array | None = None) -> Features:
+        """Return the features for hyperparameters: logarithms of the scales of (x, u), of all lags, and of linear."""
+        pairs = self.states + self.inputs
+        scales = np.exp(np.concatenate([theta[:pairs], np.full(self.Z.shape[1] - pairs, theta[pairs])]))
+        chosen = self.centres if centres is None else centres
+        return Features.of(chosen, scales, float(np.exp(theta[-1])), self.states, self.inputs)
+
+
+@dataclass(frozen=True, eq=False)
+class InnovationsFit(ABC):
+    """The posterior of the residual dynamics of one structure.
+
+    Attributes:
+        theta: hyperparameters of the features; see :meth:`Scaled.features`.
+        live: the states whose error of M is not negligible, shape ``(n,)``.
+        features, weights, noise: the most probable features, weights ``(F, n)`` and standard deviations ``(n,)``.
+        evidence: logarithm of the evidence, to compare structures.
+        innovations: recorded innovations with a root mean square of 1, shape ``(N, n)``.
+        local: how the noise changes with state and input; None if it does not.
+    """
+
+    history: History
+    scaled: Scaled
+    theta: Array
+    live: Mask
+    features: Features
+    weights: Array
+    noise: Array
+    evidence: float
+    innovations: Array
+    local: LocalNoise | None
+
+    @property
+    def share(self) -> float:
+        """The variance of the innovations as a share of the mean square of the error of M, where it is largest."""
+        return float(((self.noise / self.scaled.sizes)[self.live] ** 2).max(initial=0.0))
+
+    @property
+    def most_probable(self) -> list[DrawnWeights]:
+        """The most probable weights, as one draw."""
+        return [(self.features, self.weights[None], self.noise[None])]
+
+    def residual(self, z: Array) -> Array:
+        """Return the most probable residual ``(..., n)`` of regressors ``(..., D)``."""
+        flat = (z.reshape(-1, z.shape[-1]) - self.scaled.shift) / self.scaled.scale
+        return np.asarray((self.features(flat) @ self.weights).reshape(*z.shape[:-1], -1))
+
+    @abstractmethod
+    def draw(self, groups: int, each: int, rng: np.random.Generator) -> list[DrawnWeights]:
+        """Return draws in groups of the same hyperparameters."""
+
+
+# Records are the state
+
+
+@dataclass(frozen=True, eq=False)
+class LaggedFit(InnovationsFit):
+    """The posterior if records are the state, known in closed form; regressors may have lags."""
+
+    rows: Array  # weights of the transitions, (N, 1)
+
+    def draw(self, groups: int, each: int, rng: np.random.Generator) -> list[DrawnWeights]:
+        """Return draws in groups of the same hyperparameters."""
+        theta, n = self.theta, self.scaled.states
+        others = theta + 0.35 * rng.standard_normal((2 * groups, len(theta)))
+        heights = np.array([_height(self.scaled, one, self.live, self.rows) for one in others])
+        heights -= _height(self.scaled, theta, self.live, self.rows)
+        chances = np.exp(np.clip(heights, -30.0, 0.0))
+        chosen = rng.choice(len(others), groups - 1, p=chances / chances.sum())
+        places = [theta, *(others[row] if heights[row] > -6 else theta for row in np.sort(chosen))]
+        drawn = []
+        for place in places:
+            features = self.scaled.features(place)
+            posterior = _WeightPosterior.of(features, self.scaled, self.live, self.rows)
+            weights, noise = np.zeros((each, posterior.size, n)), np.zeros((each, n))
+            for k in range(each):
+                weights[k][:, self.live], noise[k, self.live] = posterior.draw(rng)
+            drawn.append((features, weights, noise))
+        return drawn
+
+
+@dataclass(frozen=True, eq=False)
+class _Spectrum:
+    """What the evidence needs of features and standardised errors."""
+
+    values: Array
+    vectors: Array
+    projected: Array
+    squares: Array
+    count: int
+
+    @classmethod
+    def of(cls, Phi: Array, Y: Array) -> _Spectrum:
+        values, vectors = np.linalg.eigh(Phi.T @ Phi)
+        values = np.maximum(values, 1e-12)
+        return cls(values, vectors, vectors.T @ (Phi.T @ Y), (Y**2).sum(axis=0), len(Y))
+
+    def log_evidence(self, i: int, amplitudes: Array, noises: Array) -> Array:
+        """Return the log density of one state's errors for all amplitudes and noises, shape ``(A, S)``."""
+        a2, s2 = amplitudes[:, None, None] ** 2, noises[None, :, None] ** 2
+        total = a2 * self.values + s2
+        volume = np.log(total).sum(axis=-1) + (self.count - len(self.values)) * np.log(s2[..., 0])
+        explained = (a2 * self.projected[:, i] ** 2 / (s2 * total)).sum(axis=-1)
+        return np.asarray(-0.5 * volume - 0.5 * np.maximum(self.squares[i] / s2[..., 0] - explained, 0.0))
+
+
+@dataclass(frozen=True, eq=False)
+class _WeightPosterior:
+    """The posterior of weights, amplitudes and noises for one set of features, on a grid around the mode."""
+
+    spectrum: _Spectrum
+    grids: list[tuple[Array, Array, Array]]
+    sizes: Array
+
+    @classmethod
+    def of(cls, features: Features, scaled: Scaled, live: Mask, rows: Array) -> _WeightPosterior:
+        sizes = scaled.sizes[live]
+        spectrum = _Spectrum.of(features(scaled.Z) * rows, scaled.E[:, live] / sizes * rows)
+        width, grids = min(0.3, 3 / np.sqrt(spectrum.count)), []
+        for i in range(len(sizes)):
+            coarse = spectrum.log_evidence(i, _AMPLITUDES, _NOISES)
+            j, k = np.unravel_index(int(coarse.argmax()), coarse.shape)
+            amplitudes = _AMPLITUDES[j] * np.logspace(-0.7, 0.7, 11)
+            noises = _NOISES[k] * np.exp(np.linspace(-0.24 - width, 0.24 + width, 25))
+            grids.append((spectrum.log_evidence(i, amplitudes, noises), amplitudes, noises))
+        return cls(spectrum, grids, sizes)
+
+    @property
+    def size(self) -> int:
+        return len(self.spectrum.values)
+
+    def draw(self, rng: np.random.Generator | None) -> tuple[Array, Array]:
+        """Return weights ``(F, live)`` and noises ``(live,)`` in the units of states; the mode if there is no rng."""
+        weights, noises = [], []
+        for i, (heights, amplitudes, sds) in enumerate(self.grids):
+            if rng is None:
+                j, k = divmod(int(heights.argmax()), len(sds))
+            else:
+                chances = np.exp(heights - heights.max()).ravel()
+                j, k = divmod(int(rng.choice(chances.size, p=chances / chances.sum())), len(sds))
+            precision = self.spectrum.values / sds[k] ** 2 + 1 / amplitudes[j] ** 2
+            coefficients = self.spectrum.projected[:, i] / sds[k] ** 2 / precision
+            if rng is not None:
+                coefficients = coefficients + rng.standard_normal(len(coefficients)) / np.sqrt(precision)
+            weights.append(self.spectrum.vectors @ coefficients)
+            noises.append(sds[k])
+        return np.stack(weights, axis=1) * self.sizes, np.array(noises) * self.sizes
+
+
+def _height(scaled: Scaled, theta: Array, live: Mask, rows: Array) -> float:
+    """Return the log posterior of hyperparameters, with amplitudes and noises integrated out on a grid."""
+    try:
+        features = scaled.features(theta)
+        spectrum = _Spectrum.of(features(scaled.Z) * rows, scaled.E[:, live] / scaled.sizes[live] * rows)
+    except np.linalg.LinAlgError:
+        return -np.inf
+    heights = [spectrum.log_evidence(i, _AMPLITUDES, _NOISES).ravel() for i in range(int(live.sum()))]
+    prior = -0.5 * (((theta[:-1] - _LENGTH) ** 2).sum() + ((theta[-1] - _LENGTH) / 3) ** 2)
+    return float(sum(logsumexp(each) - np.log(each.size) for each in heights) + prior)
+
+
+def learn_theta(scaled: Scaled, live: Mask, lags: int) -> Array:
+    """Return likely hyperparameters, by moves of one coordinate at a time."""
+    theta = np.full(scaled.states + scaled.inputs + 2, _LENGTH)
+    rows = np.ones((len(scaled.Z), 1))
+    best = _height(scaled, theta, live, rows)
+    moved = [i for i in range(len(theta)) if lags or i != len(theta) - 2]
+    for step in (0.9, 0.5):
+        for i in moved:
+            for sign in (1, -1):
+                other = theta.copy()
+                other[i] += sign * step * (2 if i == len(theta) - 1 else 1)
+                height = _height(scaled, other, live, rows)
+                if height > best:
+                    theta, best = other, height
+                    break
+    return theta
+
+
+def fit_lagged(history: History, records: Sequence[Record], pairs: Array, theta: Array | None, live: Mask) -> LaggedFit:
+    """Return the posterior if records are the state; hyperparameters are learned if they are not given."""
+    Z, E, _ = history.along(records)
+    scaled = Scaled.of(Z, E, pairs, records[0].inputs.shape[1])
+    theta = learn_theta(scaled, live, history.structure.lags) if theta is None else theta
+    fit = _conditioned(history, scaled, theta, live, np.ones((len(Z), 1)), None)
+    local = local_noise(scaled.Z[:, : pairs.shape[1]], fit.innovations[:, live])
+    if local is None:
+        return fit
+    rows = 1 / local(scaled.Z[:, : pairs.shape[1]])[:, None]
+    return _conditioned(history, scaled, theta, live, rows, local)
+
+
+def _conditioned(
+    history: History, scaled: Scaled, theta: Array, live: Mask, rows: Array, local: LocalNoise | None
+) -> LaggedFit:
+    features = scaled.features(theta)
+    posterior = _WeightPosterior.of(features, scaled, live, rows)
+    weights, noise = np.zeros((posterior.size, scaled.states)), np.zeros(scaled.states)
+    weights[:, live], noise[live] = posterior.draw(None)
+    innovations = _unit((scaled.E - features(scaled.Z) @ weights) * rows, live)
+    units = len(scaled.Z) * np.log(scaled.sizes[live]).sum() - live.sum() * np.log(rows).sum()
+    evidence = _height(scaled, theta, live, rows) - units
+    return LaggedFit(history, scaled, theta, live, features, weights, noise, evidence, innovations, local, rows)
+
+
+def _unit(innovations: Array, live: Mask) -> Array:
+    """Return innovations with a root mean square of 1 for each state, and 0 where the error of M is negligible."""
+    sizes = np.sqrt((innovations**2).mean(axis=0))
+    return np.where(live & (sizes > 0), innovations / np.maximum(sizes, 1e-300), 0.0)
+
+
+# With measurement noise
+
+
+@dataclass(frozen=True, eq=False)
+class FilterFit(InnovationsFit):
+    """The posterior of weights inside a filter, approximated around its mode (Laplace)."""
+
+    root: Array  # of the covariance of the weights, (F n, F n)
+
+    def draw(self, groups: int, each: int, rng: np.random.Generator) -> list[DrawnWeights]:
+        """Return draws in one group: their hyperparameters are the same."""
+        count, (F, n) = groups * each, self.weights.shape
+        moved = (rng.standard_normal((count, F * n)) @ self.root.T).reshape(count, F, n) * self.live
+        factors = np.exp(0.8 / np.sqrt(len(self.innovations)) * rng.standard_normal((count, n)))
+        return [(self.features, self.weights + moved, self.noise * factors)]
+
+
+def fit_filter(
+    history: History, records: Sequence[Record], pairs: Array, plain: InnovationsFit, steps: int = 5
+) -> FilterFit:
+    """Return the posterior with measurement noise, from that of records as states.
+
+    Raises:
+        LinAlgError: if the filter diverges.
+    """
+    live, n = plain.live, plain.scaled.states
+    Z, E, _ = history.along(records)
+    # The units are those of the records, not those of a filter that knows no residual yet.
+    own = Scaled.of(Z, E, pairs, records[0].inputs.shape[1])
+    width = n + own.inputs
+    shift, scale = own.shift.copy(), own.scale.copy()
+    shift[:width], scale[:width] = plain.scaled.shift[:width], plain.scaled.scale[:width]
+    raw = own.Z * own.scale + own.shift
+    scaled = replace(own, Z=(raw - shift) / scale, E=plain.scaled.E, shift=shift, scale=scale)
+    scaled = replace(scaled, visited=(own.visited * own.scale + own.shift - shift) / scale)
+    theta = plain.theta.copy()
+    theta[width] = np.log(6.0)
+    centres = scaled.centres[spread_rows(scaled.centres, FILTER_CENTRES)]
+    features, sizes = scaled.features(theta, centres), np.maximum(plain.scaled.sizes, 1e-12)
+    F, N = features(scaled.Z[:1]).shape[1], len(scaled.Z)
+    weights: Array = np.zeros((F, n))
+    noise, amplitudes = np.maximum(0.8 * plain.noise, 1e-3 * sizes), 0.5 * sizes
+    for _ in range(steps):
+        innovations, G = _sensitivities(history, records, features, scaled, weights)
+        Gw = (G / noise[:, None]).reshape(-1, F * n)
+        prior = np.tile(1 / amplitudes**2, F)
+        A = Gw.T @ Gw + np.diag(prior)
+        target = (innovations / noise).ravel() + Gw @ weights.ravel()
+        weights = np.asarray(np.linalg.solve(A, Gw.T @ target)).reshape(F, n)
+        left = (target - Gw @ weights.ravel()).reshape(-1, n) * noise
+        covariance = np.linalg.inv(A)
+        determined = np.maximum(F - (np.diag(covariance) * prior).reshape(F, n).sum(axis=0), 0.5)
+        # What noise does not explain of the errors has some amplitude, so that few records leave it uncertain.
+        least = 0.5 * np.sqrt(np.maximum(sizes**2 - 2 * noise**2, 0.01 * sizes**2))
+        amplitudes = np.clip(np.sqrt((weights**2).sum(axis=0) / determined), least, 30 * sizes)
+        noise = np.sqrt((left**2).sum(axis=0) / np.maximum(N - determined, N / 3))
+        noise = np.maximum(noise, 3e-3 * sizes)
+    weights, noise = weights * live, noise * live
+    fit = FilterFit(
+        history, scaled, theta, live, features, weights, noise, 0.0, np.zeros((N, n)), None,
+        np.asarray(np.linalg.cholesky(0.5 * (covariance + covariance.T) + 1e-18 * np.eye(len(A)))),
+    )  # fmt: skip
+    innovations = history.along(records, fit.residual)[2]
+    kept = np.tile(live, F)
+    likelihood = -0.5 * ((innovations / np.where(live, noise, np.inf)) ** 2).sum() - N * np.log(noise[live]).sum()
+    of_prior = -0.5 * ((weights[:, live] / amplitudes[live]) ** 2).sum() - F * np.log(amplitudes[live]).sum()
+    volume = -0.5 * np.linalg.slogdet(A[np.ix_(kept, kept)])[1] - 5.0 * live.sum()
+    unit = _unit(innovations, live)
+    local = local_noise(scaled.Z[:, :width], unit[:, live])
+    if local is not None:
+        unit = _unit(unit / local(scaled.Z[:, :width])[:, None], live)
+    return replace(fit, evidence=float(likelihood + of_prior + volume), innovations=unit, local=local)
+
+
+def _sensitivities(
+    history: History, records: Sequence[Record], features: Features, scaled: Scaled, weights: Array
+) -> tuple[Array, Array]:
+    """Return innovations ``(N, n)`` and the derivatives of the predicted records by the weights, ``(N, n, F n)``."""
+    F, n = weights.shape
+    keep, steps = np.eye(n) - history.gain, 1e-4 * scaled.scale[:n]
+    rows, innovations = [], []
+
+    def residual(z: Array) -> Array:
+        return np.asarray(features((z - scaled.shift) / scaled.scale) @ weights)
+
+    for alike in of_one_horizon(records):
+        psi = np.zeros((len(alike), n, F * n))
+
+        def visit(memory: Memory, u: Array, z: Array) -> None:
+            nonlocal psi
+
+            def step(x: Array) -> Array:
+                return np.asarray(history.model.step(x, u) + residual(np.concatenate([x, z[:, n:]], axis=1)))
+
+            G = jacobian(step, memory.estimate, steps) @ psi
+            own = G.reshape(len(z), n, F, n)
+            phi = features((z - scaled.shift) / scaled.scale)
+            for i in range(n):
+                own[:, i, :, i] += phi
+            rows.append(G)
+            psi = keep @ G
+
+        innovations.append(history.along(alike, residual, visit)[2])
+    return np.concatenate(innovations), np.concatenate(rows)
+
+
+# The structure
+
+STRUCTURES = (
+    Structure(0), Structure(1), Structure(2), Structure(3), Structure(0, 3.0), Structure(0, 30.0), Structure(2, 30.0)
+)  # fmt: skip
+EXACT = 1e-3  # share of noise below which records with lags determine the next one
+NOISY = 0.01  # share of noise from which executions of one task differ
+_BETTER, _GOOD = 0.1, 0.02  # share of the error without a history, and of the residual, that a history leaves
+_UNEXPLAINED = 0.05  # share of the residual that nothing predicts if there is noise
+
+
+@dataclass(frozen=True, eq=False)
+class ChosenStructure:
+    """A structure with its hyperparameters, learned from some executions."""
+
+    structure: Structure
+    theta: Array
+    theta_of_states: Array
+
+
+def fit_structures(
+    model: Model, records: Sequence[Record], pairs: Array, live: Mask, chosen: ChosenStructure | None = None
+) -> tuple[InnovationsFit, ChosenStructure]:
+    """Return the posterior of the most probable structure, or of a structure that was chosen before.
+
+    Fewer lags are preferred: the fewest that determine the next record, or else those with the largest evidence.
+    Measurement noise is considered if no lags determine it.
+    """
+
+    def lagged(structure: Structure, theta: Array | None) -> LaggedFit:
+        history = History(model, structure, np.eye(len(live)))
+        return fit_lagged(history, records, pairs, theta, live)
+
+    def filtered(structure: Structure, plain: InnovationsFit) -> FilterFit:
+        middle = plain.scaled.shift[: len(live)], plain.scaled.shift[len(live) : pairs.shape[1]]
+        scales = np.maximum(plain.noise, 1e-9 * plain.scaled.scale[: len(live)])
+        return fit_filter(History.of(model, structure, scales, middle), records, pairs, plain)
+
+    if chosen is not None:
+        plain = lagged(Structure(0 if chosen.structure.ratio else chosen.structure.lags), chosen.theta_of_states)
+        return (filtered(chosen.structure, plain) if chosen.structure.ratio else plain), chosen
+    longest = max(1, len(records))
+    fits: list[InnovationsFit] = [
+        lagged(structure, None) for structure in STRUCTURES if not structure.ratio and structure.lags <= longest
+    ]
+    of_states = fits[0]
+    least = min(fit.share for fit in fits)
+    exact = [fit for fit in fits if fit.share <= max(10 * least, 1e-6)] if least <= EXACT else []
+    best = min(exact, key=_lags) if exact else max(fits, key=_preference)
+    if best.share > NOISY:
+        for structure in STRUCTURES:
+            if structure.ratio and structure.lags <= longest:
+                with contextlib.suppress(np.linalg.LinAlgError):
+                    fits.append(filtered(structure, of_states))
+        best = max(fits, key=_preference)
+    structure = best.history.structure
+    return best, ChosenStructure(structure, best.theta, (of_states if structure.ratio else best).theta)
+
+
+def predicted_by_history(
+    posterior: DynamicsPosterior, records: Sequence[Record], pairs: Array, without_history: Array
+) -> bool:
+    """Return whether a history predicts the last record far better than state and input do, or neither predicts it.
+
+    The last record is left out. ``without_history`` has the predictions ``(H, n)`` of its states without a history,
+    learned from the other records.
+    """
+    last, sizes, live = records[-1], posterior.data.sizes, posterior.data.learned
+
+    def share(errors: Array) -> float:
+        return float(((errors[:, live] / sizes[live]) ** 2).mean(axis=0).max())
+
+    without = share(last.states[1:] - without_history)
+    if without < EXACT:
+        return False
+    shares = []
+    for lags in (1, 2, 3):
+        history = History(posterior.model, Structure(lags), np.eye(len(live)))
+        Z, E, _ = history.along(records[:-1])
+        scaled = Scaled.of(Z, E, pairs, last.inputs.shape[1])
+        theta = np.full(scaled.states + scaled.inputs + 2, _LENGTH)
+        fit = _conditioned(history, scaled, theta, live, np.ones((len(Z), 1)), None)
+        with_history = share(history.along([last], fit.residual)[2])
+        if with_history < min(_BETTER * without, _GOOD):
+            return True
+        shares += [with_history, fit.share]
+    return min(without, *shares) > _UNEXPLAINED  # noise
+
+
+def _lags(fit: InnovationsFit) -> int:
+    return fit.history.structure.lags
+
+
+def _preference(fit: InnovationsFit) -> float:
+    structure = fit.history.structure
+    return fit.evidence - 3 * structure.lags - (3 if structure.ratio else 0)

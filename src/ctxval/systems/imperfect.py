@@ -1,0 +1,96 @@
+"""A simulation with the sensors and actuators of robots: noise, encoders, late commands, slow motors."""
+
+from __future__ import annotations
+
+import zlib
+
+import numpy as np
+
+from ctxval._util.arrays import Array, ArrayLike
+from ctxval._util.checked import NonNegativeFloat, checked
+from ctxval._util.registry import part
+from ctxval._util.representation import ShortRepr
+from ctxval.core.controller import Controller
+from ctxval.core.model import Function, Model, Step
+from ctxval.core.rollout import rollout
+from ctxval.core.task import Task
+from ctxval.core.trajectory import Trajectory
+from ctxval.errors import InputError
+
+
+@part(functions={"step": "(x, u) -> x_next"})
+class Imperfect(ShortRepr):
+    """A step function or a model as the true system, whose records and actuators are imperfect.
+
+    The controller acts on the records, as on a robot. Executions of one task differ if there is noise.
+
+    Attributes:
+        process: standard deviations of the noise of each state in each step, a number or shape ``(n,)``.
+        measurement: standard deviations of the noise of each recorded state.
+        resolution: steps to which records are rounded, as an encoder does; 0 for a state that is not rounded.
+        delay: steps by which inputs act late; it need not be an integer. Before the first one, the input is 0.
+        lag: time constant of the actuators in steps; 0 if they follow at once.
+        seed: with a seed, noise is a function of it, of the task and of how often this object has executed.
+
+    Raises:
+        InputError: if a number is negative.
+    """
+
+    batched = True
+
+    @checked
+    def __init__(
+        self,
+        step: Step | Model,
+        *,
+        process: ArrayLike = 0.0,
+        measurement: ArrayLike = 0.0,
+        resolution: ArrayLike = 0.0,
+        delay: NonNegativeFloat = 0.0,
+        lag: NonNegativeFloat = 0.0,
+        vectorized: bool = False,
+        seed: int | None = None,
+    ) -> None:
+        self.model = step if isinstance(step, Model) else Function(step, vectorized=vectorized)
+        self.process, self.measurement, self.resolution = (
+            np.asarray(value, dtype=np.float64) for value in (process, measurement, resolution)
+        )
+        for name in ("process", "measurement", "resolution"):
+            if not (np.isfinite(getattr(self, name)) & (getattr(self, name) >= 0)).all():
+                raise InputError(f"{name} must be finite and not negative, got {getattr(self, name).tolist()}.")
+        self.delay, self.lag, self.seed = delay, lag, seed
+        self._executed = 0
+
+    def execute(self, controller: Controller, task: Task) -> Trajectory:
+        """Run the closed loop from the initial state of the task over its horizon; batches have noise of their own."""
+        start = np.array(task.initial_state, dtype=np.float64)
+        rng = self._rng(task)
+        truth, late, acting = start, list[Array](), np.zeros(())
+
+        def record(x: Array) -> Array:
+            read = x + self.measurement * rng.standard_normal(x.shape) if self.measurement.any() else x
+            unit = np.where(self.resolution > 0, self.resolution, 1.0)
+            return np.asarray(np.where(self.resolution > 0, np.round(read / unit) * unit, read))
+
+        def step(_: Array, u: Array) -> Array:
+            nonlocal truth, acting
+            late.append(np.array(u))
+            share = self.delay % 1.0
+            newer, older = (len(late) - 1 - int(self.delay) - back for back in (0, 1))
+            u = sum(w * late[k] for w, k in ((1 - share, newer), (share, older)) if w and k >= 0) + np.zeros(u.shape)
+            if self.lag:
+                u = acting + (u - acting) * (1 - np.exp(-1 / self.lag))
+                acting = u
+            truth = self.model.step(truth, u)
+            if self.process.any():
+                truth = truth + self.process * rng.standard_normal(truth.shape)
+            return record(truth)
+
+        return rollout(step, controller, task.starting_at(record(start)))
+
+    def _rng(self, task: Task) -> np.random.Generator:
+        if self.seed is None:
+            return np.random.default_rng()
+        self._executed += 1
+        of_task = zlib.crc32(np.ascontiguousarray(task.initial_state).tobytes() + task.reference.tobytes())
+        return np.random.default_rng([self.seed, of_task, self._executed])

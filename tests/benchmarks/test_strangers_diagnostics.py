@@ -1,0 +1,81 @@
+"""What each diagnostic caught, in campaigns whose thresholds are below d*."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "certificates"))
+from test_dynamics_diagnostics import BAD
+
+from rig_evidence import GOOD, prediction
+from strangers_diagnostics import FAILED, NAMES, JudgedRun, caught, name_of, stopping
+
+
+def test_each_sentence_has_the_name_of_one_diagnostic() -> None:
+    names = set()
+    for changed, _ in BAD:
+        by = stopping(replace(GOOD, **changed), 0.8, 2.0)
+        assert by
+        names.update(by)
+    assert names <= {*NAMES.values(), FAILED}
+    assert len(names) > 10
+    with pytest.raises(ValueError, match="one diagnostic gives each sentence"):
+        name_of("nothing speaks against it")
+
+
+def test_nothing_is_stopped_that_is_not_below_the_threshold() -> None:
+    assert stopping(GOOD, 0.8, 2.0) == []
+    assert stopping(GOOD, 0.8, 0.9) is None
+    assert stopping(replace(GOOD, executions=1), 2.5, 2.0) is None
+
+
+def test_a_failed_prediction_stops_what_its_raised_bound_exceeds() -> None:
+    failing = replace(GOOD, predictions=(*GOOD.predictions, prediction(4, 0.5, 0.6)))
+    assert stopping(failing, 0.8, 2.0) == [FAILED]
+    assert FAILED not in (stopping(failing, 0.8, 9.0) or [])
+
+
+class Judged:
+    """Dynamics that are judged once in each of a few executions."""
+
+    def screening(self, trials: list[Any], *, pending: bool = False) -> Any:
+        return replace(GOOD, executions=len(trials))
+
+    evidence = kept_evidence = screening
+
+
+def test_the_last_judgement_after_each_execution_counts() -> None:
+    dynamics, trials = Judged(), list[Any]()
+
+    def run(budget: int, threshold: float) -> None:
+        for _ in range(budget):
+            campaign.executions = len(trials)
+            judge: Callable[..., Any] = dynamics.screening
+            judge(trials, pending=True)
+            judge(trials)
+            trials.append(SimpleNamespace(distance=0.5))
+
+    campaign: Any = SimpleNamespace(recorder=SimpleNamespace(dynamics=dynamics), executions=0, run=run)
+    assert JudgedRun(campaign, 2.0).run(5) == [
+        [0, ["fewest executions", "largest distance untested"]],
+        [1, ["fewest executions", "largest distance untested"]],
+        [2, ["fewest executions", "largest distance untested"]],
+        [3, ["largest distance untested"]],
+        [4, ["largest distance untested"]],
+    ]
+    assert not vars(dynamics)  # nothing is watched any more
+
+
+def test_a_diagnostic_that_alone_stops_a_step_is_counted_once_for_its_campaign() -> None:
+    rows = caught([{"stopped": [[1, ["gap", "noise"]], [2, ["gap"]], [3, ["gap"]], [4, []]]}, {"stopped": []}])
+    assert rows[0] == ["gap", "3", "2", "1"]
+    assert rows[1] == ["noise", "1", "0", "0"]
+    assert len(rows) == len(NAMES) + 1
