@@ -79,6 +79,9 @@ calibrate: .venv/.test  ## do the bounds hold as often as they say? Writes docs/
 	$(BIN)/python benchmarks/calibrate_dynamics.py
 	$(BIN)/python benchmarks/calibrate_strangers.py development
 	$(BIN)/python benchmarks/calibrate_strangers.py reporting
+	$(BIN)/python benchmarks/calibrate_noise.py development
+	$(BIN)/python benchmarks/calibrate_noise.py misleading
+	$(BIN)/python benchmarks/calibrate_noise.py reporting
 	$(BIN)/python benchmarks/study_interval.py
 	$(BIN)/python benchmarks/study_time_varying.py
 	$(BIN)/python benchmarks/study_retrain.py
