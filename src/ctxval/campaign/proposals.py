@@ -241,7 +241,7 @@ class IndependentDraws:
     def test(self, trials: Sequence[Trial]) -> Array:
         """Return the next point ``(d,)`` of the Latin hypercubes of tests; it depends on no result."""
         block, row = divmod(spread_tests(trials), TESTS)
-        return hypercube(self._validation.space.dimension, self._generator(block, _HYPERCUBE))[row]
+        return np.asarray(hypercube(self._validation.space.dimension, self._generator(block, _HYPERCUBE))[row])
 
     def _generator(self, number: int, stream: int) -> np.random.Generator:
         """Return the random numbers of a draw; the streams of searches have smaller numbers."""
