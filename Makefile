@@ -8,7 +8,7 @@ CAMPAIGNS ?= 120
 # Small dense algebra is faster on one thread.
 export OMP_NUM_THREADS = 1
 
-.PHONY: demo test quick check docs reliability interleavings crash-states attack lowest bench bench-peers study study-refine reproduce search global-search calibrate drawn-tests parts pictures posterior-ranks clean
+.PHONY: demo test quick thorough check docs reliability interleavings crash-states attack lowest bench bench-peers study study-refine reproduce search global-search calibrate drawn-tests parts pictures posterior-ranks clean
 
 demo: .venv/.installed
 	$(BIN)/ctxval run pendulum
@@ -18,6 +18,9 @@ test: check
 
 quick: .venv/.test  ## everything that takes less than half a second, on all cores, for daily work
 	$(BIN)/python -m pytest -q -m "not slow" --numprocesses auto --dist worksteal
+
+thorough: .venv/.test  ## `make test` with more seeds, sizes and examples; takes about an hour
+	$(BIN)/python -m pytest --thorough --numprocesses auto --dist worksteal
 
 check: .venv/.test
 	$(BIN)/ruff check .
@@ -59,8 +62,9 @@ study: .venv/.test  ## the running example over many seeds, from the runs of `ma
 study-refine: .venv/.test  ## how much better refined models are; writes docs/refinement.md, and resumes
 	$(BIN)/python benchmarks/study_refine.py
 
-docs: .venv/.test  ## the manual, with its gallery; writes docs/_build/html
+docs: .venv/.test  ## the manual, with its gallery; writes docs/_build/html, and looks for broken links
 	$(BIN)/python -m sphinx -W --keep-going -b html docs docs/_build/html
+	$(BIN)/python -m pytest -q --thorough --manual docs/_build/html tests/test_manual_pages.py -k manual_is_built
 
 pictures: .venv/.test  ## those of the README and of the manual; needs Chromium
 	$(BIN)/ctxval run pendulum --search gp-ucb --seed 1 --store docs/pictures/pendulum.sqlite --no-report

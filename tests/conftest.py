@@ -38,14 +38,21 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 pytest_plugins = ["browser"]
 """Fixtures that tests of several folders use."""
 
-settings.register_profile("ctxval", deadline=None, derandomize=True)
-settings.load_profile("ctxval")
+settings.register_profile("short", deadline=None, derandomize=True, max_examples=20)
+settings.register_profile("thorough", deadline=None, derandomize=True, max_examples=300)
+settings.load_profile("short")
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    parser.addoption("--kills", type=int, default=10, help="how many campaigns are killed and resumed")
+    parser.addoption("--thorough", action="store_true", help="what `make thorough` runs: more seeds and sizes")
+    parser.addoption("--manual", help="a folder with the built manual, whose pages are checked")
+    parser.addoption("--kills", type=int, default=4, help="how many campaigns are killed and resumed")
     parser.addoption("--switches", type=int, default=1, help="how often two processes on one store are switched")
 
+
+TESTS = Path(__file__).parent
+IN_FULL = ("certificates", "gp", "learning", "searches")
+"""Folders whose subject are the draws and the closed loops."""
 
 STATE = "LOCALAPPDATA" if os.name == "nt" else "XDG_STATE_HOME"
 """The variable that says where the user's key is."""
@@ -56,6 +63,15 @@ def pytest_configure(config: pytest.Config) -> None:
     folder = tempfile.TemporaryDirectory()
     os.environ[STATE] = folder.name
     config.add_cleanup(folder.cleanup)
+    settings.load_profile("thorough" if config.getoption("thorough") else "short")
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Leave out the tests that only `make thorough` runs."""
+    if not config.getoption("thorough"):
+        left_out = [item for item in items if item.get_closest_marker("thorough")]
+        config.hook.pytest_deselected(items=left_out)
+        items[:] = [item for item in items if not item.get_closest_marker("thorough")]
 
 
 def make_validation(
@@ -110,7 +126,7 @@ class Predicted:
         self.asked.append(before)
         return self.function(points)
 
-    def dynamics(self, confidence: float) -> DynamicsEvidence:
+    def dynamics(self, confidence: float, quantile: float = 0.9) -> DynamicsEvidence:
         """Return evidence against which no diagnostic speaks, with 2000 draws of d* between 2 and 3."""
         rng = np.random.default_rng(4)
         gap = StateInputGap(0.01, ("x[0]",), {"x[0]": 0.0})
@@ -153,13 +169,49 @@ def validation() -> Validation:
     return make_validation()
 
 
+@pytest.fixture(scope="session", autouse=True)
+def smaller() -> Iterator[pytest.MonkeyPatch]:
+    """Take few draws of d* and of the learned dynamics, and run few closed loops on them, unless a test undoes it."""
+    with pytest.MonkeyPatch.context() as patch:
+        make_smaller(patch)
+        yield patch
+
+
+def make_smaller(patch: pytest.MonkeyPatch) -> None:
+    take_few_draws(patch.setattr)
+    run_few_loops(patch.setattr)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def module_in_full(request: pytest.FixtureRequest, smaller: pytest.MonkeyPatch) -> Iterator[None]:
+    """Compute as users do, with the fixtures of a module whose subject are draws and loops."""
+    folder = request.path.relative_to(TESTS).parts[0]
+    in_full = folder in IN_FULL or request.node.get_closest_marker("in_full") is not None
+    if in_full:
+        smaller.undo()
+    yield
+    if in_full:
+        make_smaller(smaller)
+
+
+@pytest.fixture(autouse=True)
+def one_in_full(request: pytest.FixtureRequest, smaller: pytest.MonkeyPatch, module_in_full: None) -> Iterator[None]:
+    """Compute as users do in a test that is marked."""
+    in_full = any(mark.name == "in_full" for mark in request.node.own_markers)
+    if in_full:
+        smaller.undo()
+    yield
+    if in_full:
+        make_smaller(smaller)
+
+
 @pytest.fixture
 def few_draws(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Take few draws of d*, for what does not depend on how many there are."""
+    """Take few draws of d*, where tests compute in full otherwise."""
     take_few_draws(monkeypatch.setattr)
 
 
 @pytest.fixture
 def few_loops(few_draws: None, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Run few closed loops on few draws of the learned dynamics, for what does not depend on how many there are."""
+    """Run few closed loops on few draws of the learned dynamics, where tests compute in full otherwise."""
     run_few_loops(monkeypatch.setattr)

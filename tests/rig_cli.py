@@ -15,7 +15,7 @@ from ctxval.cli import app
 Invoke = Callable[..., Result]
 
 SMALL = [sys.executable, str(Path(__file__).with_name("small_ctxval.py"))]
-"""Starts ``ctxval`` in a process of its own, as the fixture ``few_loops`` makes it here."""
+"""Starts ``ctxval`` in a process of its own, with as few draws and loops as it computes here."""
 
 
 def calling(*before: str) -> Invoke:

@@ -9,6 +9,7 @@ import sys
 
 import threadpoolctl
 
+import small_ctxval  # noqa: F401  # few draws and closed loops
 from conftest import make_validation
 from ctxval import Campaign, searches
 

@@ -56,6 +56,8 @@ def refined(store: Path | None = None, method: Any = "residual", **parts: Any) -
 
 
 if __name__ == "__main__":
+    import small_ctxval  # noqa: F401  # few draws and few closed loops, as in the process that compares
+
     made = campaign(Path(sys.argv[1]))
     print("ready", flush=True)
     refine(made, THRESHOLD, BUDGET)

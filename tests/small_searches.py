@@ -20,11 +20,14 @@ def take_few_draws(replace: Callable[[str, Any], None]) -> None:
 
     for module in ("stopping", "posterior", "maxima"):
         replace(f"ctxval.certificates.{module}.draw_maxima", fewer)
+    replace("ctxval.certificates.maxima._MOST", 1)  # the draws are not doubled where a bound is near the threshold
 
 
 def run_few_loops(replace: Callable[[str, Any], None]) -> None:
     """Make searches of the learned dynamics smaller, by a function that replaces an attribute."""
-    loops = WorstCaseSettings(pool=64, evaluations=200, elites=8, shared=16, moves=4, rounds=2, relevant=300, peaks=2)
+    loops = WorstCaseSettings(
+        pool=48, evaluations=100, elites=6, shared=8, moves=3, rounds=1, relevant=200, peaks=1, nearby=8
+    )
     draws = PosteriorSettings(hyperparameters=10, learned_from=40, centres=80, pivots=40, families=FAMILIES[:1])
     replace("ctxval.learning.worst_case.WorstCaseSettings.for_dimension", lambda *_: loops)
     replace("ctxval.learning.dynamics_posterior.PosteriorSettings.for_horizon", lambda *_: draws)

@@ -83,7 +83,7 @@ def forget_modules(folder: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("folder", "few_loops")
+@pytest.mark.usefixtures("folder")
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
 def test_the_blocks_of_a_page_run(page: Path) -> None:
     for module in NEEDS.get(page.stem, []):

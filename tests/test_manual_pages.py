@@ -19,6 +19,8 @@ import ctxval
 
 ROOT = Path(__file__).parents[1]
 GALLERY = sorted((ROOT / "examples" / "gallery").glob("plot_*.py"))
+LONG = ("plot_3_dubins", "plot_6_aspect1", "plot_6_comparison", "plot_6_refine")
+"""Scripts that only `make docs` and `make thorough` run."""
 NEEDS = {"plot_2_arm": "mujoco", "plot_7_replay": "mcap", "plot_8_fit": "onnx"}
 BUILT = ("_build", "api", "auto_examples", "__pycache__")
 
@@ -45,10 +47,14 @@ class Page(HTMLParser):
 
 
 @pytest.mark.slow
-def test_the_manual_is_built_without_a_warning_and_is_complete(tmp_path: Path) -> None:
-    for module in ("sphinx", "myst_parser", "furo", "sphinx_gallery", "sphinx_copybutton"):
-        pytest.importorskip(module)
-    manual = build(tmp_path)
+@pytest.mark.thorough
+def test_the_manual_is_built_without_a_warning_and_is_complete(tmp_path: Path, request: pytest.FixtureRequest) -> None:
+    """`make docs` runs it on the pages that it has built."""
+    built = request.config.getoption("--manual")
+    if built is None:
+        for module in ("sphinx", "myst_parser", "furo", "sphinx_gallery", "sphinx_copybutton"):
+            pytest.importorskip(module)
+    manual = Path(built).resolve() if built else build(tmp_path)
     pages = {path: Page(path) for path in sorted(manual.rglob("*.html"))}
     assert not list(broken_links(pages))
     assert not [one for page in pages.values() for one in page.loaded if urlsplit(one).scheme not in ("", "data")]
@@ -95,9 +101,14 @@ def pages_left_out(manual: Path) -> Iterator[Path]:
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("few_loops")
 @pytest.mark.filterwarnings("ignore:FigureCanvasAgg:UserWarning")
-@pytest.mark.parametrize("script", GALLERY, ids=lambda path: path.stem)
+@pytest.mark.parametrize(
+    "script",
+    [
+        pytest.param(script, id=script.stem, marks=pytest.mark.thorough if script.stem in LONG else ())
+        for script in GALLERY
+    ],
+)
 def test_a_script_of_the_gallery_runs(
     script: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

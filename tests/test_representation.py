@@ -76,7 +76,6 @@ PACKAGES = (
 )
 
 DATA = Transitions(np.linspace(-1, 1, 80).reshape(40, 2) ** 3, np.linspace(-5, 5, 40)[:, None] ** 2, np.zeros((40, 2)))
-pytestmark = pytest.mark.usefixtures("few_loops")
 
 LINEAR = models.Linear([[1, 0.1], [0, 1]], [[0], [0.1]], data=DATA)
 TASK = Task([1.0, 0.0], goal=[0.5, 0.0], horizon=25, dt=0.02)

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import array_shapes, arrays
 from threadpoolctl import threadpool_info, threadpool_limits
@@ -86,7 +86,6 @@ def test_rounding_does_not_make_a_gram_matrix_an_invalid_weight(scale: float) ->
 
 
 @pytest.mark.parametrize("order", [1, 2, np.inf])
-@settings(max_examples=40, deadline=None)
 @given(vectors=VECTORS)
 def test_the_norm_is_that_of_numpy_over_the_last_axis(order: float, vectors: np.ndarray) -> None:
     np.testing.assert_allclose(vector_norm(vectors, order), np.linalg.norm(vectors, order, axis=-1), rtol=1e-12)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
@@ -77,7 +77,6 @@ def test_ordinary_values_stand_for_themselves(values: np.ndarray) -> None:
     assert sentinels(np.append(np.linspace(990, 1000, 11), 999.0)) == []
 
 
-@settings(deadline=None)
 @given(
     steps=st.lists(st.floats(0.01, 0.3), min_size=1, max_size=30),
     dt=st.floats(0.02, 0.5),

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from ctxval import TaskSpace, controllers, distances, models, systems
@@ -42,7 +42,6 @@ def stored(value: object) -> object:
     return json.loads(json.dumps(describe(value)))
 
 
-@settings(max_examples=40, deadline=None)
 @given(PLAIN)
 def test_a_description_is_json_and_does_not_differ_from_itself(value: object) -> None:
     assert first_difference(stored(value), stored(value)) is None
@@ -151,7 +150,6 @@ def test_the_first_difference_is_named_with_its_place(one: object, other: object
     assert first_difference(one, other) == difference
 
 
-@settings(max_examples=60, deadline=None)
 @given(st.floats(-1e6, 1e6), st.floats(-5e-7, 5e-7))
 def test_rounding_between_machines_is_no_difference(value: float, error: float) -> None:
     assert first_difference({"a": value}, {"a": value * (1 + error)}) is None

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import array_shapes, arrays
 
@@ -45,7 +45,6 @@ def described(shape: str, dtype: str = "'<f8'", order: str = "False") -> str:
     return f"{{'descr': {dtype}, 'fortran_order': {order}, 'shape': {shape}, }}\n"
 
 
-@settings(max_examples=60)
 @given(DTYPES.flatmap(lambda dtype: arrays(dtype, array_shapes(min_dims=0, max_dims=4, min_side=0))), st.booleans())
 def test_numbers_of_every_kind_come_back_as_numpy_reads_them(array: Any, compressed: bool) -> None:
     content = saved(compressed, one=array, two=np.asfortranarray(array.T))
@@ -162,7 +161,6 @@ WHOLE = [
 ]
 
 
-@settings(max_examples=300)
 @given(st.sampled_from(WHOLE), st.integers(0, 2**32), st.integers(1, 6), st.booleans())
 def test_any_damage_gives_a_trajectory_or_one_error(whole: bytes, seed: int, times: int, cut: bool) -> None:
     rng = random.Random(seed)
@@ -188,7 +186,6 @@ ENTRIES = [
 FRAGMENTS = st.sampled_from([*ENTRIES, *"{}(),['\"\\\n0L", ", ", "-1", "1_0", "\0", "é"])
 
 
-@settings(max_examples=200)
 @given(st.lists(FRAGMENTS, max_size=12).map("".join), st.binary(max_size=40))
 def test_no_header_makes_the_reader_stumble(header: str, data: bytes) -> None:
     archive = Archive(zipped(a=npy(header, data)))

@@ -8,6 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from rig_thorough import more
+
 pytest.importorskip("onnx")
 pytest.importorskip("onnxruntime")
 pytest.importorskip("sklearn")
@@ -22,7 +24,7 @@ from study_crane import truth, typed
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("seed", [0, *more(1)])
 def test_designs_that_rounding_stops_are_like_those_next_to_them(seed: int) -> None:
     validation = experiment(seed).validation
     points = validation.space.iid(30, np.random.default_rng(3))
@@ -37,7 +39,7 @@ def test_designs_that_rounding_stops_are_like_those_next_to_them(seed: int) -> N
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("few_loops")
+@pytest.mark.thorough
 def test_verdicts_on_the_crane_are_true_and_its_worst_task_can_be_typed_again() -> None:
     validation = experiment(0).validation
     largest = truth(validation, 600)

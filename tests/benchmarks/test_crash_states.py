@@ -82,7 +82,9 @@ def test_a_renamed_file_has_one_of_its_names() -> None:
 
 @pytest.mark.slow
 @needs_strace
-@pytest.mark.parametrize(("name", "mode"), [("hand", "ordered"), ("full", "strict")])
+@pytest.mark.parametrize(
+    ("name", "mode"), [("hand", "ordered"), pytest.param("full", "strict", marks=pytest.mark.thorough)]
+)
 def test_no_acknowledged_execution_is_lost_or_doubled(name: str, mode: Mode, tmp_path: Path) -> None:
     counts = count(recorded(name, tmp_path), mode, each=1, seed=0, resume_each=60, workers=1)
     assert counts["distinct"] > 200
@@ -93,6 +95,7 @@ def test_no_acknowledged_execution_is_lost_or_doubled(name: str, mode: Mode, tmp
 
 
 @pytest.mark.slow
+@pytest.mark.thorough
 @needs_strace
 def test_a_journal_that_comes_back_takes_an_execution_with_it(tmp_path: Path) -> None:
     """With SQLite's own default, which shows that the check can see a loss."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import sys
 from itertools import pairwise
@@ -14,6 +15,7 @@ from threadpoolctl import threadpool_info
 from ctxval import grid_truth
 from ctxval._util.arrays import Array
 from ctxval._util.json_lines import JsonLines
+from rig_thorough import some
 
 BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
 sys.path.insert(0, str(BENCHMARKS))
@@ -35,6 +37,8 @@ from dynamics_systems import (  # noqa: E402
 )
 
 ENTRIES = {**DEVELOPMENT, **REPORTING}
+first = functools.cache(lambda name: ENTRIES[name](0).validation)
+"""Each entry with its first seed, made once."""
 STORED = dynamics_truths.TRUTHS
 
 
@@ -57,9 +61,9 @@ def test_names_are_unique_and_families_known() -> None:
         listed(Entry("mist", "fog", entry.make))
 
 
-@pytest.mark.parametrize("name", ENTRIES)
+@pytest.mark.parametrize("name", some(ENTRIES))
 def test_batches_agree_with_single_executions(name: str) -> None:
-    validation = ENTRIES[name](1).validation
+    validation = first(name)
     assert validation.batched
     points = validation.space.iid(4, np.random.default_rng(0))
     alone = [validation.outcome(point).distance for point in points]
@@ -67,14 +71,15 @@ def test_batches_agree_with_single_executions(name: str) -> None:
     np.testing.assert_allclose(validation.distances(points), alone, rtol=1e-6, atol=1e-12)
 
 
-@pytest.mark.parametrize("name", ENTRIES)
+@pytest.mark.parametrize("name", some(ENTRIES))
 def test_executions_end_well_on_nearly_all_tasks(name: str) -> None:
-    validation = ENTRIES[name](2).validation
-    values = validation.distances(validation.space.iid(1000, np.random.default_rng(0)))
-    assert np.isfinite(values).mean() >= 0.999
+    validation = first(name)
+    values = validation.distances(validation.space.iid(200, np.random.default_rng(0)))
+    assert np.isfinite(values).mean() >= 0.995
 
 
 @pytest.mark.slow
+@pytest.mark.thorough
 @pytest.mark.parametrize("name", [name for name, entry in ENTRIES.items() if entry.misleading and entry.without])
 def test_the_mechanism_that_misleads_matters(name: str) -> None:
     values, plain = dynamics_check.sample(ENTRIES[name], 0, 8000)
@@ -97,7 +102,7 @@ ROUNDED = set() if {"Haswell", "Zen"} >= KERNELS else {"levitation"}
 """Entries whose models are others than with the kernels of the records, because learning amplifies rounding."""
 
 
-@pytest.mark.parametrize("name", ENTRIES)
+@pytest.mark.parametrize("name", some(ENTRIES))
 def test_the_stored_maximum_belongs_to_the_system_as_it_is(name: str) -> None:
     found = ENTRIES[name](0).validation
     record = STORED[name, 0, dynamics_truths.digest(ENTRIES[name].make)]
@@ -117,6 +122,7 @@ def test_stored_repeats_agree() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.thorough
 def test_a_dense_grid_finds_the_same_maximum(tmp_path: Path) -> None:
     entry, file = ENTRIES["drawn-smooth"], JsonLines(tmp_path / "truths.jsonl", STORED.key)
     record = dynamics_truths.truth(entry, 3, file)

@@ -66,7 +66,9 @@ def test_functions_agree_with_the_cases(case: str, name: str, options: dict[str,
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize(
+    "case", [pytest.param(case, marks=[pytest.mark.thorough] * (case == "arm-fnn")) for case in CASES]
+)
 def test_what_is_said_of_the_functions_is_so(case: str) -> None:
     validation = experiment(case, 0).validation
     assert validation.space.dimension == CASES[case].dimension

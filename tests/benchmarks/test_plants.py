@@ -42,6 +42,10 @@ from plants.truths import TRUTHS, truth  # noqa: E402
 from study_auto import first_within  # noqa: E402
 from study_plants import STORED, run, version_of  # noqa: E402
 
+SLOW = ("automatic-transmission", "f16-pull-up", "wind-turbine")
+EACH = [pytest.param(name, marks=[pytest.mark.thorough] * (name in SLOW)) for name in PLANTS]
+"""All plants; those whose executions are slow are executed often by `make thorough` alone."""
+
 experiment = functools.cache(lambda name, seed: PLANTS[name](seed))
 
 
@@ -68,7 +72,7 @@ def test_names_are_unique_and_kinds_known() -> None:
 
 @pytest.mark.parametrize("name", PLANTS)
 def test_batches_agree_with_single_executions(name: str) -> None:
-    validation = experiment(name, 1).validation
+    validation = experiment(name, 0).validation
     assert validation.batched
     points = validation.space.iid(3, np.random.default_rng(0))
     alone = [validation.outcome(point).distance for point in points]
@@ -86,7 +90,7 @@ def test_the_systems_conform_and_the_model_carries_its_data(name: str) -> None:
     assert len(found.validation.model.data) > 100  # type: ignore[attr-defined]
 
 
-@pytest.mark.parametrize("name", PLANTS)
+@pytest.mark.parametrize("name", EACH)
 def test_executions_end_well_and_seeds_differ(name: str) -> None:
     first, other = experiment(name, 0).validation, experiment(name, 1).validation
     points = first.space.iid(100, np.random.default_rng(0))
@@ -239,7 +243,7 @@ ROUNDED = set() if {"Haswell", "Zen"} >= KERNELS else {"automatic-transmission",
 """Plants whose models are others than with the kernels of the records, because learning amplifies rounding."""
 
 
-@pytest.mark.parametrize("name", [name for name in PLANTS if TRUTHS.select(plant=name)])
+@pytest.mark.parametrize("name", EACH)
 def test_the_stored_maximum_belongs_to_the_plant_as_it_is(name: str) -> None:
     found = experiment(name, 0)
     record = TRUTHS[name, 0, digest(PLANTS[name].make)]

@@ -46,6 +46,7 @@ def test_a_rank_is_the_number_of_draws_below_and_equal_ones_are_ordered_at_rando
 
 
 @pytest.mark.slow
+@pytest.mark.thorough
 def test_ranks_of_the_truth_among_draws_are_uniform() -> None:
     # Those with few transitions, which are fast.
     seeds = [seed for seed in range(30) if study.COUNTS[seed % 4] <= 60]

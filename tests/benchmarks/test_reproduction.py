@@ -24,6 +24,7 @@ def test_no_stored_run_is_missing_or_outdated() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.thorough
 def test_the_page_is_what_the_stored_runs_give() -> None:
     page = table_text(Path("docs/reproduction"), STUDIES, Results(RESULTS), FULL)
     assert Path("docs/reproduction.md").read_text() == page

@@ -13,10 +13,10 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
 sys.path.insert(0, str(Path(__file__).parents[1] / "certificates"))
-from strangers_diagnostics import FAILED, NAMES, JudgedRun, caught, name_of, stopping
+from test_dynamics_diagnostics import BAD
 
 from rig_evidence import GOOD, prediction
-from test_dynamics_diagnostics import BAD
+from strangers_diagnostics import FAILED, NAMES, JudgedRun, caught, name_of, stopping
 
 
 def test_each_sentence_has_the_name_of_one_diagnostic() -> None:

@@ -13,7 +13,7 @@ from scipy.stats import kstest
 from conftest import interrupt_at_once, make_validation
 from ctxval import Campaign, Task, TaskSpace, Trajectory, Validation, controllers, models, searches
 from ctxval._util.arrays import Array
-from ctxval.certificates import RESOLUTION, CertificateOptions, farthest_task
+from ctxval.certificates import RESOLUTION, CertificateOptions, Posterior, farthest_task
 from ctxval.core.trial import Trial
 from ctxval.errors import (
     CertificateError,
@@ -26,6 +26,8 @@ from ctxval.errors import (
     UnknownNameError,
 )
 from ctxval.testing import FaultyRig
+
+BY_DISTANCE = CertificateOptions(Posterior())
 
 
 class OneCorner(searches.SequentialSearch):
@@ -444,27 +446,29 @@ def test_a_campaign_stops_before_the_execution_that_is_not_needed(validation: Va
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("few_draws")
 def test_a_campaign_executes_what_nothing_came_near_to_before_it_validates(tmp_path: Path) -> None:
     def campaign(name: str) -> Campaign:
         return Campaign(make_validation(), search=OneCorner(), seed=1, store=tmp_path / name)
 
     # The search alone would never leave its corner.
-    decided = campaign("a").run(20, 1e3)
+    decided = campaign("a").run(20, 1e3, certificate=BY_DISTANCE)
     origins = [trial.origin for trial in decided.trials]
-    assert decided.verdict(1e3).answer == "validated"
+    assert decided.verdict(1e3, certificate=BY_DISTANCE).answer == "validated"
     assert 0 < origins.count("covering") < decided.executions < 20
     points = np.array([trial.unit_point for trial in decided.trials])
     assert farthest_task(points) <= RESOLUTION
     # Interrupted, it goes on as if it had not been, and beyond the verdict nothing is executed.
 
-    def interrupt(trial: Trial) -> None:
-        raise KeyboardInterrupt
+    stops = [1, origins.index("covering"), decided.executions - 1]
 
-    for _ in range(decided.executions):
+    def interrupt(trial: Trial) -> None:
+        if trial.number in stops:
+            raise KeyboardInterrupt
+
+    for _ in stops:
         with pytest.raises(KeyboardInterrupt):
-            campaign("b").run(20, 1e3, on_trial=interrupt)
-    assert facts(campaign("b").run(20, 1e3).trials) == facts(decided.trials)
+            campaign("b").run(20, 1e3, on_trial=interrupt, certificate=BY_DISTANCE)
+    assert facts(campaign("b").run(20, 1e3, certificate=BY_DISTANCE).trials) == facts(decided.trials)
 
 
 def test_a_campaign_ends_at_its_counterexample(validation: Validation) -> None:
@@ -474,7 +478,6 @@ def test_a_campaign_ends_at_its_counterexample(validation: Validation) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("few_draws")
 def test_workers_decide_together(validation: Validation) -> None:
     class InOrder(cf.Executor):
         """Executes each task as soon as it is submitted, so that results come in the same order on any machine."""
@@ -485,8 +488,8 @@ def test_workers_decide_together(validation: Validation) -> None:
             return future
 
     campaign = Campaign(validation, search=OneCorner(), seed=1)
-    decided = campaign.run(40, 1e3, workers=2, executor=InOrder())
-    assert decided.verdict(1e3).answer == "validated"
+    decided = campaign.run(40, 1e3, workers=2, executor=InOrder(), certificate=BY_DISTANCE)
+    assert decided.verdict(1e3, certificate=BY_DISTANCE).answer == "validated"
     assert decided.executions < 40
 
 

@@ -15,6 +15,8 @@ from ctxval.core.model import Model
 from ctxval.gp.ascent import usual_effort
 from ctxval.testing import FaultyRig
 
+pytestmark = pytest.mark.in_full
+
 BURNT = 0.02
 
 

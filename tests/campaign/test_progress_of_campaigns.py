@@ -73,7 +73,6 @@ def test_choosing_counts_designs_towards_what_is_expected() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("few_draws")
 def test_certifying_reports_what_takes_long() -> None:
     campaign = random_campaign().run(5)
     stages = last_of(reports_of(lambda: campaign.verdict(9.0)))

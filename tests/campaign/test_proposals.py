@@ -58,6 +58,7 @@ def designs_of(campaign: Campaign) -> list[int]:
 
 
 @pytest.mark.slow
+@pytest.mark.in_full
 def test_dear_executions_are_thought_about_longer_than_cheap_ones() -> None:
     # A design takes 20 ms. So 22 of them take less than 1 s, and 60 take longer, but far less than 6 s on any machine.
     campaigns = [Campaign(validation(0.02, seconds), seed=1).run(1) for seconds in (0.0, 6.0)]
@@ -69,6 +70,7 @@ def test_dear_executions_are_thought_about_longer_than_cheap_ones() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.in_full
 def test_a_campaign_keeps_its_number_of_designs_when_it_is_resumed(tmp_path: Path) -> None:
     def campaign(design: float, reason: str | None = None) -> Campaign:
         return Campaign(validation(design, 0.0), seed=1, store=tmp_path / "a.sqlite", accept_change=reason)

@@ -18,8 +18,6 @@ from ctxval.cli import app
 from ctxval.errors import ForeignStoreError
 from ctxval.report.context import context_of_campaign
 
-pytestmark = pytest.mark.usefixtures("few_draws")
-
 BY = CertificateOptions(Posterior(resolution=1.0))
 LOOKED = "the threshold was stated after"
 

@@ -46,7 +46,7 @@ class Learned:
     def __init__(self, evidence: DynamicsEvidence | None) -> None:
         self.evidence = evidence
 
-    def dynamics(self, confidence: float) -> DynamicsEvidence | None:
+    def dynamics(self, confidence: float, quantile: float = 0.9) -> DynamicsEvidence | None:
         return self.evidence
 
     def expected(self, points: np.ndarray, before: int) -> np.ndarray:

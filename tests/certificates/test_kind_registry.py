@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from conftest import Predicted
@@ -49,7 +49,6 @@ def certified(kind: str, confidence: float) -> Certificate:
 
 
 @pytest.mark.parametrize("kind", [kind for kind in KINDS if kind != "posterior"])
-@settings(max_examples=25)
 @given(confidences, confidences)
 def test_more_confidence_never_gives_a_lower_bound_or_a_smaller_volume(kind: str, one: float, other: float) -> None:
     low, high = (certified(kind, confidence) for confidence in sorted([one, other]))

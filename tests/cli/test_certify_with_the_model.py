@@ -12,9 +12,8 @@ from typer.testing import CliRunner, Result
 from ctxval import Store
 from ctxval.cli import app
 from ctxval.cli.config import signatures
-from small_searches import run_few_loops, take_few_draws
 
-pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("few_loops")]
+pytestmark = pytest.mark.slow
 
 
 def invoke(*arguments: str) -> Result:
@@ -26,10 +25,7 @@ def searched(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A store of the pendulum with six trials of the search."""
     store = tmp_path_factory.mktemp("runs") / "pendulum.sqlite"
     searched = ("run", "pendulum", "--search", "gp-ucb", "--explore", "--budget", "6", "--no-report")
-    with pytest.MonkeyPatch.context() as patch:
-        take_few_draws(patch.setattr)
-        run_few_loops(patch.setattr)
-        assert invoke(*searched, "--store", str(store)).exit_code == 0
+    assert invoke(*searched, "--store", str(store)).exit_code == 0
     return store
 
 

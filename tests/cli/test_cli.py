@@ -54,9 +54,6 @@ number = 3
 """
 
 
-pytestmark = pytest.mark.usefixtures("few_loops")
-
-
 @pytest.fixture
 def invoke(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):  # type: ignore[no-untyped-def]
     """Run the command line in an empty folder with one module in it."""
@@ -276,7 +273,7 @@ def test_a_confidence_that_no_bound_can_have_does_not_lose_the_report(invoke) ->
 
 @pytest.mark.slow
 def test_a_campaign_stops_as_soon_as_its_verdict_is_reached(invoke) -> None:  # type: ignore[no-untyped-def]
-    given = ("run", "rig:experiment", "--budget", "30", "--decide", "--no-report", "--json")
+    given = ("run", "rig:experiment", "--budget", "30", "--decide", "--tests", "0", "--no-report", "--json")
     validated = json.loads(invoke(*given, "--threshold", "9").stdout)
     assert validated["verdict"] == "validated"
     assert 4 <= validated["executions"] < 22

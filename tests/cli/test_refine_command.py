@@ -17,9 +17,6 @@ from typer.testing import Result
 
 from ctxval import Store, models
 from rig_cli import SMALL, Invoke, calling
-from small_searches import run_few_loops, take_few_draws
-
-pytestmark = pytest.mark.usefixtures("few_loops")
 
 PLANT = """
 import time
@@ -134,8 +131,6 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Result, Path]:
     """What an unbroken refinement prints, and its folder."""
     folder = tmp_path_factory.mktemp("whole")
     with pytest.MonkeyPatch.context() as patch:
-        take_few_draws(patch.setattr)
-        run_few_loops(patch.setattr)
         prepare(folder, patch)
         return calling()(*REFINE), folder
 

@@ -13,8 +13,6 @@ from typer.testing import Result
 from rig_cli import Invoke, calling, report
 from rig_logs import DT, run, write_lerobot, write_mat, write_mcap_json
 
-pytestmark = pytest.mark.usefixtures("few_loops")
-
 LINEAR = ("--model", "Linear", "--option", f"A=[[1.0, {DT}], [0.0, 1.0]]", "--option", f"B=[[0.0], [{DT}]]")
 FIELDS = ("--state", "position=/state.cart.position", "--state", "speed=/state.cart.speed", "--input", "/command.force")
 

@@ -31,7 +31,7 @@ def experiment(seed=0):
     )
 """
 
-pytestmark = [pytest.mark.usefixtures("few_loops"), pytest.mark.slow]
+pytestmark = pytest.mark.slow
 
 
 @pytest.fixture

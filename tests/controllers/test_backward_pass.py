@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import lsq_linear
 
@@ -99,7 +99,6 @@ def test_damping_shortens_the_step_of_its_task_only() -> None:
 
 
 @pytest.mark.slow
-@settings(max_examples=60, deadline=None)
 @given(st.integers(0, 10_000), st.integers(1, 4), st.integers(1, 5))
 def test_a_stage_with_limits_is_the_bounded_minimum(seed: int, m: int, tasks: int) -> None:
     rng = np.random.default_rng(seed)

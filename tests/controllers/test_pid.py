@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from ctxval import Task, controllers, testing
@@ -77,7 +77,6 @@ def test_the_integral_does_not_wind_up_at_a_limit() -> None:
     assert held[:, 0] == pytest.approx([0.5] * 20 + [-0.5])  # the error turns, and so does the input, at once
 
 
-@settings(max_examples=40)
 @given(
     st.lists(st.floats(-5, 5), min_size=1, max_size=9),
     st.floats(0, 20),
@@ -94,7 +93,6 @@ def test_inputs_stay_within_the_limits_and_are_continuous_in_the_states(
     np.testing.assert_allclose(inputs_along(pid, y + 1e-9), u, atol=1e-5)
 
 
-@settings(max_examples=25, deadline=None)
 @given(
     st.lists(st.floats(-3, 3), min_size=1, max_size=4),
     st.floats(0, 10),

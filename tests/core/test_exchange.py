@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
@@ -58,7 +58,6 @@ def test_a_controller_comes_back_bit_for_bit(kind: str, limits: Limits | None, t
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@settings(max_examples=25)
 @given(
     gains=arrays(np.float64, (4, 2, 3), elements=st.floats(allow_nan=False, allow_infinity=False)),
     inputs=arrays(np.float64, (4, 2), elements=st.floats(allow_nan=False, allow_infinity=False)),

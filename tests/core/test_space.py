@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
@@ -37,7 +37,6 @@ def space() -> TaskSpace:
     return TaskSpace(goal=(-3, 3, "rad"), offset=([0, 10], [1, 20], "m"), mass=(1, 2))
 
 
-@settings(max_examples=40, deadline=None)
 @given(spaces_and_unit_points())
 def test_the_unit_cube_and_the_box_map_onto_each_other(given_: tuple[TaskSpace, np.ndarray]) -> None:
     space, unit = given_
@@ -48,7 +47,6 @@ def test_the_unit_cube_and_the_box_map_onto_each_other(given_: tuple[TaskSpace, 
     np.testing.assert_allclose(space.from_unit(space.to_unit(points)), points, rtol=1e-11, atol=1e-8)
 
 
-@settings(max_examples=40, deadline=None)
 @given(spaces())
 def test_the_corners_of_the_unit_cube_are_exactly_those_of_the_box(space: TaskSpace) -> None:
     np.testing.assert_array_equal(space.from_unit(np.zeros(space.dimension)), space.low)
@@ -57,7 +55,6 @@ def test_the_corners_of_the_unit_cube_are_exactly_those_of_the_box(space: TaskSp
     np.testing.assert_array_equal(space.to_unit(space.high), 1)
 
 
-@settings(max_examples=40, deadline=None)
 @given(spaces_and_unit_points())
 def test_a_described_point_is_found_again_from_its_json(given_: tuple[TaskSpace, np.ndarray]) -> None:
     space, unit = given_

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays, mutually_broadcastable_shapes
 
@@ -16,7 +16,6 @@ def task(initial_state: object = (1.0, 2.0), horizon: object = 3, dt: object = 0
     return Task(initial_state, horizon=horizon, dt=dt, **target)
 
 
-@settings(max_examples=50, deadline=None)
 @given(mutually_broadcastable_shapes(num_shapes=4, max_dims=2, max_side=3), st.data())
 def test_components_broadcast_as_numpy_does(shapes: object, data: st.DataObject) -> None:
     parts = [data.draw(arrays(np.float64, shape, elements=FINITE)) for shape in shapes.input_shapes]

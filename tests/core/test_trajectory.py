@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
@@ -135,7 +135,6 @@ def test_transitions_that_do_not_fit_are_refused_with_all_shapes(
 # NPZ
 
 
-@settings(max_examples=40, deadline=None)
 @given(trajectories(ANY, batched=True))
 def test_npz_gives_back_every_bit(trajectory: Trajectory) -> None:
     again = Trajectory.from_npz(trajectory.to_npz())
@@ -181,7 +180,6 @@ def test_bytes_that_are_no_npz_are_refused(source: bytes) -> None:
         Trajectory.from_npz(source)
 
 
-@settings(max_examples=40, deadline=None)
 @given(st.binary(max_size=200))
 def test_random_bytes_are_refused(source: bytes) -> None:
     with pytest.raises(InputError):
@@ -244,7 +242,6 @@ def test_npz_of_another_shape_than_a_plan_has_is_refused(walk: Trajectory) -> No
 # CSV
 
 
-@settings(max_examples=40, deadline=None)
 @given(trajectory=trajectories(NUMBERS, batched=False))
 def test_csv_gives_back_every_bit(trajectory: Trajectory, tmp_path_factory: pytest.TempPathFactory) -> None:
     path = tmp_path_factory.mktemp("csv") / "one.csv"

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from ctxval import Experiment, Plan, Task, TaskSpace, Trajectory, Validation, controllers, distances, models, systems
@@ -225,7 +225,6 @@ def read(path: Path, mapping: LogMapping | None) -> Trajectory:
 
 
 @pytest.mark.slow
-@settings(max_examples=60, deadline=None)
 @given(worn=clothes())
 def test_the_same_recording_in_other_clothes_has_the_same_distance(
     worn: Clothes, tmp_path_factory: pytest.TempPathFactory

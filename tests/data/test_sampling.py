@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from ctxval.data import Field, LogMapping, MemoryTable, Recordings, read_recordings, recordings_of
@@ -30,7 +30,6 @@ def test_states_are_interpolated_and_inputs_are_averaged_over_each_step() -> Non
     assert any("less often than every step of 0.04 s: its values between two samples" in note for note in found.notes)
 
 
-@settings(max_examples=40, deadline=None)
 @given(
     st.lists(st.floats(0.05, 0.15), min_size=4, max_size=40), st.floats(0.02, 0.2), st.floats(-3, 3), st.floats(-3, 3)
 )

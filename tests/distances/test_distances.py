@@ -143,7 +143,7 @@ def test_a_batch_of_distances_is_the_loop_over_them(distance: Distance, batch: t
 
 
 @pytest.mark.parametrize("distance", METRICS)
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 @given(STATES, STATES, STATES)
 def test_a_distance_of_trajectories_is_a_metric(
     distance: Distance, a: np.ndarray, b: np.ndarray, c: np.ndarray
@@ -192,7 +192,6 @@ WEIGHTED: list[Callable[..., StateNorm]] = [
 
 
 @pytest.mark.parametrize("make", WEIGHTED)
-@settings(max_examples=20, deadline=None)
 @given(
     STATES,
     STATES,
@@ -211,7 +210,6 @@ def test_scales_are_reciprocal_weights_and_the_distance_is_homogeneous_in_them(
 
 
 @pytest.mark.parametrize("make", WEIGHTED[:6])
-@settings(max_examples=20, deadline=None)
 @given(STATES, STATES, st.sampled_from(NORMS), arrays(np.float64, N, elements=st.floats(1e-3, 1e3)))
 def test_with_scales_the_distance_does_not_depend_on_the_units_of_the_states(
     make: Callable[..., Distance], a: np.ndarray, b: np.ndarray, order: float, factors: np.ndarray
@@ -224,7 +222,6 @@ def test_with_scales_the_distance_does_not_depend_on_the_units_of_the_states(
     )
 
 
-@settings(max_examples=30, deadline=None)
 @given(STATES, STATES, arrays(np.int64, N, elements=st.integers(-3, 3)), st.sampled_from(NORMS))
 def test_an_angle_is_the_same_after_any_number_of_turns(
     a: np.ndarray, b: np.ndarray, turns: np.ndarray, order: float

@@ -4,11 +4,12 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from ctxval._util.arrays import Array
 from ctxval.gp.global_search import GlobalMaximum, search_globally
+from rig_thorough import more
 
 Values = Callable[[Array], Array]
 
@@ -57,7 +58,7 @@ def rastrigin(points: Array) -> Array:
         (rastrigin, 3, 0.0, 1e-2),
     ],
 )
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, *more(1, 2)])
 def test_it_finds_the_maxima_of_reference_functions(
     function: Values, dimension: int, maximum: float, error: float, seed: int
 ) -> None:
@@ -96,10 +97,10 @@ def cliff(dimension: int, seed: int, share: float = 1.5e-4) -> Values:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("dimension", [2, 3, 4])
+@pytest.mark.parametrize("dimension", [3, *more(2, 4)])
 def test_it_finds_rare_cliffs(dimension: int) -> None:
-    found = [search(cliff(dimension, seed), dimension, seed, 9000).values[0] for seed in range(10)]
-    assert sum(value >= 0.99 for value in found) >= 9
+    found = [search(cliff(dimension, seed), dimension, seed, 9000).values[0] for seed in range(5)]
+    assert sum(value >= 0.99 for value in found) >= 4
 
 
 def test_the_elites_of_several_hills_are_on_all_of_them() -> None:
@@ -135,7 +136,6 @@ def test_a_constant_function_is_searched_without_a_warning() -> None:
     assert search(lambda X: np.ones(len(X)), 4, evaluations=500).values[0] == 1.0
 
 
-@settings(max_examples=25, deadline=None)
 @given(st.integers(1, 12), st.integers(1, 700), st.integers(0, 40), st.integers(0, 2**32 - 1))
 def test_it_keeps_its_budget_and_stays_in_the_cube(dimension: int, evaluations: int, starts: int, seed: int) -> None:
     asked: list[Array] = []

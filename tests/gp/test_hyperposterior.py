@@ -36,7 +36,7 @@ def log_scales(draws: list[Conditioned]) -> np.ndarray:
 
 def quadrature(prior: Prior, X: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The posterior of one length-scale's logarithm: a grid, and its weights for each smoothness, shape ``(k, m)``."""
-    grid = np.linspace(-9.0, 7.0, 1601)
+    grid = np.linspace(-9.0, 7.0, 401)
     logs = np.empty((len(prior.smoothness), len(grid)))
     for row, nu in enumerate(prior.smoothness):
         for column, value in enumerate(grid):
@@ -150,7 +150,7 @@ def test_a_length_scale_is_drawn_from_its_posterior() -> None:
     y = np.sin(6 * X[:, 0])
     prior = Prior(length_scale=0.5, noise=(1e-4, 1e-4), offset=None)
     grid, weights = quadrature(prior, X, y)
-    draws = draw_hyperparameters(X, y, 800, np.random.default_rng(5), prior)
+    draws = draw_hyperparameters(X, y, 250, np.random.default_rng(5), prior)
     drawn, exact = log_scales(draws)[:, 0], weights.sum(axis=0)
     mean = exact @ grid
     deviation = np.sqrt(exact @ (grid - mean) ** 2)
@@ -171,13 +171,13 @@ def test_where_the_data_say_nothing_the_draws_are_the_prior() -> None:
     # Length-scales far below the gaps: whatever they are, the values are uncorrelated.
     X, y = np.array([[0.1, 0.9], [0.5, 0.5], [0.9, 0.1], [0.2, 0.2]]), np.array([0.3, -1.0, 0.4, 2.0])
     prior = Prior(length_scale=1e-4, deviation=0.5, noise=(1e-4, 1e-2))
-    draws = draw_hyperparameters(X, y, 700, np.random.default_rng(2), prior)
+    draws = draw_hyperparameters(X, y, 250, np.random.default_rng(2), prior)
     centre = np.log(1e-4 * np.sqrt(2))
     for column in log_scales(draws)[::3].T:
         assert kstest((column - centre) / 0.5, "norm").pvalue > 1e-3
     assert abs(np.corrcoef(log_scales(draws).T)[0, 1]) < 0.15
     share = np.mean([draw.hyperparameters.nu == 1.5 for draw in draws])
-    assert abs(share - 0.5) < 4 * 0.5 / np.sqrt(700)
+    assert abs(share - 0.5) < 4 * 0.5 / np.sqrt(250)
     # Noise of independent values cannot be told from their own variance: it stays as believed.
     noise = np.array([draw.hyperparameters.log_noise for draw in draws[::3]])
     assert kstest((noise - np.log(1e-4)) / np.log(100), "uniform").pvalue > 1e-3

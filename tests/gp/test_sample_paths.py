@@ -88,7 +88,7 @@ def test_gradients_are_differences(nu: float) -> None:
         assert error < 1e-3 * float(paths.scales[0])
 
 
-@pytest.mark.parametrize(("d", "scale"), [(1, 0.3), (1, 0.08), (2, 0.4), (2, 0.2)])
+@pytest.mark.parametrize(("d", "scale"), [(1, 0.08), (2, 0.2)])
 @pytest.mark.parametrize("nu", [1.5, 2.5])
 def test_maxima_are_not_below_those_of_a_dense_grid(d: int, scale: float, nu: float) -> None:
     paths = paths_given(12, n=6 * d, d=d, nu=nu, scale=scale)
@@ -134,7 +134,7 @@ def test_noisy_paths_stay_off_the_data_by_what_the_noise_allows() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("d", "missed"), [(6, 0.003), (11, 0.003)])
+@pytest.mark.parametrize(("d", "missed"), [(6, 0.003), pytest.param(11, 0.003, marks=pytest.mark.thorough)])
 def test_maxima_in_many_dimensions_are_found_but_for_a_little(d: int, missed: float) -> None:
     rng = np.random.default_rng(d)
     X = rng.random((8 * d, d))

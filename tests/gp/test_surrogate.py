@@ -20,7 +20,7 @@ def where() -> np.ndarray:
     return np.random.default_rng(99).random((30, 2))
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 @given(st.floats(-1e3, 1e3), st.floats(1e-3, 1e3))
 def test_predictions_are_in_the_units_of_the_values(shift: float, scale: float) -> None:
     X, y = data()
@@ -75,7 +75,7 @@ def test_an_exact_prior_mean_is_predicted_everywhere() -> None:
     np.testing.assert_allclose(fit_surrogate(X, y, prior_mean=prior).predict(where())[0], prior(where()), atol=1e-12)
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 @given(st.floats(1e-2, 1e2))
 def test_a_prior_mean_is_in_the_units_of_the_values(scale: float) -> None:
     X, y = data()

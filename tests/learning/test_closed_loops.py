@@ -16,11 +16,11 @@ from ctxval.errors import DesignError
 from ctxval.learning import closed_loops
 from ctxval.learning.closed_loops import LoopPlanner
 from ctxval.learning.draws import DynamicsDraws
-from ctxval.learning.dynamics_posterior import learn_posterior
+from ctxval.learning.dynamics_posterior import PosteriorSettings, learn_posterior
 
 MODEL = models.Linear([[1.0, 0.1], [0.0, 0.9]], [[0.0], [0.1]])
 LQR = controllers.LQR([1.0, 0.1], [0.1])
-POINTS = np.random.default_rng(7).random((11, 2))
+POINTS = np.random.default_rng(7).random((7, 2))
 
 
 def truth(x: Array, u: Array) -> Array:
@@ -31,7 +31,8 @@ def truth(x: Array, u: Array) -> Array:
 def make_draws() -> DynamicsDraws:
     rng = np.random.default_rng(0)
     x, u = rng.normal(size=(30, 2)), rng.normal(size=(30, 1))
-    posterior = learn_posterior(MODEL, Transitions(x, u, truth(x, u)), np.zeros(30, dtype=np.intp))
+    settings = PosteriorSettings(hyperparameters=4)
+    posterior = learn_posterior(MODEL, Transitions(x, u, truth(x, u)), np.zeros(30, dtype=np.intp), settings=settings)
     assert posterior is not None
     return posterior.draw(2 * rng.normal(size=(80, 3)), rng)
 
@@ -191,8 +192,8 @@ def test_own_distances_are_distances_of_each_draw_on_its_own_tasks() -> None:
 def test_states_and_inputs_of_loops_belong_to_their_draws_and_tasks() -> None:
     draws, planner = make_draws(), LoopPlanner(make_validation())
     (loops,) = planner.run(draws, planner.plan(POINTS))
-    assert loops.states.shape == (len(draws), 11, 13, 2)
-    assert loops.inputs.shape == (len(draws), 11, 12, 1)
+    assert loops.states.shape == (len(draws), len(POINTS), 13, 2)
+    assert loops.inputs.shape == (len(draws), len(POINTS), 12, 1)
     following = draws.step(loops.states[:, :, 4], loops.inputs[:, :, 4])
     np.testing.assert_allclose(following, loops.states[:, :, 5], rtol=1e-8)
 

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.distance import cdist
 
@@ -30,7 +30,6 @@ def direct(kernel: ResidualKernel, theta: Array, X: Array, Z: Array) -> Array:
     return np.asarray(matern * (1 + kernel.growth * X[:, -m:] @ Z[:, -m:].T) + constant + slope * X @ Z.T)
 
 
-@settings(max_examples=40)
 @given(families, seeds)
 def test_covariances_are_those_of_the_formula(family: tuple[float, float, int], seed: int) -> None:
     kernel, rng = ResidualKernel(*family), np.random.default_rng(seed)
@@ -38,7 +37,6 @@ def test_covariances_are_those_of_the_formula(family: tuple[float, float, int], 
     np.testing.assert_allclose(kernel(theta, X, Z), direct(kernel, theta, X, Z), rtol=1e-10, atol=1e-10)
 
 
-@settings(max_examples=40)
 @given(families, seeds)
 def test_the_diagonal_is_that_of_the_matrix(family: tuple[float, float, int], seed: int) -> None:
     kernel, rng = ResidualKernel(*family), np.random.default_rng(seed)
@@ -46,7 +44,6 @@ def test_the_diagonal_is_that_of_the_matrix(family: tuple[float, float, int], se
     np.testing.assert_allclose(kernel.diagonal(theta, X), np.diag(kernel(theta, X, X)), rtol=1e-10)
 
 
-@settings(max_examples=40)
 @given(families, seeds, st.integers(2, 40))
 def test_the_matrix_is_positive_semidefinite(family: tuple[float, float, int], seed: int, count: int) -> None:
     kernel, rng = ResidualKernel(*family), np.random.default_rng(seed)

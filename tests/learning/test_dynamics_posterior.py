@@ -11,6 +11,7 @@ from ctxval.gp.cholesky import factorise
 from ctxval.learning.component import Component, draw_functions
 from ctxval.learning.dynamics_posterior import DynamicsPosterior, PosteriorSettings, learn_posterior
 from ctxval.learning.hyperparameters import FAMILIES, Hyperparameters, ResidualKernel
+from rig_thorough import more
 
 MODEL = models.Linear([[1.0, 0.1], [0.0, 0.9]], [[0.0], [0.1]])
 OTHER = models.Linear([[1.02, 0.05], [0.1, 0.9]], [[0.05], [0.08]], [0.01, -0.02])
@@ -114,6 +115,7 @@ def test_draws_have_the_moments_of_the_posterior_at_pivots(family: tuple[float, 
 
 
 @pytest.mark.slow
+@pytest.mark.thorough
 def test_between_many_pivots_draws_have_the_moments_of_the_posterior_too() -> None:
     rng, one = np.random.default_rng(1), component()
     relevant, between = rng.uniform(-2, 2, (400, 2)), rng.uniform(-1.9, 1.9, (12, 2))
@@ -218,13 +220,13 @@ def test_too_few_transitions_leave_a_linear_system_uncertain_where_they_do_not_l
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, *more(1, 2)])
 @pytest.mark.parametrize("deviation", [0.01, 0.05])
-def test_noise_is_learned_within_a_factor_of_two(deviation: float) -> None:
-    for seed in range(3):
-        transitions = record(250, truth=models.Function(rough, vectorized=True), noise=deviation, seed=seed)
-        posterior = learn(transitions, seed)
-        expected = (deviation / posterior.data.sizes.min()) ** 2
-        assert 0.5 < posterior.noise / expected < 2
+def test_noise_is_learned_within_a_factor_of_two(deviation: float, seed: int) -> None:
+    transitions = record(250, truth=models.Function(rough, vectorized=True), noise=deviation, seed=seed)
+    posterior = learn(transitions, seed)
+    expected = (deviation / posterior.data.sizes.min()) ** 2
+    assert 0.5 < posterior.noise / expected < 2
 
 
 @pytest.mark.slow

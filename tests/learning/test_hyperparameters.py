@@ -141,7 +141,7 @@ def test_rows_without_weight_are_never_drawn() -> None:
 def test_draws_have_the_moments_of_the_posterior() -> None:
     Z, Y = observations(10, 1)
     rng = np.random.default_rng(0)
-    prior = [draw_prior(2, 1, rng) for _ in range(12_000)]
+    prior = [draw_prior(2, 1, rng) for _ in range(5_000)]
     parameters = np.array([np.append(one.theta, np.log(one.noise)) for one in prior if one.kernel == KERNEL])
     # Prior draws, weighted by the likelihood: slow and crude, but without any approximation of the shape.
     log_weights = np.array([log_posterior(KERNEL, at, Z, Y)[0] - log_prior(at) for at in parameters])

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from sklearn.linear_model import LinearRegression
 
@@ -47,7 +47,6 @@ def test_the_jacobian_is_the_matrices() -> None:
     assert B is model.B
 
 
-@settings(max_examples=20, deadline=None)
 @given(st.integers(1, 4), st.integers(0, 3), st.integers(0, 10_000), st.booleans())
 def test_a_fit_to_exact_data_recovers_the_model(n: int, m: int, seed: int, intercept: bool) -> None:
     truth = draw_model(n, m, seed)

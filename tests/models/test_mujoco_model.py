@@ -33,7 +33,7 @@ def mjcf(damping: float) -> str:
     <sensor><jointpos name="angle" joint="hinge"/></sensor></mujoco>"""
 
 
-def recorded(seed: int = 0, steps: int = 150, damping: float = 0.08) -> Trajectory:
+def recorded(seed: int = 0, steps: int = 80, damping: float = 0.08) -> Trajectory:
     """Return a run of the true pendulum, recorded every 0.02 s."""
     model = mujoco.MjModel.from_xml_string(mjcf(damping))
     data, rng = mujoco.MjData(model), np.random.default_rng(seed)

@@ -28,7 +28,7 @@ POINT_AT_THE_END = """(chart) => {
   chart.dispatchEvent(new PointerEvent("pointermove", { clientX: box.right - 1, clientY: box.top + 1 }));
 }"""
 
-pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("few_loops")]
+pytestmark = pytest.mark.slow
 
 
 def case(name: str, executions: int) -> ReportContext:
@@ -92,7 +92,9 @@ class Opened:
         return accessibility_findings(self.page)
 
 
-@pytest.mark.parametrize("name", sorted(REPORTS))
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.thorough] * (name in ("arm", "plane"))) for name in sorted(REPORTS)]
+)
 def test_a_report_is_quiet_small_and_accessible(name: str, browser: Any, tmp_path: Path) -> None:
     path = write_page(REPORTS[name](tmp_path), tmp_path / "report.html")
     assert path.stat().st_size < LARGEST

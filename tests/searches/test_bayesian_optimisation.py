@@ -10,8 +10,12 @@ from ctxval._util.arrays import Array
 from ctxval.errors import InputError
 from ctxval.searches import BayesianOptimisation, Random, Search, by_name
 from ctxval.testing import check_search
+from rig_thorough import more
 
 Function = Callable[[Array], Array]
+
+
+SEEDS = [0, *more(1, 2)]
 
 
 def peak(X: Array) -> Array:
@@ -49,14 +53,14 @@ def run(search: Search, function: Function, budget: int, dimension: int = 2, see
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize(("dimension", "budget"), [(1, 12), (2, 20), (6, 40)])
 def test_it_finds_the_top_of_a_hill(dimension: int, budget: int, seed: int) -> None:
     assert run(BayesianOptimisation(), peak, budget, dimension, seed).max() > 0.98
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", SEEDS)
 def test_it_finds_the_highest_corner_of_a_folded_plane(seed: int) -> None:
     values = run(BayesianOptimisation(), fold, 40, 8, seed)
     assert values.max() > 0.98 * corner(np.empty((0, 8)))
@@ -65,7 +69,7 @@ def test_it_finds_the_highest_corner_of_a_folded_plane(seed: int) -> None:
 
 @pytest.mark.slow
 def test_it_leaves_a_wide_basin_for_a_higher_one_that_is_hidden() -> None:
-    found = [run(BayesianOptimisation(), trap, 40, 3, seed).max() for seed in range(4)]
+    found = [run(BayesianOptimisation(), trap, 40, 3, seed).max() for seed in range(2)]
     assert min(found) > 0.7
     assert np.median(found) > 0.9
 
@@ -118,8 +122,8 @@ def test_values_that_are_all_the_same_and_negative_ones_do_no_harm() -> None:
 # Batches and failures
 
 
-@pytest.mark.parametrize("dimension", [1, 2, 5, 20])
-@pytest.mark.parametrize("told", [0, 6, 20])
+@pytest.mark.parametrize("dimension", [1, 2, 20])
+@pytest.mark.parametrize("told", [0, 20])
 def test_a_batch_of_questions_is_diverse(told: int, dimension: int) -> None:
     search = BayesianOptimisation()
     if told:
@@ -163,12 +167,12 @@ def test_what_failed_is_not_asked_again_and_does_not_stop_the_search() -> None:
 @pytest.mark.slow
 def test_it_keeps_the_contract_of_a_search() -> None:
     check_search(BayesianOptimisation())
-    check_search(BayesianOptimisation(initial=1), dimension=5, budget=30)
+    check_search(BayesianOptimisation(initial=1), dimension=5, budget=12)
     assert type(by_name("scalar", beta=1.0)) is BayesianOptimisation
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("told", [1, 21, 30, 43])
+@pytest.mark.parametrize("told", [21, *more(1, 30, 43)])
 def test_told_its_history_late_and_in_another_order_it_asks_for_the_same_point(told: int) -> None:
     whole = BayesianOptimisation()
     values = run(whole, fold, 44, 5)

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import kstest
 
@@ -16,7 +16,6 @@ def fresh(dimension: int = 2, seed: int = 0) -> Random:
     return search
 
 
-@settings(max_examples=20, deadline=None)
 @given(st.integers(0, 10_000), st.integers(1, 5), st.lists(st.integers(1, 4), min_size=1, max_size=4))
 def test_draws_depend_on_the_seed_and_their_index_alone(seed: int, dimension: int, groups: list[int]) -> None:
     one_by_one, grouped = fresh(dimension, seed), fresh(dimension, seed)

@@ -40,6 +40,7 @@ from ctxval._util.describe import describe, first_difference
 from ctxval.cli import app
 from ctxval.errors import InputError, ShapeError, UnknownNameError
 from ctxval.systems import FMU, fmu_process
+from rig_thorough import more
 
 fmpy = pytest.importorskip("fmpy")
 
@@ -174,6 +175,7 @@ def test_a_failure_in_the_middle_ends_the_trajectory(path: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("path", ["fmi2", *more("fmi3")], indirect=True)
 def test_a_process_is_kept_until_something_goes_wrong(path: Path) -> None:
     system = FMU(path, **NAMES)
     (first,) = processes(system)
@@ -325,6 +327,7 @@ def test_what_an_fmu_prints_and_reads_does_not_disturb(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("path", ["fmi2", *more("fmi3")], indirect=True)
 def test_many_executions_and_garbage_collections_leave_the_process_alive(path: Path) -> None:
     # In a process of its own, which may crash.
     code = f"""
@@ -345,6 +348,7 @@ print("alive")
     assert done.returncode == 0
 
 
+@pytest.mark.parametrize("path", ["fmi2", *more("fmi3")], indirect=True)
 def test_the_unpacked_files_go_with_the_system(path: Path) -> None:
     system = FMU(path, **NAMES)
     folder = system._unpacked.path
@@ -353,6 +357,7 @@ def test_the_unpacked_files_go_with_the_system(path: Path) -> None:
     assert not folder.exists()
 
 
+@pytest.mark.parametrize("path", ["fmi2", *more("fmi3")], indirect=True)
 def test_it_can_be_sent_to_another_process(path: Path) -> None:
     system = FMU(path, **NAMES)
     other = pickle.loads(pickle.dumps(system))
@@ -364,6 +369,7 @@ def test_it_can_be_sent_to_another_process(path: Path) -> None:
 # What the user may get wrong
 
 
+@pytest.mark.parametrize("path", ["fmi2", *more("fmi3")], indirect=True)
 def test_names_must_be_those_of_variables(path: Path) -> None:
     with pytest.raises(UnknownNameError, match="no variable of the FMU is called 'velocity'"):
         FMU(path, states=["position", "velocity"], inputs=["force"])
@@ -380,6 +386,7 @@ def test_states_must_be_real_numbers(fmi2: Path) -> None:
         FMU(fmi2, states=["teeth"], inputs=["force"])
 
 
+@pytest.mark.parametrize("path", ["fmi2", *more("fmi3")], indirect=True)
 def test_an_initial_state_that_is_not_taken_is_an_error(path: Path) -> None:
     # The start values go to the mass, so that the position stays where it was.
     system = FMU(path, **NAMES, start={"position": "mass"})
@@ -438,6 +445,7 @@ def test_the_process_serves_line_by_line(fmi2: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("path", ["fmi2", *more("fmi3")], indirect=True)
 def test_threads_do_not_disturb_each_other(path: Path) -> None:
     system = FMU(path, **NAMES)
     alone = system.execute(feedback, TASK).states
@@ -447,6 +455,7 @@ def test_threads_do_not_disturb_each_other(path: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("path", ["fmi2", *more("fmi3")], indirect=True)
 def test_shapes_and_steps_must_fit(path: Path) -> None:
     system = FMU(path, **NAMES, step=0.04)
     with pytest.raises(InputError, match=r"whole multiple of the step 0\.04 s, got 0\.1 s"):
@@ -553,7 +562,7 @@ name = "gp-ucb"
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("few_loops")
+@pytest.mark.parametrize("path", ["fmi2", *more("fmi3")], indirect=True)
 def test_an_experiment_file_validates_a_learned_model_on_an_fmu(
     path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -23,6 +23,7 @@ from ctxval.core.controller import AffineFeedback
 from ctxval.errors import ExecutionError, InputError
 from ctxval.systems import Subprocess, supervised
 from ctxval.systems import subprocess as adapter
+from rig_thorough import more
 
 MODEL = models.Linear([[1.0, 0.1], [0.0, 1.0]], [[0.0], [0.05]])
 TASK = Task([1.0, -0.5], goal=[0.2, 0.0], horizon=20, dt=0.1)
@@ -193,7 +194,7 @@ child = subprocess.Popen([sys.executable, "-S", "-c", "import time; time.sleep(6
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("workers", [1, 2])
+@pytest.mark.parametrize("workers", [2, *more(1)])
 def test_a_command_ends_with_a_campaign_that_is_killed(workers: int, tmp_path: Path) -> None:
     campaign = rig_command.start(tmp_path, seconds=60, workers=workers)
     deadline = time.monotonic() + 30

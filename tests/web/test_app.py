@@ -18,7 +18,7 @@ from ctxval.core.trial import Trial
 from ctxval.web.security import HEADERS, MOST_UPLOAD
 from rig_page import Response, Server, ctxval, new_store, record, serving
 
-pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("few_loops")]
+pytestmark = pytest.mark.slow
 
 SHORT = b"t,position,speed,force\n0,0,0,1\n0.1,0,0,1\n"
 """A recording of two times."""
@@ -387,7 +387,9 @@ def test_a_wrong_result_is_replaced_with_a_reason(tmp_path: Path) -> None:
     store.close()
 
 
-@pytest.mark.parametrize(("how", "options"), [("next", ("--explore",)), ("decides", ())])
+@pytest.mark.parametrize(
+    ("how", "options"), [pytest.param("next", ("--explore",), marks=pytest.mark.thorough), ("decides", ())]
+)
 def test_the_choices_are_those_of_the_command_line(tmp_path: Path, how: str, options: tuple[str, ...]) -> None:
     by_hand, by_page = tmp_path / "hand", tmp_path / "page"
     for folder in (by_hand, by_page):

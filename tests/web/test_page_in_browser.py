@@ -16,7 +16,7 @@ from ctxval.core.trial import Trial
 from rig_cli import SMALL
 from rig_page import ctxval, new_store, record, serving
 
-pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("few_loops")]
+pytestmark = pytest.mark.slow
 
 WAIT = 60_000
 """Milliseconds to wait for a choice or a verdict."""

@@ -175,8 +175,13 @@ def _condition(certificate: Certificate, quantities: Quantities) -> str:
                 "independent from step to step"
             )
         missed = "the system" if certificate.details["without_model"] else "what M misses"
+        of = (
+            f"recorded states and inputs{_of_lags(certificate)}"
+            if certificate.details["lags"]
+            else "recorded state and input"
+        )
         return (
-            f"probability under a Gaussian process, if {missed} is one smooth function of recorded state and input, "
+            f"probability under a Gaussian process, if {missed} is one smooth function of {of}, "
             "the same in every task and over time"
         )
     if certificate.kind == "posterior":
@@ -318,9 +323,19 @@ def conditions(certificate: Certificate, space: TaskSpace | None) -> list[str]:
         case "dynamics":
             gaps, again = with_units(details["resolution"]), details.get("differing")
             noise = "" if again is None else f" (trials {again[0]} and {again[1]} of one task differ a little)"
+            unchanging = "its dynamics changing neither with time nor with the task"
+            steps = f"the last {details['lags'] + 1} records and inputs"
+            if details["quantile"] is not None:
+                complete = f"{steps} determining the next record up to noise"
+                alike = f"noise being independent from step to step and like that of the records, and {unchanging}"
+            else:
+                complete = (
+                    f"{steps} determining the next record" if details["lags"] else "the recorded state being complete"
+                )
+                alike = f"the system being deterministic{noise}, and {unchanging}"
             return [
-                "the recorded state being complete",
-                f"the system being deterministic{noise}, and its dynamics changing neither with time nor with the task",
+                complete,
+                alike,
                 f"its dynamics being, in gaps of the records of up to {gaps}, like what was seen",
             ]
         case "posterior":

@@ -32,7 +32,8 @@ from ctxval.learning.dynamics_posterior import (
 from ctxval.learning.execution_prediction import ExecutionPrediction, predict_execution
 from ctxval.learning.histories import Record
 from ctxval.learning.innovations import NOISY, ChosenStructure, predicted_by_history
-from ctxval.learning.noisy_draws import EACH, GROUPS, REPLICATES, NoisyPosterior, learn_noisy
+from ctxval.learning.noise_effect import effect_of_noise
+from ctxval.learning.noisy_draws import EACH, GROUPS, MATTERS, REPLICATES, NoisyPosterior, learn_noisy
 from ctxval.learning.prediction import predict_distance
 from ctxval.learning.recorded import closed_loops_on_model, recorded_transitions
 from ctxval.learning.tolerance import PushResponse, push_response
@@ -41,6 +42,7 @@ from ctxval.learning.worst_case import WorstCase, WorstCaseSearch, WorstCaseSett
 from ctxval.models.corrected import before_refinement
 from ctxval.searches import Prediction
 
+_TRIED = 32  # tasks of the pool among which those with the largest distances show what noise does
 _SLOW = 0.02  # seconds: if a single closed loop on M takes longer, closed loops are distributed over the cores
 
 
@@ -191,13 +193,18 @@ class DynamicsStudy(ShortRepr):
             while len(self._structures) > 8:
                 self._structures.popitem(last=False)
             if some == len(records):
-                return first[0]
+                return self._with_effect(first[0])
         again = learn(records, chosen=self._structures[key], seed=(self.seed, len(records)))
-        return None if again is None else again[0]
+        return None if again is None else self._with_effect(again[0])
+
+    def _with_effect(self, noisy: NoisyPosterior) -> NoisyPosterior:
+        return noisy.with_effect(effect_of_noise(self.planner, noisy, self.search.pool[:_TRIED]))
 
     def _needs_history(self, posterior: DynamicsPosterior, records: Sequence[Record], pairs: Array) -> bool:
         """Return whether the next state is no function of state and input: noise, or what is not recorded, acts."""
         if float((posterior.most_probable.noise**2).max()) > NOISY:
+            return True
+        if effect_of_noise(self.planner, posterior, self.search.pool[:_TRIED]) > MATTERS:
             return True
         if len(records) < 3:
             return False

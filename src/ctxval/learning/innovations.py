@@ -460,7 +460,8 @@ def predicted_by_history(
 ) -> bool:
     """Return whether a history predicts the last record far better than state and input do, or neither predicts it.
 
-    The last record is left out. ``without_history`` has the predictions ``(H, n)`` of its states without a history, learned from the other records.
+    The last record is left out. ``without_history`` has the predictions ``(H, n)`` of its states without a history,
+    learned from the other records.
     """
     last, sizes, live = records[-1], posterior.data.sizes, posterior.data.learned
 

@@ -19,14 +19,16 @@ from ctxval.learning.dynamics_posterior import DynamicsPosterior
 from ctxval.learning.features import Features, LinearFunction
 from ctxval.learning.histories import Record
 from ctxval.learning.innovations import (
-    EXACT,
-    NOISY,
     ChosenStructure,
     DrawnWeights,
     InnovationsFit,
     fit_structures,
 )
 from ctxval.learning.residual_data import ResidualData
+
+MATTERS = 0.01
+"""Standard deviation of the distance of a task over its executions, as a share of the largest distance, from which
+noise matters."""
 
 GROUPS, EACH = 5, 4  # draws of the hyperparameters, and of weights for each
 REPLICATES = 10  # sequences of noise of each draw in a search
@@ -182,10 +184,14 @@ class NoisyPosterior(ShortRepr):
         """The variance of noise as a share of the mean square of a state's error of M, where it is largest."""
         return self.fit.share
 
+    def with_effect(self, effect: float) -> NoisyPosterior:
+        """Return it without noise if noise changes distances by less than a share of the largest one."""
+        return self if effect > MATTERS else replace(self, replicates=1)
+
     @property
     def is_noisy(self) -> bool:
-        """Whether executions of one task differ, by more than rounding does."""
-        return self.fit.share > NOISY
+        """Whether the distances of executions of one task differ."""
+        return self.replicates > 1
 
     @functools.cached_property
     def mean(self) -> NoisyDraws:
@@ -248,6 +254,4 @@ def learn_noisy(
         return None
     differences = np.array([record.states[0] - record.start for record in records])
     scatter, horizon = np.sqrt((differences**2).mean(axis=0)), max(len(record.inputs) for record in records)
-    if fit.share <= EXACT:
-        replicates, scatter = 1, np.zeros_like(scatter)  # a history determines the next record
     return NoisyPosterior(fit, posterior.data, scatter, horizon, replicates, quantile, seed), chosen

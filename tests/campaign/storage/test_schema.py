@@ -12,7 +12,7 @@ from contextlib import suppress
 from pathlib import Path
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from typer.testing import CliRunner
 
@@ -379,7 +379,6 @@ STATEMENT = st.one_of(
 )
 
 
-@settings(max_examples=40)
 @given(statements=st.lists(STATEMENT, min_size=1, max_size=5))
 def test_any_database_is_read_or_refused(whole: Path, statements: list[str]) -> None:
     path = whole.with_name("fuzzed.sqlite")

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from ctxval import Store, Trajectory, Trial
@@ -124,7 +124,6 @@ def test_memory_is_bounded(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@settings(max_examples=20, deadline=None)
 @given(st.lists(st.tuples(st.integers(0, 1), st.booleans(), st.booleans()), max_size=12))
 def test_a_store_with_memory_reads_what_a_new_one_reads(steps: list[tuple[int, bool, bool]]) -> None:
     """Two connections add trials in any order; either may have read in between."""

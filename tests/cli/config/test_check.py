@@ -16,8 +16,8 @@ CASES: list[tuple[str, dict[str, Any]]] = [
     ("dubins", {"variant": "basin"}),
     ("dubins", {"variant": "heavy-tail"}),
     ("arm", {"model": "linear"}),
-    ("arm", {"model": "gp"}),
-    ("arm", {"model": "fnn"}),
+    pytest.param("arm", {"model": "gp"}, marks=pytest.mark.thorough),
+    pytest.param("arm", {"model": "fnn"}, marks=pytest.mark.thorough),
     ("linear", {"dim": 1}),
     ("linear", {"dim": 10}),
 ]

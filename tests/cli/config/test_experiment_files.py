@@ -61,7 +61,6 @@ def sentence(result: Result) -> str:
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("few_loops")
 def test_the_file_of_init_reaches_a_verdict_as_it_is(invoke: Any) -> None:
     result = invoke("run", "experiment.toml", "--json")
     assert result.exit_code == 0, result.stderr
@@ -197,7 +196,6 @@ def test_the_file_says_the_largest_horizon_that_is_planned(invoke: Any, target: 
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("few_loops")
 def test_the_certificate_of_the_file_is_what_run_and_certify_judge_by(invoke: Any) -> None:
     scenario = ('kind = "auto"', 'kind = "scenario"\nvolume = 0.5')
     target = changed(scenario, ('name = "auto"', 'name = "random"'))

@@ -237,6 +237,7 @@ def test_it_is_a_case_by_name() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.thorough
 def test_its_truth_is_a_best_known_value_kept_in_a_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     experiment = dubins.experiment(settings=dubins.Settings(horizon=3))

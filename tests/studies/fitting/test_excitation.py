@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from conftest import make_validation
@@ -18,7 +18,6 @@ KINDS: list[Any] = ["random", "multisine", "chirp"]
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@settings(max_examples=20, deadline=None)
 @given(st.integers(1, 300), st.lists(st.floats(0.1, 10), min_size=1, max_size=3), st.integers(0, 10**6))
 def test_a_signal_stays_within_its_amplitude(kind: Any, horizon: int, amplitude: list[float], seed: int) -> None:
     signal = excitation(kind, horizon, amplitude, np.random.default_rng(seed))

@@ -117,11 +117,11 @@ def test_a_mass_that_is_a_fifth_off_is_found_within_its_confidence_interval(vect
 @pytest.mark.slow
 def test_confidence_intervals_contain_the_truth_as_often_as_they_say() -> None:
     inside = np.zeros(2)
-    for seed in range(60):
+    for seed in range(24):
         _, found = fit_parameters(cart, BOUNDS, noisy(1.2, 0.3, 0.02, seed, 120), vectorized=True, confidence=0.9)
         inside += [one.low <= truth <= one.high for one, truth in zip(found, (1.2, 0.3), strict=True)]
-    # 0.9 within three standard errors of 60 trials.
-    assert (np.abs(inside / 60 - 0.9) < 3 * np.sqrt(0.9 * 0.1 / 60)).all()
+    # 0.9 within three standard errors of 24 trials.
+    assert (np.abs(inside / 24 - 0.9) < 3 * np.sqrt(0.9 * 0.1 / 24)).all()
 
 
 def test_intervals_are_those_of_linear_regression_if_the_model_is_linear_in_theta() -> None:

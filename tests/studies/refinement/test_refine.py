@@ -117,7 +117,6 @@ def _no_correction() -> models.Correction:
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("few_loops")
 def test_a_mass_that_is_20_per_cent_off_is_found() -> None:
     def step(x: np.ndarray, u: np.ndarray, theta: np.ndarray) -> np.ndarray:
         return np.stack([x[..., 0] + 0.1 * x[..., 1], x[..., 1] + 0.1 * u[..., 0] / theta[0]], axis=-1)
@@ -180,7 +179,7 @@ def executions(store: Path) -> int:
 def test_a_killed_refinement_resumes_with_the_same_choices(
     found: Refinement, store: Path, tmp_path: Path, request: pytest.FixtureRequest
 ) -> None:
-    kills = max(2, request.config.getoption("--kills") // 5)
+    kills = max(1, request.config.getoption("--kills") // 5)
     expected, rng = content(store), np.random.default_rng(7)
     for number in range(kills):
         killed = tmp_path / f"{number}.sqlite"

@@ -11,6 +11,7 @@ from ctxval.errors import InputError, UnknownNameError
 
 NAMES: dict[str, str] = {
     "pendulum": "inverted pendulum, learned linear model, iLQR to a goal angle (1-D)",
+    "pendulum-noisy": "the pendulum with an encoder, noise and a torque that acts late (1-D)",
     "arm": "2-DoF arm in MuJoCo; network, Gaussian process or linear model; iLQR to a point on the table (2-D)",
     "dubins": "Dubins car, learned linear model, LQR along ten sine waves (11-D)",
     "linear": "random linear systems and models with n = 1 to 10 states, random feedback (2 n-D)",
@@ -20,7 +21,7 @@ NAMES: dict[str, str] = {
 __all__ = ["NAMES", "REGISTRY", "by_name", "options_of", "text_of"]
 
 REGISTRY: Registry[Experiment] = Registry(
-    "case", "ctxval.cases", modules={name: f"{__name__}.{name}:experiment" for name in NAMES}
+    "case", "ctxval.cases", modules={name: f"{__name__}.{name.replace('-', '_')}:experiment" for name in NAMES}
 )
 """The cases that are found by name: those of this package, and those that installed packages add."""
 

@@ -1,0 +1,86 @@
+"""How much noise changes the distance of a task, and so whether it matters.
+
+The better M is, the smaller its residual, and the larger the share of noise in it. So noise is not judged by this
+share, but by what it does to distances in closed loop.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ctxval._util.arrays import Array, ArrayLike, single_threaded
+from ctxval.learning.closed_loops import LoopPlanner
+from ctxval.learning.draws import DynamicsDraws
+from ctxval.learning.dynamics_posterior import DynamicsPosterior
+from ctxval.learning.noisy_draws import NoisyPosterior
+
+_TASKS, _RUNS = 6, 10
+
+
+def effect_of_noise(planner: LoopPlanner, posterior: DynamicsPosterior | NoisyPosterior, tasks: Array) -> float:
+    """Return the largest standard deviation of the distance of tasks ``(q, d)`` over noise, as a share of the largest.
+
+    Of the tasks, those with the largest distances count. Only finite distances do.
+    """
+    with single_threaded(), np.errstate(all="ignore"):
+        planned = planner.plan(tasks)
+        silent = posterior.silent if isinstance(posterior, NoisyPosterior) else posterior.mean
+        distances = np.nan_to_num(planner.distances(silent, planned, len(tasks))[0], nan=-1.0, posinf=-1.0)
+        largest = tasks[np.argsort(-distances, kind="stable")[:_TASKS]]
+        planned = planner.plan(largest)
+        runs = np.full((_RUNS, len(largest)), np.nan)
+        noisy = posterior.mean if isinstance(posterior, NoisyPosterior) else _shaken(posterior)
+        for plan, loops in zip(planned, planner.run(noisy, planned), strict=True):
+            runs[: len(loops.distances), plan.rows] = loops.distances[:_RUNS]
+    runs = runs[:, np.isfinite(runs).any(axis=0)]
+    if not runs.size or not distances.max(initial=0.0) > 0:
+        return 0.0
+    finite = np.where(np.isfinite(runs), runs, np.nan)
+    return float(np.nanmax(np.nanstd(finite, axis=0)) / distances.max())
+
+
+def _shaken(posterior: DynamicsPosterior) -> ShakenDynamics:
+    """Return the posterior mean with white noise as large as was learned."""
+    mean, data = posterior.mean, posterior.data
+    deviations = np.zeros(len(data.sizes))
+    deviations[data.learned] = posterior.most_probable.noise * data.sizes[data.learned]
+    return ShakenDynamics(
+        model=posterior.model,
+        data=data,
+        expansions=mean.expansions,
+        limit=mean.limit,
+        deviations=deviations,
+        runs=_RUNS,
+    )
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ShakenDynamics(DynamicsDraws):
+    """One model with white noise in each step, several times: models that are run together, as draws are.
+
+    Attributes:
+        deviations: standard deviations of the noise of each state, shape ``(n,)``.
+        runs: how many times.
+    """
+
+    deviations: Array
+    runs: int
+    first: int = 0
+
+    def __len__(self) -> int:
+        return self.runs
+
+    def __getitem__(self, rows: ArrayLike) -> ShakenDynamics:
+        chosen = np.atleast_1d(rows)
+        return replace(self, runs=len(chosen), first=int(chosen[0]))
+
+    def step(self, x: Array, u: Array) -> Array:
+        """Return the next states, shapes ``(S, q, n), (S, q, m) -> (S, q, n)``."""
+        count = x.shape[0] * x.shape[1]  # there may be no inputs, so it is not left to reshape
+        together = super().step(x.reshape(1, count, x.shape[-1]), u.reshape(1, count, u.shape[-1]))
+        # The noise is a function of the states, so that a loop is the same each time.
+        seed = np.frombuffer(np.ascontiguousarray(x).tobytes()[-64:], dtype=np.uint32)
+        rng = np.random.default_rng([self.first, *seed.tolist()])
+        return np.asarray(together.reshape(x.shape) + self.deviations * rng.standard_normal(x.shape))

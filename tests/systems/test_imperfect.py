@@ -1,0 +1,65 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from ctxval import Task, rollout, systems
+from ctxval._util.arrays import Array
+from ctxval.errors import InputError
+
+
+def step(x: Array, u: Array) -> Array:
+    return np.asarray(x + 0.1 * np.concatenate([x[..., 1:], u], axis=-1))
+
+
+def pi(t: int, x: Array) -> Array:
+    return np.asarray(-x[..., :1] - x[..., 1:] + 0.1 * t)
+
+
+TASK = Task([1.0, 0.0], horizon=20, dt=0.1)
+
+
+def test_without_imperfections_it_is_the_simulation() -> None:
+    run = systems.Imperfect(step, vectorized=True).execute(pi, TASK)
+    assert run.states == pytest.approx(rollout(step, pi, TASK).states)
+
+
+def test_the_controller_acts_on_records_of_an_encoder() -> None:
+    run = systems.Imperfect(step, vectorized=True, resolution=[0.25, 0.0]).execute(pi, TASK)
+    assert (run.states[:, 0] % 0.25 == 0).all()
+    assert run.inputs == pytest.approx(np.stack([pi(t, x) for t, x in enumerate(run.states[:-1])]))
+
+
+@pytest.mark.parametrize(("delay", "weights"), [(1.0, (0.0, 1.0)), (1.5, (0.0, 0.5, 0.5)), (2.0, (0.0, 0.0, 1.0))])
+def test_inputs_act_late(delay: float, weights: tuple[float, ...]) -> None:
+    run = systems.Imperfect(step, vectorized=True, delay=delay).execute(pi, TASK)
+    padded = np.concatenate([np.zeros((len(weights) - 1, 1)), run.inputs])
+    late = sum(w * padded[len(weights) - 1 - k : len(padded) - k] for k, w in enumerate(weights))
+    assert run.states[1:] == pytest.approx(step(run.states[:-1], np.asarray(late)))
+
+
+def test_an_actuator_follows_with_its_time_constant() -> None:
+    constant = np.ones(1)
+    run = systems.Imperfect(step, vectorized=True, lag=4.0).execute(
+        lambda t, x: constant, Task([0.0, 0.0], horizon=9, dt=0.1)
+    )
+    assert np.diff(run.states[:, 1]) == pytest.approx(0.1 * (1 - np.exp(-np.arange(1, 10) / 4.0)))
+
+
+def test_noise_has_its_size_and_follows_from_the_seed() -> None:
+    noisy = {"process": [0.0, 0.02], "measurement": 0.01, "vectorized": True}
+    task = Task(np.zeros((400, 2)), horizon=2, dt=0.1)
+    run = systems.Imperfect(step, seed=3, **noisy).execute(lambda t, x: np.zeros((400, 1)), task)
+    assert run.states[:, 0].std(axis=0) == pytest.approx([0.01, 0.01], rel=0.2)
+    assert run.states[:, 1, 1].std() == pytest.approx(np.hypot(0.02, 0.01), rel=0.2)
+    one = systems.Imperfect(step, seed=3, **noisy)
+    first, second = (one.execute(pi, TASK).states for _ in range(2))
+    assert np.abs(first - second).max() > 1e-3
+    assert systems.Imperfect(step, seed=3, **noisy).execute(pi, TASK).states == pytest.approx(first)
+
+
+def test_bad_numbers_are_named() -> None:
+    with pytest.raises(InputError, match=r"process must be finite and not negative, got \[0.1, -1.0\]"):
+        systems.Imperfect(step, process=[0.1, -1.0])
+    with pytest.raises(InputError, match="delay"):
+        systems.Imperfect(step, delay=-1.0)
