@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from itertools import combinations, permutations, product
 from typing import get_args
 
@@ -22,6 +22,8 @@ from ctxval.certificates.prediction_tests import (
 )
 from ctxval.core.trial import Origin
 
+SPREAD: Origin = "spread"
+IID: Origin = "iid"
 SEEDS = st.integers(0, 2**32 - 1)
 
 
@@ -88,10 +90,10 @@ def test_no_set_is_missed_more_often_than_the_bound_says(size: tuple[int, int], 
 
 def blocks(points: np.ndarray, halves: int) -> np.ndarray:
     """Return which points lie in blocks of cells along the diagonal, where a hypercube lies most often."""
-    return (np.floor(halves * points) == np.floor(halves * points[..., :1])).all(axis=-1)
+    return np.asarray((np.floor(halves * points) == np.floor(halves * points[..., :1])).all(axis=-1))
 
 
-SETS = {
+SETS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "diagonal": lambda points: blocks(points, 2),
     "cells of the diagonal": lambda points: blocks(points, TESTS),
     "corner": lambda points: (points > 0.6).all(axis=-1),
@@ -162,7 +164,7 @@ def test_more_tests_leave_less(spread: int, independent: int, dimension: int, co
 
 
 def test_what_tests_show_is_counted_by_their_origins() -> None:
-    origins: list[Origin] = ["spread"] * 8 + ["iid"] * 2
+    origins = [SPREAD] * 8 + [IID] * 2
     shown = shown_by_tests(origins, 2, 0.95, uniform=True)
     assert (shown["drawn"], shown["independent"], shown["spread"]) == (10, 2, 8)
     assert shown["share_missed"] == share_missed(8, 2, 2, 0.95)
@@ -170,8 +172,8 @@ def test_what_tests_show_is_counted_by_their_origins() -> None:
 
 
 def test_points_of_a_hypercube_show_nothing_of_tasks_with_a_distribution() -> None:
-    assert shown_by_tests(["spread"] * 8, 2, 0.95, uniform=False)["share_missed"] is None
-    shown = shown_by_tests(["spread"] * 8 + ["iid"] * 2, 2, 0.95, uniform=False)
+    assert shown_by_tests([SPREAD] * 8, 2, 0.95, uniform=False)["share_missed"] is None
+    shown = shown_by_tests([SPREAD] * 8 + [IID] * 2, 2, 0.95, uniform=False)
     assert shown["share_missed"] == share_missed(0, 2, 2, 0.95)
 
 

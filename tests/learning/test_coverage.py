@@ -151,7 +151,7 @@ def test_tasks_that_cannot_be_planned_are_not_counted() -> None:
 
 
 def trajectory(*states: list[float]) -> Trajectory:
-    times = 0.1 * np.arange(len(states))
+    times = np.linspace(0.0, 1.0, len(states))
     return Trajectory(times, np.array(states), np.zeros((len(states) - 1, 1)))
 
 
