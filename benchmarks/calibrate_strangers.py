@@ -23,7 +23,7 @@ from strangers_diagnostics import JudgedRun
 from strangers_reporting import REPORTING
 from strangers_truths import TRUTHS
 
-RULE = 3
+RULE = 2
 """Version of the rule by which campaigns are run: 3 learns histories and noise, and tests are points of a hypercube."""
 
 BUDGET, SEEDS = 25, 2
