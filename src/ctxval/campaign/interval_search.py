@@ -40,7 +40,6 @@ from ctxval.certificates.dynamics_diagnostics import (
 from ctxval.certificates.options import WITHIN
 from ctxval.certificates.posterior import Posterior
 from ctxval.certificates.prediction_tests import DRAWN, MANY, TESTS
-from ctxval.certificates.sample import executions_of
 from ctxval.certificates.verdict import counterexample, quantile_of
 from ctxval.certificates.verdict_sentences import NO_UNITS
 from ctxval.core.trial import Trial
@@ -156,7 +155,8 @@ class IntervalSearch:
         if learned is None or learned.noisy is None or not learned.noisy.is_noisy:
             return None
         worst = max((trial for trial in trials if trial.distance is not None), key=lambda trial: trial.distance or 0.0)
-        if len(executions_of(worst, trials)) <= _REPEATED:
+        alike = (trial for trial in trials if trial.distance is not None or trial.state == "open")
+        if sum(np.abs(trial.unit_point - worst.unit_point).max() <= 1e-9 for trial in alike) <= _REPEATED:
             return Choice(worst.unit_point, "covering", planned_draws=0, rejected=0)
         tasks = [worst.unit_point, learned.worst_of_mean.elites[0]]
         chances = []

@@ -138,7 +138,8 @@ def judge_by(
     tau, known = float(threshold), provenance or Provenance()
     require_confidence(certificate.confidence)
     kind, quantities = KINDS.of(certificate), known.quantities
-    falsified = counterexample(trials, tau, quantities, certificate.confidence, quantile_of(kind))
+    quantile = certificate.details.get("quantile") or quantile_of(kind)
+    falsified = counterexample(trials, tau, quantities, certificate.confidence, quantile)
     if falsified is not None:
         return replace(falsified, certificate=certificate)
     if not certificate.covers(tau, require_volume(volume)):

@@ -431,6 +431,9 @@ def undecided(certificate: Certificate, tau: float, volume: float, quantities: Q
         support = supported(certificate, tau, quantities)
         return f"{support}; but {certificate.doubt}." if support else f"{certificate.doubt}."
     upper, limit = _bound_and_limit(certificate, tau, quantities)
+    if certificate.upper_bound > tau and certificate.details.get("quantile") is not None:
+        share = f"{100 * certificate.details['quantile']:g} % of the executions of a task"
+        return f"{share} may have distances of up to {upper}, and the threshold is {limit}{_shortfall(certificate)}."
     if certificate.upper_bound > tau:
         return f"no distance above {limit} was executed, but d* may be up to {upper}{_shortfall(certificate)}."
     if not certificate.covers(tau, certificate.volume):
