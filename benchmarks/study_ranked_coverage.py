@@ -34,7 +34,8 @@ NAMES = ("salt-bath", "wet-surface", "spinning-tracks", "heavy-bin", "stalling-w
 TRUE, FALSE = 1.25, 0.95
 """Thresholds as shares of d*, of regular and of misleading systems."""
 SEEDS, CANDIDATES = 2, 16
-CONCLUSION = ""
+CONCLUSION = """Ranked by pushes, campaigns execute more tasks and falsify no earlier, so the farthest task is
+executed. The comparison is a small one: it says that nothing was gained, not how much is lost."""
 STORED = JsonLines(RESULTS / "ranked_coverage.jsonl", ("entry", "seed", "share", "ranked"))
 
 
