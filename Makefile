@@ -7,6 +7,10 @@ CAMPAIGNS ?= 120
 
 # Small dense algebra is faster on one thread.
 export OMP_NUM_THREADS = 1
+# Tests write many small stores durably, which takes no time in memory.
+ifeq ($(shell test 0$$(df -k --output=avail /dev/shm 2>/dev/null | tail -1 | tr -d ' ') -gt 4000000 && echo large),large)
+export PYTEST_DEBUG_TEMPROOT ?= /dev/shm
+endif
 
 .PHONY: demo test quick thorough check docs reliability interleavings crash-states attack lowest bench bench-peers study study-refine reproduce search global-search calibrate drawn-tests parts pictures posterior-ranks clean
 
@@ -64,7 +68,7 @@ study-refine: .venv/.test  ## how much better refined models are; writes docs/re
 
 docs: .venv/.test  ## the manual, with its gallery; writes docs/_build/html, and looks for broken links
 	$(BIN)/python -m sphinx -W --keep-going -b html docs docs/_build/html
-	$(BIN)/python -m pytest -q --thorough --manual docs/_build/html tests/test_manual_pages.py -k manual_is_built
+	$(BIN)/python -m pytest -q --thorough --manual=docs/_build/html tests/test_manual_pages.py -k manual_is_built
 
 pictures: .venv/.test  ## those of the README and of the manual; needs Chromium
 	$(BIN)/ctxval run pendulum --search gp-ucb --seed 1 --store docs/pictures/pendulum.sqlite --no-report
@@ -79,6 +83,9 @@ calibrate: .venv/.test  ## do the bounds hold as often as they say? Writes docs/
 	$(BIN)/python benchmarks/calibrate_dynamics.py
 	$(BIN)/python benchmarks/calibrate_strangers.py development
 	$(BIN)/python benchmarks/calibrate_strangers.py reporting
+	$(BIN)/python benchmarks/calibrate_noise.py development
+	$(BIN)/python benchmarks/calibrate_noise.py misleading
+	$(BIN)/python benchmarks/calibrate_noise.py reporting
 	$(BIN)/python benchmarks/study_interval.py
 	$(BIN)/python benchmarks/study_time_varying.py
 	$(BIN)/python benchmarks/study_retrain.py

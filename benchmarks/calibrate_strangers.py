@@ -24,7 +24,7 @@ from strangers_reporting import REPORTING
 from strangers_truths import TRUTHS
 
 RULE = 2
-"""Version of the rule by which campaigns are run: 2 searches fewer tasks on posterior samples, and knows tolerances."""
+"""Version of the rule by which campaigns are run: 3 learns histories and noise, and tests are points of a hypercube."""
 
 BUDGET, SEEDS = 25, 2
 FALSE, TRUE = (0.8, 0.95, 0.99), (1.1, 1.25, 1.5)

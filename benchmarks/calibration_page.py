@@ -28,6 +28,7 @@ from calibrate import (
     stored,
 )
 from calibration_dynamics_part import by_dynamics
+from calibration_noise_part import under_noise
 from calibration_strangers_part import of_strangers
 from calibration_verdicts_part import interval, table, until_decided
 from ctxval.certificates import RESOLUTION
@@ -283,6 +284,8 @@ with that value.
 
 {of_strangers}
 
+{under_noise}
+
 ## Audits after retraining
 
 {retrained}
@@ -326,6 +329,7 @@ def main() -> None:
             until_decided=until_decided(),
             by_dynamics=by_dynamics(),
             of_strangers=of_strangers(),
+            under_noise=under_noise(),
             retrained=retrained(),
         )
     )

@@ -9,6 +9,7 @@ import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 # Before numpy is imported: small algebra is faster on one thread.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -17,6 +18,7 @@ os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 import numpy as np
 import pytest
+import typer.main
 from hypothesis import settings
 
 from ctxval import Task, TaskSpace, Validation, controllers, distances, models, systems
@@ -53,6 +55,20 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 TESTS = Path(__file__).parent
 IN_FULL = ("certificates", "gp", "learning", "searches")
 """Folders whose subject are the draws and the closed loops."""
+
+get_group = typer.main.get_group
+groups: dict[tuple[int, int], Any] = {}
+
+
+def get_group_once(app: typer.Typer) -> Any:
+    """Return the commands of an application, which typer would put together again for each call of the tests."""
+    key = id(app), len(app.registered_commands)
+    if key not in groups:
+        groups[key] = get_group(app)
+    return groups[key]
+
+
+typer.main.get_group = get_group_once
 
 STATE = "LOCALAPPDATA" if os.name == "nt" else "XDG_STATE_HOME"
 """The variable that says where the user's key is."""

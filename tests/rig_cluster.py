@@ -14,6 +14,7 @@ from pathlib import Path
 
 from conftest import make_validation
 from ctxval import Experiment
+from rig_cli import SMALL
 from rig_workers import Logging
 
 HERE = Path(__file__).parent
@@ -80,7 +81,7 @@ def run(folder: Path, address: str) -> subprocess.Popen[str]:
     """Start ``ctxval run`` on a cluster; what is executed leaves its marks."""
     (folder / "marks").mkdir(exist_ok=True)
     (folder / "e.toml").write_text(EXPERIMENT.format(marks=folder / "marks"))
-    command = [sys.executable, "-m", "ctxval.cli", "run", "e.toml", "--dask", address, "--json"]
+    command = [*SMALL, "run", "e.toml", "--dask", address, "--json", "--no-report"]
     return subprocess.Popen(
         command, cwd=folder, env=ENVIRONMENT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import functools
 import subprocess
 import sys
 from pathlib import Path
@@ -31,6 +32,7 @@ READ_ONLY = ("campaign.plot", "report")
 EXECUTING = {"execute", "run", "ask", "tell", "outcome", "distances", "plan"}
 
 
+@functools.cache
 def modules() -> dict[str, Path]:
     return {
         ".".join(path.relative_to(SOURCE).with_suffix("").parts).removesuffix(".__init__"): path
@@ -39,6 +41,7 @@ def modules() -> dict[str, Path]:
     }
 
 
+@functools.cache
 def imports_of(path: Path) -> set[str]:
     """Return the ctxval modules that a file imports when it is loaded or later; typing-only imports count too."""
     known = modules()
@@ -52,6 +55,7 @@ def imports_of(path: Path) -> set[str]:
     return found
 
 
+@functools.cache
 def floors() -> dict[str, int]:
     """Read the table of floors: rows ``| number | module, module |``."""
     table: dict[str, int] = {}

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import runpy
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
+SHORTEST = "4_own_distance_and_search"
 EXAMPLES = Path(__file__).parents[1] / "examples"
 PRINTED = {
     "1_first_verdict": [
@@ -49,7 +51,23 @@ def test_an_example_fits_on_a_page(name: str) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", PRINTED)
-def test_an_example_runs_and_leaves_nothing_behind(name: str, tmp_path: Path) -> None:
+def test_an_example_prints_what_it_promises_and_leaves_nothing_behind(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    runpy.run_path(str(EXAMPLES / f"{name}.py"), run_name="__main__")
+    printed = capsys.readouterr().out
+    for sentence in PRINTED[name]:
+        assert sentence in printed
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "name", [SHORTEST, *(pytest.param(name, marks=pytest.mark.thorough) for name in PRINTED if name != SHORTEST)]
+)
+def test_an_example_runs_as_a_reader_runs_it(name: str, tmp_path: Path) -> None:
+    """In a process of its own, with as many draws and closed loops as the reader's."""
     command = [sys.executable, "-W", "error", str(EXAMPLES / f"{name}.py")]
     done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path)
     assert done.returncode == 0, done.stderr

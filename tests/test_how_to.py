@@ -25,6 +25,8 @@ NEEDS |= {"onnx": ["onnx", "onnxruntime"], "scikit-learn": ["sklearn"], "state-s
 NEEDS |= {"gymnasium-and-network": ["gymnasium", "mujoco", "sklearn"]}
 NEEDS |= {"fit": ["mujoco", "sklearn", "onnx"]}
 NEEDS |= {"operate": ["starlette", "uvicorn", "jinja2", "python_multipart"]}
+LONG = ("aspect1",)
+"""Pages whose examples only `make thorough` runs: they learn a network and search the tasks of the arm on it."""
 CTXVAL = ["-c", "from ctxval.cli import main; main()"]
 
 
@@ -84,7 +86,10 @@ def forget_modules(folder: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("folder")
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+@pytest.mark.parametrize(
+    "page",
+    [pytest.param(page, id=page.stem, marks=pytest.mark.thorough if page.stem in LONG else ()) for page in PAGES],
+)
 def test_the_blocks_of_a_page_run(page: Path) -> None:
     for module in NEEDS.get(page.stem, []):
         pytest.importorskip(module)

@@ -70,7 +70,7 @@ def test_names_are_unique_and_kinds_known() -> None:
         listed(Plant("mist", "both", plant.make, 2, 10))
 
 
-@pytest.mark.parametrize("name", PLANTS)
+@pytest.mark.parametrize("name", EACH)
 def test_batches_agree_with_single_executions(name: str) -> None:
     validation = experiment(name, 0).validation
     assert validation.batched

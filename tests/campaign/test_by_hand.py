@@ -632,20 +632,20 @@ def ends(processes: list[subprocess.Popen[str]]) -> list[tuple[int, str, str]]:
 @pytest.mark.slow
 def test_several_terminals_ask_and_tell_at_once(invoke: Any) -> None:
     ask = ["ask", "my_rig:experiment", "--store", "a.sqlite", "--search", "random", "--json"]
-    first = ends([start(*ask) for _ in range(4)])
-    assert [status for status, _, _ in first] == [0] * 4, first
+    first = ends([start(*ask) for _ in range(3)])
+    assert [status for status, _, _ in first] == [0] * 3, first
     reports = [json.loads(stdout) for _, stdout, _ in first]
-    assert sorted(report["trial"] for report in reports) == [0, 1, 2, 3]
-    assert len({report["task"]["goal"] for report in reports}) == 4
+    assert sorted(report["trial"] for report in reports) == [0, 1, 2]
+    assert len({report["task"]["goal"] for report in reports}) == 3
     told = ends(
-        [start("tell", "a.sqlite", str(n), "--distance", f"0.{n}{who}") for n in (2, 0) for who in (1, 2)]
+        [start("tell", "a.sqlite", "1", "--distance", f"0.{who}") for who in (1, 2)]
         + [start("ask", "a.sqlite", "--json")]
     )
-    assert Counter(status for status, _, _ in told[:4]) == {0: 2, 2: 2}
-    for status, _, stderr in told[:4]:
+    assert Counter(status for status, _, _ in told[:2]) == {0: 1, 2: 1}
+    for status, _, stderr in told[:2]:
         assert status == 0 or re.search(r"trial \d is completed, so nothing more can be told of it", stderr)
-    assert (told[4][0], json.loads(told[4][1])["trial"]) == (0, 4)
-    assert [trial.state for trial in Store("a.sqlite").trials()] == ["completed", "open", "completed", "open", "open"]
+    assert (told[2][0], json.loads(told[2][1])["trial"]) == (0, 3)
+    assert [trial.state for trial in Store("a.sqlite").trials()] == ["open", "completed", "open", "open"]
 
 
 @pytest.mark.slow

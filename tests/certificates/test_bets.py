@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -29,6 +30,14 @@ def test_two_predicted_excesses_falsify_and_one_does_not() -> None:
     assert verdict is not None
     assert verdict.answer == "falsified"
     assert "2 of 2 executions exceed it, more than noise explains" in verdict.reason
+
+
+def test_a_repetition_is_a_bet_on_another_excess_whatever_was_predicted() -> None:
+    unlikely = np.linspace(0.1, 0.9, 200)
+    first = trial(0, 1.2, unlikely)
+    repeated = [first, *(replace(first, number=number) for number in (1, 2))]
+    wealth = [bets_against(repeated[:k], 1.0).wealth for k in (1, 2, 3)]  # type: ignore[union-attr]
+    assert wealth == pytest.approx([1.0, 9.0, 81.0])
 
 
 def test_without_noise_one_execution_falsifies() -> None:

@@ -40,12 +40,15 @@ from ctxval.certificates.dynamics_diagnostics import (
 from ctxval.certificates.options import WITHIN
 from ctxval.certificates.posterior import Posterior
 from ctxval.certificates.prediction_tests import DRAWN, MANY, TESTS
+from ctxval.certificates.sample import executions_of
 from ctxval.certificates.verdict import counterexample, quantile_of
 from ctxval.certificates.verdict_sentences import NO_UNITS
 from ctxval.core.trial import Trial
 from ctxval.errors import CertificateError, InputError
 
 _FAILING = 6  # of so many last predictions, at least half must hold
+
+_REPEATED = 2  # times that a noisy task is repeated in any case if its distance exceeds the limit
 
 _PATIENCE = 16  # executions, besides tests, after which `auto` uses the posterior bound if the dynamics decide nothing
 
@@ -153,6 +156,8 @@ class IntervalSearch:
         if learned is None or learned.noisy is None or not learned.noisy.is_noisy:
             return None
         worst = max((trial for trial in trials if trial.distance is not None), key=lambda trial: trial.distance or 0.0)
+        if len(executions_of(worst, trials)) <= _REPEATED:
+            return Choice(worst.unit_point, "covering", planned_draws=0, rejected=0)
         tasks = [worst.unit_point, learned.worst_of_mean.elites[0]]
         chances = []
         for task in tasks:

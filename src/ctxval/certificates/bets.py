@@ -1,7 +1,8 @@
 """Bets against a threshold: what executed distances prove of a noisy system, whatever its model.
 
 If in every task a share q of the executions stays below tau, then each execution exceeds tau with probability at most
-1 - q, whatever its task and whatever came before. Before each execution, a probability pi of an excess is predicted.
+1 - q, whatever its task and whatever came before. Before each execution, a probability pi of an excess is predicted,
+from the learned noise, or from an earlier excess of the same task.
 The product of ``pi / (1 - q)`` for each excess and ``(1 - pi) / q`` for each other execution is then a nonnegative
 supermartingale with the first value 1. It reaches ``1 / (1 - confidence)`` with probability at most 1 - confidence
 (Ville 1939), at any time. So tau is falsified there, without any assumption on the system.
@@ -14,6 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ctxval.certificates.sample import executions_of
 from ctxval.core.quantiles import QUANTILE, chance_of_more
 from ctxval.core.trial import Trial
 
@@ -44,8 +46,12 @@ def bets_against(trials: Sequence[Trial], threshold: float, quantile: float = QU
     if not any(_prediction(trial).get("noise") for trial in trials):
         return None
     wealth, above, known = 1.0, 0, [trial for trial in trials if trial.distance is not None]
-    for trial in known:
-        chance = float(np.clip(_predicted_chance(trial, threshold), 1 - quantile, _BOLDEST))
+    for k, trial in enumerate(known):
+        before = executions_of(trial, known[:k])
+        if any((earlier.distance or 0.0) > threshold for earlier in before):
+            chance = _BOLDEST  # it is repeated because it may exceed the threshold again, whatever was predicted
+        else:
+            chance = float(np.clip(_predicted_chance(trial, threshold), 1 - quantile, _BOLDEST))
         exceeds = (trial.distance or 0.0) > threshold
         above += exceeds
         wealth *= chance / (1 - quantile) if exceeds else (1 - chance) / quantile

@@ -31,11 +31,11 @@ from ctxval.learning.dynamics_posterior import (
 )
 from ctxval.learning.execution_prediction import ExecutionPrediction, predict_execution
 from ctxval.learning.histories import Record
-from ctxval.learning.innovations import NOISY, ChosenStructure, predicted_by_history
 from ctxval.learning.noise_effect import effect_of_noise
 from ctxval.learning.noisy_draws import EACH, GROUPS, MATTERS, REPLICATES, NoisyPosterior, learn_noisy
 from ctxval.learning.prediction import predict_distance
 from ctxval.learning.recorded import closed_loops_on_model, recorded_transitions
+from ctxval.learning.structures import NOISY, ChosenStructure, predicted_by_history
 from ctxval.learning.tolerance import PushResponse, push_response
 from ctxval.learning.vector import ErrorVectors, Executed, predict_composed
 from ctxval.learning.worst_case import WorstCase, WorstCaseSearch, WorstCaseSettings

@@ -17,6 +17,7 @@ from ctxval.learning.dynamics_posterior import DynamicsPosterior
 from ctxval.learning.noisy_draws import NoisyPosterior
 
 _TASKS, _RUNS = 6, 10
+_ROUNDING = 1e-5  # standard deviation of noise, as a share of a state's, below which it is rounding
 
 
 def effect_of_noise(planner: LoopPlanner, posterior: DynamicsPosterior | NoisyPosterior, tasks: Array) -> float:
@@ -24,6 +25,8 @@ def effect_of_noise(planner: LoopPlanner, posterior: DynamicsPosterior | NoisyPo
 
     Of the tasks, those with the largest distances count. Only finite distances do.
     """
+    if not (_deviations(posterior) > _ROUNDING * posterior.data.scale[: len(posterior.data.sizes)]).any():
+        return 0.0
     with single_threaded(), np.errstate(all="ignore"):
         planned = planner.plan(tasks)
         silent = posterior.silent if isinstance(posterior, NoisyPosterior) else posterior.mean
@@ -41,11 +44,19 @@ def effect_of_noise(planner: LoopPlanner, posterior: DynamicsPosterior | NoisyPo
     return float(np.nanmax(np.nanstd(finite, axis=0)) / distances.max())
 
 
-def _shaken(posterior: DynamicsPosterior) -> ShakenDynamics:
-    """Return the posterior mean with white noise as large as was learned."""
-    mean, data = posterior.mean, posterior.data
+def _deviations(posterior: DynamicsPosterior | NoisyPosterior) -> Array:
+    """Return the learned standard deviations of the noise of each state in a step, shape ``(n,)``."""
+    if isinstance(posterior, NoisyPosterior):
+        return posterior.fit.noise
+    data = posterior.data
     deviations = np.zeros(len(data.sizes))
     deviations[data.learned] = posterior.most_probable.noise * data.sizes[data.learned]
+    return deviations
+
+
+def _shaken(posterior: DynamicsPosterior) -> ShakenDynamics:
+    """Return the posterior mean with white noise as large as was learned."""
+    mean, data, deviations = posterior.mean, posterior.data, _deviations(posterior)
     return ShakenDynamics(
         model=posterior.model,
         data=data,

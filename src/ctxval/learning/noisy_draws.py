@@ -18,13 +18,9 @@ from ctxval.errors import InputError
 from ctxval.learning.dynamics_posterior import DynamicsPosterior
 from ctxval.learning.features import Features, LinearFunction
 from ctxval.learning.histories import Record
-from ctxval.learning.innovations import (
-    ChosenStructure,
-    DrawnWeights,
-    InnovationsFit,
-    fit_structures,
-)
+from ctxval.learning.innovations import DrawnWeights, InnovationsFit
 from ctxval.learning.residual_data import ResidualData
+from ctxval.learning.structures import ChosenStructure, fit_structures
 
 MATTERS = 0.01
 """Standard deviation of the distance of a task over its executions, as a share of the largest distance, from which

@@ -1,0 +1,78 @@
+"""Campaigns on a system with noise that nobody declared."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ctxval import Campaign, Task, TaskSpace, Validation, controllers, distances, models, systems
+from ctxval._util.arrays import Array
+from ctxval.certificates import Automatic, CertificateOptions
+
+FEW_TESTS = CertificateOptions(Automatic(tests=2))
+
+
+def step(x: Array, u: Array) -> Array:
+    speed = x[..., 1]
+    return np.asarray(x + 0.1 * np.stack([speed, u[..., 0] - 0.4 * speed - 0.2 * speed * np.abs(speed)], axis=-1))
+
+
+def cart(process: float = 0.01, seed: int = 1) -> Validation:
+    return Validation(
+        space=TaskSpace(goal=(-2.0, 2.0)),
+        task=lambda p: Task(np.stack([0 * p.goal, 0 * p.goal], axis=-1), goal=[p.goal, 0.0], horizon=20, dt=0.1),
+        system=systems.Imperfect(step, vectorized=True, process=[0.0, process], seed=seed),
+        model=models.Linear([[1.0, 0.1], [0.0, 0.97]], [[0.0], [0.1]]),
+        synthesizer=controllers.LQR([1.0, 0.1], [0.1]),
+        distance=distances.MaximumDeviation(components=(0,)),
+    )
+
+
+def largest_quantile(validation: Validation) -> float:
+    tasks = np.linspace(-2, 2, 81)[:, None]
+    return float(np.quantile([validation.distances(tasks) for _ in range(200)], 0.9, axis=0).max())
+
+
+@pytest.mark.slow
+def test_a_bound_on_the_quantile_is_validated_and_says_so(tmp_path: Path) -> None:
+    validation = cart()
+    largest = largest_quantile(validation)
+    campaign = Campaign(validation, store=tmp_path / "a.sqlite", seed=0).run(20, 1.5 * largest, certificate=FEW_TESTS)
+    verdict = campaign.verdict(1.5 * largest, certificate=FEW_TESTS)
+    assert verdict.answer == "validated"
+    assert campaign.executions < 20
+    assert verdict.bound is not None
+    assert 0.85 * largest < verdict.bound < 1.5 * largest
+    assert "in at least 90 % of its executions" in verdict.reason
+    assert verdict.rests_on is not None
+    assert "noise being independent from step to step" in verdict.rests_on
+    assert "deterministic" not in verdict.rests_on
+    assert verdict.certificate is not None
+    assert verdict.certificate.details["quantile"] == 0.9
+    # The stored predictions of later executions know the noise.
+    noisy = [trial for trial in campaign.trials if ((trial.note or {}).get("prediction") or {}).get("noise")]
+    assert noisy
+
+
+@pytest.mark.slow
+def test_one_execution_above_the_threshold_is_not_enough() -> None:
+    validation = cart()
+    largest = largest_quantile(validation)
+    campaign = Campaign(validation, seed=0).run(20, 0.7 * largest, certificate=FEW_TESTS)
+    verdict = campaign.verdict(0.7 * largest, certificate=FEW_TESTS)
+    assert verdict.answer == "falsified"
+    assert sum((trial.distance or 0) > 0.7 * largest for trial in campaign.trials) >= 2
+    assert "more than noise explains" in verdict.reason
+
+
+@pytest.mark.slow
+def test_without_noise_nothing_changes() -> None:
+    campaign = Campaign(cart(0.0), seed=0).run(20, 0.5, certificate=FEW_TESTS)
+    verdict = campaign.verdict(0.5, certificate=FEW_TESTS)
+    assert verdict.answer == "validated"
+    assert verdict.certificate is not None
+    assert verdict.certificate.details["quantile"] is None
+    assert verdict.certificate.details["lags"] == 0
+    assert "of its executions" not in verdict.reason
