@@ -42,8 +42,8 @@ at drawn tasks.
 
 {table}
 
-So such a word would be given to true validations too: on a regular system, M errs smoothly and largely, and the
-posterior has learned it. It is therefore not given; the verdict states both numbers."""
+So such a word would be given to true validations, and not to the false ones: on a regular system, M errs smoothly and
+largely, and the posterior has learned it. It is therefore not given; the verdict states both numbers."""
 
 RANKED = """### Coverage tasks ranked by pushes
 
