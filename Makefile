@@ -35,7 +35,7 @@ reliability: .venv/.test  ## kill -9 and resume, KILLS times
 	$(BIN)/python -m pytest tests/campaign/test_kill.py --kills $(KILLS)
 
 interleavings: .venv/.test  ## two processes on one store, switched SWITCHES times at every statement
-	$(BIN)/python -m pytest tests/campaign/test_interleavings.py --switches $(SWITCHES)
+	$(BIN)/python -m pytest --thorough tests/campaign/test_interleavings.py --switches $(SWITCHES)
 
 crash-states: .venv/.test  ## power cuts, thousands of them; needs strace; writes docs/reliability.md
 	$(BIN)/python benchmarks/crash_states.py

@@ -15,4 +15,4 @@ def more(*cases: Any) -> list[Any]:
 
 def some(cases: Iterable[Any], every: int = 4) -> list[Any]:
     """Return all cases, of which ``make test`` runs the first one and each so many-th."""
-    return [more(case)[0] if place % every else case for place, case in enumerate(cases)]
+    return [more((case,))[0] if place % every else case for place, case in enumerate(cases)]

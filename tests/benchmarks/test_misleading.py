@@ -58,6 +58,7 @@ def best_of_random(case: str, budget: int) -> Array:
 
 
 @pytest.mark.slow
+@pytest.mark.in_full
 @pytest.mark.parametrize(
     ("case", "budget"), [pytest.param("hidden-load", 14, marks=pytest.mark.thorough), ("corner-stop", 12)]
 )

@@ -191,9 +191,9 @@ def test_a_job_keeps_the_properties_of_each_of_its_tasks() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("name", "seed"), [("heavy-bin", 1), pytest.param("wet-surface", 0, marks=pytest.mark.thorough)]
-)
+@pytest.mark.thorough
+@pytest.mark.in_full
+@pytest.mark.parametrize(("name", "seed"), [("heavy-bin", 1), ("wet-surface", 0)])
 def test_what_depends_on_the_task_is_found_by_tests_where_nobody_chose_to_look(name: str, seed: int) -> None:
     largest = record_of(name, seed)["distance"]
     campaign = Campaign(DEVELOPMENT[name](seed).validation, seed=seed).run(25, 0.95 * largest)

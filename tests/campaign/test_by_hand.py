@@ -25,6 +25,7 @@ from ctxval.controllers import read_controller
 from ctxval.core.exchange import read_task
 from ctxval.core.rollout import rollout
 from ctxval.errors import ExecutionError, InputError, StoreAccessError
+from rig_cli import SMALL
 
 MODULE = """
 from ctxval import Experiment, Task, TaskSpace, Validation, controllers, distances, models, systems
@@ -48,8 +49,6 @@ def policy(seed):
     made.validation.synthesizer = controllers.Policy(lambda t, x, task: task.goal[..., :1] - x[..., :1] - x[..., 1:])
     return made
 """
-
-PYTHON = [sys.executable, "-c", "from ctxval.cli import main; main()"]
 
 
 @pytest.fixture
@@ -618,7 +617,7 @@ def test_the_search_knows_what_was_imported(invoke: Any) -> None:
 
 
 def start(*arguments: str) -> subprocess.Popen[str]:
-    return subprocess.Popen([*PYTHON, *arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    return subprocess.Popen([*SMALL, *arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
 def ends(processes: list[subprocess.Popen[str]]) -> list[tuple[int, str, str]]:

@@ -11,6 +11,7 @@ from conftest import interrupt_at_once, make_validation
 from ctxval import Campaign, Validation, cases, searches
 from ctxval.errors import CtxvalError
 from ctxval.testing import FaultyRig
+from rig_thorough import more
 
 
 def facts(campaign: Campaign) -> list[tuple[object, ...]]:
@@ -25,7 +26,7 @@ def no_data(validation: Validation) -> Validation:
 
 @pytest.mark.slow
 @pytest.mark.in_full
-@pytest.mark.parametrize(("with_data", "budget"), [(True, 3), (False, 5)])
+@pytest.mark.parametrize(("with_data", "budget"), [(True, 3), *more((False, 5))])
 def test_the_worst_task_is_found_in_a_handful_of_executions(with_data: bool, budget: int) -> None:
     case = cases.by_name("pendulum", 0)
     if not with_data:

@@ -14,10 +14,12 @@ from typer.testing import CliRunner
 
 from ctxval import Campaign, Task, TaskSpace, Trajectory, Validation, controllers, distances, models, systems
 from ctxval._util.arrays import Array
+from ctxval.certificates import Automatic, CertificateOptions
 from ctxval.cli import app
 from ctxval.errors import ExecutionError
 
 DT = 0.05
+UNTESTED = CertificateOptions(Automatic(tests=0))
 
 
 def rub(x: Array, u: Array) -> Array:
@@ -52,7 +54,9 @@ def truth() -> float:
 def test_a_campaign_ends_with_a_verdict_and_the_prediction_runs_many_memories_at_once() -> None:
     largest = truth()
     campaign = Campaign(validation(), seed=3)
-    verdict = campaign.run(25, threshold=1.5 * largest).verdict(1.5 * largest)
+    verdict = campaign.run(25, threshold=1.5 * largest, certificate=UNTESTED).verdict(
+        1.5 * largest, certificate=UNTESTED
+    )
     assert verdict.answer == "validated", verdict.reason
     refused = Campaign(validation(), seed=3)
     assert refused.run(25, threshold=0.7 * largest).verdict(0.7 * largest).answer == "falsified"
@@ -66,7 +70,9 @@ def test_workers_and_a_resumed_campaign_have_the_same_distances(tmp_path: Path) 
     assert first.executions == 4
     resumed = Campaign(made, seed=3, store=tmp_path / "cart.sqlite")
     assert resumed.executions == 4
-    verdict = resumed.run(25, threshold=1.5 * largest, workers=2).verdict(1.5 * largest)
+    verdict = resumed.run(25, 1.5 * largest, workers=2, certificate=UNTESTED).verdict(
+        1.5 * largest, certificate=UNTESTED
+    )
     assert verdict.answer == "validated", verdict.reason
     points = np.array([trial.parameters["goal"] for trial in resumed.completed])[:, None]
     distances_ = [trial.distance for trial in resumed.completed]

@@ -17,7 +17,7 @@ from ctxval.testing import FaultyRig
 
 pytestmark = pytest.mark.in_full
 
-BURNT = 0.02
+BURNT = 0.01
 
 
 class Busy:
