@@ -7,10 +7,6 @@ CAMPAIGNS ?= 120
 
 # Small dense algebra is faster on one thread.
 export OMP_NUM_THREADS = 1
-# Tests write many small stores durably, which takes no time in memory.
-ifeq ($(shell test 0$$(df -k --output=avail /dev/shm 2>/dev/null | tail -1 | tr -d ' ') -gt 4000000 && echo large),large)
-export PYTEST_DEBUG_TEMPROOT ?= /dev/shm
-endif
 
 .PHONY: demo test quick thorough check docs reliability interleavings crash-states attack lowest bench bench-peers study study-refine reproduce search global-search calibrate drawn-tests parts pictures posterior-ranks clean
 

@@ -24,6 +24,9 @@ from noise_reporting import PLANTS as REPORTING
 from noise_systems import IMPERFECTIONS, Plant
 
 RULE = 1
+"""Version of the rule by which campaigns are run. The stored ones at 0.95 on reporting plants were run before a
+repetition of an excess was a bet on another one, which falsifies in fewer executions."""
+
 BUDGET, SEEDS, QUANTILE = 25, 2, 0.9
 SHARES = (0.95, 1.25, 1.1)
 """Thresholds as shares of d_q*: the first one must not be validated, the others should be."""

@@ -35,7 +35,8 @@ def test_no_case_of_the_paper_fails_a_check(name: str, options: dict[str, Any]) 
 
 
 def test_every_case_is_checked() -> None:
-    assert {name for name, _ in CASES} == set(cases.NAMES)
+    names = {getattr(case, "values", case)[0] for case in CASES}
+    assert names == set(cases.NAMES) - {"pendulum-noisy"}  # its executions differ, as they should
 
 
 @pytest.mark.parametrize(("error", "state"), [(1e-15, "ok"), (1e-9, "failed")])
