@@ -12,8 +12,7 @@ that the table names ([noise](explanation/noise.md)). They were never tuned on. 
 {quantile:g} quantile of the distance, d_q*. Campaigns run with the default certificate, eight tests and at most
 {budget} executions until they are decided. {count} campaigns are stored.
 
-**At 0.95 d_q*, {false} of {below} campaigns were validated, which is false (the 95 % interval is {low:.1f} to
-{high:.1f} %).**
+**At 0.95 d_q*, {false} of {below} campaigns were validated falsely (the 95 % interval is {low:.1f} to {high:.1f} %).**
 
 {reported}
 {developed}{misleading}"""
