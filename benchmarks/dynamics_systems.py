@@ -191,18 +191,7 @@ def realisations(validation: Validation, count: int) -> list[Validation]:
     noisy = validation.system
     if not isinstance(noisy, Noisy):
         return [validation]
-    return [_with_system(validation, replace(noisy, realisation=row)) for row in range(count)]
-
-
-def _with_system(validation: Validation, system: systems.System) -> Validation:
-    return Validation(
-        space=validation.space,
-        task=validation.task,
-        system=system,
-        model=validation.model,
-        synthesizer=validation.synthesizer,
-        distance=validation.distance,
-    )
+    return [validation.with_system(replace(noisy, realisation=row)) for row in range(count)]
 
 
 def friction(velocity: Array, push: Array, grip: Any, dt: float) -> Array:

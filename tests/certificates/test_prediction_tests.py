@@ -11,11 +11,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from ctxval._util.boxes import latin_hypercube
 from ctxval.certificates.prediction_tests import (
     DRAWN,
     MANY,
     TESTS,
-    hypercube,
     probability_missed,
     share_missed,
     shown_by_tests,
@@ -29,13 +29,13 @@ SEEDS = st.integers(0, 2**32 - 1)
 
 @given(SEEDS, st.integers(1, 6), st.integers(1, 12))
 def test_each_part_of_each_parameter_has_a_test(seed: int, dimension: int, points: int) -> None:
-    tests = hypercube(dimension, np.random.default_rng(seed), points)
+    tests = latin_hypercube(points, dimension, np.random.default_rng(seed))
     parts = np.sort(np.floor(points * tests).astype(int), axis=0)
     assert (parts == np.arange(points)[:, None]).all()
 
 
 def test_each_test_is_uniform() -> None:
-    tests = np.array([hypercube(2, np.random.default_rng(seed)) for seed in range(400)])
+    tests = np.array([latin_hypercube(TESTS, 2, np.random.default_rng(seed)) for seed in range(400)])
     for row in range(TESTS):
         counts, _ = np.histogram(tests[:, row], bins=5, range=(0, 1))
         assert np.abs(counts - 160).max() < 5 * np.sqrt(160)
@@ -106,7 +106,7 @@ SETS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
 @pytest.mark.parametrize("name", SETS)
 def test_sets_are_missed_as_rarely_as_the_bound_says(name: str, dimension: int) -> None:
     rng = np.random.default_rng(0)
-    tests = np.array([hypercube(dimension, rng) for _ in range(4000)])
+    tests = np.array([latin_hypercube(TESTS, dimension, rng) for _ in range(4000)])
     outside = SETS[name](rng.random((200_000, dimension))).mean()
     for inside in (True, False):
         kept = float(outside if inside else 1 - outside)
@@ -118,7 +118,7 @@ def test_sets_are_missed_as_rarely_as_the_bound_says(name: str, dimension: int) 
 
 def test_what_is_other_in_one_of_eight_parts_is_met_with_certainty() -> None:
     rng = np.random.default_rng(1)
-    tests, draws = np.array([hypercube(3, rng) for _ in range(500)]), rng.random((4000, MANY, 3))
+    tests, draws = np.array([latin_hypercube(TESTS, 3, rng) for _ in range(500)]), rng.random((4000, MANY, 3))
     for part in range(TESTS):
         assert (np.floor(TESTS * tests) == part).any(axis=1).all()
     met = (np.floor(TESTS * draws) == 2).any(axis=1).mean()

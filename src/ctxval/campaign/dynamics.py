@@ -35,7 +35,6 @@ from ctxval.errors import CertificateError
 from ctxval.learning import DynamicsStudy, ExecutionPrediction, LearnedDynamics
 from ctxval.learning.closed_loops import LoopPlanner
 from ctxval.learning.coverage import Coverage, Gap
-from ctxval.learning.noisy_draws import GROUPS
 from ctxval.learning.tolerance import LEVELS, PushResponse
 from ctxval.learning.vector import Executed
 from ctxval.learning.worst_case import WorstCase
@@ -204,11 +203,9 @@ class CampaignDynamics:
 
     def kept_evidence(self, trials: Sequence[Trial], confidence: float) -> DynamicsEvidence | None:
         """Return :meth:`evidence` that the store keeps for these trials; None if there is none."""
-        return (
-            None
-            if self.elsewhere()
-            else DynamicsEvidence.from_json(self._store.computed(self._key(trials, confidence)))
-        )
+        if self.elsewhere():
+            return None
+        return DynamicsEvidence.from_json(self._store.computed(self._key(trials, confidence)))
 
     def _key(self, trials: Sequence[Trial], confidence: float) -> str:
         """Return the key of the evidence of some trials in the store."""
@@ -219,12 +216,10 @@ class CampaignDynamics:
         self, learned: LearnedDynamics, trials: Sequence[Trial], draws: int, confidence: float
     ) -> DynamicsEvidence:
         evidence = self._evidence(learned, trials, learned.worst_case_of(draws))
-        noisy = learned.noisy
-        groups = GROUPS if noisy is not None else len(learned.posterior.components)
         evidence = replace(
             evidence,
-            noise=learned.posterior.noise if noisy is None else noisy.noise,
-            groups=len(evidence.maxima) // groups,
+            noise=learned.drawn_from.noise,
+            groups=len(evidence.maxima) // learned.drawn_from.groups,
             without_model=learned.posterior.covariances.without_model,
         )
         best = largest_distance(trials)
@@ -234,7 +229,7 @@ class CampaignDynamics:
         # Many closed loops, which only matter to a bound that nothing else withdraws.
         evidence = _with_jumps(evidence, learned, bound)
         evidence = replace(evidence, pocket=self._pocket(learned))
-        if noisy is not None:
+        if learned.noisy is not None:
             return evidence  # a push is compared with residuals of state and input, which do not hold here
         return replace(evidence, pushed=_pushed(learned.push_response, self._coordinates(learned)))
 

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from ctxval._util.arrays import Array, Rows
+from ctxval._util.boxes import latin_hypercube
 from ctxval._util.progress import stage
 from ctxval._util.texts import enumerated, shortened
 from ctxval.campaign.choices import Choice
@@ -25,7 +26,7 @@ from ctxval.campaign.costs import costs_of
 from ctxval.campaign.dynamics import PREDICTION, CampaignDynamics
 from ctxval.campaign.history import waiting_points
 from ctxval.campaign.storage.store import Store
-from ctxval.certificates.prediction_tests import TESTS, hypercube
+from ctxval.certificates.prediction_tests import TESTS
 from ctxval.core.model import Model
 from ctxval.core.rollout import rollout
 from ctxval.core.trial import CONVERGED, UNSTEADY, Trial
@@ -241,7 +242,8 @@ class IndependentDraws:
     def test(self, trials: Sequence[Trial]) -> Array:
         """Return the next point ``(d,)`` of the Latin hypercubes of tests; it depends on no result."""
         block, row = divmod(spread_tests(trials), TESTS)
-        return np.asarray(hypercube(self._validation.space.dimension, self._generator(block, _HYPERCUBE))[row])
+        points = latin_hypercube(TESTS, self._validation.space.dimension, self._generator(block, _HYPERCUBE))
+        return np.asarray(points[row])
 
     def _generator(self, number: int, stream: int) -> np.random.Generator:
         """Return the random numbers of a draw; the streams of searches have smaller numbers."""

@@ -76,9 +76,13 @@ def untested(evidence: DynamicsEvidence, best: float, bound: float) -> str | Non
 
 def only_tests_missing(evidence: DynamicsEvidence, best: float, bound: float) -> bool:
     """Return whether tests are missing, and executions of other tasks would not help."""
-    fewest = FEWEST if evidence.quantile is None else NOISY_FEWEST
-    needed = evidence.executions >= fewest and tests_missing(evidence) is not None
+    needed = evidence.executions >= fewest_executions(evidence) and tests_missing(evidence) is not None
     return needed and uncovered(evidence) is None and untested(evidence, best, bound) is None
+
+
+def fewest_executions(evidence: DynamicsEvidence) -> int:
+    """Return the fewest executions for a bound."""
+    return FEWEST if evidence.quantile is None else NOISY_FEWEST
 
 
 def tests_missing(evidence: DynamicsEvidence) -> str | None:
@@ -92,8 +96,9 @@ def fewest_missing(evidence: DynamicsEvidence, best: float, bound: float) -> int
     in_a_row = next((k for k, last in enumerate(reversed(checked)) if not held(last, bound)), len(checked))
     each_takes_one = chain(_uncovered(evidence), _untested(evidence, best, bound, raised(evidence, bound)))
     tests = missing_tests(evidence.predictions, evidence.tests)
-    fewest = FEWEST if evidence.quantile is None else NOISY_FEWEST
-    return max(fewest - evidence.executions, PREDICTIONS - in_a_row, len(list(each_takes_one)), tests, 1)
+    return max(
+        fewest_executions(evidence) - evidence.executions, PREDICTIONS - in_a_row, len(list(each_takes_one)), tests, 1
+    )
 
 
 def agrees(distance: float, predicted: float, bound: float) -> bool:
@@ -184,7 +189,7 @@ def jumps(evidence: DynamicsEvidence, bound: float) -> bool:
 
 def _unlearned(evidence: DynamicsEvidence, bound: float) -> Iterator[str]:
     """Yield why too little is known of the dynamics."""
-    fewest = FEWEST if evidence.quantile is None else NOISY_FEWEST
+    fewest = fewest_executions(evidence)
     if evidence.executions < fewest:
         yield (
             f"the dynamics are learned from {evidence.executions} executed trajectories, and the bound needs at least "

@@ -28,18 +28,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ctxval._util.arrays import Array
 from ctxval.core.trial import Origin
 
 TESTS = 8  # default number, and number of points of a hypercube
 MANY = 22  # number of tests from which on they are independent draws
 DRAWN: tuple[Origin, ...] = ("iid", "spread")  # origins of tests: independent draws, and points of hypercubes
-
-
-def hypercube(dimension: int, rng: np.random.Generator, points: int = TESTS) -> Array:
-    """Return a Latin hypercube, points ``(n, d)`` in random order: each n-th of each parameter's range has one."""
-    parts = rng.permuted(np.tile(np.arange(points), (dimension, 1)), axis=1).T
-    return np.asarray((parts + rng.random((points, dimension))) / points)
 
 
 def share_missed(spread: int, independent: int, dimension: int, confidence: float) -> float:

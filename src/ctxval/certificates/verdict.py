@@ -168,10 +168,10 @@ def judge(
         options: ``auto`` by default. If the theory of the certificate refuses the trials, the verdict is undecided.
         provenance: what is known besides the trials.
     """
-    known = provenance or Provenance()
-    verdict = _judged(trials, threshold, options or CertificateOptions(), known)
+    known, chosen = provenance or Provenance(), options or CertificateOptions()
+    verdict = _judged(trials, threshold, chosen, known)
     parts = [verdict.reason.removesuffix("."), verdict.expected, designs_sentence(trials)]
-    bets = bets_against(trials, float(threshold), quantile_of((options or CertificateOptions()).kind))
+    bets = bets_against(trials, float(threshold), quantile_of(chosen.kind))
     if verdict.answer != "falsified" and bets is not None and bets.above:
         parts.append(sentences.noise_may_explain(bets, float(threshold), known.quantities))
     reason = "; ".join(str(part) for part in parts if part is not None)

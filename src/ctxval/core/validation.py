@@ -124,6 +124,10 @@ class Validation:
         """Return this validation with another largest horizon that is planned."""
         return self._with(longest=longest)
 
+    def with_system(self, system: System) -> Validation:
+        """Return the validation of another system with the same model, controllers and tasks."""
+        return self._with(system=system)
+
     def _with(self, **changed: Any) -> Validation:
         return Validation(**{**vars(self), **changed})
 

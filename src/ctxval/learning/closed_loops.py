@@ -291,8 +291,7 @@ def distances_of(draws: AnyDraws, loops: Sequence[Loops], planned: Sequence[Plan
     """Return the distances ``(S, q)`` of closed loops of S draws on planned tasks; NaN for a task without a plan."""
     found = np.full((len(draws), tasks), np.nan)
     for one, of_batch in zip(planned, loops, strict=True):
-        reduced = draws.reduced(of_batch.distances) if isinstance(draws, NoisyDraws) else of_batch.distances
-        found[:, one.rows] = reduced
+        found[:, one.rows] = draws.reduced(of_batch.distances)
     return found
 
 

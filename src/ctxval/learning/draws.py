@@ -44,6 +44,14 @@ class DynamicsDraws(ShortRepr):
             residuals[:, :, self.data.learned] = learned
             return self.model.step(x, u) + residuals * self.data.units
 
+    def reduced(self, distances: Array) -> Array:
+        """Return the distances ``(S, q)`` of draws from those of their loops, of which each draw has one."""
+        return distances
+
+    def alone(self, x: Array, u: Array) -> Array:
+        """Return the next states ``(..., n)`` of the only one of some draws."""
+        return np.asarray(DynamicsDraws.step(self, rows_of(x)[None], rows_of(u)[None]).reshape(x.shape))
+
     def __getitem__(self, rows: ArrayLike) -> DynamicsDraws:
         """Return some draws; their rows are in ascending order."""
         rows = np.atleast_1d(np.asarray(rows, dtype=np.intp))

@@ -112,6 +112,16 @@ class DynamicsPosterior(ShortRepr):
         """Numbers on which accuracy and cost depend."""
         return self.covariances.settings
 
+    @property
+    def groups(self) -> int:
+        """The number of draws of the hyperparameters."""
+        return len(self.components)
+
+    @property
+    def functions(self) -> int:
+        """The usual number of functions that are drawn for each of them."""
+        return self.settings.functions
+
     @functools.cached_property
     def most_probable(self) -> Component:
         """The posterior of the learned states for the mode of the hyperparameters."""
@@ -170,6 +180,11 @@ class DynamicsPosterior(ShortRepr):
     def mean(self) -> DynamicsDraws:
         """The model plus the posterior mean of r for the most probable hyperparameters, as one draw."""
         return self._limited(self.most_probable.mean)
+
+    @property
+    def silent(self) -> DynamicsDraws:
+        """The mean, which has no noise."""
+        return self.mean
 
     @functools.cached_property
     def rough_mean(self) -> DynamicsDraws:

@@ -32,7 +32,7 @@ from ctxval.learning.dynamics_posterior import (
 from ctxval.learning.execution_prediction import ExecutionPrediction, predict_execution
 from ctxval.learning.histories import Record
 from ctxval.learning.noise_effect import effect_of_noise
-from ctxval.learning.noisy_draws import EACH, GROUPS, MATTERS, REPLICATES, NoisyPosterior, learn_noisy
+from ctxval.learning.noisy_draws import MATTERS, REPLICATES, NoisyPosterior, learn_noisy
 from ctxval.learning.prediction import predict_distance
 from ctxval.learning.recorded import closed_loops_on_model, recorded_transitions
 from ctxval.learning.structures import NOISY, ChosenStructure, predicted_by_history
@@ -288,7 +288,7 @@ class LearnedDynamics(ShortRepr):
             return self.study.noisy(self)
 
     @property
-    def _drawn_from(self) -> DynamicsPosterior | NoisyPosterior:
+    def drawn_from(self) -> DynamicsPosterior | NoisyPosterior:
         """The posterior of which draws bound d*."""
         return self.noisy or self.posterior
 
@@ -296,7 +296,7 @@ class LearnedDynamics(ShortRepr):
         """Return the distances ``(m,)`` on the posterior mean at points ``(m, d)``; infinity if a loop diverges."""
         planner = self.study.planner
         with single_threaded():
-            return np.asarray(planner.distances(self._drawn_from.mean, planner.plan(points), len(points))[0])
+            return np.asarray(planner.distances(self.drawn_from.mean, planner.plan(points), len(points))[0])
 
     def trajectories(self, points: Array) -> list[tuple[Array, Trajectory]]:
         """Return tasks ``(m, d)`` with their closed loops on the posterior mean, without those that diverge."""
@@ -318,36 +318,31 @@ class LearnedDynamics(ShortRepr):
     @functools.cached_property
     def screened(self) -> WorstCase:
         """The largest distance over some tasks, for each of a few draws of the dynamics: a quick lower bound."""
-        return self.study.search.screened(self._drawn_from, self.worst_of_mean, self.executed, self._rng(5))
+        return self.study.search.screened(self.drawn_from, self.worst_of_mean, self.executed, self._rng(5))
 
     @functools.cached_property
     def worst_of_mean(self) -> WorstCase:
         """The largest distance over some tasks on the posterior mean alone, as if it were the only draw."""
-        return self.study.search.on_mean(
-            self._drawn_from, self._on_pool[0], self.executed, self._rng(4), globally=False
-        )
+        return self.study.search.on_mean(self.drawn_from, self._on_pool[0], self.executed, self._rng(4), globally=False)
 
     def worst_case_of(self, draws: int) -> WorstCase:
         """Return the largest distance over all tasks, for each of at least so many draws of the dynamics."""
-        if self.noisy is not None:
-            functions = max(EACH, -(-draws // GROUPS))
-        else:
-            functions = max(self.posterior.settings.functions, -(-draws // len(self.posterior.components)))
+        functions = max(self.drawn_from.functions, -(-draws // self.drawn_from.groups))
         if functions not in self._worst_cases:
             search, known, rng = self.study.search, self.executed, self._rng(1)
-            of_mean = search.on_mean(self._drawn_from, self._on_pool[0], known, rng)
-            self._worst_cases[functions] = search.maxima(self._drawn_from, of_mean, known, rng, functions)
+            of_mean = search.on_mean(self.drawn_from, self._on_pool[0], known, rng)
+            self._worst_cases[functions] = search.maxima(self.drawn_from, of_mean, known, rng, functions)
         return self._worst_cases[functions]
 
     @functools.cached_property
     def largest_jump(self) -> float:
         """The largest jump of the distance on the posterior mean between nearly equal tasks."""
-        return self.study.search.largest_jump(self._drawn_from)
+        return self.study.search.largest_jump(self.drawn_from)
 
     @functools.cached_property
     def deeper(self) -> tuple[Array, Array]:
         """The largest distances on the posterior mean ``(2,)`` in two deeper searches, and their points ``(2, d)``."""
-        return self.study.search.deeper(self._drawn_from, self._rng(3))
+        return self.study.search.deeper(self.drawn_from, self._rng(3))
 
     @functools.cached_property
     def push_response(self) -> PushResponse:
@@ -388,12 +383,10 @@ class LearnedDynamics(ShortRepr):
         """The distances of the pool's tasks on the posterior mean, and the coverage of their closed loops."""
         search, planner = self.study.search, self.study.planner
         with single_threaded():
-            if self.noisy is not None:
-                loops = planner.run(self.noisy.silent, search.plans)
-                (distances,) = planner.distances(self.noisy.mean, search.plans, len(search.pool))
-            else:
-                loops = planner.run(self.posterior.mean, search.plans)
-                (distances,) = distances_of(self.posterior.mean, loops, search.plans, len(search.pool))
+            mean, silent = self.drawn_from.mean, self.drawn_from.silent
+            loops = planner.run(silent, search.plans)
+            noisy = loops if mean is silent else planner.run(mean, search.plans)
+            (distances,) = distances_of(mean, noisy, search.plans, len(search.pool))
             return distances, coverage(self.posterior, search.pool, search.plans, loops)
 
     def predict(self, point: Array) -> ExecutionPrediction | None:

@@ -69,6 +69,11 @@ class Scaled:
         """The number n of states."""
         return int(self.E.shape[1])
 
+    @property
+    def usual_theta(self) -> Array:
+        """The most likely hyperparameters a priori."""
+        return np.full(self.states + self.inputs + 2, _LENGTH)
+
     @functools.cached_property
     def centres(self) -> Array:
         """Well-spread regressors, shape ``(M, D)``."""
@@ -149,7 +154,8 @@ class LaggedFit(InnovationsFit):
         drawn = []
         for place in places:
             features = self.scaled.features(place)
-            posterior = _WeightPosterior.of(features, self.scaled, self.live, self.rows)
+            spectrum = _Spectrum.given(features(self.scaled.Z), self.scaled, self.live, self.rows)
+            posterior = _WeightPosterior.of(spectrum, self.scaled.sizes[self.live])
             weights, noise = np.zeros((each, posterior.size, n)), np.zeros((each, n))
             for k in range(each):
                 weights[k][:, self.live], noise[k, self.live] = posterior.draw(rng)
@@ -168,7 +174,9 @@ class _Spectrum:
     count: int
 
     @classmethod
-    def of(cls, Phi: Array, Y: Array) -> _Spectrum:
+    def given(cls, phi: Array, scaled: Scaled, live: Mask, rows: Array) -> _Spectrum:
+        """Return it for features ``(N, F)`` of the regressors, with weights of the transitions ``(N, 1)``."""
+        Phi, Y = phi * rows, scaled.E[:, live] / scaled.sizes[live] * rows
         values, vectors = np.linalg.eigh(Phi.T @ Phi)
         values = np.maximum(values, 1e-12)
         return cls(values, vectors, vectors.T @ (Phi.T @ Y), (Y**2).sum(axis=0), len(Y))
@@ -191,9 +199,8 @@ class _WeightPosterior:
     sizes: Array
 
     @classmethod
-    def of(cls, features: Features, scaled: Scaled, live: Mask, rows: Array) -> _WeightPosterior:
-        sizes = scaled.sizes[live]
-        spectrum = _Spectrum.of(features(scaled.Z) * rows, scaled.E[:, live] / sizes * rows)
+    def of(cls, spectrum: _Spectrum, sizes: Array) -> _WeightPosterior:
+        """Return it in the units of states whose errors of M have these root mean squares."""
         width, grids = min(0.3, 3 / np.sqrt(spectrum.count)), []
         for i in range(len(sizes)):
             coarse = spectrum.log_evidence(i, _AMPLITUDES, _NOISES)
@@ -226,20 +233,24 @@ class _WeightPosterior:
 
 
 def _height(scaled: Scaled, theta: Array, live: Mask, rows: Array) -> float:
-    """Return the log posterior of hyperparameters, with amplitudes and noises integrated out on a grid."""
+    """Return the log posterior of hyperparameters; minus infinity if their covariance is not positive definite."""
     try:
-        features = scaled.features(theta)
-        spectrum = _Spectrum.of(features(scaled.Z) * rows, scaled.E[:, live] / scaled.sizes[live] * rows)
+        phi = scaled.features(theta)(scaled.Z)
+        return _height_of(_Spectrum.given(phi, scaled, live, rows), theta)
     except np.linalg.LinAlgError:
         return -np.inf
-    heights = [spectrum.log_evidence(i, _AMPLITUDES, _NOISES).ravel() for i in range(int(live.sum()))]
+
+
+def _height_of(spectrum: _Spectrum, theta: Array) -> float:
+    """Return the log posterior of hyperparameters, with amplitudes and noises integrated out on a grid."""
+    heights = [spectrum.log_evidence(i, _AMPLITUDES, _NOISES).ravel() for i in range(len(spectrum.squares))]
     prior = -0.5 * (((theta[:-1] - _LENGTH) ** 2).sum() + ((theta[-1] - _LENGTH) / 3) ** 2)
     return float(sum(logsumexp(each) - np.log(each.size) for each in heights) + prior)
 
 
 def learn_theta(scaled: Scaled, live: Mask, lags: int) -> Array:
     """Return likely hyperparameters, by moves of one coordinate at a time."""
-    theta = np.full(scaled.states + scaled.inputs + 2, _LENGTH)
+    theta = scaled.usual_theta
     rows = np.ones((len(scaled.Z), 1))
     best = _height(scaled, theta, live, rows)
     moved = [i for i in range(len(theta)) if lags or i != len(theta) - 2]
@@ -272,20 +283,21 @@ def fit_usual(history: History, records: Sequence[Record], pairs: Array, live: M
     """Return :func:`fit_lagged` with the usual hyperparameters and constant noise, which costs little."""
     Z, E, _ = history.along(records)
     scaled = Scaled.of(Z, E, pairs, records[0].inputs.shape[1])
-    theta = np.full(scaled.states + scaled.inputs + 2, _LENGTH)
-    return _conditioned(history, scaled, theta, live, np.ones((len(Z), 1)), None)
+    return _conditioned(history, scaled, scaled.usual_theta, live, np.ones((len(Z), 1)), None)
 
 
 def _conditioned(
     history: History, scaled: Scaled, theta: Array, live: Mask, rows: Array, local: LocalNoise | None
 ) -> LaggedFit:
     features = scaled.features(theta)
-    posterior = _WeightPosterior.of(features, scaled, live, rows)
+    phi = features(scaled.Z)
+    spectrum = _Spectrum.given(phi, scaled, live, rows)
+    posterior = _WeightPosterior.of(spectrum, scaled.sizes[live])
     weights, noise = np.zeros((posterior.size, scaled.states)), np.zeros(scaled.states)
     weights[:, live], noise[live] = posterior.draw(None)
-    innovations = _unit((scaled.E - features(scaled.Z) @ weights) * rows, live)
+    innovations = _unit((scaled.E - phi @ weights) * rows, live)
     units = len(scaled.Z) * np.log(scaled.sizes[live]).sum() - live.sum() * np.log(rows).sum()
-    evidence = _height(scaled, theta, live, rows) - units
+    evidence = _height_of(spectrum, theta) - units
     return LaggedFit(history, scaled, theta, live, features, weights, noise, evidence, innovations, local, rows)
 
 

@@ -29,8 +29,7 @@ def effect_of_noise(planner: LoopPlanner, posterior: DynamicsPosterior | NoisyPo
         return 0.0
     with single_threaded(), np.errstate(all="ignore"):
         planned = planner.plan(tasks)
-        silent = posterior.silent if isinstance(posterior, NoisyPosterior) else posterior.mean
-        distances = np.nan_to_num(planner.distances(silent, planned, len(tasks))[0], nan=-1.0, posinf=-1.0)
+        distances = np.nan_to_num(planner.distances(posterior.silent, planned, len(tasks))[0], nan=-1.0, posinf=-1.0)
         largest = tasks[np.argsort(-distances, kind="stable")[:_TASKS]]
         planned = planner.plan(largest)
         runs = np.full((_RUNS, len(largest)), np.nan)
@@ -89,9 +88,7 @@ class ShakenDynamics(DynamicsDraws):
 
     def step(self, x: Array, u: Array) -> Array:
         """Return the next states, shapes ``(S, q, n), (S, q, m) -> (S, q, n)``."""
-        count = x.shape[0] * x.shape[1]  # there may be no inputs, so it is not left to reshape
-        together = super().step(x.reshape(1, count, x.shape[-1]), u.reshape(1, count, u.shape[-1]))
         # The noise is a function of the states, so that a loop is the same each time.
         seed = np.frombuffer(np.ascontiguousarray(x).tobytes()[-64:], dtype=np.uint32)
         rng = np.random.default_rng([self.first, *seed.tolist()])
-        return np.asarray(together.reshape(x.shape) + self.deviations * rng.standard_normal(x.shape))
+        return np.asarray(self.alone(x, u) + self.deviations * rng.standard_normal(x.shape))

@@ -180,6 +180,16 @@ class NoisyPosterior(ShortRepr):
         """The variance of noise as a share of the mean square of a state's error of M, where it is largest."""
         return self.fit.share
 
+    @property
+    def groups(self) -> int:
+        """The number of draws of the hyperparameters."""
+        return GROUPS
+
+    @property
+    def functions(self) -> int:
+        """The usual number of weights that are drawn for each of them."""
+        return EACH
+
     def with_effect(self, effect: float) -> NoisyPosterior:
         """Return it without noise if noise changes distances by less than a share of the largest one."""
         return self if effect > MATTERS else replace(self, replicates=1)
@@ -204,7 +214,7 @@ class NoisyPosterior(ShortRepr):
     @functools.cached_property
     def silent(self) -> NoisyDraws:
         """The most probable residual without noise."""
-        return self.mean.without_noise()
+        return self.mean.without_noise() if self.is_noisy else self.mean
 
     def draw(
         self,
@@ -222,7 +232,7 @@ class NoisyPosterior(ShortRepr):
 
     def _with_noise(self, drawn: Sequence[DrawnWeights], rng: np.random.Generator) -> NoisyDraws:
         draws = NoisyDraws.of(self.fit, drawn, self.scatter, self.horizon, self.replicates, self.quantile, rng)
-        return draws if self.replicates > 1 else draws.without_noise()
+        return draws if self.is_noisy else draws.without_noise()
 
 
 def learn_noisy(

@@ -25,11 +25,10 @@ _UNEXPLAINED = 0.05  # share of the residual that nothing predicts if there is n
 
 @dataclass(frozen=True, eq=False)
 class ChosenStructure:
-    """A structure with its hyperparameters, learned from some executions."""
+    """A structure, learned from some executions, with the hyperparameters of the fit whose records are the state."""
 
     structure: Structure
     theta: Array
-    theta_of_states: Array
 
 
 def fit_structures(
@@ -51,7 +50,7 @@ def fit_structures(
         return fit_filter(History.of(model, structure, scales, middle), records, pairs, plain)
 
     if chosen is not None:
-        plain = lagged(Structure(0 if chosen.structure.ratio else chosen.structure.lags), chosen.theta_of_states)
+        plain = lagged(Structure(0 if chosen.structure.ratio else chosen.structure.lags), chosen.theta)
         return (filtered(chosen.structure, plain) if chosen.structure.ratio else plain), chosen
     longest = max(1, len(records))
     fits: list[InnovationsFit] = [
@@ -68,7 +67,7 @@ def fit_structures(
                     fits.append(filtered(structure, of_states))
         best = max(fits, key=_preference)
     structure = best.history.structure
-    return best, ChosenStructure(structure, best.theta, (of_states if structure.ratio else best).theta)
+    return best, ChosenStructure(structure, (of_states if structure.ratio else best).theta)
 
 
 def predicted_by_history(

@@ -16,7 +16,7 @@ from functools import partial
 import numpy as np
 
 from ctxval._util.arrays import Array, Rows, single_threaded
-from ctxval._util.boxes import moves_to_bounds, separated_rows
+from ctxval._util.boxes import latin_hypercube, moves_to_bounds, separated_rows
 from ctxval.gp.ascent import Ascent
 from ctxval.gp.global_search import search_globally
 from ctxval.learning.closed_loops import AnyDraws, LoopPlanner, PlannedTasks, loop_pairs
@@ -126,9 +126,7 @@ class WorstCaseSearch:
         """Tasks that are spread over the cube, every second one with coordinates at bounds, shape ``(N, d)``."""
         rng = np.random.default_rng([self._seed, 0])
         count = self.settings.pool
-        # A Latin hypercube; scipy.stats, which has others, takes a second to load.
-        strata = rng.permuted(np.tile(np.arange(count), (self.dimension, 1)), axis=1).T
-        points = (strata + rng.random((count, self.dimension))) / count
+        points = latin_hypercube(count, self.dimension, rng)
         ends = rng.random(points.shape) < rng.random((len(points), 1))
         ends[::2] = False
         return np.asarray(np.where(ends, np.round(points), points))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from ctxval import Experiment, Validation, systems
+from ctxval import Experiment, systems
 from ctxval.paper.cases import pendulum
 
 ENCODER = 1e-3  # rad, about that of an encoder with 6,000 steps
@@ -26,12 +26,4 @@ def experiment(seed: int = 0) -> Experiment:
         delay=DELAY,
         seed=seed,
     )
-    validation = Validation(
-        space=parts.space,
-        task=parts.task,
-        system=system,
-        model=parts.model,
-        synthesizer=parts.synthesizer,
-        distance=parts.distance,
-    )
-    return replace(ideal, name="pendulum-noisy", validation=validation, truth=None)
+    return replace(ideal, name="pendulum-noisy", validation=parts.with_system(system), truth=None)
