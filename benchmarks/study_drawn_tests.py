@@ -22,9 +22,10 @@ from calibrate import RESULTS, all_of
 from calibrate_strangers import BUDGET
 from ctxval import Campaign
 from ctxval._util.arrays import Array, single_threaded
+from ctxval._util.boxes import latin_hypercube
 from ctxval._util.json_lines import JsonLines
 from ctxval.certificates.dynamics_diagnostics import ACCURATE
-from ctxval.certificates.prediction_tests import TESTS, hypercube
+from ctxval.certificates.prediction_tests import TESTS
 from dynamics_truths import digest
 from strangers import Stranger
 from strangers_development import DEVELOPMENT
@@ -75,6 +76,11 @@ def truth(entry: Stranger, seed: int) -> float:
 
 
 # Designs of tests, each a function of the number of task parameters and a generator to unit points (TESTS, d)
+
+
+def hypercube(d: int, rng: np.random.Generator) -> Array:
+    """Return a Latin hypercube, as the tests of campaigns are."""
+    return latin_hypercube(TESTS, d, rng)
 
 
 def corners(d: int, rng: np.random.Generator) -> Array:
