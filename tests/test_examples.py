@@ -9,7 +9,10 @@ from pathlib import Path
 
 import pytest
 
+from rig_thorough import more
+
 SHORTEST = "4_own_distance_and_search"
+LONGEST = "7_from_logs_to_a_validated_model"
 EXAMPLES = Path(__file__).parents[1] / "examples"
 PRINTED = {
     "1_first_verdict": [
@@ -50,7 +53,7 @@ def test_an_example_fits_on_a_page(name: str) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", PRINTED)
+@pytest.mark.parametrize("name", [*(name for name in PRINTED if name != LONGEST), *more(LONGEST)])
 def test_an_example_prints_what_it_promises_and_leaves_nothing_behind(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -63,9 +66,7 @@ def test_an_example_prints_what_it_promises_and_leaves_nothing_behind(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "name", [SHORTEST, *(pytest.param(name, marks=pytest.mark.thorough) for name in PRINTED if name != SHORTEST)]
-)
+@pytest.mark.parametrize("name", [SHORTEST, *more(*(name for name in PRINTED if name != SHORTEST))])
 def test_an_example_runs_as_a_reader_runs_it(name: str, tmp_path: Path) -> None:
     """In a process of its own, with as many draws and closed loops as the reader's."""
     command = [sys.executable, "-W", "error", str(EXAMPLES / f"{name}.py")]

@@ -25,8 +25,9 @@ NEEDS |= {"onnx": ["onnx", "onnxruntime"], "scikit-learn": ["sklearn"], "state-s
 NEEDS |= {"gymnasium-and-network": ["gymnasium", "mujoco", "sklearn"]}
 NEEDS |= {"fit": ["mujoco", "sklearn", "onnx"]}
 NEEDS |= {"operate": ["starlette", "uvicorn", "jinja2", "python_multipart"]}
-LONG = ("aspect1",)
-"""Pages whose examples only `make thorough` runs: they learn a network and search the tasks of the arm on it."""
+LONG = ("aspect1", "compare-controllers", "controllers", "fit", "gymnasium-and-network", "noise", "read-certificate")
+LONG += ("retrain", "workers")
+"""Pages that only `make docs` and `make thorough` run: campaigns on several models, with noise or in many processes."""
 CTXVAL = ["-c", "from ctxval.cli import main; main()"]
 
 

@@ -138,7 +138,7 @@ def test_a_recipe_is_short(part: str) -> None:
     assert Path(recipe.test).parts[1:-1] == Path(recipe.module).parts[2:-1]  # tests mirror the source
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_what_the_recipes_give_passes_make_check(tree: Path) -> None:
     for recipe in RECIPES.values():  # it is formatted and in order as it is written in the guide
         assert (tree / recipe.module).read_text() == recipe.source

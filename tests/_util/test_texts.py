@@ -49,6 +49,7 @@ def test_nothing_that_acts_is_left_in_any_text(text: str) -> None:
 
 
 @given(st.text(), st.integers(100, 200))
+@pytest.mark.thorough
 def test_a_long_text_keeps_its_beginning_and_its_end(text: str, longest: int) -> None:
     long = f"begin{text * 100}end"
     short = shortened(long, longest)

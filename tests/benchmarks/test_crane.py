@@ -25,6 +25,7 @@ from study_crane import truth, typed
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, *more(1)])
+@pytest.mark.thorough
 def test_designs_that_rounding_stops_are_like_those_next_to_them(seed: int) -> None:
     validation = experiment(seed).validation
     points = validation.space.iid(30, np.random.default_rng(3))
@@ -38,7 +39,6 @@ def test_designs_that_rounding_stops_are_like_those_next_to_them(seed: int) -> N
         assert validation.measure(other, validation.execute(other)) == pytest.approx(distance, rel=0.02, abs=1e-4)
 
 
-@pytest.mark.slow
 @pytest.mark.thorough
 def test_verdicts_on_the_crane_are_true_and_its_worst_task_can_be_typed_again() -> None:
     validation = experiment(0).validation

@@ -62,6 +62,7 @@ def best_of_random(case: str, budget: int) -> Array:
 @pytest.mark.parametrize(
     ("case", "budget"), [pytest.param("hidden-load", 14, marks=pytest.mark.thorough), ("corner-stop", 12)]
 )
+@pytest.mark.thorough
 def test_the_search_falls_back_says_why_and_beats_random(case: str, budget: int) -> None:
     campaign = Campaign(misleading.CASES[case](0).validation, search=Thrifty(), seed=0)
     campaign.run(budget, explore=True)

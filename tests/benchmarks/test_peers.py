@@ -78,6 +78,7 @@ def test_what_is_said_of_the_functions_is_so(case: str) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", HERE)
+@pytest.mark.thorough
 def test_methods_stop_with_the_budget_and_repeat_themselves(name: str) -> None:
     first, again = (
         run.record(METHODS[name].load(), Recorder(function("linear-5", 1), 6), seed=1)[0].values for _ in range(2)

@@ -628,7 +628,7 @@ def ends(processes: list[subprocess.Popen[str]]) -> list[tuple[int, str, str]]:
     return ended
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_several_terminals_ask_and_tell_at_once(invoke: Any) -> None:
     ask = ["ask", "my_rig:experiment", "--store", "a.sqlite", "--search", "random", "--json"]
     first = ends([start(*ask) for _ in range(3)])

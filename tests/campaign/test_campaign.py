@@ -375,6 +375,7 @@ def test_what_an_audit_draws_does_not_depend_on_the_search(validation: Validatio
     assert {t.unit_point.tobytes() for t in plain.trials}.isdisjoint(t.unit_point.tobytes() for t in other.trials)
 
 
+@pytest.mark.thorough
 def test_the_points_of_many_audits_are_uniform() -> None:
     cheap = make_validation(horizon=1)
     points = np.array([t.unit_point[0] for seed in range(25) for t in Campaign(cheap, seed=seed).audit(8).trials])
@@ -445,7 +446,7 @@ def test_a_campaign_stops_before_the_execution_that_is_not_needed(validation: Va
     assert facts(campaign.trials) == facts(gp_ucb(validation, seed=1).run(7).trials)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_campaign_executes_what_nothing_came_near_to_before_it_validates(tmp_path: Path) -> None:
     def campaign(name: str) -> Campaign:
         return Campaign(make_validation(), search=OneCorner(), seed=1, store=tmp_path / name)

@@ -27,6 +27,7 @@ def no_data(validation: Validation) -> Validation:
 @pytest.mark.slow
 @pytest.mark.in_full
 @pytest.mark.parametrize(("with_data", "budget"), [(True, 3), *more((False, 5))])
+@pytest.mark.thorough
 def test_the_worst_task_is_found_in_a_handful_of_executions(with_data: bool, budget: int) -> None:
     case = cases.by_name("pendulum", 0)
     if not with_data:
@@ -117,7 +118,6 @@ def test_a_note_of_a_task_that_could_not_be_planned_is_kept(tmp_path: Path) -> N
     assert reopened.run(2).executions == 2
 
 
-@pytest.mark.slow
 @pytest.mark.thorough
 @pytest.mark.in_full
 def test_a_hidden_state_that_misleads_the_prediction_does_not_keep_the_worst_task_hidden() -> None:

@@ -50,7 +50,7 @@ def truth() -> float:
     return float(validation().distances(np.linspace(0.5, 2.0, 301)[:, None]).max())
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_campaign_ends_with_a_verdict_and_the_prediction_runs_many_memories_at_once() -> None:
     largest = truth()
     campaign = Campaign(validation(), seed=3)

@@ -46,7 +46,7 @@ def costs(validation: Validation) -> ThinkingCosts:
     return ThinkingCosts.measured(validation, [np.array([goal]) for goal in (-3.0, 0.5, 3.0)])
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_suggestion_costs_at_least_its_designs() -> None:
     found = costs(with_synthesizer(Busy()))
     assert found.designs == 150
@@ -61,7 +61,7 @@ def test_a_suggestion_costs_at_least_its_designs() -> None:
     assert usual[1] * BURNT <= found.fast < found.suggestion
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_the_estimate_is_that_of_a_real_suggestion_within_a_factor() -> None:
     validation = make_validation()
     campaign = Campaign(validation, search=searches.Auto("thorough"), seed=1).run(3, explore=True)

@@ -153,7 +153,7 @@ def check_damaged(path: Path, expected: Everything) -> bool:
     return False
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_flipped_bytes_are_noticed_or_harmless(whole: Path, tmp_path: Path) -> None:
     expected, data = everything(Store(whole)), whole.read_bytes()
     rng = np.random.default_rng(0)

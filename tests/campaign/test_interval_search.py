@@ -45,6 +45,7 @@ def linear(dim: int = 1, seed: int = 0):  # type: ignore[no-untyped-def]
 
 @pytest.mark.slow
 @pytest.mark.in_full
+@pytest.mark.thorough
 def test_a_linear_system_is_validated_in_few_executions_by_a_bound_that_is_true() -> None:
     validation, largest = linear(2)
     campaign = Campaign(validation).run(16, 1.1 * largest)
@@ -86,6 +87,7 @@ def test_a_threshold_below_the_maximum_is_falsified() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("batched", [True, False])
+@pytest.mark.thorough
 def test_a_system_without_inputs_is_validated(batched: bool) -> None:
     validation = make_validation_without_inputs(batched)
     campaign = Campaign(validation)
@@ -210,7 +212,7 @@ def test_a_hypercube_that_was_begun_is_completed_before_tests_are_independent_dr
     assert parts == list(range(TESTS))
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_the_posterior_bound_predicts_nothing() -> None:
     campaign = Campaign(make_validation(), seed=1)
     campaign.run(20, 1e3, certificate=CertificateOptions(Posterior()))

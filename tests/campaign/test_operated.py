@@ -28,6 +28,7 @@ def operate(campaign: Campaign, threshold: float, budget: int, **options: object
 
 @pytest.mark.slow
 @pytest.mark.parametrize("share", [0.9, 1.1])
+@pytest.mark.thorough
 def test_people_execute_the_same_tasks_as_a_campaign_that_runs_by_itself(share: float, tmp_path: Path) -> None:
     case = cases.by_name("linear", 0, dim=1)
     assert case.truth is not None

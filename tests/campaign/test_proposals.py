@@ -59,6 +59,7 @@ def designs_of(campaign: Campaign) -> list[int]:
 
 @pytest.mark.slow
 @pytest.mark.in_full
+@pytest.mark.thorough
 def test_dear_executions_are_thought_about_longer_than_cheap_ones() -> None:
     # A design takes 20 ms. So 22 of them take less than 1 s, and 60 take longer, but far less than 6 s on any machine.
     campaigns = [Campaign(validation(0.02, seconds), seed=1).run(1) for seconds in (0.0, 6.0)]

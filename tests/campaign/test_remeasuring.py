@@ -75,7 +75,7 @@ def execute_by_hand(invoke: Any, goal: float) -> None:
     answer(invoke("tell", "a.sqlite", str(asked["trial"]), "--trajectory", "run.csv", "--json"))
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_distance_changed_after_ten_executions_is_decided_without_an_eleventh(invoke: Any) -> None:
     for goal in np.linspace(0.5, 2.0, 10):
         execute_by_hand(invoke, goal)

@@ -106,7 +106,7 @@ goal = { type = "normal", mean = 0.5, deviation = 0.1 }
 """
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_an_experiment_file_states_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     Path("p.toml").write_text(FILE)

@@ -392,6 +392,7 @@ def test_a_campaign_on_dask_survives_the_death_of_a_worker(tmp_path: Path) -> No
 
 @pytest.mark.slow
 @pytest.mark.skipif(importlib.util.find_spec("distributed") is None, reason="needs dask.distributed")
+@pytest.mark.thorough
 def test_a_campaign_whose_dask_scheduler_is_killed_goes_on_with_another(tmp_path: Path) -> None:
     status, stderr, before = rig_cluster.killed_and_resumed(tmp_path, after=4, wait=0.1)
     assert status == 3

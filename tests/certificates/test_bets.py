@@ -52,6 +52,7 @@ def test_an_undecided_verdict_says_that_noise_may_explain_an_excess() -> None:
 
 
 @pytest.mark.parametrize("quantile", [0.8, 0.9])
+@pytest.mark.thorough
 def test_the_bets_rarely_win_if_the_threshold_holds(quantile: float) -> None:
     # Executions exceed the threshold with the largest chance that is permitted, whatever was predicted.
     rng, won = np.random.default_rng(0), 0

@@ -127,6 +127,7 @@ def from_prior(seed: int) -> tuple[Sample, float]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("runs", [20, pytest.param(60, marks=pytest.mark.thorough)])
+@pytest.mark.thorough
 def test_on_the_prior_the_stated_confidence_is_the_measured_coverage(runs: int) -> None:
     held = {0.5: 0, 0.9: 0}
     for seed in range(runs):
@@ -211,7 +212,6 @@ def test_one_task_with_two_distances_is_not_deterministic() -> None:
 # The error of the bound
 
 
-@pytest.mark.slow
 @pytest.mark.thorough
 def test_the_error_is_what_seeds_differ_by() -> None:
     trials = sample(7)
@@ -223,7 +223,7 @@ def test_the_error_is_what_seeds_differ_by() -> None:
         assert (np.abs(bounds - bounds.mean()) < 2 * errors).mean() >= 0.8
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_more_draws_have_a_smaller_error() -> None:
     few, many = (draw_maxima(sample(7), draws=draws, paths=4) for draws in (16, 128))
     assert 0 < many.error(0.9) < 0.7 * few.error(0.9)

@@ -91,6 +91,7 @@ def imported(order: np.ndarray, spike: float) -> list[Trial]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("spike", [0.0, 8.0])
+@pytest.mark.thorough
 def test_the_order_of_imported_rows_changes_nothing(spike: float) -> None:
     rng, found = np.random.default_rng(1), []
     worst_first = np.roll(np.arange(15), 1)
@@ -104,7 +105,7 @@ def test_the_order_of_imported_rows_changes_nothing(spike: float) -> None:
     assert {one[0]: one[3] for one in found}[False] == (spike == 0)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_the_test_of_unordered_trials_sees_as_much_as_that_of_trials_in_order() -> None:
     heights = (0.5, 1.0, 2.0, 3.0, 5.0, 8.0, 12.0, 20.0)
     fired = {"in order": 0, "worst first": 0, "unordered": 0}

@@ -32,7 +32,7 @@ def surprises(hyper: Hyperparameters, assumed: Hyperparameters) -> list[float]:
     return [diagnose([condition(assumed, X, y)], X).surprise for X, y in drawn]
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_surprises_of_the_process_itself_are_uniform_whatever_chose_the_tasks() -> None:
     assert kstest(surprises(KNOWN, KNOWN), "uniform").pvalue > 1e-3
 
@@ -135,7 +135,7 @@ def test_left_out_alone_the_surprise_is_the_t_test_of_each_against_all_others() 
     assert diagnosis.trial == int(np.argmin(tails))
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_left_out_surprises_of_the_process_itself_are_as_rare_as_stated() -> None:
     found = []
     for seed in range(400):

@@ -209,7 +209,7 @@ def test_a_margin_below_zero_is_said_in_words() -> None:
     assert "keeps 0.65 on 0 ± 0.1 % of the tasks (an estimate from 1000 predicted tasks)" in over
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_on_campaigns_the_bound_holds_at_tasks_that_were_not_drawn() -> None:
     exceeding = [seed for seed in (4, 5, 6, 7) if share_above_bound(seed) > 0]
     assert len(exceeding) <= 1  # each holds with a probability of 0.95; of seeds 0 to 15, that of seed 5 does not

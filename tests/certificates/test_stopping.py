@@ -34,7 +34,7 @@ def test_a_corner_that_a_trial_is_only_near_to_is_executed_before_anything_is_va
     assert judge([*known, trial(9, 1.0, 0.01)], 0.9, by_distance).answer == "validated"
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_corners_of_two_parameters_come_first() -> None:
     points = [[0.5, 0.5], [0.05, 0.05], [0.95, 0.0], [0.0, 0.95], [0.5, 0.0], [0.0, 0.5]]
     known = [replace(trial(k, 0.0, 0.1 * k), unit_point=np.array(point)) for k, point in enumerate(points)]
@@ -66,7 +66,7 @@ def test_a_bound_is_put_to_the_test_twice_before_it_decides() -> None:
     assert not now.decided
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_study_can_vary_how_often_a_bound_is_put_to_the_test() -> None:
     known = [trial(k, x, 0.5 + 0.3 * np.sin(9 * x)) for k, x in enumerate([0.0, 0.2, 0.42, 0.6, 0.8, 1.0])]
     assert not StoppingRule(50.0).decide(known, left=5).decided

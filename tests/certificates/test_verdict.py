@@ -232,6 +232,7 @@ def test_a_confidence_beyond_the_draws_is_undecided_and_one_that_is_none_is_refu
 
 @pytest.mark.slow
 @pytest.mark.parametrize("stochastic", [False, True])
+@pytest.mark.thorough
 def test_decided_is_what_the_verdict_is_not_undecided_of(stochastic: bool) -> None:
     known = trials(6)
     upper = certify_posterior(Sample.of(known), 0.95, stochastic=stochastic).upper_bound

@@ -67,6 +67,7 @@ def test_people_read_the_same_sentences() -> None:
     assert "neighbouring tasks" in done.output
 
 
+@pytest.mark.thorough
 def test_an_experiment_file_has_a_table_for_it(folder: Path) -> None:
     with (folder / "cart.toml").open("a") as file:
         file.write('[aspect1]\nthreshold = 0.3\ntasks = 12\ndistance = { type = "GoalError", norm = 1 }\n')

@@ -271,7 +271,7 @@ def test_a_confidence_that_no_bound_can_have_does_not_lose_the_report(invoke) ->
     assert "needs more than" in report["reason"]
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_campaign_stops_as_soon_as_its_verdict_is_reached(invoke) -> None:  # type: ignore[no-untyped-def]
     given = ("run", "rig:experiment", "--budget", "30", "--decide", "--tests", "0", "--no-report", "--json")
     validated = json.loads(invoke(*given, "--threshold", "9").stdout)
@@ -370,7 +370,7 @@ def test_what_was_executed_falsifies_without_any_certificate(invoke, campaigns: 
     assert "no certificate" in spoken.stdout
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_what_is_undecided_says_how_many_more_executions_would_decide(invoke, campaigns: dict[str, Path]) -> None:  # type: ignore[no-untyped-def]
     plain = json.loads(invoke("certify", str(campaigns["linear"]), "--resolution", "1", "--json").stdout)
     tau = 0.5 * (plain["details"]["best"] + plain["upper_bound"])

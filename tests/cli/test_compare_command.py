@@ -132,6 +132,7 @@ def trials(folder: Path) -> dict[str, list[tuple[list[float], float | None, str]
 
 @pytest.mark.slow
 @pytest.mark.skipif(os.name == "nt", reason="there is no SIGKILL")
+@pytest.mark.thorough
 def test_a_comparison_that_is_killed_makes_the_same_choices(invoke: Invoke) -> None:
     def arguments(folder: str) -> list[str]:
         return ["gentle.toml", "stiff.toml", "--stores", folder, "--budget", "10", "--json"]

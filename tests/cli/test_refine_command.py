@@ -155,7 +155,7 @@ def test_parameters_of_a_function_are_estimated_and_written(invoke: Invoke) -> N
     assert 'type = "Parametric"' in Path("law.toml").read_text()
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_function_of_the_user_learns_the_model(invoke: Invoke) -> None:
     store = falsified(invoke)
     done = invoke("refine", store, "--method", "fit", "--fit", "refined_plant:network", "--budget", "4", "--json")
@@ -163,7 +163,7 @@ def test_a_function_of_the_user_learns_the_model(invoke: Invoke) -> None:
     assert json.loads(done.stdout)["rounds"][1]["method"] == "fit"
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_killed_refinement_loses_nothing_and_ends_as_an_unbroken_one(
     whole: tuple[Result, Path], invoke: Invoke, folder: Path
 ) -> None:

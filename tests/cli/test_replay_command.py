@@ -135,7 +135,7 @@ def test_a_model_is_a_file_a_reference_or_that_of_an_experiment(model: str, invo
     assert report(invoke("logs", "--model", model, "--json"))["errors"] == expected
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_model_is_an_onnx_file_with_options(invoke: Invoke) -> None:
     pytest.importorskip("onnxruntime")
     onnx = pytest.importorskip("onnx")

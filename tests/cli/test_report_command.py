@@ -74,6 +74,7 @@ def store(invoke: Any) -> Path:
     ],
     ids=" ".join,
 )
+@pytest.mark.thorough
 def test_the_command_of_a_report_repeats_the_campaign(invoke: Any, options: list[str]) -> None:
     first = ["run", "short_rig:experiment", "--seed", "2", "--no-report", "--json", *options]
     ran = invoke(*first, "--store", "a.sqlite")

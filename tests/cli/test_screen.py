@@ -132,7 +132,7 @@ def run_ascii(*arguments: str) -> subprocess.CompletedProcess[bytes]:
     return subprocess.run(command, capture_output=True, env=environment, check=False)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_terminal_that_cannot_hold_a_character_gets_it_written_out(store: Path) -> None:
     campaign = Campaign(make_validation(horizon=2), search=searches.Random(), store="c.sqlite", name="Prüfstand Ω 机")
     campaign.tell(campaign.ask(), failed="Überstrom 机器")

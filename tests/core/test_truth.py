@@ -110,7 +110,7 @@ def test_the_seed_decides_and_the_space_is_searched_in_batches() -> None:
     assert calls.count(1) == 3 * 2 * 3
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_climbs_find_a_narrow_peak_that_evolution_passes_by() -> None:
     def surface(x: np.ndarray) -> np.ndarray:
         """A wide hill of 1 in the middle, and in a corner a slope of small basin that leads to 1.5."""

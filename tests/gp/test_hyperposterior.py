@@ -166,7 +166,7 @@ def test_a_length_scale_is_drawn_from_its_posterior() -> None:
     assert 0.05 < rough < 0.95  # else the shares would say nothing
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_where_the_data_say_nothing_the_draws_are_the_prior() -> None:
     # Length-scales far below the gaps: whatever they are, the values are uncorrelated.
     X, y = np.array([[0.1, 0.9], [0.5, 0.5], [0.9, 0.1], [0.2, 0.2]]), np.array([0.3, -1.0, 0.4, 2.0])

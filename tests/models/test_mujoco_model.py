@@ -135,7 +135,7 @@ def test_states_and_inputs_have_the_numbers_of_the_model() -> None:
         models.MuJoCo(mjcf(0.1)).step(np.zeros(3), np.zeros(1))
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_the_result_of_mujoco_sysid_is_a_model_with_its_held_out_error(tmp_path: Path, monkeypatch: Any) -> None:
     monkeypatch.chdir(tmp_path)
     runs = [recorded(seed) for seed in range(4)]

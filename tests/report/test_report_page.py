@@ -314,7 +314,7 @@ def test_the_map_of_the_region_certificate_is_drawn(dimension: int) -> None:
     assert "cannot be shown" not in found
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_the_report_of_very_many_trials_stays_small(tmp_path: Path) -> None:
     from ctxval import Store
     from ctxval.core.trajectory import Trajectory

@@ -67,7 +67,7 @@ def test_it_finds_the_highest_corner_of_a_folded_plane(seed: int) -> None:
     assert values.max() > run(Random(), fold, 400, 8, seed).max()
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_it_leaves_a_wide_basin_for_a_higher_one_that_is_hidden() -> None:
     found = [run(BayesianOptimisation(), trap, 40, 3, seed).max() for seed in range(2)]
     assert min(found) > 0.7

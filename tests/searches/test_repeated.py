@@ -104,7 +104,7 @@ class Shaky:
         return Trajectory(whole.times, states, whole.inputs)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_campaign_estimates_the_largest_mean_distance() -> None:
     campaign = Campaign(make_validation(system=Shaky()), search=by_name("scalar", repeats=3), seed=2).run(15)
     goals = np.array([trial.unit_point for trial in campaign.trials]).reshape(5, 3)

@@ -355,6 +355,7 @@ def test_a_campaign_by_hand_by_forms_alone(tmp_path: Path) -> None:
     assert stored[3].parameters == {"goal": 1.5}
 
 
+@pytest.mark.thorough
 def test_a_wrong_result_is_replaced_with_a_reason(tmp_path: Path) -> None:
     new_store(tmp_path)
     recording = record(tmp_path / "a.trials" / "0", tmp_path / "run.csv").read_bytes()

@@ -183,6 +183,7 @@ def test_two_operators_lose_and_double_nothing(browser: Any, folder: Path, addre
     assert first.errors == []
 
 
+@pytest.mark.thorough
 def test_a_reload_midway_loses_nothing(browser: Any, tmp_path: Path) -> None:
     new_store(tmp_path, "my_rig:slow")
     with serving(tmp_path) as server:
@@ -224,6 +225,7 @@ def test_a_reload_midway_loses_nothing(browser: Any, tmp_path: Path) -> None:
         assert one.page.locator("#trials tbody tr").count() == len(stored(tmp_path))
 
 
+@pytest.mark.thorough
 def test_hostile_names_are_text(browser: Any, tmp_path: Path) -> None:
     new_store(tmp_path, "my_rig:hostile")
     with serving(tmp_path) as server:
@@ -249,6 +251,7 @@ def test_hostile_names_are_text(browser: Any, tmp_path: Path) -> None:
         assert one.errors == []
 
 
+@pytest.mark.thorough
 def test_everything_works_without_javascript(browser: Any, folder: Path, address: str) -> None:
     one = Operator(browser, folder, address, java_script_enabled=False, accept_downloads=True)
     for number in range(2):
@@ -300,6 +303,7 @@ def test_the_page_fits_a_small_screen_and_is_accessible(browser: Any, folder: Pa
         one.context.close()
 
 
+@pytest.mark.thorough
 def test_the_entrance_is_accessible_and_the_token_leaves_the_address(browser: Any, folder: Path) -> None:
     with serving(folder, "--host", "0.0.0.0", "--allow-host", "localhost") as server:
         bare = f"http://127.0.0.1:{server.port}/"

@@ -61,13 +61,14 @@ def sentence(result: Result) -> str:
 
 
 @pytest.mark.slow
+@pytest.mark.in_full
 def test_the_file_of_init_reaches_a_verdict_as_it_is(invoke: Any) -> None:
     result = invoke("run", "experiment.toml", "--json")
     assert result.exit_code == 0, result.stderr
     report = json.loads(result.stdout)
     assert (report["case"], report["search"], report["units"]) == ("cart", "auto", "m")
     assert report["verdict"] == "validated"
-    assert 4 <= report["executions"] < 40
+    assert 4 <= report["executions"] <= 20
     assert report["worst"]["distance"] > 0.01
     again = json.loads(invoke("run", "experiment.toml", "--json").stdout)
     assert again == report

@@ -31,7 +31,7 @@ def test_a_batched_random_search_is_the_search_of_the_same_seed() -> None:
     np.testing.assert_allclose(running_estimate(distances_of(result), "random"), np.maximum.accumulate(distances))
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_results_are_stored_once_and_reused_until_their_case_has_changed(tmp_path: Path) -> None:
     results, done = Results(tmp_path / "results"), []
     results.fill([PROFILE, PROFILE], 1, done.append)

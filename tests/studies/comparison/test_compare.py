@@ -85,7 +85,7 @@ def test_the_controller_with_the_smaller_largest_distance_is_found() -> None:
     assert known["gentle"].executions < 4  # only the better one needs a bound
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_the_controller_with_the_smaller_expected_distance_is_found_by_the_same_tasks() -> None:
     pair = {"gentle": cart(), "stiff": cart(10.0)}
     made = campaigns(**pair)
@@ -102,7 +102,7 @@ def test_the_controller_with_the_smaller_expected_distance_is_found_by_the_same_
     assert found.executions == 2 * decided.tasks
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_distances_of_one_controller_share_every_execution() -> None:
     Counted.executed = 0
     pair = campaigns(whole=cart(), mean=cart(distance=distances.MeanDeviation(components=[0])))
@@ -141,7 +141,7 @@ def test_an_execution_agrees_only_with_the_controller_that_gave_its_inputs() -> 
     assert not gives_inputs(replace(one.plan([1.0]), controller=fails), trajectory, 1e-9)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_comparison_that_is_stopped_continues_with_the_same_choices(tmp_path: Path) -> None:
     def stores(folder: str) -> dict[str, Campaign]:
         pair = {"gentle": cart(), "stiff": cart(10.0)}

@@ -116,7 +116,7 @@ def _no_correction() -> models.Correction:
     )
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_mass_that_is_20_per_cent_off_is_found() -> None:
     def step(x: np.ndarray, u: np.ndarray, theta: np.ndarray) -> np.ndarray:
         return np.stack([x[..., 0] + 0.1 * x[..., 1], x[..., 1] + 0.1 * u[..., 0] / theta[0]], axis=-1)

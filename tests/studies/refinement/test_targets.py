@@ -22,6 +22,7 @@ def campaign(validation: Validation, seed: int) -> Campaign:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, *more(1, 2)])
+@pytest.mark.thorough
 def test_a_linear_model_of_the_pendulum_is_brought_to_a_tenth(seed: int) -> None:
     validation = cases.by_name("pendulum", seed=seed).validation
     goals = validation.space.grid(101)
@@ -31,7 +32,6 @@ def test_a_linear_model_of_the_pendulum_is_brought_to_a_tenth(seed: int) -> None
     assert found.last.campaign.validation.distances(goals).max() < 0.1 * before
 
 
-@pytest.mark.slow
 @pytest.mark.thorough
 def test_executions_alone_teach_a_model_without_data() -> None:
     validation = cases.by_name("pendulum", seed=0).validation
