@@ -35,6 +35,7 @@ from ctxval.errors import CertificateError
 from ctxval.learning import DynamicsStudy, ExecutionPrediction, LearnedDynamics
 from ctxval.learning.closed_loops import LoopPlanner
 from ctxval.learning.coverage import Coverage, Gap
+from ctxval.learning.physical import with_parameters
 from ctxval.learning.tolerance import LEVELS, PushResponse
 from ctxval.learning.vector import Executed
 from ctxval.learning.worst_case import WorstCase
@@ -64,7 +65,8 @@ class CampaignDynamics:
 
     def __init__(self, validation: Validation, store: Store, seed: int, description: Mapping[str, Any]) -> None:
         redefined = sum(change.why == REDEFINED for change in store.history())
-        text = json.dumps([redefined, description.get("validation")], sort_keys=True)
+        identity = [redefined, description.get("validation"), *validation.physical]
+        text = json.dumps(identity, sort_keys=True)
         self.experiment = hashlib.sha256(text.encode()).hexdigest()[:16]
         self._study = DynamicsStudy(validation, seed)
         self._store = store
@@ -75,7 +77,7 @@ class CampaignDynamics:
     def use_quantile(self, quantile: float) -> None:
         """State the share of the executions of a task that distances are about, if the system is noisy."""
         if quantile != self._study.quantile:
-            self._study = DynamicsStudy(self._study.validation, self._study.seed, quantile)
+            self._study = self._study.anew(quantile)
             self._learned = {}
 
     @property
@@ -210,7 +212,8 @@ class CampaignDynamics:
     def _key(self, trials: Sequence[Trial], confidence: float) -> str:
         """Return the key of the evidence of some trials in the store."""
         text = json.dumps([(trial.number, trial.state, trial.distance, trial.note) for trial in trials])
-        return f"evidence {confidence} {self._study.quantile} {hashlib.sha256(text.encode()).hexdigest()}"
+        physical = "".join(f"{name} " for name in self._study.given.physical)
+        return f"evidence {confidence} {self._study.quantile} {physical}{hashlib.sha256(text.encode()).hexdigest()}"
 
     def _whole(
         self, learned: LearnedDynamics, trials: Sequence[Trial], draws: int, confidence: float
@@ -252,6 +255,7 @@ class CampaignDynamics:
             dense=worst.points.shape[1] <= DENSE and self._study.planner.batched,
             quantile=noisy.quantile if noisy is not None and noisy.is_noisy else None,
             lags=0 if noisy is None else noisy.fit.history.structure.lags,
+            physical=self._study.given.physical,
         )
 
     def _pocket(self, learned: LearnedDynamics) -> StatePocket | None:
@@ -308,6 +312,8 @@ class CampaignDynamics:
         if prediction is None:
             return CheckedPrediction(trial.number, np.nan, np.inf, np.inf, distance, **how)
         trajectory = self._store.trajectory(trial.number, "system")
+        if trajectory is not None:
+            trajectory = with_parameters(self._study.given, trial.unit_point, trajectory)
         score = None if trajectory is None else prediction.score(trajectory, distance)
         z2, rank = (np.nan, np.nan) if score is None else (score.z2, score.rank)
         if prediction.noise is not None and score is not None:

@@ -190,6 +190,7 @@ def certify_dynamics(sample: Sample, evidence: DynamicsEvidence, confidence: Pro
             "noise": evidence.noise,
             "quantile": evidence.quantile,
             "lags": evidence.lags,
+            "physical": list(evidence.physical),
             "without_model": evidence.without_model,
             "sharpness": evidence.sharpness,
             "jump": evidence.jump,

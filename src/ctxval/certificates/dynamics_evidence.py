@@ -247,6 +247,7 @@ class DynamicsEvidence(ShortRepr):
             noisy, so that all are alike.
         lags: number of earlier records and inputs that the learned dynamics depend on.
         pocket: the largest region that no execution has entered; None if it is not known.
+        physical: the task parameters that the learned dynamics depend on.
     """
 
     maxima: Array
@@ -273,6 +274,7 @@ class DynamicsEvidence(ShortRepr):
     quantile: float | None = None
     lags: int = 0
     pocket: StatePocket | None = None
+    physical: tuple[str, ...] = ()
 
     def rank(self, confidence: float) -> int:
         """Return the row, in ascending order, of the maximum that d* stays below with this probability."""
@@ -310,6 +312,7 @@ class DynamicsEvidence(ShortRepr):
                 "untried": untried and UntriedParameter(**{**untried, "task": np.array(untried["task"])}),
                 "pushed": values["pushed"] and PushedDistances.from_json(values["pushed"]),
                 "pocket": values["pocket"] and StatePocket(**values["pocket"]),
+                "physical": tuple(values["physical"]),
             }
             return cls(**{**values, **arrays, **parts})
         except (KeyError, TypeError, ValueError):

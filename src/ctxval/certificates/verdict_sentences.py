@@ -168,20 +168,21 @@ _UNTESTED = "no prediction was tested where nobody chose to look (tests = 0)"
 def _condition(certificate: Certificate, quantities: Quantities) -> str:
     """Return what the confidence of a bound on d* is, and the condition under which it holds."""
     if certificate.kind == "dynamics":
+        physical = certificate.details.get("physical") or []  # stores of earlier versions do not have it
         if certificate.details["quantile"] is not None:
+            of = enumerated([f"recorded states and inputs{_of_lags(certificate)}", *physical], 10)
             return (
-                "probability under a Gaussian process with noise, if what M misses is a smooth function of recorded "
-                f"states and inputs{_of_lags(certificate)}, the same in every task and over time, and noise is "
+                "probability under a Gaussian process with noise, if what M misses is a smooth function of "
+                f"{of}, the same in every task and over time, and noise is "
                 "independent from step to step"
             )
         missed = "the system" if certificate.details["without_model"] else "what M misses"
-        of = (
-            f"recorded states and inputs{_of_lags(certificate)}"
-            if certificate.details["lags"]
-            else "recorded state and input"
-        )
+        recorded = [f"recorded states and inputs{_of_lags(certificate)}"]
+        if not certificate.details["lags"]:
+            recorded = ["recorded state", "input"] if physical else ["recorded state and input"]
         return (
-            f"probability under a Gaussian process, if {missed} is one smooth function of {of}, "
+            f"probability under a Gaussian process, if {missed} is one smooth function of "
+            f"{enumerated([*recorded, *physical], 10)}, "
             "the same in every task and over time"
         )
     if certificate.kind == "posterior":
@@ -197,6 +198,11 @@ def _which(certificate: Certificate) -> str:
     """Return in how many executions of a task a bound holds; empty if all of them are alike."""
     quantile = certificate.details.get("quantile")
     return "" if quantile is None else f" in at least {100 * quantile:g} % of its executions"
+
+
+def _but(physical: Sequence[str] | None) -> str:
+    """Return the task parameters that dynamics may change with; empty if there are none."""
+    return f", except for {enumerated(physical, 10)}" if physical else ""
 
 
 def _of_lags(certificate: Certificate) -> str:
@@ -323,7 +329,7 @@ def conditions(certificate: Certificate, space: TaskSpace | None) -> list[str]:
         case "dynamics":
             gaps, again = with_units(details["resolution"]), details.get("differing")
             noise = "" if again is None else f" (trials {again[0]} and {again[1]} of one task differ a little)"
-            unchanging = "its dynamics changing neither with time nor with the task"
+            unchanging = f"its dynamics changing neither with time nor with the task{_but(details.get('physical'))}"
             steps = f"the last {details['lags'] + 1} records and inputs"
             if details["quantile"] is not None:
                 complete = f"{steps} determining the next record up to noise"
@@ -472,7 +478,8 @@ def _shortfall(certificate: Certificate) -> str:
             f": trial {worst['trial']} came out at {worst['distance']:.4g} where {worst['median']:.4g} was predicted, "
             f"which raises the bound from {details['raised_from']:.4g} until 3 predictions in a row hold. If "
             "predictions go on failing, a state that is not recorded, a jump such as a contact or dry friction, or "
-            "noise is the likely cause: record more states, or use --kind posterior or an audit"
+            "dynamics that depend on the task are the likely cause: record more states, state the task parameters that "
+            "change the dynamics (physical = [...]), or use --kind posterior or an audit"
         )
     outside, missing = "", details.get("not_counted")
     if "share_kept" in details:

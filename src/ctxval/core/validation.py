@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from typing import Any, NoReturn
 from weakref import WeakSet
@@ -54,6 +54,8 @@ class Validation:
             value if that is larger.
         labels: the names and units of states, inputs and distance for files, pictures and reports.
         longest: the largest horizon that is planned.
+        physical: names of the task parameters that change the dynamics of S, such as a payload or a surface. What M
+            misses is learned as a function of state, input and these parameters.
 
     Its methods raise a DesignError if the synthesizer fails, a ModelError if the model fails or its closed loop is not
     finite, an ExecutionError if the system fails or its result is not an execution of the task, and a DistanceError if
@@ -72,6 +74,7 @@ class Validation:
         start_tolerance: NonNegativeFloat = START,
         labels: Labels | None = None,
         longest: PositiveInt = 1_000_000,
+        physical: Sequence[str] = (),
     ) -> None:
         self.space = space
         self.task = task
@@ -84,6 +87,9 @@ class Validation:
         self.distance: Distance = named(self.labels.state_names(system)) if callable(named) else distance
         self.start_tolerance = float(start_tolerance)
         self.longest = int(longest)
+        self.physical = tuple(dict.fromkeys(physical))
+        for name in self.physical:
+            space.columns(name)
 
     def describe(self) -> dict[str, Any]:
         """Return what identifies this validation in a store."""
@@ -123,6 +129,10 @@ class Validation:
     def with_longest(self, longest: int) -> Validation:
         """Return this validation with another largest horizon that is planned."""
         return self._with(longest=longest)
+
+    def with_physical(self, names: Sequence[str]) -> Validation:
+        """Return this validation with other task parameters that change the dynamics of S."""
+        return self._with(physical=names)
 
     def with_system(self, system: System) -> Validation:
         """Return the validation of another system with the same model, controllers and tasks."""

@@ -33,6 +33,7 @@ from ctxval.learning.execution_prediction import ExecutionPrediction, predict_ex
 from ctxval.learning.histories import Record
 from ctxval.learning.noise_effect import effect_of_noise
 from ctxval.learning.noisy_draws import MATTERS, REPLICATES, NoisyPosterior, learn_noisy
+from ctxval.learning.physical import with_parameters, with_parameters_as_states
 from ctxval.learning.prediction import predict_distance
 from ctxval.learning.recorded import closed_loops_on_model, recorded_transitions
 from ctxval.learning.structures import NOISY, ChosenStructure, predicted_by_history
@@ -52,20 +53,23 @@ class DynamicsStudy(ShortRepr):
     Everything is a function of the executions and the seed. Controllers that are designed are kept.
 
     Attributes:
+        given: the user's validation.
+        validation: the same with the physical task parameters as states, of which everything is learned.
         quantile: the share of the executions of a task that a distance is about, if the system is noisy.
     """
 
     def __init__(self, validation: Validation, seed: int = 0, quantile: float = QUANTILE) -> None:
-        self.validation, self.seed, self.quantile = validation, seed, quantile
-        self.planner = LoopPlanner(validation)
+        self.given, self.seed, self.quantile = validation, seed, quantile
+        self.validation = with_parameters_as_states(validation)
+        self.planner = LoopPlanner(self.validation)
         self._errors = ErrorVectors(self.planner)
         self._covariances: OrderedDict[bytes, LearnedCovariances | None] = OrderedDict()
         self._structures: OrderedDict[bytes, ChosenStructure] = OrderedDict()
         self._parts: tuple[str, bytes] | None = None
 
-    def anew(self) -> DynamicsStudy:
-        """Return a study of the same experiment that has learned nothing yet."""
-        return DynamicsStudy(self.validation, self.seed, self.quantile)
+    def anew(self, quantile: float | None = None) -> DynamicsStudy:
+        """Return a study of the same experiment that has learned nothing yet, with a quantile if it is given."""
+        return DynamicsStudy(self.given, self.seed, self.quantile if quantile is None else quantile)
 
     @property
     def is_current(self) -> bool:
@@ -129,6 +133,7 @@ class DynamicsStudy(ShortRepr):
         """
         if self._parts is None:
             self._parts = self._state_of_parts()
+        executed, logged = self._extended(executed), () if self.given.physical else logged
         recorded = self._recorded(executed, logged)
         if recorded is None:
             return None
@@ -147,8 +152,13 @@ class DynamicsStudy(ShortRepr):
         The hyperparameters and the predicted distances stay, and the doubt is less near the pending executions, which
         are :meth:`LearnedDynamics.trajectories` of the tasks that are being executed.
         """
-        together = [*executed, *pending]
+        together = [*self._extended(executed), *pending]
+        logged = () if self.given.physical else logged
         return self._conditioned(learned.posterior.covariances, self._recorded(together, logged), together)
+
+    def _extended(self, executed: Executed) -> Executed:
+        """Return executions with the physical parameters of their tasks; other recordings do not tell theirs."""
+        return [(point, with_parameters(self.given, point, trajectory)) for point, trajectory in executed]
 
     def _conditioned(
         self, covariances: LearnedCovariances | None, recorded: tuple[Transitions, Rows] | None, executed: Executed

@@ -21,6 +21,7 @@ from ctxval.core.trajectory import Trajectory
 from ctxval.core.validation import Validation
 from ctxval.learning.draws import DrawnModel
 from ctxval.learning.dynamics_study import DynamicsStudy
+from ctxval.learning.physical import without_parameters
 from ctxval.learning.vector import Executed, executions_of
 
 
@@ -47,24 +48,26 @@ def replay_executed(validation: Validation, executed: Executed, wanted: Sequence
         wanted: points of the unit cube ``(d,)`` of the tasks.
     """
     models: list[DrawnModel | None] = [None] * len(wanted)
+    study = DynamicsStudy(validation)
     with single_threaded():
         with contextlib.suppress(Exception):  # the user's own parts, at states that no execution has reached
-            learned = DynamicsStudy(validation).learn(executed)
+            learned = study.learn(executed)
             if learned is not None:
                 without = learned.posterior.means_without(executions_of(learned.executed, wanted))
                 models = [without.model_of(k) for k in range(len(wanted))]
-        return [_replayed(validation, model, point) for model, point in zip(models, wanted, strict=True)]
+        return [_replayed(study, model, point) for model, point in zip(models, wanted, strict=True)]
 
 
-def _replayed(validation: Validation, model: DrawnModel | None, point: Array) -> Replay | None:
+def _replayed(study: DynamicsStudy, model: DrawnModel | None, point: Array) -> Replay | None:
     advance()
-    space = validation.space
+    validation, space = study.validation, study.validation.space
     try:
-        task = validation.task(space.parameters(space.from_unit(point)))
+        parameters = space.parameters(space.from_unit(point))
+        plain, task = study.given.task(parameters), validation.task(parameters)
         controller = validation.synthesizer.design(task, validation.model)
     except Exception:  # the user's own parts
         return None
-    nothing = Replay(task, None, np.nan)
+    nothing = Replay(plain, None, np.nan)
     if model is None:
         return nothing
     try:
@@ -76,4 +79,4 @@ def _replayed(validation: Validation, model: DrawnModel | None, point: Array) ->
     except Exception:  # the same
         return nothing
     finite = bool(predicted.finite.all()) and np.isfinite(distance)
-    return Replay(task, predicted, distance) if finite else nothing
+    return Replay(plain, without_parameters(study.given, predicted), distance) if finite else nothing

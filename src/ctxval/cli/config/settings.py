@@ -145,6 +145,7 @@ class Settings(BaseModel):
     Attributes:
         distribution: see :func:`~ctxval.cli.config.parts.with_distribution`; a named experiment may have one too.
         longest: the largest horizon.
+        physical: the task parameters that change the dynamics of the system; a named experiment may have some too.
         explore, within: as the options of ``ctxval run``, so that a store knows the command that made it.
         refined: the file of a model that `ctxval refine` has learned from executions; it replaces the given model.
         folder: the folder of modules and files, which is that of the experiment file; None for the current folder.
@@ -168,6 +169,7 @@ class Settings(BaseModel):
     budget: int | None = Field(default=None, ge=1)
     threshold: float | None = Field(default=None, gt=0, allow_inf_nan=False, strict=True)
     longest: int | None = Field(default=None, ge=1, strict=True)
+    physical: list[str] | None = None
     explore: bool | None = None
     within: float = Field(default=WITHIN, gt=0, allow_inf_nan=False, strict=True)
     confidence: float = Field(default=CONFIDENCE, ge=LEAST_CONFIDENCE, lt=1, strict=True)
@@ -193,6 +195,8 @@ class Settings(BaseModel):
             experiment = replace(experiment, truth=None)
         if self.longest is not None:
             validation = validation.with_longest(self.longest)
+        if self.physical is not None:
+            validation = validation.with_physical(self.physical)
         if self.distribution is not None:
             validation = validation.with_space(with_distribution(validation.space, self.distribution, self.folder))
         return experiment if validation is given else replace(experiment, validation=validation)

@@ -1,0 +1,151 @@
+"""Task parameters that change the dynamics are states of what is learned, and nothing that the user's parts see."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ctxval import Campaign, Task, TaskSpace, Validation, controllers, distances, models, systems
+from ctxval._util.arrays import Array
+from ctxval.core.task import Task as CoreTask
+from ctxval.errors import InputError, UnknownNameError
+from ctxval.learning.physical import with_parameters, with_parameters_as_states, without_parameters
+from ctxval.learning.replays import replay_executed
+
+H, DT = 30, 0.1
+
+
+class Carried(Task):
+    """A task with a load that the system knows, and its model and its controller do not."""
+
+    def __init__(self, task: CoreTask, load: Array) -> None:
+        super().__init__(task.initial_state, goal=task.goal, horizon=H, dt=DT)
+        self.load = np.broadcast_to(load, self.batch_shape)
+
+    def __getitem__(self, index: int) -> Carried:
+        return Carried(super().__getitem__(index), self.load[index])
+
+
+def cart(x: Array, u: Array, load: Array) -> Array:
+    position, speed = x[..., 0], x[..., 1]
+    pushed = u[..., 0] / (1 + load) - 0.3 * speed * np.abs(speed)
+    return np.stack([position + DT * speed, speed + DT * pushed], axis=-1)
+
+
+@dataclass(frozen=True)
+class Cart:
+    """Carries the load of its task."""
+
+    batched: bool = True
+
+    def execute(self, controller: Any, task: Task) -> Any:
+        assert isinstance(task, Carried)
+        return systems.Simulated(lambda x, u: cart(x, u, task.load), vectorized=True).execute(controller, task)
+
+
+def loaded_cart(physical: tuple[str, ...] = ("load",), synthesizer: Any = None) -> Validation:
+    model = models.Linear(np.array([[1.0, DT], [0.0, 1.0]]), np.array([[0.0], [DT]]))
+    return Validation(
+        space=TaskSpace(goal=(0.5, 2.0, "m"), load=(0.0, 1.0, "kg")),
+        task=lambda p: Carried(Task([0.0, 0.0], goal=[p.goal, 0.0], horizon=H, dt=DT), 0.4 * p.load**2),
+        system=Cart(),
+        model=model,
+        synthesizer=synthesizer or controllers.LQR([10.0, 1.0], [1.0]),
+        distance=distances.MaximumDeviation(components=(0,)),
+        physical=physical,
+    )
+
+
+def test_names_are_those_of_task_parameters() -> None:
+    with pytest.raises(UnknownNameError, match="lod"):
+        loaded_cart(("lod",))
+    with pytest.raises(InputError, match="physical must be a list, got 'load'"):
+        loaded_cart("load")  # type: ignore[arg-type]
+    assert loaded_cart(("load", "load")).physical == ("load",)
+
+
+def test_without_physical_parameters_nothing_changes() -> None:
+    validation = loaded_cart(())
+    assert with_parameters_as_states(validation) is validation
+    trajectory = validation.execute(validation.plan(np.array([1.0, 0.5])))
+    assert with_parameters(validation, np.array([0.3, 0.5]), trajectory) is trajectory
+    assert without_parameters(validation, trajectory) is trajectory
+
+
+@pytest.mark.parametrize(
+    "synthesizer", [controllers.LQR([10.0, 1.0], [1.0]), controllers.PID(4.0, 0.5, 2.0)], ids=["LQR", "PID"]
+)
+def test_controllers_model_and_distance_are_those_of_the_user(synthesizer: Any) -> None:
+    """The loops of M and the distances of a trajectory are the same with the parameter as a state and without."""
+    validation = loaded_cart(synthesizer=synthesizer)
+    extended, unit = with_parameters_as_states(validation), np.array([[0.2, 0.9], [0.7, 0.1]])
+    points = validation.space.from_unit(unit)
+    for row, point in zip(unit, points, strict=True):
+        plan, beside = validation.plan(point), extended.plan(point)
+        states = beside.model_trajectory.states
+        np.testing.assert_allclose(states[:, :2], plan.model_trajectory.states, rtol=1e-12)
+        np.testing.assert_array_equal(states[:, 2], point[1])
+        trajectory = validation.execute(plan)
+        longer = with_parameters(validation, row, trajectory)
+        np.testing.assert_array_equal(without_parameters(validation, longer).states, trajectory.states)
+        assert extended.measure(beside, longer) == pytest.approx(validation.measure(plan, trajectory), rel=1e-12)
+
+
+def test_a_batch_is_planned_as_its_tasks_are() -> None:
+    extended = with_parameters_as_states(loaded_cart())
+    points = extended.space.from_unit(np.array([[0.2, 0.9], [0.7, 0.1], [1.0, 0.0]]))
+    for plan, point in zip(extended.plans(points), points, strict=True):
+        np.testing.assert_allclose(
+            plan.model_trajectory.states, extended.plan(point).model_trajectory.states, rtol=1e-12, atol=1e-12
+        )
+
+
+def test_states_keep_their_names_and_a_parameter_of_the_same_name_gets_another() -> None:
+    labels = with_parameters_as_states(loaded_cart()).labels
+    assert labels.states == ("x0", "x1", "load [kg]")
+    validation = loaded_cart()
+    named = validation.with_labels(type(validation.labels)(states=("load [N]", "speed [m/s]")))
+    assert with_parameters_as_states(named).labels.states == ("load [N]", "speed [m/s]", "task load [kg]")
+
+
+@pytest.mark.slow
+@pytest.mark.in_full
+def test_dynamics_that_depend_on_a_stated_parameter_are_validated_by_a_bound_that_is_true(tmp_path: Path) -> None:
+    validation = loaded_cart()
+    largest = float(validation.distances(validation.space.grid(21)).max())
+    store = tmp_path / "cart.sqlite"
+    campaign = Campaign(validation, store=store, seed=0).run(25, 1.25 * largest)
+    verdict = campaign.verdict(1.25 * largest)
+    assert verdict.answer == "validated"
+    assert verdict.bound is not None
+    assert verdict.bound >= largest * (1 - 1e-3)
+    assert "one smooth function of recorded state, input, load, the same in every task" in str(verdict)
+    assert "changing neither with time nor with the task, except for load" in str(verdict)
+    assert verdict.certificate is not None
+    assert verdict.certificate.details["physical"] == ["load"]
+    # A campaign that is opened again with another statement does not count predictions of the first one.
+    without = Campaign(validation.with_physical(()), store=store, seed=0)
+    assert without.executions == campaign.executions
+    assert without.verdict(1.25 * largest).answer != "validated"
+
+
+@pytest.mark.slow
+def test_a_statement_that_leaves_out_the_parameter_is_not_validated_below_the_largest_distance() -> None:
+    validation = loaded_cart(("goal",))
+    largest = float(validation.distances(validation.space.grid(21)).max())
+    assert Campaign(validation, seed=0).run(14, 0.95 * largest).verdict(0.95 * largest).answer != "validated"
+
+
+def test_executed_tasks_are_replayed_in_the_states_of_the_user() -> None:
+    validation, executed = loaded_cart(), []
+    for unit in (np.array([0.2, 0.9]), np.array([0.7, 0.1]), np.array([1.0, 0.5])):
+        executed.append((unit, validation.execute(validation.plan(validation.space.from_unit(unit)))))
+    for replay in replay_executed(validation, executed, [executed[0][0]]):
+        assert replay is not None
+        assert isinstance(replay.task, Carried)
+        assert replay.corrected is not None
+        assert replay.corrected.states.shape == (H + 1, 2)
