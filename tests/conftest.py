@@ -213,7 +213,8 @@ def module_in_full(request: pytest.FixtureRequest, smaller: pytest.MonkeyPatch) 
 @pytest.fixture(autouse=True)
 def one_in_full(request: pytest.FixtureRequest, smaller: pytest.MonkeyPatch, module_in_full: None) -> Iterator[None]:
     """Compute as users do in a test that is marked."""
-    in_full = any(mark.name == "in_full" for mark in request.node.own_markers)
+    folder = request.path.relative_to(TESTS).parts[0]
+    in_full = folder not in IN_FULL and any(mark.name == "in_full" for mark in request.node.own_markers)
     if in_full:
         smaller.undo()
     yield

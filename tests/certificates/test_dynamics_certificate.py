@@ -28,6 +28,7 @@ from ctxval.certificates.dynamics import bound_of
 from ctxval.certificates.dynamics_diagnostics import ACCURATE, GAP, PREDICTIONS
 from ctxval.certificates.dynamics_evidence import PushedDistances, StatePocket
 from ctxval.certificates.verdict import judge, judge_by
+from ctxval.certificates.verdict_sentences import NO_UNITS, undecided
 from ctxval.errors import CertificateError
 from rig_evidence import COVERED, GOOD, gap, prediction
 
@@ -320,3 +321,11 @@ def test_a_validation_names_the_largest_region_that_no_execution_has_entered(
 def test_without_a_pocket_nothing_is_said_of_one() -> None:
     verdict = judge(trials(), 1.35, CertificateOptions(Dynamics(tests=0)), Provenance(learned=Learned(GOOD)))
     assert "No execution" not in str(verdict)
+
+
+def test_an_undecided_verdict_names_the_parameter_that_dynamics_seem_to_depend_on() -> None:
+    certificate = Dynamics().certify(sample(replace(GOOD, suspect=("load", 2.4))))
+    sentence = undecided(certificate, 0.5 * certificate.upper_bound, 0.0, NO_UNITS)
+    assert "The dynamics seem to depend on load" in sentence
+    assert '2.4 times as well. State it as physical = ["load"].' in sentence
+    assert "seem to depend" not in undecided(Dynamics().certify(sample()), 0.1, 0.0, NO_UNITS)

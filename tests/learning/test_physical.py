@@ -12,7 +12,9 @@ import pytest
 from ctxval import Campaign, Task, TaskSpace, Validation, controllers, distances, models, systems
 from ctxval._util.arrays import Array
 from ctxval.core.task import Task as CoreTask
+from ctxval.core.trajectory import Transitions
 from ctxval.errors import InputError, UnknownNameError
+from ctxval.learning import DynamicsStudy
 from ctxval.learning.physical import with_parameters, with_parameters_as_states, without_parameters
 from ctxval.learning.replays import replay_executed
 
@@ -113,7 +115,6 @@ def test_states_keep_their_names_and_a_parameter_of_the_same_name_gets_another()
 
 
 @pytest.mark.slow
-@pytest.mark.in_full
 def test_dynamics_that_depend_on_a_stated_parameter_are_validated_by_a_bound_that_is_true(tmp_path: Path) -> None:
     validation = loaded_cart()
     largest = float(validation.distances(validation.space.grid(21)).max())
@@ -149,3 +150,52 @@ def test_executed_tasks_are_replayed_in_the_states_of_the_user() -> None:
         assert isinstance(replay.task, Carried)
         assert replay.corrected is not None
         assert replay.corrected.states.shape == (H + 1, 2)
+
+
+def random_executions(validation: Validation, count: int) -> list[tuple[Array, Any]]:
+    points = np.random.default_rng(3).random((count, 2))
+    return [(unit, validation.execute(validation.plan(validation.space.from_unit(unit)))) for unit in points]
+
+
+def test_nothing_is_suspected_if_state_and_input_explain_the_executions() -> None:
+    validation = loaded_cart().with_system(systems.Simulated(lambda x, u: cart(x, u, np.array(0.3)), vectorized=True))
+    study = DynamicsStudy(validation.with_physical(()))
+    learned = study.learn(random_executions(validation, 8))
+    assert learned is not None
+    assert learned.study is study
+    assert study.suspected_parameter(learned) is None
+
+
+def test_a_parameter_that_clearly_explains_the_executions_is_found() -> None:
+    validation = loaded_cart(())
+    executed = random_executions(validation, 8)
+    learned = DynamicsStudy(validation).learn(executed)
+    assert learned is not None
+    assert learned.study.given.physical == ("load",)
+    few = DynamicsStudy(validation).learn(executed[:5])
+    assert few is not None
+    assert few.study.given.physical == ()
+    assert learned.left_out_error < 0.1
+    stated = DynamicsStudy(loaded_cart()).learn(executed)
+    assert stated is not None
+    point = np.array([0.9, 0.9])
+    assert learned.predict(point) == stated.predict(point)
+    prediction = learned.predict(point)
+    assert prediction is not None
+    trajectory = validation.execute(validation.plan(validation.space.from_unit(point)))
+    assert prediction.score(trajectory, 0.2) is not None  # it is one of the states of the system
+
+
+@pytest.mark.parametrize("load", [0.0, 0.5])
+def test_data_of_another_system_are_left_out(load: float) -> None:
+    """M was learned without a load. If the system carries one, the data of M contradict its executions."""
+    rng = np.random.default_rng(0)
+    x, u = rng.uniform([-0.5, -0.5], [2.5, 1.5], (200, 2)), rng.uniform(-6, 6, (200, 1))
+    model = models.Linear.fit(Transitions(x, u, cart(x, u, np.zeros(200)), DT))
+    validation = loaded_cart(()).with_model(model)
+    validation = validation.with_system(systems.Simulated(lambda x, u: cart(x, u, np.array(load)), vectorized=True))
+    learned = DynamicsStudy(validation).learn(random_executions(validation, 4))
+    assert learned is not None
+    assert learned.with_data == (load == 0)
+    assert bool((learned.posterior.data.sources == -1).any()) == (load == 0)
+    assert learned.left_out_error < 0.2

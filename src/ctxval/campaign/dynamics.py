@@ -16,7 +16,7 @@ from ctxval._util.texts import parted, reason_of
 from ctxval.campaign.history import executed_trials, for_known_values, largest_distance, waiting_points
 from ctxval.campaign.storage.store import Store
 from ctxval.certificates.dynamics import bound_of, draws_for
-from ctxval.certificates.dynamics_diagnostics import DENSE, FEWEST, PREDICTIONS, doubt_of, jumps
+from ctxval.certificates.dynamics_diagnostics import DENSE, FEWEST, PREDICTIONS, doubt_of, failed, jumps
 from ctxval.certificates.dynamics_evidence import (
     CheckedPrediction,
     DynamicsEvidence,
@@ -35,7 +35,6 @@ from ctxval.errors import CertificateError
 from ctxval.learning import DynamicsStudy, ExecutionPrediction, LearnedDynamics
 from ctxval.learning.closed_loops import LoopPlanner
 from ctxval.learning.coverage import Coverage, Gap
-from ctxval.learning.physical import with_parameters
 from ctxval.learning.tolerance import LEVELS, PushResponse
 from ctxval.learning.vector import Executed
 from ctxval.learning.worst_case import WorstCase
@@ -227,6 +226,8 @@ class CampaignDynamics:
         )
         best = largest_distance(trials)
         bound = bound_of(evidence, best, confidence)
+        if failed(evidence, bound) is not None:
+            evidence = replace(evidence, suspect=learned.study.suspected_parameter(learned))
         if doubt_of(replace(evidence, tests=0), best, bound):  # how many tests a verdict needs is not known here
             return evidence
         # Many closed loops, which only matter to a bound that nothing else withdraws.
@@ -255,7 +256,8 @@ class CampaignDynamics:
             dense=worst.points.shape[1] <= DENSE and self._study.planner.batched,
             quantile=noisy.quantile if noisy is not None and noisy.is_noisy else None,
             lags=0 if noisy is None else noisy.fit.history.structure.lags,
-            physical=self._study.given.physical,
+            physical=learned.study.given.physical,
+            without_data=not learned.with_data,
         )
 
     def _pocket(self, learned: LearnedDynamics) -> StatePocket | None:
@@ -273,7 +275,7 @@ class CampaignDynamics:
         inputs = learned.posterior.data.inputs
         states = len(learned.coverage.resolution) - inputs
         coordinates = [*(("x", i) for i in range(states)), *(("u", i) for i in range(inputs))]
-        labels = [label for names in self._study.validation.names(states, inputs) for label in labels_of(names)]
+        labels = [label for names in learned.study.validation.names(states, inputs) for label in labels_of(names)]
         twice = len(set(labels)) < len(labels)  # a state and an input of the same name
         return tuple(
             f"{letter}[{i}]" if twice or label == f"{letter}{i}" else label
@@ -312,8 +314,6 @@ class CampaignDynamics:
         if prediction is None:
             return CheckedPrediction(trial.number, np.nan, np.inf, np.inf, distance, **how)
         trajectory = self._store.trajectory(trial.number, "system")
-        if trajectory is not None:
-            trajectory = with_parameters(self._study.given, trial.unit_point, trajectory)
         score = None if trajectory is None else prediction.score(trajectory, distance)
         z2, rank = (np.nan, np.nan) if score is None else (score.z2, score.rank)
         if prediction.noise is not None and score is not None:

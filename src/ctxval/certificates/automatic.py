@@ -88,7 +88,11 @@ class Automatic(CertificateKind):
         if by_dynamics is None or _decides(by_distance[0], threshold):
             return by_distance
         supported = threshold is not None and supported_by(by_dynamics[0], threshold)
-        return by_dynamics if _is_sound(by_dynamics[0]) or supported else by_distance
+        if _is_sound(by_dynamics[0]) or supported:
+            return by_dynamics
+        certificate, expected = by_distance
+        suspect = by_dynamics[0].details["suspect"]
+        return replace(certificate, details={**certificate.details, "suspect": suspect}), expected
 
     def missing_tests(self, sample: Sample) -> int:
         """Return the number of executions after which the posterior bound has seen tasks of the whole space."""

@@ -248,6 +248,9 @@ class DynamicsEvidence(ShortRepr):
         lags: number of earlier records and inputs that the learned dynamics depend on.
         pocket: the largest region that no execution has entered; None if it is not known.
         physical: the task parameters that the learned dynamics depend on.
+        suspect: another one that they seem to depend on, and how many times less predictions of executions from the
+            others err with it; None if predictions hold, or if there is none.
+        without_data: whether the data that M was made from are left out, because they contradict the executions.
     """
 
     maxima: Array
@@ -275,6 +278,8 @@ class DynamicsEvidence(ShortRepr):
     lags: int = 0
     pocket: StatePocket | None = None
     physical: tuple[str, ...] = ()
+    suspect: tuple[str, float] | None = None
+    without_data: bool = False
 
     def rank(self, confidence: float) -> int:
         """Return the row, in ascending order, of the maximum that d* stays below with this probability."""
@@ -313,6 +318,7 @@ class DynamicsEvidence(ShortRepr):
                 "pushed": values["pushed"] and PushedDistances.from_json(values["pushed"]),
                 "pocket": values["pocket"] and StatePocket(**values["pocket"]),
                 "physical": tuple(values["physical"]),
+                "suspect": values["suspect"] and tuple(values["suspect"]),
             }
             return cls(**{**values, **arrays, **parts})
         except (KeyError, TypeError, ValueError):

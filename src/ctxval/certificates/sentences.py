@@ -186,6 +186,12 @@ def dynamics_statement(upper: float, error: float, confidence: float, quantile: 
     )
 
 
+_WITHOUT_DATA = (
+    "the data that M was made from contradict the executions and are left out: M was learned on another system, or the "
+    "system has changed since",
+)
+
+
 def dynamics_assumptions(evidence: DynamicsEvidence) -> tuple[str, ...]:
     """Return what the bound from learned dynamics assumes."""
     coordinates = len(evidence.coverage.resolution)
@@ -221,6 +227,7 @@ def dynamics_assumptions(evidence: DynamicsEvidence) -> tuple[str, ...]:
         complete,
         alike,
         f"{prior}; its hyperparameters are unknown and integrated over",
+        *(_WITHOUT_DATA if evidence.without_data else ()),
         "in gaps of the records, the residual is like what was seen beside them; the largest gaps of states and inputs "
         f"are {with_units(evidence.coverage.resolution)}",
         joint,

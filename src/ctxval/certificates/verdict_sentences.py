@@ -433,6 +433,17 @@ def _without_assumptions(certificate: Certificate, tau: float, quantities: Quant
 
 def undecided(certificate: Certificate, tau: float, volume: float, quantities: Quantities) -> str:
     """Return why a certificate does not validate a threshold that a share of the tasks may exceed."""
+    suspicion, suspect = "", certificate.details.get("suspect")
+    if suspect is not None:
+        suspicion = (
+            f" The dynamics seem to depend on {suspect[0]}: with it, executions are predicted from the others "
+            f'{suspect[1]:.2g} times as well. State it as physical = ["{suspect[0]}"].'
+        )
+    return f"{_undecided(certificate, tau, volume, quantities)}{suspicion}"
+
+
+def _undecided(certificate: Certificate, tau: float, volume: float, quantities: Quantities) -> str:
+    """Return :func:`undecided` without the suspicion."""
     if certificate.doubt is not None:
         support = supported(certificate, tau, quantities)
         return f"{support}; but {certificate.doubt}." if support else f"{certificate.doubt}."

@@ -33,7 +33,7 @@ from ctxval.learning.execution_prediction import ExecutionPrediction, predict_ex
 from ctxval.learning.histories import Record
 from ctxval.learning.noise_effect import effect_of_noise
 from ctxval.learning.noisy_draws import MATTERS, REPLICATES, NoisyPosterior, learn_noisy
-from ctxval.learning.physical import with_parameters, with_parameters_as_states
+from ctxval.learning.physical import added_states, with_parameters, with_parameters_as_states, without_parameters
 from ctxval.learning.prediction import predict_distance
 from ctxval.learning.recorded import closed_loops_on_model, recorded_transitions
 from ctxval.learning.structures import NOISY, ChosenStructure, predicted_by_history
@@ -44,6 +44,10 @@ from ctxval.models.corrected import before_refinement
 from ctxval.searches import Prediction
 
 _TRIED = 32  # tasks of the pool among which those with the largest distances show what noise does
+_FEWEST_TOLD = 6  # executions from which on a task parameter is suspected of changing the dynamics
+_FEWEST_AGAINST = 3  # executions from which on the data that M was made from may be left out
+_WELL = 0.1  # left-out error below which neither these data nor task parameters are asked about
+_CLEARLY = 3.0  # factor by which predictions must err less without these data, or with a task parameter
 _SLOW = 0.02  # seconds: if a single closed loop on M takes longer, closed loops are distributed over the cores
 
 
@@ -65,6 +69,8 @@ class DynamicsStudy(ShortRepr):
         self._errors = ErrorVectors(self.planner)
         self._covariances: OrderedDict[bytes, LearnedCovariances | None] = OrderedDict()
         self._structures: OrderedDict[bytes, ChosenStructure] = OrderedDict()
+        self._found: OrderedDict[bytes, str | None] = OrderedDict()
+        self._others: dict[str, DynamicsStudy] = {}
         self._parts: tuple[str, bytes] | None = None
 
     def anew(self, quantile: float | None = None) -> DynamicsStudy:
@@ -133,16 +139,30 @@ class DynamicsStudy(ShortRepr):
         """
         if self._parts is None:
             self._parts = self._state_of_parts()
-        executed, logged = self._extended(executed), () if self.given.physical else logged
-        recorded = self._recorded(executed, logged)
+        extended, logged = self._extended(executed), () if self.given.physical else logged
+        learned = self._learn(extended, logged, with_data=True)
+        if learned is None or len(executed) < _FEWEST_AGAINST or not learned.left_out_error > _WELL:
+            return learned
+        if (learned.posterior.data.sources == -1).any():
+            without = self._learn(extended, logged, with_data=False)
+            if without is not None and without.left_out_error < learned.left_out_error / _CLEARLY:
+                learned = without
+        if logged or len(executed) < _FEWEST_TOLD or not learned.left_out_error > _WELL:
+            return learned
+        found = self._found_parameter(executed)
+        return learned if found is None else self._with_parameter(found).learn(executed)
+
+    def _learn(self, executed: Executed, logged: Sequence[Trajectory], *, with_data: bool) -> LearnedDynamics | None:
+        recorded = self._recorded(executed, logged, with_data)
         if recorded is None:
             return None
         some = _scheduled(len(executed))
-        covariances = self._learned_covariances(executed[:some], logged, recorded if some == len(executed) else None)
+        known = recorded if some == len(executed) else None
+        covariances = self._learned_covariances(executed[:some], logged, known, with_data)
         if covariances is None and some < len(executed):
             # If nothing could be learned when it was scheduled, it is learned now.
-            covariances = self._learned_covariances(executed, logged, recorded)
-        return self._conditioned(covariances, recorded, executed)
+            covariances = self._learned_covariances(executed, logged, recorded, with_data)
+        return self._conditioned(covariances, recorded, executed, with_data)
 
     def as_if_executed(
         self, learned: LearnedDynamics, executed: Executed, pending: Executed, logged: Sequence[Trajectory] = ()
@@ -152,16 +172,23 @@ class DynamicsStudy(ShortRepr):
         The hyperparameters and the predicted distances stay, and the doubt is less near the pending executions, which
         are :meth:`LearnedDynamics.trajectories` of the tasks that are being executed.
         """
+        if learned.study is not self:
+            return learned.study.as_if_executed(learned, executed, pending, logged)
         together = [*self._extended(executed), *pending]
         logged = () if self.given.physical else logged
-        return self._conditioned(learned.posterior.covariances, self._recorded(together, logged), together)
+        recorded = self._recorded(together, logged, learned.with_data)
+        return self._conditioned(learned.posterior.covariances, recorded, together, learned.with_data)
 
     def _extended(self, executed: Executed) -> Executed:
         """Return executions with the physical parameters of their tasks; other recordings do not tell theirs."""
         return [(point, with_parameters(self.given, point, trajectory)) for point, trajectory in executed]
 
     def _conditioned(
-        self, covariances: LearnedCovariances | None, recorded: tuple[Transitions, Rows] | None, executed: Executed
+        self,
+        covariances: LearnedCovariances | None,
+        recorded: tuple[Transitions, Rows] | None,
+        executed: Executed,
+        with_data: bool,
     ) -> LearnedDynamics | None:
         if covariances is None or recorded is None:
             return None
@@ -169,7 +196,7 @@ class DynamicsStudy(ShortRepr):
         if posterior is None or not np.isfinite(posterior.most_probable.weights).all():
             return None
         points = np.array([point for point, _ in executed]).reshape(-1, self.validation.space.dimension)
-        return LearnedDynamics(self, posterior, points, [trajectory for _, trajectory in executed])
+        return LearnedDynamics(self, posterior, points, [trajectory for _, trajectory in executed], with_data)
 
     def noisy(self, learned: LearnedDynamics) -> NoisyPosterior | None:
         """Return dynamics with noise and histories, learned from the executions.
@@ -226,13 +253,17 @@ class DynamicsStudy(ShortRepr):
         return False
 
     def _learned_covariances(
-        self, executed: Executed, logged: Sequence[Trajectory], recorded: tuple[Transitions, Rows] | None
+        self,
+        executed: Executed,
+        logged: Sequence[Trajectory],
+        recorded: tuple[Transitions, Rows] | None,
+        with_data: bool,
     ) -> LearnedCovariances | None:
         """Return the covariances learned from some executions, whose transitions may be known; the latest are kept."""
         together = [*(one for _, one in executed), *logged]
-        key = b"".join(part.tobytes() for one in together for part in (one.states, one.inputs))
+        key = b"".join(part.tobytes() for one in together for part in (one.states, one.inputs)) + bytes([with_data])
         if key not in self._covariances:
-            recorded = self._recorded(executed, logged) if recorded is None else recorded
+            recorded = self._recorded(executed, logged, with_data) if recorded is None else recorded
             if recorded is None or self._loops is None:
                 return None
             model, seed = before_refinement(self.validation.model), (self.seed, len(executed), 0)
@@ -242,10 +273,52 @@ class DynamicsStudy(ShortRepr):
                 self._covariances.popitem(last=False)
         return self._covariances[key]
 
-    def _recorded(self, executed: Executed, logged: Sequence[Trajectory]) -> tuple[Transitions, Rows] | None:
+    def _recorded(
+        self, executed: Executed, logged: Sequence[Trajectory], with_data: bool
+    ) -> tuple[Transitions, Rows] | None:
         if self._loops is None:
             return None
-        return recorded_transitions(self.validation.model, [one for _, one in executed], self._loops, logged)
+        trajectories = [one for _, one in executed]
+        return recorded_transitions(self.validation.model, trajectories, self._loops, logged, with_data=with_data)
+
+    def _found_parameter(self, executed: Executed) -> str | None:
+        """Return a task parameter that clearly explains the errors of predictions; asked when something is learned."""
+        some = _scheduled(len(executed))
+        key = b"".join(part.tobytes() for _, one in executed[:some] for part in (one.states, one.inputs))
+        if key not in self._found:
+            learned = self._learn(self._extended(executed[:some]), (), with_data=True)
+            suspect = None if learned is None else self.suspected_parameter(learned)
+            self._found[key] = suspect[0] if suspect is not None and suspect[1] > _CLEARLY else None
+            while len(self._found) > 8:
+                self._found.popitem(last=False)
+        return self._found[key]
+
+    def _with_parameter(self, name: str) -> DynamicsStudy:
+        """Return the study with another task parameter as a state; it is kept."""
+        if name not in self._others:
+            given = self.given.with_physical([*self.given.physical, name])
+            self._others[name] = DynamicsStudy(given, self.seed, self.quantile)
+        return self._others[name]
+
+    def suspected_parameter(self, learned: LearnedDynamics) -> tuple[str, float] | None:
+        """Return the task parameter that the dynamics depend on most clearly, and how many times less predictions err.
+
+        Each execution is predicted from the others, with the parameter as a state and without it. It is None if there
+        are too few executions, or if no parameter halves the error.
+        """
+        given, executed = self.given, list(zip(learned.executed, learned.trajectories_of_system, strict=True))
+        if len(executed) < _FEWEST_TOLD or not learned.left_out_error > _WELL:
+            return None
+        plain = [(point, without_parameters(given, trajectory)) for point, trajectory in executed]
+        suspect, least = None, learned.left_out_error / 2
+        for name in given.space.units:
+            if name in given.physical:
+                continue
+            study = self._with_parameter(name)
+            with_it = study._learn(study._extended(plain), (), with_data=False)
+            if with_it is not None and with_it.left_out_error < least:
+                suspect, least = name, with_it.left_out_error
+        return None if suspect is None else (suspect, learned.left_out_error / max(least, 1e-300))
 
     def predict(self, executed: Executed) -> Prediction | None:
         """Return the distances that executions predict, for a search; None if nothing can be learned.
@@ -264,7 +337,7 @@ class DynamicsStudy(ShortRepr):
                 return self._predict_vectors(executed)
             loops, seconds = self._timed_loops
             in_parallel = loops is not None and not loops.batch_shape and seconds > _SLOW
-            found = predict_distance(self.planner, learned.posterior, learned.executed, in_parallel)
+            found = predict_distance(learned.study.planner, learned.posterior, learned.executed, in_parallel)
             return replace(found, otherwise=lambda: self._predict_vectors(executed))
 
     def _predict_vectors(self, executed: Executed) -> Prediction | None:
@@ -282,12 +355,15 @@ class LearnedDynamics(ShortRepr):
     Attributes:
         executed: the executed tasks, points of the unit cube ``(n, d)``.
         trajectories_of_system: their trajectories.
+        with_data: whether the data that M was made from are learned from too; if they contradict the executions, M was
+            learned on another system, such as one without its load.
     """
 
     study: DynamicsStudy
     posterior: DynamicsPosterior
     executed: Array
     trajectories_of_system: Sequence[Trajectory]
+    with_data: bool = True
 
     _worst_cases: dict[int, WorstCase] = field(default_factory=dict, init=False)
 
@@ -319,6 +395,18 @@ class LearnedDynamics(ShortRepr):
                     if executed.finite:
                         found.append((point, executed))
         return found
+
+    @functools.cached_property
+    def left_out_error(self) -> float:
+        """The error of the next states of each execution, predicted from the others, as a share of the error of M."""
+        learned = self.posterior.data.learned
+        without = self.posterior.means_without([[k] for k in range(len(self.executed))])
+        errors, of_model = list[Array](), list[Array]()
+        for k, loop in enumerate(self.trajectories_of_system):
+            for model, of in ((without.model_of(k), errors), (self.study.validation.model, of_model)):
+                of.append((model.step(loop.states[:-1], loop.inputs) - loop.states[1:])[:, learned])
+        scale = np.sqrt((np.concatenate(of_model) ** 2).mean(axis=0))
+        return float(np.sqrt(((np.concatenate(errors) / np.maximum(scale, 1e-300)) ** 2).mean()))
 
     @property
     def worst_case(self) -> WorstCase:
@@ -401,17 +489,17 @@ class LearnedDynamics(ShortRepr):
 
     def predict(self, point: Array) -> ExecutionPrediction | None:
         """Return the prediction of the execution of a task, a point ``(d,)``; None if it cannot be planned."""
-        rng = self._rng(2)
+        rng, added = self._rng(2), added_states(self.study.given)
         with single_threaded():
             if self.noisy is not None:
                 drawn = self.noisy.draw(np.empty((0, 0)), rng)
                 is_noisy = self.noisy.is_noisy
-                return predict_execution(self.study.planner, drawn, point, len(self.executed), noisy=is_noisy)
+                return predict_execution(self.study.planner, drawn, point, len(self.executed), added, noisy=is_noisy)
             pairs = loop_pairs(self.study.planner, self.posterior, point[None])
             if not len(pairs):
                 return None
             draws = self.posterior.draw(pairs[rng.permutation(len(pairs))[:300]], rng)
-            return predict_execution(self.study.planner, draws, point, len(self.executed))
+            return predict_execution(self.study.planner, draws, point, len(self.executed), added)
 
     def _rng(self, purpose: int) -> np.random.Generator:
         return np.random.default_rng([self.study.seed, len(self.executed), purpose])

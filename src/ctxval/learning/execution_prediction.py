@@ -172,15 +172,19 @@ def _deviation(states: Array, medians: Array, deviations: Array, ranges: Array) 
 
 
 def predict_execution(
-    planner: LoopPlanner, draws: AnyDraws, point: Array, learned_from: int, *, noisy: bool = False
+    planner: LoopPlanner, draws: AnyDraws, point: Array, learned_from: int, added: int = 0, *, noisy: bool = False
 ) -> ExecutionPrediction | None:
-    """Return the prediction of the execution of a task ``(d,)``; None if it cannot be planned."""
+    """Return the prediction of the execution of a task ``(d,)``; None if it cannot be planned.
+
+    The last ``added`` states are none of the system's, and are not predicted.
+    """
     found = planner.run(draws, planner.plan(point[None]))
     if not found:
         return None
     horizon = found[0].inputs.shape[2]
     steps = np.unique(np.linspace(1, horizon, min(horizon, 16)).astype(int))
-    states, distances = found[0].states[:, 0][:, steps], found[0].distances[:, 0]
+    loops = found[0].states[:, 0, :, : found[0].states.shape[-1] - added]
+    states, distances = loops[:, steps], found[0].distances[:, 0]
     size = max(float(np.nanmedian(np.abs(states))), 1e-9)
     with np.errstate(all="ignore"):  # what is far beyond the states of all other draws has diverged
         kept = np.isfinite(distances) & (np.abs(states) < 1e6 * size).all(axis=(1, 2))
@@ -188,7 +192,7 @@ def predict_execution(
     medians, deviations = np.median(good, axis=0), good.std(axis=0)
     noise = None
     if noisy and kept.any():
-        whole = found[0].states[:, 0][kept]
+        whole = loops[kept]
         roughness = np.sqrt((np.diff(whole, 2, axis=1) ** 2).mean(axis=(0, 1)))
         ranges = np.maximum(np.ptp(medians, axis=0), 1e-9)
         of_runs = (_deviation(good, medians, deviations, ranges), *_differences(whole, roughness))

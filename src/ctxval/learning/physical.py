@@ -71,6 +71,11 @@ def without_parameters(validation: Validation, trajectory: Trajectory) -> Trajec
     return _cut(trajectory, len(_columns(validation))) if validation.physical else trajectory
 
 
+def added_states(validation: Validation) -> int:
+    """Return the number of states that are physical parameters."""
+    return len(_columns(validation))
+
+
 def _columns(validation: Validation) -> list[int]:
     d = validation.space.dimension
     return [int(i) for name in validation.physical for i in np.atleast_1d(np.arange(d)[validation.space.columns(name)])]

@@ -19,7 +19,12 @@ _POOL = 3000  # largest number of transitions that these are chosen from
 
 
 def recorded_transitions(
-    model: Model, executed: Sequence[Trajectory], loops: Trajectory, logged: Sequence[Trajectory] = ()
+    model: Model,
+    executed: Sequence[Trajectory],
+    loops: Trajectory,
+    logged: Sequence[Trajectory] = (),
+    *,
+    with_data: bool = True,
 ) -> tuple[Transitions, Rows] | None:
     """Return the known transitions of the system and the execution of each; -1 for data that the model was made from.
 
@@ -28,6 +33,7 @@ def recorded_transitions(
     Args:
         loops: closed loops on M, which show which of the other data the tasks need.
         logged: recordings that belong to no task; their numbers follow those of the executions.
+        with_data: whether the data that the model was made from are among them.
     """
     parts = [trajectory.transitions() for trajectory in executed]
     sources = [np.full(len(part), k) for k, part in enumerate(parts)]
@@ -38,7 +44,7 @@ def recorded_transitions(
         rows = _nearest(together, loops, 1500, many=True)
         parts.append(together[rows])
         sources.append(of[rows])
-    data = getattr(model, "data", None)
+    data = getattr(model, "data", None) if with_data else None
     if isinstance(data, Transitions) and len(data):
         parts.append(data[_nearest(data, loops, 600)])
         sources.append(np.full(len(parts[-1]), -1))

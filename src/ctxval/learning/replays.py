@@ -53,6 +53,7 @@ def replay_executed(validation: Validation, executed: Executed, wanted: Sequence
         with contextlib.suppress(Exception):  # the user's own parts, at states that no execution has reached
             learned = study.learn(executed)
             if learned is not None:
+                study = learned.study
                 without = learned.posterior.means_without(executions_of(learned.executed, wanted))
                 models = [without.model_of(k) for k in range(len(wanted))]
         return [_replayed(study, model, point) for model, point in zip(models, wanted, strict=True)]
