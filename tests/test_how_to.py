@@ -22,11 +22,12 @@ PAGES = [*HOW_TO, *sorted(DOCS.glob("tutorials/*.md")), *sorted(DOCS.glob("expla
 PAGES += sorted(DOCS.glob("reference/*.md"))
 NEEDS = {"gymnasium": ["gymnasium", "mujoco"], "mujoco": ["mujoco"], "fmu": ["fmpy", "pythonfmu"], "mpc": ["casadi"]}
 NEEDS |= {"onnx": ["onnx", "onnxruntime"], "scikit-learn": ["sklearn"], "state-space": ["control"]}
+NEEDS |= {"noisy-environment": ["gymnasium", "mujoco"]}
 NEEDS |= {"gymnasium-and-network": ["gymnasium", "mujoco", "sklearn"]}
 NEEDS |= {"fit": ["mujoco", "sklearn", "onnx"]}
 NEEDS |= {"operate": ["starlette", "uvicorn", "jinja2", "python_multipart"]}
-LONG = ("aspect1", "compare-controllers", "controllers", "fit", "gymnasium-and-network", "noise", "read-certificate")
-LONG += ("retrain", "workers")
+LONG = ("aspect1", "compare-controllers", "controllers", "fit", "gymnasium-and-network", "noise")
+LONG += ("noisy-environment", "read-certificate", "retrain", "workers")
 """Pages that only `make docs` and `make thorough` run: campaigns on several models, with noise or in many processes."""
 CTXVAL = ["-c", "from ctxval.cli import main; main()"]
 

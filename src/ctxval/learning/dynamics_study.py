@@ -47,7 +47,9 @@ _TRIED = 32  # tasks of the pool among which those with the largest distances sh
 _FEWEST_TOLD = 6  # executions from which on a task parameter is suspected of changing the dynamics
 _FEWEST_AGAINST = 3  # executions from which on the data that M was made from may be left out
 _WELL = 0.1  # left-out error below which neither these data nor task parameters are asked about
-_CLEARLY = 3.0  # factor by which predictions must err less without these data, or with a task parameter
+_CLEARLY = (
+    3.0  # factor by which predictions must err less without these data, or with a parameter, besides erring little
+)
 _SLOW = 0.02  # seconds: if a single closed loop on M takes longer, closed loops are distributed over the cores
 
 
@@ -145,7 +147,7 @@ class DynamicsStudy(ShortRepr):
             return learned
         if (learned.posterior.data.sources == -1).any():
             without = self._learn(extended, logged, with_data=False)
-            if without is not None and without.left_out_error < learned.left_out_error / _CLEARLY:
+            if without is not None and without.left_out_error < min(_WELL, learned.left_out_error / _CLEARLY):
                 learned = without
         if logged or len(executed) < _FEWEST_TOLD or not learned.left_out_error > _WELL:
             return learned
@@ -282,13 +284,13 @@ class DynamicsStudy(ShortRepr):
         return recorded_transitions(self.validation.model, trajectories, self._loops, logged, with_data=with_data)
 
     def _found_parameter(self, executed: Executed) -> str | None:
-        """Return a task parameter that clearly explains the errors of predictions; asked when something is learned."""
+        """Return a task parameter that explains the errors of predictions; asked when something is learned."""
         some = _scheduled(len(executed))
         key = b"".join(part.tobytes() for _, one in executed[:some] for part in (one.states, one.inputs))
         if key not in self._found:
-            learned = self._learn(self._extended(executed[:some]), (), with_data=True)
-            suspect = None if learned is None else self.suspected_parameter(learned)
-            self._found[key] = suspect[0] if suspect is not None and suspect[1] > _CLEARLY else None
+            name, with_it, without_it = self._most_telling(executed[:some])
+            # If errors remain, it may be a sign of noise, or of a state that is not recorded.
+            self._found[key] = name if with_it < min(_WELL, without_it / _CLEARLY) else None
             while len(self._found) > 8:
                 self._found.popitem(last=False)
         return self._found[key]
@@ -300,25 +302,33 @@ class DynamicsStudy(ShortRepr):
             self._others[name] = DynamicsStudy(given, self.seed, self.quantile)
         return self._others[name]
 
+    def _most_telling(self, executed: Executed) -> tuple[str | None, float, float]:
+        """Return the task parameter with which predictions err least, and the left-out errors with it and without.
+
+        The data that M was made from tell no parameters, and are left out of both.
+        """
+        name, least = None, np.inf
+        for other in self.given.space.units:
+            if other not in self.given.physical:
+                study = self._with_parameter(other)
+                learned = study._learn(study._extended(executed), (), with_data=False)
+                if learned is not None and learned.left_out_error < least:
+                    name, least = other, learned.left_out_error
+        without_it = self._learn(self._extended(executed), (), with_data=False)
+        return name, least, 0.0 if without_it is None else without_it.left_out_error
+
     def suspected_parameter(self, learned: LearnedDynamics) -> tuple[str, float] | None:
         """Return the task parameter that the dynamics depend on most clearly, and how many times less predictions err.
 
         Each execution is predicted from the others, with the parameter as a state and without it. It is None if there
         are too few executions, or if no parameter halves the error.
         """
-        given, executed = self.given, list(zip(learned.executed, learned.trajectories_of_system, strict=True))
+        executed = list(zip(learned.executed, learned.trajectories_of_system, strict=True))
         if len(executed) < _FEWEST_TOLD or not learned.left_out_error > _WELL:
             return None
-        plain = [(point, without_parameters(given, trajectory)) for point, trajectory in executed]
-        suspect, least = None, learned.left_out_error / 2
-        for name in given.space.units:
-            if name in given.physical:
-                continue
-            study = self._with_parameter(name)
-            with_it = study._learn(study._extended(plain), (), with_data=False)
-            if with_it is not None and with_it.left_out_error < least:
-                suspect, least = name, with_it.left_out_error
-        return None if suspect is None else (suspect, learned.left_out_error / max(least, 1e-300))
+        plain = [(point, without_parameters(self.given, trajectory)) for point, trajectory in executed]
+        name, with_it, without_it = self._most_telling(plain)
+        return None if name is None or with_it > without_it / 2 else (name, without_it / max(with_it, 1e-300))
 
     def predict(self, executed: Executed) -> Prediction | None:
         """Return the distances that executions predict, for a search; None if nothing can be learned.

@@ -116,7 +116,7 @@ class InnovationsFit(ABC):
     @property
     def share(self) -> float:
         """The variance of the innovations as a share of the mean square of the error of M, where it is largest."""
-        return float(((self.noise / self.scaled.sizes)[self.live] ** 2).max(initial=0.0))
+        return float(((self.noise[self.live] / self.scaled.sizes[self.live]) ** 2).max(initial=0.0))
 
     @property
     def most_probable(self) -> list[DrawnWeights]:
