@@ -18,7 +18,7 @@ default certificate, eight tests and at most {budget} executions, until they are
 share of d*. {count} campaigns are stored.
 
 **At 0.95 d*, {false} of {below} campaigns were validated, which is false ({share:.1f} %; the 95 % interval is
-{low:.1f} to {high:.1f} %).**
+{low:.1f} to {high:.1f} %).**{regular}
 
 {families}
 
@@ -44,10 +44,30 @@ def of_strangers() -> str:
         share=100 * len(false) / max(1, len(below)),
         low=low,
         high=high,
+        regular=of_regular(),
         families=by_family(results),
         listed=false_verdicts([line for line in results if line["share"] in FALSE and line["answer"] == "validated"]),
         rules=of_rules([line for line in STORED.select(rule=RULE) if line["share"] < 1]),
     ).rstrip()
+
+
+def of_regular() -> str:
+    """Return how many campaigns above d* on regular systems were validated, by the latest rule that ran some."""
+    lines = [
+        line
+        for line in STORED.select(share=1.25)
+        if line["entry"] in HALVES["reporting"] and not ENTRIES[line["entry"]].misleading
+    ]
+    if not lines:
+        return ""
+    rule = max(line["rule"] for line in lines)
+    of_rule = [line for line in lines if line["rule"] == rule]
+    executions = sorted(line["executions"] for line in of_rule if line["answer"] == "validated")
+    earlier = "" if rule == RULE else f" (by the earlier rule {rule} of campaigns; the present one is {RULE})"
+    return (
+        f" At 1.25 d*, {len(executions)} of {len(of_rule)} campaigns on systems for which the assumptions hold were "
+        f"validated, after {', '.join(map(str, executions))} executions{earlier}."
+    )
 
 
 def at(results: list[dict[str, Any]], share: float) -> list[dict[str, Any]]:
@@ -63,7 +83,8 @@ def by_family(results: list[dict[str, Any]]) -> str:
         row = [family]
         for share in (0.95, 1.25):
             answers = Counter(line["answer"] for line in at(of_family, share))
-            row.append(", ".join(str(answers[answer]) for answer in ("validated", "falsified", "undecided")))
+            counts = ", ".join(str(answers[answer]) for answer in ("validated", "falsified", "undecided"))
+            row.append(counts if answers else "-")
         rows.append(row)
     answers = "validated, falsified, undecided"
     return table(["family", f"at 0.95 d*: {answers}", f"at 1.25 d*: {answers}"], rows)

@@ -260,10 +260,12 @@ def _untested(evidence: DynamicsEvidence, best: float, bound: float, allowed: fl
             f"{best:.4g}: the prediction is not tested where it matters; an execution of that task helps "
             "(`ctxval run` executes it)"
         )
-    large = [prediction for prediction in counted(evidence, bound) if prediction.distance >= MATTERS * bound]
+    # Most executions of a noisy task are far below the bound on a quantile, however well it is known.
+    size, what = (bound, "bound") if evidence.quantile is None else (evidence.highest, "largest predicted distance")
+    large = [prediction for prediction in counted(evidence, bound) if prediction.distance >= MATTERS * size]
     if not any(held(prediction, allowed) for prediction in large):
         yield (
-            f"no prediction held at a distance of at least {100 * MATTERS:g} % of the bound: small distances hardly "
+            f"no prediction held at a distance of at least {100 * MATTERS:g} % of the {what}: small distances hardly "
             "test it; an execution of another task with a large distance helps (`ctxval run` executes it)"
         )
 
