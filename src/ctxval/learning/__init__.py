@@ -9,8 +9,9 @@ from ctxval.learning.dynamics_posterior import (
     PosteriorSettings,
     learn_posterior,
 )
-from ctxval.learning.dynamics_study import DynamicsStudy, LearnedDynamics
+from ctxval.learning.dynamics_study import DynamicsStudy
 from ctxval.learning.execution_prediction import ExecutionPrediction, PredictionScore
+from ctxval.learning.learned_dynamics import LearnedDynamics
 from ctxval.learning.prediction import predict_distance
 from ctxval.learning.replays import Replay, replay_executed
 from ctxval.learning.vector import predict_composed

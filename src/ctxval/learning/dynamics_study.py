@@ -1,4 +1,4 @@
-"""What the executions so far teach of the dynamics, and what follows for the largest distance over all tasks."""
+"""Learning the dynamics from executions: from which data, with which task parameters and histories."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import functools
 import time
 from collections import OrderedDict
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -20,8 +20,7 @@ from ctxval.core.quantiles import QUANTILE
 from ctxval.core.trajectory import Trajectory, Transitions
 from ctxval.core.validation import Validation
 from ctxval.errors import InputError
-from ctxval.learning.closed_loops import LoopPlanner, distances_of, loop_pairs
-from ctxval.learning.coverage import Coverage, Pocket, coverage, largest_pocket
+from ctxval.learning.closed_loops import LoopPlanner
 from ctxval.learning.dynamics_posterior import (
     DynamicsPosterior,
     LearnedCovariances,
@@ -29,17 +28,16 @@ from ctxval.learning.dynamics_posterior import (
     condition,
     learn_covariances,
 )
-from ctxval.learning.execution_prediction import ExecutionPrediction, predict_execution
 from ctxval.learning.histories import Record
+from ctxval.learning.learned_dynamics import LearnedDynamics
 from ctxval.learning.noise_effect import effect_of_noise
 from ctxval.learning.noisy_draws import MATTERS, REPLICATES, NoisyPosterior, learn_noisy
-from ctxval.learning.physical import added_states, with_parameters, with_parameters_as_states, without_parameters
+from ctxval.learning.physical import with_parameters, with_parameters_as_states, without_parameters
 from ctxval.learning.prediction import predict_distance
 from ctxval.learning.recorded import closed_loops_on_model, recorded_transitions
 from ctxval.learning.structures import NOISY, ChosenStructure, predicted_by_history
-from ctxval.learning.tolerance import PushResponse, push_response
 from ctxval.learning.vector import ErrorVectors, Executed, predict_composed
-from ctxval.learning.worst_case import WorstCase, WorstCaseSearch, WorstCaseSettings
+from ctxval.learning.worst_case import WorstCaseSearch, WorstCaseSettings
 from ctxval.models.corrected import before_refinement
 from ctxval.searches import Prediction
 
@@ -47,9 +45,7 @@ _TRIED = 32  # tasks of the pool among which those with the largest distances sh
 _FEWEST_TOLD = 6  # executions from which on a task parameter is suspected of changing the dynamics
 _FEWEST_AGAINST = 3  # executions from which on the data that M was made from may be left out
 _WELL = 0.1  # left-out error below which neither these data nor task parameters are asked about
-_CLEARLY = (
-    3.0  # factor by which predictions must err less without these data, or with a parameter, besides erring little
-)
+_CLEARLY = 3.0  # factor by which predictions must err less without these data, or with a parameter, and err little
 _SLOW = 0.02  # seconds: if a single closed loop on M takes longer, closed loops are distributed over the cores
 
 
@@ -143,16 +139,17 @@ class DynamicsStudy(ShortRepr):
             self._parts = self._state_of_parts()
         extended, logged = self._extended(executed), () if self.given.physical else logged
         learned = self._learn(extended, logged, with_data=True)
-        if learned is None or len(executed) < _FEWEST_AGAINST or not learned.left_out_error > _WELL:
-            return learned
-        if (learned.posterior.data.sources == -1).any():
-            without = self._learn(extended, logged, with_data=False)
-            if without is not None and without.left_out_error < min(_WELL, learned.left_out_error / _CLEARLY):
-                learned = without
-        if logged or len(executed) < _FEWEST_TOLD or not learned.left_out_error > _WELL:
-            return learned
-        found = self._found_parameter(executed)
-        return learned if found is None else self._with_parameter(found).learn(executed)
+        with contextlib.suppress(np.linalg.LinAlgError, InputError, ValueError):
+            if learned is None or len(executed) < _FEWEST_AGAINST or not learned.left_out_error > _WELL:
+                return learned
+            if (learned.posterior.data.sources == -1).any():
+                without = self._learn(extended, logged, with_data=False)
+                if without is not None and without.left_out_error < min(_WELL, learned.left_out_error / _CLEARLY):
+                    learned = without
+            if not logged and len(executed) >= _FEWEST_TOLD and learned.left_out_error > _WELL:
+                found = self._found_parameter(executed)
+                learned = learned if found is None else self._with_parameter(found).learn(executed)
+        return learned
 
     def _learn(self, executed: Executed, logged: Sequence[Trajectory], *, with_data: bool) -> LearnedDynamics | None:
         recorded = self._recorded(executed, logged, with_data)
@@ -284,8 +281,10 @@ class DynamicsStudy(ShortRepr):
         return recorded_transitions(self.validation.model, trajectories, self._loops, logged, with_data=with_data)
 
     def _found_parameter(self, executed: Executed) -> str | None:
-        """Return a task parameter that explains the errors of predictions; asked when something is learned."""
-        some = _scheduled(len(executed))
+        """Return a task parameter that explains the errors of predictions; asked in each doubling of the executions."""
+        some = _FEWEST_TOLD
+        while 2 * some <= len(executed):
+            some *= 2
         key = b"".join(part.tobytes() for _, one in executed[:some] for part in (one.states, one.inputs))
         if key not in self._found:
             name, with_it, without_it = self._most_telling(executed[:some])
@@ -358,163 +357,6 @@ class DynamicsStudy(ShortRepr):
         return predict_composed(np.array([point for point, _ in executed]), vectors, distance.compose)
 
 
-@dataclass(frozen=True, eq=False)
-class LearnedDynamics(ShortRepr):
-    """The dynamics learned from the executions so far; everything that follows is computed once, if it is needed.
-
-    Attributes:
-        executed: the executed tasks, points of the unit cube ``(n, d)``.
-        trajectories_of_system: their trajectories.
-        with_data: whether the data that M was made from are learned from too; if they contradict the executions, M was
-            learned on another system, such as one without its load.
-    """
-
-    study: DynamicsStudy
-    posterior: DynamicsPosterior
-    executed: Array
-    trajectories_of_system: Sequence[Trajectory]
-    with_data: bool = True
-
-    _worst_cases: dict[int, WorstCase] = field(default_factory=dict, init=False)
-
-    @functools.cached_property
-    def noisy(self) -> NoisyPosterior | None:
-        """The dynamics with noise and histories, if the next state does not follow from state and input; else None."""
-        with single_threaded():
-            return self.study.noisy(self)
-
-    @property
-    def drawn_from(self) -> DynamicsPosterior | NoisyPosterior:
-        """The posterior of which draws bound d*."""
-        return self.noisy or self.posterior
-
-    def expected(self, points: Array) -> Array:
-        """Return the distances ``(m,)`` on the posterior mean at points ``(m, d)``; infinity if a loop diverges."""
-        planner = self.study.planner
-        with single_threaded():
-            return np.asarray(planner.distances(self.drawn_from.mean, planner.plan(points), len(points))[0])
-
-    def trajectories(self, points: Array) -> list[tuple[Array, Trajectory]]:
-        """Return tasks ``(m, d)`` with their closed loops on the posterior mean, without those that diverge."""
-        planner, found = self.study.planner, list[tuple[Array, Trajectory]]()
-        with single_threaded():
-            for point in points:
-                for one in planner.plan(point[None]):
-                    (loops,) = planner.run(self.posterior.mean, [one])
-                    executed = Trajectory(one.promised.times, loops.states[0, 0], loops.inputs[0, 0])
-                    if executed.finite:
-                        found.append((point, executed))
-        return found
-
-    @functools.cached_property
-    def left_out_error(self) -> float:
-        """The error of the next states of each execution, predicted from the others, as a share of the error of M."""
-        learned = self.posterior.data.learned
-        without = self.posterior.means_without([[k] for k in range(len(self.executed))])
-        errors, of_model = list[Array](), list[Array]()
-        for k, loop in enumerate(self.trajectories_of_system):
-            for model, of in ((without.model_of(k), errors), (self.study.validation.model, of_model)):
-                of.append((model.step(loop.states[:-1], loop.inputs) - loop.states[1:])[:, learned])
-        scale = np.sqrt((np.concatenate(of_model) ** 2).mean(axis=0))
-        return float(np.sqrt(((np.concatenate(errors) / np.maximum(scale, 1e-300)) ** 2).mean()))
-
-    @property
-    def worst_case(self) -> WorstCase:
-        """The largest distance over all tasks, for each of the usual number of draws."""
-        return self.worst_case_of(1)
-
-    @functools.cached_property
-    def screened(self) -> WorstCase:
-        """The largest distance over some tasks, for each of a few draws of the dynamics: a quick lower bound."""
-        return self.study.search.screened(self.drawn_from, self.worst_of_mean, self.executed, self._rng(5))
-
-    @functools.cached_property
-    def worst_of_mean(self) -> WorstCase:
-        """The largest distance over some tasks on the posterior mean alone, as if it were the only draw."""
-        return self.study.search.on_mean(self.drawn_from, self._on_pool[0], self.executed, self._rng(4), globally=False)
-
-    def worst_case_of(self, draws: int) -> WorstCase:
-        """Return the largest distance over all tasks, for each of at least so many draws of the dynamics."""
-        functions = max(self.drawn_from.functions, -(-draws // self.drawn_from.groups))
-        if functions not in self._worst_cases:
-            search, known, rng = self.study.search, self.executed, self._rng(1)
-            of_mean = search.on_mean(self.drawn_from, self._on_pool[0], known, rng)
-            self._worst_cases[functions] = search.maxima(self.drawn_from, of_mean, known, rng, functions)
-        return self._worst_cases[functions]
-
-    @functools.cached_property
-    def largest_jump(self) -> float:
-        """The largest jump of the distance on the posterior mean between nearly equal tasks."""
-        return self.study.search.largest_jump(self.drawn_from)
-
-    @functools.cached_property
-    def deeper(self) -> tuple[Array, Array]:
-        """The largest distances on the posterior mean ``(2,)`` in two deeper searches, and their points ``(2, d)``."""
-        return self.study.search.deeper(self.drawn_from, self._rng(3))
-
-    @functools.cached_property
-    def push_response(self) -> PushResponse:
-        """The largest distances over large, executed and random tasks if something pushes the posterior mean."""
-        search = self.study.search
-        tasks = [self.worst_of_mean.elites[:16], self.executed, search.pool[:16]]
-        return push_response(self.study.planner, self.posterior, np.concatenate(tasks))
-
-    def pocket(self, units: Sequence[str]) -> Pocket | None:
-        """Return the largest region of two states, with these units, that loops enter and no execution has entered."""
-        planner = self.study.planner
-        with single_threaded():
-            loops = planner.run(self.posterior.mean, planner.plan(self.study.search.pool[:256]))
-        visited = np.concatenate([each.states.reshape(-1, len(units)) for each in loops])
-        return largest_pocket(visited[np.isfinite(visited).all(axis=1)], self.trajectories_of_system, units)
-
-    @property
-    def untried_parameter(self) -> tuple[int, float, Array] | None:
-        """A parameter that M's loops do not depend on, its largest gap between executions, and a task in the gap.
-
-        The gap is a share of the parameter's range; None if there is no such parameter.
-        """
-        gaps = [(j, *_widest_gap(self.executed[:, j])) for j in self.study.unseen_parameters]
-        if not gaps:
-            return None
-        j, gap, value = max(gaps, key=lambda one: one[1])
-        task = self.coverage.task.copy()
-        task[j] = value
-        return j, gap, task
-
-    @property
-    def coverage(self) -> Coverage:
-        """How well the records cover the closed loops of the tasks, in states and inputs."""
-        return self._on_pool[1]
-
-    @functools.cached_property
-    def _on_pool(self) -> tuple[Array, Coverage]:
-        """The distances of the pool's tasks on the posterior mean, and the coverage of their closed loops."""
-        search, planner = self.study.search, self.study.planner
-        with single_threaded():
-            mean, silent = self.drawn_from.mean, self.drawn_from.silent
-            loops = planner.run(silent, search.plans)
-            noisy = loops if mean is silent else planner.run(mean, search.plans)
-            (distances,) = distances_of(mean, noisy, search.plans, len(search.pool))
-            return distances, coverage(self.posterior, search.pool, search.plans, loops)
-
-    def predict(self, point: Array) -> ExecutionPrediction | None:
-        """Return the prediction of the execution of a task, a point ``(d,)``; None if it cannot be planned."""
-        rng, added = self._rng(2), added_states(self.study.given)
-        with single_threaded():
-            if self.noisy is not None:
-                drawn = self.noisy.draw(np.empty((0, 0)), rng)
-                is_noisy = self.noisy.is_noisy
-                return predict_execution(self.study.planner, drawn, point, len(self.executed), added, noisy=is_noisy)
-            pairs = loop_pairs(self.study.planner, self.posterior, point[None])
-            if not len(pairs):
-                return None
-            draws = self.posterior.draw(pairs[rng.permutation(len(pairs))[:300]], rng)
-            return predict_execution(self.study.planner, draws, point, len(self.executed), added)
-
-    def _rng(self, purpose: int) -> np.random.Generator:
-        return np.random.default_rng([self.study.seed, len(self.executed), purpose])
-
-
 def _scheduled(count: int) -> int:
     """Return the largest number of executions, up to ``count``, at which hyperparameters are learned.
 
@@ -524,14 +366,3 @@ def _scheduled(count: int) -> int:
     while count >= 4 * step:
         step *= 2
     return count - count % step
-
-
-def _widest_gap(values: Array) -> tuple[float, float]:
-    """Return the largest distance from a number in [0, 1] to the nearest value, and that number."""
-    ordered = np.sort(values)
-    if not len(ordered):
-        return 1.0, 0.5
-    middles = 0.5 * (ordered[1:] + ordered[:-1])
-    places = np.concatenate([[0.0], middles, [1.0]])
-    gaps = np.concatenate([[ordered[0]], 0.5 * np.diff(ordered), [1 - ordered[-1]]])
-    return float(gaps.max()), float(places[gaps.argmax()])

@@ -1,0 +1,193 @@
+"""The dynamics learned from the executions so far, and what follows for the largest distance over all tasks."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ctxval._util.arrays import Array, single_threaded
+from ctxval._util.representation import ShortRepr
+from ctxval.core.trajectory import Trajectory
+from ctxval.learning.closed_loops import distances_of, loop_pairs
+from ctxval.learning.coverage import Coverage, Pocket, coverage, largest_pocket
+from ctxval.learning.dynamics_posterior import DynamicsPosterior
+from ctxval.learning.execution_prediction import ExecutionPrediction, predict_execution
+from ctxval.learning.noisy_draws import NoisyPosterior
+from ctxval.learning.physical import added_states
+from ctxval.learning.tolerance import PushResponse, push_response
+from ctxval.learning.worst_case import WorstCase
+
+if TYPE_CHECKING:
+    from ctxval.learning.dynamics_study import DynamicsStudy
+
+
+@dataclass(frozen=True, eq=False)
+class LearnedDynamics(ShortRepr):
+    """The dynamics learned from the executions so far; everything that follows is computed once, if it is needed.
+
+    Attributes:
+        executed: the executed tasks, points of the unit cube ``(n, d)``.
+        trajectories_of_system: their trajectories.
+        with_data: whether the data that M was made from are learned from too; if they contradict the executions, M was
+            learned on another system, such as one without its load.
+    """
+
+    study: DynamicsStudy
+    posterior: DynamicsPosterior
+    executed: Array
+    trajectories_of_system: Sequence[Trajectory]
+    with_data: bool = True
+
+    _worst_cases: dict[int, WorstCase] = field(default_factory=dict, init=False)
+
+    @functools.cached_property
+    def noisy(self) -> NoisyPosterior | None:
+        """The dynamics with noise and histories, if the next state does not follow from state and input; else None."""
+        with single_threaded():
+            return self.study.noisy(self)
+
+    @property
+    def drawn_from(self) -> DynamicsPosterior | NoisyPosterior:
+        """The posterior of which draws bound d*."""
+        return self.noisy or self.posterior
+
+    def expected(self, points: Array) -> Array:
+        """Return the distances ``(m,)`` on the posterior mean at points ``(m, d)``; infinity if a loop diverges."""
+        planner = self.study.planner
+        with single_threaded():
+            return np.asarray(planner.distances(self.drawn_from.mean, planner.plan(points), len(points))[0])
+
+    def trajectories(self, points: Array) -> list[tuple[Array, Trajectory]]:
+        """Return tasks ``(m, d)`` with their closed loops on the posterior mean, without those that diverge."""
+        planner, found = self.study.planner, list[tuple[Array, Trajectory]]()
+        with single_threaded():
+            for point in points:
+                for one in planner.plan(point[None]):
+                    (loops,) = planner.run(self.posterior.mean, [one])
+                    executed = Trajectory(one.promised.times, loops.states[0, 0], loops.inputs[0, 0])
+                    if executed.finite:
+                        found.append((point, executed))
+        return found
+
+    @functools.cached_property
+    def left_out_error(self) -> float:
+        """The error of the next states of each execution, predicted from the others, as a share of the error of M."""
+        learned = self.posterior.data.learned
+        without = self.posterior.means_without([[k] for k in range(len(self.executed))])
+        errors, of_model = list[Array](), list[Array]()
+        for k, loop in enumerate(self.trajectories_of_system):
+            for model, of in ((without.model_of(k), errors), (self.study.validation.model, of_model)):
+                of.append((model.step(loop.states[:-1], loop.inputs) - loop.states[1:])[:, learned])
+        scale = np.sqrt((np.concatenate(of_model) ** 2).mean(axis=0))
+        return float(np.sqrt(((np.concatenate(errors) / np.maximum(scale, 1e-300)) ** 2).mean()))
+
+    @property
+    def worst_case(self) -> WorstCase:
+        """The largest distance over all tasks, for each of the usual number of draws."""
+        return self.worst_case_of(1)
+
+    @functools.cached_property
+    def screened(self) -> WorstCase:
+        """The largest distance over some tasks, for each of a few draws of the dynamics: a quick lower bound."""
+        return self.study.search.screened(self.drawn_from, self.worst_of_mean, self.executed, self._rng(5))
+
+    @functools.cached_property
+    def worst_of_mean(self) -> WorstCase:
+        """The largest distance over some tasks on the posterior mean alone, as if it were the only draw."""
+        return self.study.search.on_mean(self.drawn_from, self._on_pool[0], self.executed, self._rng(4), globally=False)
+
+    def worst_case_of(self, draws: int) -> WorstCase:
+        """Return the largest distance over all tasks, for each of at least so many draws of the dynamics."""
+        functions = max(self.drawn_from.functions, -(-draws // self.drawn_from.groups))
+        if functions not in self._worst_cases:
+            search, known, rng = self.study.search, self.executed, self._rng(1)
+            of_mean = search.on_mean(self.drawn_from, self._on_pool[0], known, rng)
+            self._worst_cases[functions] = search.maxima(self.drawn_from, of_mean, known, rng, functions)
+        return self._worst_cases[functions]
+
+    @functools.cached_property
+    def largest_jump(self) -> float:
+        """The largest jump of the distance on the posterior mean between nearly equal tasks."""
+        return self.study.search.largest_jump(self.drawn_from)
+
+    @functools.cached_property
+    def deeper(self) -> tuple[Array, Array]:
+        """The largest distances on the posterior mean ``(2,)`` in two deeper searches, and their points ``(2, d)``."""
+        return self.study.search.deeper(self.drawn_from, self._rng(3))
+
+    @functools.cached_property
+    def push_response(self) -> PushResponse:
+        """The largest distances over large, executed and random tasks if something pushes the posterior mean."""
+        search = self.study.search
+        tasks = [self.worst_of_mean.elites[:16], self.executed, search.pool[:16]]
+        return push_response(self.study.planner, self.posterior, np.concatenate(tasks))
+
+    def pocket(self, units: Sequence[str]) -> Pocket | None:
+        """Return the largest region of two states, with these units, that loops enter and no execution has entered."""
+        planner = self.study.planner
+        with single_threaded():
+            loops = planner.run(self.posterior.mean, planner.plan(self.study.search.pool[:256]))
+        visited = np.concatenate([each.states.reshape(-1, len(units)) for each in loops])
+        return largest_pocket(visited[np.isfinite(visited).all(axis=1)], self.trajectories_of_system, units)
+
+    @property
+    def untried_parameter(self) -> tuple[int, float, Array] | None:
+        """A parameter that M's loops do not depend on, its largest gap between executions, and a task in the gap.
+
+        The gap is a share of the parameter's range; None if there is no such parameter.
+        """
+        gaps = [(j, *_widest_gap(self.executed[:, j])) for j in self.study.unseen_parameters]
+        if not gaps:
+            return None
+        j, gap, value = max(gaps, key=lambda one: one[1])
+        task = self.coverage.task.copy()
+        task[j] = value
+        return j, gap, task
+
+    @property
+    def coverage(self) -> Coverage:
+        """How well the records cover the closed loops of the tasks, in states and inputs."""
+        return self._on_pool[1]
+
+    @functools.cached_property
+    def _on_pool(self) -> tuple[Array, Coverage]:
+        """The distances of the pool's tasks on the posterior mean, and the coverage of their closed loops."""
+        search, planner = self.study.search, self.study.planner
+        with single_threaded():
+            mean, silent = self.drawn_from.mean, self.drawn_from.silent
+            loops = planner.run(silent, search.plans)
+            noisy = loops if mean is silent else planner.run(mean, search.plans)
+            (distances,) = distances_of(mean, noisy, search.plans, len(search.pool))
+            return distances, coverage(self.posterior, search.pool, search.plans, loops)
+
+    def predict(self, point: Array) -> ExecutionPrediction | None:
+        """Return the prediction of the execution of a task, a point ``(d,)``; None if it cannot be planned."""
+        rng, added = self._rng(2), added_states(self.study.given)
+        with single_threaded():
+            if self.noisy is not None:
+                drawn = self.noisy.draw(np.empty((0, 0)), rng)
+                is_noisy = self.noisy.is_noisy
+                return predict_execution(self.study.planner, drawn, point, len(self.executed), added, noisy=is_noisy)
+            pairs = loop_pairs(self.study.planner, self.posterior, point[None])
+            if not len(pairs):
+                return None
+            draws = self.posterior.draw(pairs[rng.permutation(len(pairs))[:300]], rng)
+            return predict_execution(self.study.planner, draws, point, len(self.executed), added)
+
+    def _rng(self, purpose: int) -> np.random.Generator:
+        return np.random.default_rng([self.study.seed, len(self.executed), purpose])
+
+
+def _widest_gap(values: Array) -> tuple[float, float]:
+    """Return the largest distance from a number in [0, 1] to the nearest value, and that number."""
+    ordered = np.sort(values)
+    if not len(ordered):
+        return 1.0, 0.5
+    middles = 0.5 * (ordered[1:] + ordered[:-1])
+    places = np.concatenate([[0.0], middles, [1.0]])
+    gaps = np.concatenate([[ordered[0]], 0.5 * np.diff(ordered), [1 - ordered[-1]]])
+    return float(gaps.max()), float(places[gaps.argmax()])
