@@ -64,8 +64,11 @@ def get_group_once(app: typer.Typer) -> Any:
     """Return the commands of an application, which typer would put together again for each call of the tests."""
     key = id(app), len(app.registered_commands)
     if key not in groups:
-        groups[key] = get_group(app)
-    return groups[key]
+        group = get_group(app)
+        groups[key] = group, [*group.params]
+    group, parameters = groups[key]
+    group.params = [*parameters]  # typer 0.15 adds those of completion each time
+    return group
 
 
 typer.main.get_group = get_group_once
