@@ -14,6 +14,7 @@ import argparse
 import time
 from collections import Counter
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -78,11 +79,6 @@ def truth(entry: Stranger, seed: int) -> float:
 # Designs of tests, each a function of the number of task parameters and a generator to unit points (TESTS, d)
 
 
-def hypercube(d: int, rng: np.random.Generator) -> Array:
-    """Return a Latin hypercube, as the tests of campaigns are."""
-    return latin_hypercube(TESTS, d, rng)
-
-
 def corners(d: int, rng: np.random.Generator) -> Array:
     """Return tasks on corners and edges: each parameter is at one of its bounds with probability 1/2."""
     return np.where(rng.random((TESTS, d)) < 0.5, rng.integers(2, size=(TESTS, d)), rng.random((TESTS, d)))
@@ -106,7 +102,7 @@ def without_gaps(d: int, rng: np.random.Generator) -> Array:
 WIDEST = 0.12
 
 DESIGNS: dict[str, Callable[[int, np.random.Generator], Array]] = {
-    "hypercube": hypercube,
+    "hypercube": partial(latin_hypercube, TESTS),  # as the tests of campaigns are
     "without gaps": without_gaps,
     "corners": corners,
     "independent draws": independent,

@@ -201,11 +201,15 @@ def make_smaller(patch: pytest.MonkeyPatch) -> None:
     run_few_loops(patch.setattr)
 
 
+def is_of_draws(request: pytest.FixtureRequest) -> bool:
+    """Return whether the subject of a module are draws and loops, by its folder."""
+    return request.path.relative_to(TESTS).parts[0] in IN_FULL
+
+
 @pytest.fixture(scope="module", autouse=True)
 def module_in_full(request: pytest.FixtureRequest, smaller: pytest.MonkeyPatch) -> Iterator[None]:
     """Compute as users do, with the fixtures of a module whose subject are draws and loops."""
-    folder = request.path.relative_to(TESTS).parts[0]
-    in_full = folder in IN_FULL or request.node.get_closest_marker("in_full") is not None
+    in_full = is_of_draws(request) or request.node.get_closest_marker("in_full") is not None
     if in_full:
         smaller.undo()
     yield
@@ -216,8 +220,7 @@ def module_in_full(request: pytest.FixtureRequest, smaller: pytest.MonkeyPatch) 
 @pytest.fixture(autouse=True)
 def one_in_full(request: pytest.FixtureRequest, smaller: pytest.MonkeyPatch, module_in_full: None) -> Iterator[None]:
     """Compute as users do in a test that is marked."""
-    folder = request.path.relative_to(TESTS).parts[0]
-    in_full = folder not in IN_FULL and any(mark.name == "in_full" for mark in request.node.own_markers)
+    in_full = not is_of_draws(request) and any(mark.name == "in_full" for mark in request.node.own_markers)
     if in_full:
         smaller.undo()
     yield

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from ctxval._util.texts import parted
+from ctxval._util.texts import enumerated, parted
 
 ERRORS = 2.0
 """Number of its standard errors by which a bound from random draws must stay below a threshold."""
@@ -45,6 +45,11 @@ def percent(probability: float) -> str:
 def of_tasks(distribution: str | None) -> str:
     """Return of what a share is a share; the distribution of tasks is a text, None if it is uniform."""
     return "of the tasks" if distribution is None else "of the tasks under the stated distribution"
+
+
+def except_for(physical: Sequence[str]) -> str:
+    """Return the task parameters that dynamics may change with, after a comma; empty if there are none."""
+    return f", except for {enumerated(physical, 10)}" if physical else ""
 
 
 def with_units(values: Mapping[str, float], digits: int = 2) -> str:

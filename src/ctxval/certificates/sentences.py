@@ -7,8 +7,7 @@ stands beside the test that withdraws it, in the diagnostics.
 from __future__ import annotations
 
 from ctxval._util.representation import counted
-from ctxval._util.texts import enumerated
-from ctxval.certificates.bounds import at_most, of_tasks, percent, with_error, with_units
+from ctxval.certificates.bounds import at_most, except_for, of_tasks, percent, with_error, with_units
 from ctxval.certificates.dynamics_evidence import DynamicsEvidence
 from ctxval.certificates.sample import Sample, listed
 
@@ -216,7 +215,7 @@ def dynamics_assumptions(evidence: DynamicsEvidence) -> tuple[str, ...]:
     complete = "the recorded state is complete: the next state depends on it and on the input alone"
     if evidence.lags or evidence.quantile is not None:
         complete = f"the next record depends on {steps} and inputs alone, up to noise"
-    but = f", except for {enumerated(evidence.physical, 10)}" if evidence.physical else ""
+    but = except_for(evidence.physical)
     alike = f"the system is deterministic, and its dynamics do not change with time or with the task{but}"
     if evidence.quantile is not None:
         alike = (

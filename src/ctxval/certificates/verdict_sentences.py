@@ -12,7 +12,7 @@ import numpy as np
 from ctxval._util.representation import counted, shown
 from ctxval._util.texts import enumerated, parted, quoted
 from ctxval.certificates.bets import Bets
-from ctxval.certificates.bounds import at_most, of_tasks, percent, with_error, with_units
+from ctxval.certificates.bounds import at_most, except_for, of_tasks, percent, with_error, with_units
 from ctxval.certificates.covering import RESOLUTION
 from ctxval.certificates.dynamics_evidence import PushedDistances, Tolerance
 from ctxval.certificates.sample import executions_of
@@ -200,11 +200,6 @@ def _which(certificate: Certificate) -> str:
     return "" if quantile is None else f" in at least {100 * quantile:g} % of its executions"
 
 
-def _but(physical: Sequence[str] | None) -> str:
-    """Return the task parameters that dynamics may change with; empty if there are none."""
-    return f", except for {enumerated(physical, 10)}" if physical else ""
-
-
 def _of_lags(certificate: Certificate) -> str:
     lags = certificate.details["lags"]
     return "" if not lags else f" of the last {lags + 1} steps"
@@ -329,7 +324,9 @@ def conditions(certificate: Certificate, space: TaskSpace | None) -> list[str]:
         case "dynamics":
             gaps, again = with_units(details["resolution"]), details.get("differing")
             noise = "" if again is None else f" (trials {again[0]} and {again[1]} of one task differ a little)"
-            unchanging = f"its dynamics changing neither with time nor with the task{_but(details.get('physical'))}"
+            unchanging = (
+                f"its dynamics changing neither with time nor with the task{except_for(details.get('physical') or ())}"
+            )
             steps = f"the last {details['lags'] + 1} records and inputs"
             if details["quantile"] is not None:
                 complete = f"{steps} determining the next record up to noise"
@@ -488,9 +485,9 @@ def _shortfall(certificate: Certificate) -> str:
         return (
             f": trial {worst['trial']} came out at {worst['distance']:.4g} where {worst['median']:.4g} was predicted, "
             f"which raises the bound from {details['raised_from']:.4g} until 3 predictions in a row hold. If "
-            "predictions go on failing, a state that is not recorded, a jump such as a contact or dry friction, or "
-            "dynamics that depend on the task are the likely cause: record more states, state the task parameters that "
-            "change the dynamics (physical = [...]), or use --kind posterior or an audit"
+            "predictions go on failing, a state that is not recorded, a jump such as a contact or dry friction, noise, "
+            "or dynamics that depend on the task are the likely cause: record more states, state the task parameters "
+            "that change the dynamics (physical = [...]), or use --kind posterior or an audit"
         )
     outside, missing = "", details.get("not_counted")
     if "share_kept" in details:

@@ -99,11 +99,11 @@ class Validation:
 
     def with_distance(self, distance: Distance) -> Validation:
         """Return this validation with another distance."""
-        return self._with(distance=distance)
+        return self.with_parts(distance=distance)
 
     def with_model(self, model: Model | Step) -> Validation:
         """Return this validation with another model."""
-        return self._with(model=model)
+        return self.with_parts(model=model)
 
     def on_model(self, distance: Distance, *, units: str | None = None) -> Validation:
         """Return this validation with M itself in the place of S, which is never executed (the paper's Aspect 1).
@@ -111,7 +111,7 @@ class Validation:
         The distance, with its units, is how far M is from completing its task, as :class:`ctxval.distances.GoalError`.
         """
         labels = self.labels if units is None else replace(self.labels, units=units)
-        return self._with(system=Simulated(self.model), distance=distance, labels=labels, start_tolerance=START)
+        return self.with_parts(system=Simulated(self.model), distance=distance, labels=labels, start_tolerance=START)
 
     @property
     def is_on_model(self) -> bool:
@@ -120,25 +120,26 @@ class Validation:
 
     def with_space(self, space: TaskSpace) -> Validation:
         """Return this validation with another task space of the same parameters, for example with a distribution."""
-        return self._with(space=space)
+        return self.with_parts(space=space)
 
     def with_labels(self, labels: Labels) -> Validation:
         """Return this validation with other names and units."""
-        return self._with(labels=labels)
+        return self.with_parts(labels=labels)
 
     def with_longest(self, longest: int) -> Validation:
         """Return this validation with another largest horizon that is planned."""
-        return self._with(longest=longest)
+        return self.with_parts(longest=longest)
 
     def with_physical(self, names: Sequence[str]) -> Validation:
         """Return this validation with other task parameters that change the dynamics of S."""
-        return self._with(physical=names)
+        return self.with_parts(physical=names)
 
     def with_system(self, system: System) -> Validation:
         """Return the validation of another system with the same model, controllers and tasks."""
-        return self._with(system=system)
+        return self.with_parts(system=system)
 
-    def _with(self, **changed: Any) -> Validation:
+    def with_parts(self, **changed: Any) -> Validation:
+        """Return this validation with other arguments."""
         return Validation(**{**vars(self), **changed})
 
     def names(self, states: int, inputs: int) -> tuple[dict[str, str], dict[str, str]]:

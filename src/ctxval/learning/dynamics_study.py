@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import hashlib
 import time
 from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -67,7 +68,7 @@ class DynamicsStudy(ShortRepr):
         self._errors = ErrorVectors(self.planner)
         self._covariances: OrderedDict[bytes, LearnedCovariances | None] = OrderedDict()
         self._structures: OrderedDict[bytes, ChosenStructure] = OrderedDict()
-        self._found: OrderedDict[bytes, str | None] = OrderedDict()
+        self._found: dict[bytes, str | None] = {}
         self._others: dict[str, DynamicsStudy] = {}
         self._parts: tuple[str, bytes] | None = None
 
@@ -217,7 +218,7 @@ class DynamicsStudy(ShortRepr):
         if not self._needs_history(posterior, records, pairs):
             return None
         some = _scheduled(len(records))
-        key = b"".join(part.tobytes() for record in records[:some] for part in (record.states, record.inputs))
+        key = _digest(records[:some])
         # There are fewer sequences of noise if each closed loop is designed and run on its own.
         replicates = REPLICATES if self.planner.batched else 4
         learn = functools.partial(learn_noisy, posterior, pairs=pairs, replicates=replicates, quantile=self.quantile)
@@ -260,7 +261,7 @@ class DynamicsStudy(ShortRepr):
     ) -> LearnedCovariances | None:
         """Return the covariances learned from some executions, whose transitions may be known; the latest are kept."""
         together = [*(one for _, one in executed), *logged]
-        key = b"".join(part.tobytes() for one in together for part in (one.states, one.inputs)) + bytes([with_data])
+        key = _digest(together) + bytes([with_data])
         if key not in self._covariances:
             recorded = self._recorded(executed, logged, with_data) if recorded is None else recorded
             if recorded is None or self._loops is None:
@@ -285,13 +286,11 @@ class DynamicsStudy(ShortRepr):
         some = _FEWEST_TOLD
         while 2 * some <= len(executed):
             some *= 2
-        key = b"".join(part.tobytes() for _, one in executed[:some] for part in (one.states, one.inputs))
+        key = _digest(trajectory for _, trajectory in executed[:some])
         if key not in self._found:
             name, with_it, without_it = self._most_telling(executed[:some])
             # If errors remain, it may be a sign of noise, or of a state that is not recorded.
             self._found[key] = name if with_it < min(_WELL, without_it / _CLEARLY) else None
-            while len(self._found) > 8:
-                self._found.popitem(last=False)
         return self._found[key]
 
     def _with_parameter(self, name: str) -> DynamicsStudy:
@@ -355,6 +354,11 @@ class DynamicsStudy(ShortRepr):
         if vectors is None or not isinstance(distance, ComposedDistance):
             return None
         return predict_composed(np.array([point for point, _ in executed]), vectors, distance.compose)
+
+
+def _digest(runs: Iterable[Trajectory | Record]) -> bytes:
+    """Return what identifies the states and inputs of some runs."""
+    return hashlib.sha256(b"".join(part.tobytes() for run in runs for part in (run.states, run.inputs))).digest()
 
 
 def _scheduled(count: int) -> int:

@@ -39,22 +39,16 @@ def with_parameters_as_states(validation: Validation) -> Validation:
     columns = _columns(validation)
     with contextlib.suppress(Exception):  # the user's task, which is planned with its own errors elsewhere
         n = validation.task(space.parameters(0.5 * (space.low + space.high))).initial_state.shape[-1]
-        states = labels_of(validation.names(n, 0)[0])
-        taken = {label.split(" [")[0] for label in states}
-        own = [space.labels[i] for i in columns]
-        own = [f"task {label}" if label.split(" [")[0] in taken else label for label in own]
-        labels = replace(labels, states=(*states, *own))
-    k = len(columns)
-    return Validation(
-        space=space,
+        states, _ = validation.names(n, 0)
+        own = (f"task {space.labels[i]}" if space.names[i] in states else space.labels[i] for i in columns)
+        labels = replace(labels, states=(*labels_of(states), *own))
+    return validation.with_parts(
         task=task,
-        system=validation.system,
-        model=_ExtendedModel(validation.model, k),
+        model=_ExtendedModel(validation.model, len(columns)),
         synthesizer=_ExtendedSynthesizer(validation.synthesizer, validation.model),
-        distance=_ExtendedDistance(validation.distance, k),
-        start_tolerance=validation.start_tolerance,
+        distance=_ExtendedDistance(validation.distance, len(columns)),
         labels=labels,
-        longest=validation.longest,
+        physical=(),
     )
 
 
@@ -68,7 +62,7 @@ def with_parameters(validation: Validation, point: Array, trajectory: Trajectory
 
 def without_parameters(validation: Validation, trajectory: Trajectory) -> Trajectory:
     """Return a trajectory without the states that :func:`with_parameters` adds."""
-    return _cut(trajectory, len(_columns(validation))) if validation.physical else trajectory
+    return _cut(trajectory, added_states(validation)) if validation.physical else trajectory
 
 
 def added_states(validation: Validation) -> int:
