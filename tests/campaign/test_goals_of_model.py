@@ -16,14 +16,14 @@ SHORT, LONG = 25, 150
 def long_enough() -> Validation:
     # The weights of the pendulum's own case, with which M swings to every goal.
     synthesizer = controllers.ILQR([1.0, 0.1], [1e-4], [10.0, 1.0])
-    return make_validation(horizon=LONG)._with(synthesizer=synthesizer)
+    return make_validation(horizon=LONG).with_parts(synthesizer=synthesizer)
 
 
 def without_goal() -> Validation:
     def task(p: object) -> Task:
         return Task([3.1, 0.0], horizon=SHORT, dt=0.02)
 
-    return make_validation(horizon=SHORT)._with(task=task)
+    return make_validation(horizon=SHORT).with_parts(task=task)
 
 
 def test_a_campaign_warns_once_that_the_model_misses_its_goals() -> None:
@@ -56,7 +56,7 @@ def test_nothing_is_planned_for_the_warning(monkeypatch: pytest.MonkeyPatch) -> 
             designed.append(task)
             return super().design(task, model)  # type: ignore[arg-type]
 
-    counted = validation._with(synthesizer=Counting([1.0, 0.1], [1e-2], [10.0, 1.0]))
+    counted = validation.with_parts(synthesizer=Counting([1.0, 0.1], [1e-2], [10.0, 1.0]))
     with pytest.warns(GoalWarning):
         Campaign(counted, search=Random(), seed=0).run(5)
     watched = len(designed)

@@ -72,7 +72,7 @@ def test_goals_are_those_of_states_that_are_weighed_and_compared() -> None:
         compared = make_validation(distance=distances.FinalState(components=components))
         assert aimed_states(compared, 2).tolist() == aimed
     # A policy does not tell what it brings to a goal.
-    told = validation._with(synthesizer=controllers.Policy(lambda t, x, task: 0 * x[..., :1]))
+    told = validation.with_parts(synthesizer=controllers.Policy(lambda t, x, task: 0 * x[..., :1]))
     assert not len(aimed_states(told, 2))
 
 

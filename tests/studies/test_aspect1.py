@@ -109,7 +109,7 @@ def test_a_controller_that_flips_is_named_with_two_neighbours() -> None:
 def test_designs_that_do_not_converge_are_counted_and_named() -> None:
     pendulum = cases.by_name("pendulum", seed=0).validation
     hasty = controllers.ILQR([1.0, 0.1], [1e-4], [10.0, 1.0], iterations=1, tolerance=1e-12, limits=0.5)
-    report = aspect1.check(pendulum._with(system=Refusing(), synthesizer=hasty), tasks=6)
+    report = aspect1.check(pendulum.with_parts(system=Refusing(), synthesizer=hasty), tasks=6)
     assert report.designs > 6  # neighbours are designed, too
     assert len(report.not_converged) == report.designs
     assert set(report.not_converged[0]) == {"goal"}
