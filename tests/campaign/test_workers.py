@@ -22,6 +22,8 @@ from conftest import make_validation
 from ctxval import Campaign, Store, Task, Trajectory, Trial, controllers, searches
 from ctxval._util.progress import ignore, is_heard, listening
 from ctxval.campaign.choices import Choice
+from ctxval.campaign.trials import TrialRecorder
+from ctxval.campaign.workers import ProcessPool
 from ctxval.errors import CampaignError, InputError, ModelError
 from ctxval.testing import FaultyRig
 from rig_workers import Logging
@@ -480,6 +482,29 @@ def test_the_first_interrupt_ends_after_the_running_executions(tmp_path: Path, w
     assert len(list(marks.iterdir())) == len(states)
     whole = logged(None, str(marks), 0).run(len(states) + 2)
     assert facts(logged(str(store), str(marks), 0).run(len(states) + 2)) == facts(whole)
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+@pytest.mark.parametrize(("part", "method"), [("TrialRecorder", "start"), ("ProcessPool", "_start_worker")])
+def test_an_interrupt_while_an_execution_begins_leaves_it_to_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, part: str, method: str, workers: int
+) -> None:
+    owner = {"TrialRecorder": TrialRecorder, "ProcessPool": ProcessPool}[part]
+    begin = getattr(owner, method)
+    calls = itertools.count(1)
+
+    def interrupted(*arguments: Any) -> Any:
+        begun = begin(*arguments)
+        if next(calls) == workers:
+            signal.raise_signal(signal.SIGINT)
+        return begun
+
+    monkeypatch.setattr(owner, method, interrupted)
+    store = tmp_path / "a.sqlite"
+    validation = make_validation()
+    with pytest.raises(KeyboardInterrupt):
+        Campaign(validation, store=store, search=searches.Random(), seed=5).run(8, workers=workers, timeout=60)
+    assert [trial.state for trial in Store(store).trials()] == ["completed"] * workers
 
 
 @pytest.mark.slow

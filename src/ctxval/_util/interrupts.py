@@ -8,7 +8,7 @@ import sys
 import threading
 import traceback
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from types import FrameType
 from typing import NoReturn
 
@@ -47,12 +47,16 @@ class Interrupts:
         sys.stderr.write("\nending after the running executions; press Ctrl-C again to stop at once\n")
 
     @contextmanager
-    def shielded(self) -> Iterator[None]:
-        before, self._shielded = self._shielded, True
+    def shielded(self, shielded: bool = True) -> Iterator[None]:
+        before, self._shielded = self._shielded, shielded
         try:
             yield
         finally:
             self._shielded = before
+
+    def at_once(self) -> AbstractContextManager[None]:
+        """A part of shielded code in which a SIGINT raises KeyboardInterrupt."""
+        return self.shielded(False)
 
     def raise_if_asked(self) -> None:
         if self.asked:

@@ -84,15 +84,15 @@ class _Loop:
 
     def run(self, interrupts: Interrupts) -> None:
         """Execute the schedule; if an error stops it, first wait for the running executions."""
-        try:
-            while True:
-                self._fill_pool(interrupts)
-                if not self.running:
-                    break
-                with interrupts.shielded():
+        with interrupts.shielded():
+            try:
+                while True:
+                    self._fill_pool(interrupts)
+                    if not self.running:
+                        break
                     self._take(*self.pool.wait())
-        finally:
-            self.pool.close()
+            finally:
+                self.pool.close()
         if self.stopped is not None:
             raise self.stopped
         interrupts.raise_if_asked()
@@ -100,7 +100,8 @@ class _Loop:
     def _fill_pool(self, interrupts: Interrupts) -> None:
         while self.stopped is None and not interrupts.asked and len(self.running) < self.pool.size:
             try:
-                chosen = self.schedule.next()
+                with interrupts.at_once():  # a choice may take long, and nothing is lost with it
+                    chosen = self.schedule.next()
                 if chosen is None:
                     return
                 self._start(self.recorder.start(chosen))
