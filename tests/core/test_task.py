@@ -112,12 +112,15 @@ def test_a_component_that_is_no_number_is_refused_by_its_place() -> None:
         task(goal=[0, "left"])
 
 
-def test_a_goal_of_another_length_is_refused_with_both_lengths() -> None:
-    with pytest.raises(ShapeError, match="goal must have 2 components like initial_state, got 3"):
-        task(goal=[0, 0, 0])
+@pytest.mark.parametrize("aim", [{"goal": [0, 0, 0]}, {"reference": np.zeros((4, 3))}])
+def test_a_goal_or_reference_of_another_width_is_refused_with_both(aim: dict[str, object]) -> None:
+    other = task(**aim)
+    other.require_width(3)
+    with pytest.raises(ShapeError, match="goal or reference of a task must have 2 components, got 3"):
+        other.require_width(2)
 
 
-@pytest.mark.parametrize("shape", [(3, 2), (4, 3), (4,), (2,)])
+@pytest.mark.parametrize("shape", [(3, 2), (3, 3), (4,), (2,)])
 def test_a_reference_of_another_shape_is_refused_with_both_shapes(shape: tuple[int, ...]) -> None:
     with pytest.raises(ShapeError) as caught:
         task(reference=np.zeros(shape))

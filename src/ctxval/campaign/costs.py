@@ -19,7 +19,6 @@ from ctxval._util.progress import stage
 from ctxval.certificates.dynamics import draws_for
 from ctxval.certificates.options import CONFIDENCE
 from ctxval.core.plan import Plan
-from ctxval.core.rollout import rollout
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import Trial
 from ctxval.core.validation import Validation
@@ -56,7 +55,7 @@ class ThinkingCosts:
         model, task = validation.model, validation.task(validation.space.parameters(points[0]))
         controller = validation.synthesizer.design(task, model)
         design = min(_seconds(lambda: validation.synthesizer.design(task, model)) for _ in range(3))
-        loop = min(_seconds(lambda: rollout(model.step, controller, task)) for _ in range(3))
+        loop = min(_seconds(lambda: validation.closed_loop(controller, task)) for _ in range(3))
         made_up = [(validation.space.to_unit(point), _unlike(validation.plan(point))) for point in points]
         begun, study = _now(), DynamicsStudy(validation)
         learned = study.learn(made_up)

@@ -34,6 +34,7 @@ class QuadraticCost(ShortRepr):
         n = task.initial_state.shape[-1]
         if len(self.Q) != n:
             raise ShapeError(f"Q must weigh the task's {n} states, got shape {self.Q.shape}.")
+        task.require_width(n)
 
     def value(self, deviations: Array, inputs: Array) -> Array:
         """Return the cost, shape ``(...)``, of deviations ``(H+1, ..., n)`` and inputs ``(H, ..., m)``."""

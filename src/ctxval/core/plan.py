@@ -56,7 +56,7 @@ def require_execution(plan: Plan, trajectory: Trajectory, start_tolerance: float
         raise ShapeError(
             f"the trajectory must have {wanted}, got {trajectory.states.shape} and {trajectory.inputs.shape}."
         )
-    start = plan.task.initial_state
+    start = expected.states[0]  # the initial state of the task, or its outputs
     ranges = np.ptp(expected.states, axis=0)
     scale = np.maximum(np.maximum(ranges, np.abs(start)), max(0.05 * ranges.max(), 1e-6))
     near = np.abs(trajectory.states[0] - start) <= start_tolerance * scale

@@ -47,7 +47,7 @@ class StartOffset:
 
 def start_offset(validation: Validation, point: ArrayLike, trajectory: Trajectory) -> StartOffset:
     """Return how far an execution of the task at ``(d,)`` starts from the initial state of the task."""
-    start: Array = validation.task(validation.space.parameters(point)).initial_state
+    start = validation.recorded(validation.task(validation.space.parameters(point)).initial_state)
     gap = np.abs(trajectory.states[0] - start)
     size, state = float(gap.max()), int(gap.argmax())
     if hasattr(validation.distance, "difference"):

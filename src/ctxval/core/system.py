@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
+import numpy as np
+
+from collections.abc import Callable
+from ctxval._util.arrays import Array
 from ctxval._util.registry import part
 from ctxval._util.representation import ShortRepr
 from ctxval.core.controller import Controller
 from ctxval.core.model import Function, Model, Step
+from ctxval.core.outputs import Outputs, OutputsLike
 from ctxval.core.rollout import rollout
 from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory
@@ -28,18 +33,51 @@ class System(Protocol):
         """
 
 
-@part(functions={"step": "(x, u) -> x_next"})
+@part(functions={"step": "(x, u) -> x_next", "start": "x -> first state"})
 class Simulated(ShortRepr):
     """A step function ``(x, u) -> x_next``, or a model, as the true system.
 
     An object with a method ``step`` takes batches; a plain function does so if it is ``vectorized``.
+
+    Args:
+        start: the system's first state ``(..., s)`` for the initial state ``(..., n)`` of a task, if the two differ.
     """
 
     batched = True
 
-    def __init__(self, step: Step | Model, *, vectorized: bool = False) -> None:
+    def __init__(
+        self, step: Step | Model, *, vectorized: bool = False, start: Callable[[Array], Array] | None = None
+    ) -> None:
         self.model = step if isinstance(step, Model) else Function(step, vectorized=vectorized)
+        self.start = start
+
+    def describe(self) -> dict[str, Any]:
+        """Return what identifies this system in a store."""
+        return {"model": self.model, **({} if self.start is None else {"start": self.start})}
 
     def execute(self, controller: Controller, task: Task) -> Trajectory:
         """Run the closed loop from the initial state of the task over its horizon."""
-        return rollout(self.model.step, controller, task)
+        begun = task if self.start is None else task.starting_at(np.asarray(self.start(task.initial_state)))
+        return rollout(self.model.step, controller, begun)
+
+
+@part(functions={"outputs": "x -> y"})
+class WithOutputs(ShortRepr):
+    """A system whose controllers see outputs of its states, and that records them in the place of states.
+
+    Args:
+        system: the system with all its states.
+        outputs: a function ``h(x) -> y`` of these states, or the indices of those that are recorded.
+    """
+
+    def __init__(self, system: System, outputs: OutputsLike) -> None:
+        self.system, self.outputs = system, Outputs(outputs)
+
+    @property
+    def batched(self) -> bool:
+        """Whether the system takes a batch of tasks in one call."""
+        return bool(getattr(self.system, "batched", False))
+
+    def execute(self, controller: Controller, task: Task) -> Trajectory:
+        """Execute the system, and return the inputs and outputs."""
+        return self.outputs.of(self.system.execute(self.outputs.seen_by(controller), task))

@@ -21,8 +21,9 @@ class Task:
             ``(..., n)``.
         horizon: number of steps H.
         dt: length of a step, seconds.
-        goal: the state to reach, given like ``initial_state``; a goal is a constant reference.
-        reference: the states to follow, array ``(..., H + 1, n)``; give this or ``goal``, not both.
+        goal: the state to reach, given like ``initial_state``; a goal is a constant reference. If the validation has
+            outputs, it is the outputs to reach, and has their number.
+        reference: the states, or outputs, to follow, array ``(..., H + 1, n)``; give this or ``goal``, not both.
     """
 
     def __init__(
@@ -35,13 +36,10 @@ class Task:
         state = _components("initial_state", initial_state)
         n = state.shape[-1]
         if goal is not None:
-            target = _components("goal", goal)
-            if target.shape[-1] != n:
-                raise ShapeError(f"goal must have {n} components like initial_state, got {target.shape[-1]}.")
-            target = target[..., None, :]
+            target = _components("goal", goal)[..., None, :]
         elif reference is not None:
             target = as_floats("reference", reference)
-            if target.shape[-2:] != (self.horizon + 1, n):
+            if target.ndim < 2 or target.shape[-2] != self.horizon + 1:
                 raise ShapeError(f"reference must have shape (..., {self.horizon + 1}, {n}), got {target.shape}.")
         else:
             target = np.zeros((1, n))
@@ -56,7 +54,7 @@ class Task:
             ) from None
         self.initial_state: Array = np.broadcast_to(state, (*self.batch_shape, n))
         """Shape ``(..., n)``."""
-        self.reference: Array = np.broadcast_to(target, (*self.batch_shape, self.horizon + 1, n))
+        self.reference: Array = np.broadcast_to(target, (*self.batch_shape, self.horizon + 1, target.shape[-1]))
         """Shape ``(..., H + 1, n)``; all zero if the task has neither goal nor reference."""
         self.has_goal: bool = goal is not None or reference is not None
         """Whether a goal or a reference was given."""
@@ -70,6 +68,12 @@ class Task:
     def times(self) -> Array:
         """The times of the states, shape ``(H + 1,)``, seconds."""
         return np.asarray(np.arange(self.horizon + 1) * self.dt)
+
+    def require_width(self, width: int) -> None:
+        """Refuse a goal or a reference that has another number of components."""
+        got = self.reference.shape[-1]
+        if self.has_goal and got != width:
+            raise ShapeError(f"the goal or reference of a task must have {width} components, got {got}.")
 
     def __getitem__(self, index: int) -> Task:
         """Return one task of the batch."""

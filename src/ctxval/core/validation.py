@@ -18,14 +18,15 @@ from ctxval._util.interrupts import raised_by_signal
 from ctxval._util.progress import advance
 from ctxval._util.representation import call, lines, shown
 from ctxval._util.texts import reason_of, text_of
-from ctxval.core.controller import Synthesizer, is_controller
+from ctxval.core.controller import Controller, Synthesizer, is_controller
 from ctxval.core.distance import Distance
 from ctxval.core.labels import Labels
 from ctxval.core.model import Model, Step, as_model, require_time_step
+from ctxval.core.outputs import OutputsLike, as_outputs
 from ctxval.core.plan import Measurement, Outcome, Plan, require_execution
 from ctxval.core.rollout import rollout
 from ctxval.core.space import Parameters, TaskSpace
-from ctxval.core.system import Simulated, System
+from ctxval.core.system import Simulated, System, WithOutputs
 from ctxval.core.task import Task
 from ctxval.core.trajectory import COMPLETE, Trajectory
 from ctxval.errors import CtxvalError, DesignError, DistanceError, ExecutionError, InputError, ModelError, ShapeError
@@ -56,6 +57,9 @@ class Validation:
         longest: the largest horizon that is planned.
         physical: names of the task parameters that change the dynamics of S, such as a payload or a surface. What M
             misses is learned as a function of state, input and these parameters.
+        outputs: a function ``h(x) -> y`` of M's states, or the indices of states, if S records outputs y in the place
+            of states. Trajectories then have the outputs as their ``states``: controllers see them, distances and
+            labels are about them, and goals and references of tasks are outputs. The initial state is one of M.
 
     Its methods raise a DesignError if the synthesizer fails, a ModelError if the model fails or its closed loop is not
     finite, an ExecutionError if the system fails or its result is not an execution of the task, and a DistanceError if
@@ -75,6 +79,7 @@ class Validation:
         labels: Labels | None = None,
         longest: PositiveInt = 1_000_000,
         physical: Sequence[str] = (),
+        outputs: OutputsLike | None = None,
     ) -> None:
         self.space = space
         self.task = task
@@ -90,10 +95,13 @@ class Validation:
         self.physical = tuple(dict.fromkeys(physical))
         for name in self.physical:
             space.columns(name)
+        self.outputs = as_outputs(outputs)
 
     def describe(self) -> dict[str, Any]:
         """Return what identifies this validation in a store."""
         parts = {part: describe(getattr(self, part)) for part in ("space", "task", "system", "synthesizer", "distance")}
+        if self.outputs is not None:
+            parts["outputs"] = describe(self.outputs)
         # The numbers of M are learned: its closed loops show whether it is the same.
         return {**parts, "model": without_numbers(describe(self.model))}
 
@@ -111,12 +119,34 @@ class Validation:
         The distance, with its units, is how far M is from completing its task, as :class:`ctxval.distances.GoalError`.
         """
         labels = self.labels if units is None else replace(self.labels, units=units)
-        return self.with_parts(system=Simulated(self.model), distance=distance, labels=labels, start_tolerance=START)
+        system: System = Simulated(self.model)
+        if self.outputs is not None:
+            system = WithOutputs(system, self.outputs)
+        return self.with_parts(system=system, distance=distance, labels=labels, start_tolerance=START)
 
     @property
     def is_on_model(self) -> bool:
         """Whether M itself is in the place of S."""
-        return isinstance(self.system, Simulated) and self.system.model is self.model
+        system = self.system.system if isinstance(self.system, WithOutputs) else self.system
+        return isinstance(system, Simulated) and system.model is self.model
+
+    def recorded(self, x: Array) -> Array:
+        """Return what is recorded in states of M ``(..., n)``: their outputs if there are any, or these states."""
+        return x if self.outputs is None else self.outputs(x)
+
+    def _recorded_of(self, task: Task) -> Array:
+        try:
+            return self.recorded(task.initial_state)
+        except CtxvalError:
+            raise
+        except Exception as error:  # the user's function
+            raise InputError(f"the outputs h(x) failed: {reason_of(error)}.") from error
+
+    def closed_loop(self, controller: Controller, task: Task) -> Trajectory:
+        """Return the closed loop of a controller with M, as it is recorded."""
+        if self.outputs is None:
+            return rollout(self.model.step, controller, task)
+        return self.outputs.of(rollout(self.model.step, self.outputs.seen_by(controller), task))
 
     def with_space(self, space: TaskSpace) -> Validation:
         """Return this validation with another task space of the same parameters, for example with a distribution."""
@@ -299,6 +329,7 @@ class Validation:
 
     def plan_of(self, parameters: Parameters, task: Task) -> Plan:
         """Return the plan of a task, or of a batch, that is made already; :meth:`plan` checks more."""
+        task.require_width(self._recorded_of(task).shape[-1])
         try:
             controller = self.synthesizer.design(task, self.model)
         except CtxvalError:
@@ -306,7 +337,7 @@ class Validation:
         except (Exception, SystemExit) as error:
             raise DesignError(f"the synthesizer failed: {reason_of(error)}.") from error
         try:
-            trajectory = rollout(self.model.step, controller, task)
+            trajectory = self.closed_loop(controller, task)
         except CtxvalError:
             raise
         except (Exception, SystemExit) as error:

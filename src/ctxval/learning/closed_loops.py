@@ -136,7 +136,7 @@ class LoopPlanner:
         parts = self.validation
         task = parts.task_at(parts.space.parameters(parts.space.from_unit(chosen)))
         controller = parts.synthesizer.design(task, parts.model)
-        promised = rollout(parts.model.step, controller, task)
+        promised = parts.closed_loop(controller, task)
         if promised.batch_shape != chosen.shape[:-1]:
             raise ValueError("the task function did not return one task for each point")
         return PlannedTasks(rows, task, controller, promised)

@@ -33,13 +33,15 @@ from ctxval.learning.histories import Record
 from ctxval.learning.learned_dynamics import LearnedDynamics
 from ctxval.learning.noise_effect import effect_of_noise
 from ctxval.learning.noisy_draws import MATTERS, REPLICATES, NoisyPosterior, learn_noisy
-from ctxval.learning.physical import with_parameters, with_parameters_as_states, without_parameters
+from ctxval.learning.physical import added_states, with_parameters, with_parameters_as_states, without_parameters
 from ctxval.learning.prediction import predict_distance
 from ctxval.learning.recorded import closed_loops_on_model, recorded_transitions
+from ctxval.learning.state_estimates import StateEstimates, with_states_of_model
 from ctxval.learning.structures import NOISY, ChosenStructure, predicted_by_history
 from ctxval.learning.vector import ErrorVectors, Executed, predict_composed
 from ctxval.learning.worst_case import WorstCaseSearch, WorstCaseSettings
 from ctxval.models.corrected import before_refinement
+from ctxval.models.scaling import standard_deviations
 from ctxval.searches import Prediction
 
 _TRIED = 32  # tasks of the pool among which those with the largest distances show what noise does
@@ -57,15 +59,16 @@ class DynamicsStudy(ShortRepr):
 
     Attributes:
         given: the user's validation.
-        validation: the same with the physical task parameters as states, of which everything is learned.
+        validation: the same with the states of M if only outputs are recorded, and with the physical task parameters
+            as further states; everything is learned of these.
         quantile: the share of the executions of a task that a distance is about, if the system is noisy.
     """
 
     def __init__(self, validation: Validation, seed: int = 0, quantile: float = QUANTILE) -> None:
         self.given, self.seed, self.quantile = validation, seed, quantile
-        self.validation = with_parameters_as_states(validation)
+        self.validation = with_parameters_as_states(with_states_of_model(validation))
         self.planner = LoopPlanner(self.validation)
-        self._errors = ErrorVectors(self.planner)
+        self._errors = ErrorVectors(self.planner if validation.outputs is None else LoopPlanner(validation))
         self._covariances: OrderedDict[bytes, LearnedCovariances | None] = OrderedDict()
         self._structures: OrderedDict[bytes, ChosenStructure] = OrderedDict()
         self._found: dict[bytes, str | None] = {}
@@ -138,7 +141,7 @@ class DynamicsStudy(ShortRepr):
         """
         if self._parts is None:
             self._parts = self._state_of_parts()
-        extended, logged = self._extended(executed), () if self.given.physical else logged
+        extended, logged = self._extended(executed), () if self._needs_tasks else logged
         learned = self._learn(extended, logged, with_data=True)
         with contextlib.suppress(np.linalg.LinAlgError, InputError, ValueError):
             if learned is None or len(executed) < _FEWEST_AGAINST or not learned.left_out_error > _WELL:
@@ -175,13 +178,34 @@ class DynamicsStudy(ShortRepr):
         if learned.study is not self:
             return learned.study.as_if_executed(learned, executed, pending, logged)
         together = [*self._extended(executed), *pending]
-        logged = () if self.given.physical else logged
+        logged = () if self._needs_tasks else logged
         recorded = self._recorded(together, logged, learned.with_data)
         return self._conditioned(learned.posterior.covariances, recorded, together, learned.with_data)
 
+    @property
+    def _needs_tasks(self) -> bool:
+        """Whether only executions of tasks can be learned from: other recordings tell no parameters and no start."""
+        return bool(self.given.physical) or self.given.outputs is not None
+
     def _extended(self, executed: Executed) -> Executed:
-        """Return executions with the physical parameters of their tasks; other recordings do not tell theirs."""
+        """Return executions with states of M, if outputs are recorded, and the physical parameters of their tasks."""
+        if self._estimates is not None:
+            states = self._estimates.of(executed, _scheduled(len(executed)))
+            executed = [(point, trajectory) for (point, _), trajectory in zip(executed, states, strict=True)]
         return [(point, with_parameters(self.given, point, trajectory)) for point, trajectory in executed]
+
+    @functools.cached_property
+    def _estimates(self) -> StateEstimates | None:
+        if self.given.outputs is None or self._loops is None:
+            return None
+        states = self._loops.states[..., : self._loops.states.shape[-1] - added_states(self.given)]
+        changes = np.diff(states, axis=-2).reshape(-1, states.shape[-1])
+        return StateEstimates(self.given, self.given.outputs, standard_deviations(changes[np.isfinite(changes).all(1)]))
+
+    def recorded(self, trajectory: Trajectory) -> Trajectory:
+        """Return a trajectory as the system records it, without physical parameters and with outputs for states."""
+        plain = without_parameters(self.given, trajectory)
+        return plain if self.given.outputs is None else self.given.outputs.of(plain)
 
     def _conditioned(
         self,
@@ -324,7 +348,7 @@ class DynamicsStudy(ShortRepr):
         executed = list(zip(learned.executed, learned.trajectories_of_system, strict=True))
         if len(executed) < _FEWEST_TOLD or not learned.left_out_error > _WELL:
             return None
-        plain = [(point, without_parameters(self.given, trajectory)) for point, trajectory in executed]
+        plain = [(point, self.recorded(trajectory)) for point, trajectory in executed]
         name, with_it, without_it = self._most_telling(plain)
         return None if name is None or with_it > without_it / 2 else (name, without_it / max(with_it, 1e-300))
 
@@ -350,7 +374,7 @@ class DynamicsStudy(ShortRepr):
 
     def _predict_vectors(self, executed: Executed) -> Prediction | None:
         """Return the prediction from the vectors of which distances are composed; None if they are not known."""
-        distance, vectors = self.validation.distance, self._errors.of(executed)
+        distance, vectors = self._errors.validation.distance, self._errors.of(executed)
         if vectors is None or not isinstance(distance, ComposedDistance):
             return None
         return predict_composed(np.array([point for point, _ in executed]), vectors, distance.compose)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass
 from itertools import pairwise
 from typing import Any, Self
@@ -172,18 +172,25 @@ def _deviation(states: Array, medians: Array, deviations: Array, ranges: Array) 
 
 
 def predict_execution(
-    planner: LoopPlanner, draws: AnyDraws, point: Array, learned_from: int, added: int = 0, *, noisy: bool = False
+    planner: LoopPlanner,
+    draws: AnyDraws,
+    point: Array,
+    learned_from: int,
+    recorded: Callable[[Trajectory], Trajectory] = lambda trajectory: trajectory,
+    *,
+    noisy: bool = False,
 ) -> ExecutionPrediction | None:
     """Return the prediction of the execution of a task ``(d,)``; None if it cannot be planned.
 
-    The last ``added`` states are none of the system's, and are not predicted.
+    ``recorded`` turns a trajectory of all states into what the system records.
     """
-    found = planner.run(draws, planner.plan(point[None]))
+    planned = planner.plan(point[None])
+    found = planner.run(draws, planned)
     if not found:
         return None
     horizon = found[0].inputs.shape[2]
     steps = np.unique(np.linspace(1, horizon, min(horizon, 16)).astype(int))
-    loops = found[0].states[:, 0, :, : found[0].states.shape[-1] - added]
+    loops = recorded(Trajectory(planned[0].promised.times, found[0].states[:, 0], found[0].inputs[:, 0])).states
     states, distances = loops[:, steps], found[0].distances[:, 0]
     size = max(float(np.nanmedian(np.abs(states))), 1e-9)
     with np.errstate(all="ignore"):  # what is far beyond the states of all other draws has diverged

@@ -17,7 +17,6 @@ from ctxval.learning.coverage import Coverage, Pocket, coverage, largest_pocket
 from ctxval.learning.dynamics_posterior import DynamicsPosterior
 from ctxval.learning.execution_prediction import ExecutionPrediction, predict_execution
 from ctxval.learning.noisy_draws import NoisyPosterior
-from ctxval.learning.physical import added_states
 from ctxval.learning.tolerance import PushResponse, push_response
 from ctxval.learning.worst_case import WorstCase
 
@@ -166,17 +165,17 @@ class LearnedDynamics(ShortRepr):
 
     def predict(self, point: Array) -> ExecutionPrediction | None:
         """Return the prediction of the execution of a task, a point ``(d,)``; None if it cannot be planned."""
-        rng, added = self._rng(2), added_states(self.study.given)
+        rng, recorded = self._rng(2), self.study.recorded
         with single_threaded():
             if self.noisy is not None:
                 drawn = self.noisy.draw(np.empty((0, 0)), rng)
                 is_noisy = self.noisy.is_noisy
-                return predict_execution(self.study.planner, drawn, point, len(self.executed), added, noisy=is_noisy)
+                return predict_execution(self.study.planner, drawn, point, len(self.executed), recorded, noisy=is_noisy)
             pairs = loop_pairs(self.study.planner, self.posterior, point[None])
             if not len(pairs):
                 return None
             draws = self.posterior.draw(pairs[rng.permutation(len(pairs))[:300]], rng)
-            return predict_execution(self.study.planner, draws, point, len(self.executed), added)
+            return predict_execution(self.study.planner, draws, point, len(self.executed), recorded)
 
     def _rng(self, purpose: int) -> np.random.Generator:
         return np.random.default_rng([self.study.seed, len(self.executed), purpose])

@@ -10,7 +10,6 @@ from scipy.spatial.distance import cdist
 
 from ctxval._util.arrays import Rows
 from ctxval.core.model import Model
-from ctxval.core.rollout import rollout
 from ctxval.core.trajectory import Trajectory, Transitions
 from ctxval.core.validation import Validation
 from ctxval.models.scaling import standard_deviations
@@ -68,7 +67,7 @@ def closed_loops_on_model(validation: Validation) -> Trajectory | None:
     for rows in [*batches, *points[:3]]:
         try:
             task = validation.task_at(space.parameters(rows))
-            loops = rollout(validation.model.step, validation.synthesizer.design(task, validation.model), task)
+            loops = validation.closed_loop(validation.synthesizer.design(task, validation.model), task)
         except Exception:  # the user's own parts, on tasks that may never be executed
             continue
         if loops.batch_shape == rows.shape[:-1]:

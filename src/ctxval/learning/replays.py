@@ -21,7 +21,6 @@ from ctxval.core.trajectory import Trajectory
 from ctxval.core.validation import Validation
 from ctxval.learning.draws import DrawnModel
 from ctxval.learning.dynamics_study import DynamicsStudy
-from ctxval.learning.physical import without_parameters
 from ctxval.learning.vector import Executed, executions_of
 
 
@@ -72,7 +71,7 @@ def _replayed(study: DynamicsStudy, model: DrawnModel | None, point: Array) -> R
     if model is None:
         return nothing
     try:
-        promised = rollout(validation.model.step, controller, task)
+        promised = validation.closed_loop(controller, task)
         predicted = rollout(model.step, controller, task)
         with np.errstate(all="ignore"):
             # Some distances change the arrays that they are given.
@@ -80,4 +79,4 @@ def _replayed(study: DynamicsStudy, model: DrawnModel | None, point: Array) -> R
     except Exception:  # the same
         return nothing
     finite = bool(predicted.finite.all()) and np.isfinite(distance)
-    return Replay(plain, without_parameters(study.given, predicted), distance) if finite else nothing
+    return Replay(plain, study.recorded(predicted), distance) if finite else nothing

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from ctxval._util.registry import Registry
-from ctxval.core.system import Simulated, System
+from ctxval.core.system import Simulated, System, WithOutputs
 from ctxval.systems.fmu import FMU
 from ctxval.systems.function import Function
 from ctxval.systems.gymnasium import Gymnasium
@@ -24,6 +24,7 @@ __all__ = [
     "Simulated",
     "Subprocess",
     "System",
+    "WithOutputs",
     "by_name",
     "rk4",
 ]

@@ -1,0 +1,107 @@
+"""Outputs y = h(x) of M, if the system records them in place of states."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from ctxval._util.arrays import Array, rows_of
+from ctxval._util.representation import ShortRepr
+from ctxval.core.controller import Controller, ControllerWithMemory
+from ctxval.core.model import central_differences
+from ctxval.core.trajectory import Trajectory
+from ctxval.errors import InputError, ShapeError
+
+OutputsLike = Callable[[Array], Array] | Sequence[int]
+"""A function ``h(x) -> y`` of states ``(..., n)`` to outputs ``(..., p)``, or the indices of the states to record."""
+
+
+class Outputs(ShortRepr):
+    """The outputs y = h(x) of states of M, shapes ``(..., n) -> (..., p)``.
+
+    A function that takes one state ``(n,)`` at a time is called once for each.
+    """
+
+    def __init__(self, given: OutputsLike) -> None:
+        if callable(given):
+            self.function: OutputsLike = given
+        else:
+            self.function = [int(i) for i in given]
+            if not self.function or len(set(self.function)) < len(self.function) or min(self.function) < 0:
+                raise InputError(f"outputs must be a function h(x), or different indices of states, got {given!r}.")
+
+    def describe(self) -> dict[str, Any]:
+        """Return what identifies these outputs in a store."""
+        return {"of": self.function}
+
+    @property
+    def indices(self) -> list[int] | None:
+        """The indices of the states that are recorded; None if a function gives the outputs."""
+        return None if callable(self.function) else list(self.function)
+
+    def __call__(self, x: Array) -> Array:
+        """Return outputs ``(..., p)`` of states ``(..., n)``."""
+        x = np.asarray(x, dtype=np.float64)
+        if not callable(self.function):
+            if max(self.function) >= x.shape[-1]:
+                raise InputError(f"outputs must be indices of M's {x.shape[-1]} states, got {list(self.function)}.")
+            return x[..., self.function]
+        y = np.asarray(self.function(x), dtype=np.float64)
+        if y.shape[:-1] == x.shape[:-1] and y.ndim == x.ndim:
+            return y
+        if x.ndim > 1 and x.size:
+            rows = np.stack([np.asarray(self.function(row), dtype=np.float64) for row in rows_of(x)])
+            if rows.ndim == 2:
+                return rows.reshape(*x.shape[:-1], -1)
+        raise ShapeError(f"outputs of one state must have shape (p,), got {y.shape} for states of shape {x.shape}.")
+
+    def jacobian(self, x: Array) -> Array:
+        """Return C = dh/dx, shape ``(..., p, n)``, at states ``(..., n)``."""
+        n = x.shape[-1]
+        if not callable(self.function):
+            C = np.eye(n)[self.function]
+            return np.broadcast_to(C, (*x.shape[:-1], *C.shape))
+        p = self(x).shape[-1]
+
+        def padded(states: Array, _: Array) -> Array:
+            """h as a step, which returns as many numbers as it takes."""
+            y = self(states[..., :n])
+            return np.concatenate([y, np.zeros((*y.shape[:-1], width - p))], axis=-1)
+
+        width = max(n, p)
+        wide = np.concatenate([x, np.zeros((*x.shape[:-1], width - n))], axis=-1)
+        A, _ = central_differences(padded, wide, np.zeros((*x.shape[:-1], 0)))
+        return A[..., :p, :n]
+
+    def of(self, trajectory: Trajectory) -> Trajectory:
+        """Return a trajectory with its outputs in the place of states."""
+        with np.errstate(all="ignore"):  # of a loop that diverged
+            return replace(trajectory, states=self(trajectory.states))
+
+    def seen_by(self, controller: Controller) -> Controller:
+        """Return a controller of the states for a controller that sees the outputs alone."""
+        if isinstance(controller, ControllerWithMemory):
+            return _OfOutputs(controller, self)
+        return lambda t, x: controller(t, self(x))
+
+
+@dataclass(frozen=True)
+class _OfOutputs:
+    """A controller with memory that sees the outputs alone."""
+
+    controller: ControllerWithMemory
+    outputs: Outputs
+
+    def start(self, task: Any) -> Any:
+        return self.controller.start(task)
+
+    def step(self, t: int, x: Array, memory: Any) -> tuple[Array, Any]:
+        return self.controller.step(t, self.outputs(x), memory)
+
+
+def as_outputs(given: OutputsLike | Outputs | None) -> Outputs | None:
+    """Return outputs from any form in which users may give them; None stays None."""
+    return given if given is None or isinstance(given, Outputs) else Outputs(given)

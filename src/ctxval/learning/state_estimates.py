@@ -1,0 +1,163 @@
+"""States of M along executions of which outputs are recorded, so that what M misses can be learned.
+
+The learned dynamics need states. Each execution gets those that M, its recorded inputs and its recorded outputs make
+most probable, by an extended Kalman smoother; the recorded outputs are reproduced. How much M misses in what is
+recorded, beside what it misses in the other states, is chosen by how well the filter predicts the next outputs.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+from collections import OrderedDict
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ctxval._util.arrays import Array
+from ctxval.core.controller import Controller, Synthesizer
+from ctxval.core.distance import Distance
+from ctxval.core.kalman import Estimate, corrected, predicted, smoothed
+from ctxval.core.labels import labels_of
+from ctxval.core.model import Model
+from ctxval.core.outputs import Outputs
+from ctxval.core.task import Task
+from ctxval.core.trajectory import Trajectory
+from ctxval.core.validation import Validation
+from ctxval.learning.vector import Executed
+
+_SHARES = np.array([1.0, 1e-1, 1e-2, 1e-3, 1e-4])
+"""What M misses in recorded directions, beside what it misses in all others, as shares of their steps."""
+
+_EXACT = 1e-6  # error of the recorded outputs, as a share of their smallest step: they are reproduced
+_REMEMBERED = 256  # executions whose estimates are kept
+
+
+def with_states_of_model(validation: Validation) -> Validation:
+    """Return a validation whose trajectories have the states of M; itself if the states are recorded.
+
+    Its system is that of the given one, and cannot be executed.
+    """
+    outputs = validation.outputs
+    if outputs is None:
+        return validation
+    labels, space = replace(validation.labels, states=()), validation.space
+    with contextlib.suppress(Exception):  # the user's task, which is planned with its own errors elsewhere
+        n = validation.task(space.parameters(0.5 * (space.low + space.high))).initial_state.shape[-1]
+        names = [f"state {i}" for i in range(n)]
+        recorded = outputs.indices or []
+        for i, label in zip(recorded, labels_of(validation.names(len(recorded), 0)[0]), strict=True):
+            names[i] = label
+        labels = replace(labels, states=tuple(names))
+    return validation.with_parts(
+        synthesizer=_OfStates(validation.synthesizer, outputs),
+        distance=_OfOutputs(validation.distance, outputs),
+        labels=labels,
+        outputs=None,
+    )
+
+
+@dataclass(frozen=True)
+class _OfStates:
+    """Designs the user's controllers, which see the outputs alone."""
+
+    synthesizer: Synthesizer
+    outputs: Outputs
+
+    @property
+    def batched(self) -> bool:
+        return bool(getattr(self.synthesizer, "batched", False))
+
+    def design(self, task: Task, model: Model) -> Controller:
+        return self.outputs.seen_by(self.synthesizer.design(task, model))
+
+
+@dataclass(frozen=True)
+class _OfOutputs:
+    """The user's distance, which is about the outputs alone."""
+
+    distance: Distance
+    outputs: Outputs
+
+    def __call__(self, model_trajectory: Trajectory, system_trajectory: Trajectory, task: Task) -> Array:
+        return self.distance(self.outputs.of(model_trajectory), self.outputs.of(system_trajectory), task)
+
+
+class StateEstimates:
+    """The states of M along executions, estimated from their inputs and outputs; the latest ones are kept.
+
+    Args:
+        validation: the user's validation, which has outputs.
+        steps: typical changes of M's states in one step, ``(n,)``.
+    """
+
+    def __init__(self, validation: Validation, outputs: Outputs, steps: Array) -> None:
+        self.validation, self.outputs = validation, outputs
+        self.steps = np.maximum(steps, 1e-9 * max(float(steps.max(initial=0.0)), 1e-300))
+        self._kept: OrderedDict[bytes, tuple[Array, Array]] = OrderedDict()
+
+    def of(self, executed: Executed, judged: int) -> list[Trajectory]:
+        """Return the executions, points of the unit cube with recorded outputs, with states ``(H + 1, n)``.
+
+        The first ``judged`` of them choose how much M misses in what is recorded.
+        """
+        known = [self._smoothed(point, trajectory) for point, trajectory in executed]
+        errors = np.sum([np.log(np.maximum(errors, 1e-300)) for _, errors in known[: max(judged, 1)]], axis=(0, 2))
+        chosen = int(np.argmin(np.where(np.isfinite(errors), errors, np.inf)))
+        return [
+            replace(trajectory, states=states[:, chosen])
+            for (states, _), (_, trajectory) in zip(known, executed, strict=True)
+        ]
+
+    def _smoothed(self, point: Array, trajectory: Trajectory) -> tuple[Array, Array]:
+        """Return smoothed states ``(H + 1, k, n)`` and mean squared innovations ``(k, p)``, one for each share."""
+        key = hashlib.sha256(b"".join(a.tobytes() for a in (point, trajectory.states, trajectory.inputs))).digest()
+        if key not in self._kept:
+            space = self.validation.space
+            task = self.validation.task(space.parameters(space.from_unit(point)))
+            start = np.asarray(task.initial_state, dtype=np.float64)
+            self._kept[key] = smoothed_states(
+                self.validation.model, self.outputs, start, trajectory.states, trajectory.inputs, self.steps
+            )
+            while len(self._kept) > _REMEMBERED:
+                self._kept.popitem(last=False)
+        return self._kept[key]
+
+
+def smoothed_states(
+    model: Model, outputs: Outputs, start: Array, y: Array, u: Array, steps: Array
+) -> tuple[Array, Array]:
+    """Return the most probable states of a model with these inputs and outputs, and how well outputs are predicted.
+
+    Args:
+        start: the first state ``(n,)``, before the first outputs correct it.
+        y: outputs ``(H + 1, p)``.
+        u: inputs ``(H, m)``.
+        steps: typical changes of the states in one step, ``(n,)``.
+
+    Returns:
+        States ``(H + 1, k, n)``, and mean squared innovations ``(k, p)``, for each of k shares of what the model misses
+        in recorded directions.
+    """
+    k, scale = len(_SHARES), np.diag(steps)
+    C = outputs.jacobian(start) @ scale
+    # The recorded directions of the space in which each state is measured in its steps.
+    recorded = np.linalg.pinv(C) @ C
+    shares = _SHARES[:, None, None] * recorded + np.eye(len(steps)) - recorded
+    process = scale @ shares @ np.swapaxes(shares, -1, -2) @ scale
+    spreads = np.sqrt(np.maximum(np.einsum("ij,ij->i", C, C), 1e-300))
+    measurement = np.diag((_EXACT * _SHARES[-1] * spreads) ** 2)
+    inputs = np.repeat(u[:, None], k, axis=1)
+    known, _ = corrected(outputs, Estimate(np.repeat(start[None], k, axis=0), process), y[0], measurement)
+    filtered, priors, jacobians, innovations = [known], list[Estimate](), list[Array](), list[Array]()
+    for t in range(len(u)):
+        prior, A = predicted(model, known, inputs[t], process)
+        known, innovation = corrected(outputs, prior, y[t + 1], measurement)
+        filtered.append(known)
+        priors.append(prior)
+        jacobians.append(A)
+        innovations.append(innovation)
+    states = [known.mean]
+    for t in reversed(range(len(u))):
+        states.append(smoothed(filtered[t], jacobians[t], priors[t], states[-1]))
+    return np.stack(states[::-1]), np.square(innovations).mean(axis=0)
