@@ -18,6 +18,7 @@ from ctxval.certificates import Certificate, CertificateKind, Sample
 from ctxval.core.controller import Controller, ControllerWithMemory, Synthesizer, converged_of
 from ctxval.core.distance import Distance
 from ctxval.core.model import Model, central_differences, linearize
+from ctxval.core.outputs import OutputsLike, as_outputs
 from ctxval.core.rollout import rollout
 from ctxval.core.system import System
 from ctxval.core.task import Task
@@ -57,22 +58,32 @@ def check_model(
             )
 
 
-def check_system(system: System, controller: Controller, task: Task, *, tolerance: float = _TOLERANCE) -> None:
+def check_system(
+    system: System,
+    controller: Controller,
+    task: Task,
+    *,
+    tolerance: float = _TOLERANCE,
+    outputs: OutputsLike | None = None,
+) -> None:
     """Check that a system starts in the task's initial state, runs to the horizon, and repeats itself.
 
     The check executes the system twice, and once more if it is ``batched``.
 
     The controller is for this task, which is no batch. The tolerance is the largest difference between two executions,
-    relative to the larger of 1 and the state; set it to the noise that you expect.
+    relative to the larger of 1 and the state; set it to the noise that you expect. Outputs are those of the
+    :class:`ctxval.Validation`, if it has any.
     """
+    recorded = as_outputs(outputs)
+    expected_start = task.initial_state if recorded is None else recorded(task.initial_state)
     first, second = system.execute(controller, task), system.execute(controller, task)
     for trajectory in (first, second):
         _require(isinstance(trajectory, Trajectory), f"execute must return a Trajectory, got {type(trajectory)}")
-        expected = (task.horizon + 1, task.initial_state.shape[-1])
+        expected = (task.horizon + 1, len(expected_start))
         got = trajectory.states.shape
         _require(got == expected, f"states must have shape {expected} for this task, got {got}")
         _require(trajectory.ended == COMPLETE, f"the execution ended early: {trajectory.ended}")
-        start = np.abs(trajectory.states[0] - task.initial_state).max()
+        start = np.abs(trajectory.states[0] - expected_start).max()
         _require(start <= tolerance, f"the execution starts {start:g} away from the task's initial state")
     _require_close("the first execution", first.states, "the second", second.states, tolerance)
     if getattr(system, "batched", False):

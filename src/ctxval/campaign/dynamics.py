@@ -258,6 +258,7 @@ class CampaignDynamics:
             lags=0 if noisy is None else noisy.fit.history.structure.lags,
             physical=learned.study.given.physical,
             without_data=not learned.with_data,
+            estimated=learned.study.given.outputs is not None,
         )
 
     def _pocket(self, learned: LearnedDynamics) -> StatePocket | None:

@@ -52,6 +52,11 @@ def except_for(physical: Sequence[str]) -> str:
     return f", except for {enumerated(physical, 10)}" if physical else ""
 
 
+def state_of(estimated: object) -> str:
+    """Return what learned dynamics are a function of, beside the input."""
+    return "M's state (estimated from outputs)" if estimated else "recorded state"
+
+
 def with_units(values: Mapping[str, float], digits: int = 2) -> str:
     """Return numbers with their names; the unit of a label ``name [unit]`` follows its number."""
     parts = ((*parted(label), value) for label, value in values.items())

@@ -194,6 +194,7 @@ def certify_dynamics(sample: Sample, evidence: DynamicsEvidence, confidence: Pro
             "suspect": evidence.suspect and list(evidence.suspect),
             "without_model": evidence.without_model,
             "without_data": evidence.without_data,
+            "estimated": evidence.estimated,
             "sharpness": evidence.sharpness,
             "jump": evidence.jump,
             "missed": evidence.missed,

@@ -251,6 +251,7 @@ class DynamicsEvidence(ShortRepr):
         suspect: another one that they seem to depend on, and how many times less predictions of executions from the
             others err with it; None if predictions hold, or if there is none.
         without_data: whether the data that M was made from are left out, because they contradict the executions.
+        estimated: whether states of M are estimated from recorded outputs.
     """
 
     maxima: Array
@@ -280,6 +281,7 @@ class DynamicsEvidence(ShortRepr):
     physical: tuple[str, ...] = ()
     suspect: tuple[str, float] | None = None
     without_data: bool = False
+    estimated: bool = False
 
     def rank(self, confidence: float) -> int:
         """Return the row, in ascending order, of the maximum that d* stays below with this probability."""

@@ -7,7 +7,7 @@ stands beside the test that withdraws it, in the diagnostics.
 from __future__ import annotations
 
 from ctxval._util.representation import counted
-from ctxval.certificates.bounds import at_most, except_for, of_tasks, percent, with_error, with_units
+from ctxval.certificates.bounds import at_most, except_for, of_tasks, percent, state_of, with_error, with_units
 from ctxval.certificates.dynamics_evidence import DynamicsEvidence
 from ctxval.certificates.sample import Sample, listed
 
@@ -212,7 +212,8 @@ def dynamics_assumptions(evidence: DynamicsEvidence) -> tuple[str, ...]:
             "is not covered"
         )
     steps = "the last record" if not evidence.lags else f"the last {evidence.lags + 1} records"
-    complete = "the recorded state is complete: the next state depends on it and on the input alone"
+    state = f"{'' if evidence.estimated else 'the '}{state_of(evidence.estimated)}"
+    complete = f"{state} is complete: the next state depends on it and on the input alone"
     if evidence.lags or evidence.quantile is not None:
         complete = f"the next record depends on {steps} and inputs alone, up to noise"
     but = except_for(evidence.physical)

@@ -12,7 +12,7 @@ import numpy as np
 from ctxval._util.representation import counted, shown
 from ctxval._util.texts import enumerated, parted, quoted
 from ctxval.certificates.bets import Bets
-from ctxval.certificates.bounds import at_most, except_for, of_tasks, percent, with_error, with_units
+from ctxval.certificates.bounds import at_most, except_for, of_tasks, percent, state_of, with_error, with_units
 from ctxval.certificates.covering import RESOLUTION
 from ctxval.certificates.dynamics_evidence import PushedDistances, Tolerance
 from ctxval.certificates.sample import executions_of
@@ -169,17 +169,19 @@ def _condition(certificate: Certificate, quantities: Quantities) -> str:
     """Return what the confidence of a bound on d* is, and the condition under which it holds."""
     if certificate.kind == "dynamics":
         physical = certificate.details.get("physical") or []  # stores of earlier versions do not have it
+        state = state_of(certificate.details.get("estimated"))
+        states = state.replace("state", "states", 1)
         if certificate.details["quantile"] is not None:
-            of = enumerated([f"recorded states and inputs{_of_lags(certificate)}", *physical], 10)
+            of = enumerated([f"{states} and inputs{_of_lags(certificate)}", *physical], 10)
             return (
                 "probability under a Gaussian process with noise, if what M misses is a smooth function of "
                 f"{of}, the same in every task and over time, and noise is "
                 "independent from step to step"
             )
         missed = "the system" if certificate.details["without_model"] else "what M misses"
-        recorded = [f"recorded states and inputs{_of_lags(certificate)}"]
+        recorded = [f"{states} and inputs{_of_lags(certificate)}"]
         if not certificate.details["lags"]:
-            recorded = ["recorded state", "input"] if physical else ["recorded state and input"]
+            recorded = [state, "input"] if physical else [f"{state} and input"]
         return (
             f"probability under a Gaussian process, if {missed} is one smooth function of "
             f"{enumerated([*recorded, *physical], 10)}, "
@@ -332,9 +334,10 @@ def conditions(certificate: Certificate, space: TaskSpace | None) -> list[str]:
                 complete = f"{steps} determining the next record up to noise"
                 alike = f"noise being independent from step to step and like that of the records, and {unchanging}"
             else:
-                complete = (
-                    f"{steps} determining the next record" if details["lags"] else "the recorded state being complete"
-                )
+                complete = f"{steps} determining the next record"
+                if not details["lags"]:
+                    estimated = details.get("estimated")
+                    complete = f"{'' if estimated else 'the '}{state_of(estimated)} being complete"
                 alike = f"the system being deterministic{noise}, and {unchanging}"
             return [
                 complete,

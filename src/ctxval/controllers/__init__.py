@@ -7,6 +7,7 @@ from ctxval.controllers.ilqr import ILQR, ILQRSolution
 from ctxval.controllers.lqr import LQR, StationaryLQR
 from ctxval.controllers.mpc import MPC, RecedingHorizon
 from ctxval.controllers.onnx_policy import OnnxPolicy, RecurrentPolicy
+from ctxval.controllers.output_feedback import EstimatedFeedback, OutputFeedback
 from ctxval.controllers.pid import PID, PIDFeedback
 from ctxval.core.controller import (
     AffineFeedback,
@@ -31,9 +32,11 @@ __all__ = [
     "ControllerFile",
     "ControllerRun",
     "ControllerWithMemory",
+    "EstimatedFeedback",
     "ILQRSolution",
     "Limits",
     "OnnxPolicy",
+    "OutputFeedback",
     "PIDFeedback",
     "Policy",
     "RecedingHorizon",

@@ -12,6 +12,7 @@ from ctxval._util.arrays import Array, rows_of
 from ctxval._util.representation import ShortRepr
 from ctxval.core.controller import Controller, ControllerWithMemory
 from ctxval.core.model import central_differences
+from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory
 from ctxval.errors import InputError, ShapeError
 
@@ -32,6 +33,7 @@ class Outputs(ShortRepr):
             self.function = [int(i) for i in given]
             if not self.function or len(set(self.function)) < len(self.function) or min(self.function) < 0:
                 raise InputError(f"outputs must be a function h(x), or different indices of states, got {given!r}.")
+        self._batched: bool | None = None
 
     def describe(self) -> dict[str, Any]:
         """Return what identifies these outputs in a store."""
@@ -49,14 +51,34 @@ class Outputs(ShortRepr):
             if max(self.function) >= x.shape[-1]:
                 raise InputError(f"outputs must be indices of M's {x.shape[-1]} states, got {list(self.function)}.")
             return x[..., self.function]
+        if x.ndim == 1:
+            return self._of_one(x)
+        rows = rows_of(x)
+        if self._batched is None and len(rows):
+            self._batched = self._takes_batches(x, rows)
+        if self._batched:
+            return np.asarray(self.function(x), dtype=np.float64)
+        return np.stack([self._of_one(row) for row in rows]).reshape(*x.shape[:-1], -1)
+
+    def _of_one(self, x: Array) -> Array:
+        assert callable(self.function)
         y = np.asarray(self.function(x), dtype=np.float64)
-        if y.shape[:-1] == x.shape[:-1] and y.ndim == x.ndim:
-            return y
-        if x.ndim > 1 and x.size:
-            rows = np.stack([np.asarray(self.function(row), dtype=np.float64) for row in rows_of(x)])
-            if rows.ndim == 2:
-                return rows.reshape(*x.shape[:-1], -1)
-        raise ShapeError(f"outputs of one state must have shape (p,), got {y.shape} for states of shape {x.shape}.")
+        if y.ndim != 1 or not y.size:
+            raise ShapeError(f"outputs of one state must have shape (p,), got {y.shape} for a state {x.shape}.")
+        return y
+
+    def _takes_batches(self, x: Array, rows: Array) -> bool:
+        """Return whether the function returns for a batch what it returns for its first and last state alone."""
+        assert callable(self.function)
+        alone = [self._of_one(row) for row in (rows[0], rows[-1])]
+        try:
+            y = np.asarray(self.function(x), dtype=np.float64)
+        except Exception:  # the user's function, which may take one state only
+            return False
+        if y.shape != (*x.shape[:-1], *alone[0].shape):
+            return False
+        ends = rows_of(y)[[0, -1]]
+        return bool(np.allclose(ends, alone, rtol=1e-9, atol=0, equal_nan=True))
 
     def jacobian(self, x: Array) -> Array:
         """Return C = dh/dx, shape ``(..., p, n)``, at states ``(..., n)``."""
@@ -67,7 +89,7 @@ class Outputs(ShortRepr):
         p = self(x).shape[-1]
 
         def padded(states: Array, _: Array) -> Array:
-            """h as a step, which returns as many numbers as it takes."""
+            """H as a step, which returns as many numbers as it takes."""
             y = self(states[..., :n])
             return np.concatenate([y, np.zeros((*y.shape[:-1], width - p))], axis=-1)
 
@@ -81,10 +103,13 @@ class Outputs(ShortRepr):
         with np.errstate(all="ignore"):  # of a loop that diverged
             return replace(trajectory, states=self(trajectory.states))
 
-    def seen_by(self, controller: Controller) -> Controller:
-        """Return a controller of the states for a controller that sees the outputs alone."""
+    def seen_by(self, controller: Controller, task: Task | None = None) -> Controller:
+        """Return a controller of the states for a controller that sees the outputs alone.
+
+        A task is the one from which a controller with memory starts, if the states are not those of M.
+        """
         if isinstance(controller, ControllerWithMemory):
-            return _OfOutputs(controller, self)
+            return _OfOutputs(controller, self, task)
         return lambda t, x: controller(t, self(x))
 
 
@@ -94,9 +119,10 @@ class _OfOutputs:
 
     controller: ControllerWithMemory
     outputs: Outputs
+    task: Task | None
 
-    def start(self, task: Any) -> Any:
-        return self.controller.start(task)
+    def start(self, task: Task) -> Any:
+        return self.controller.start(task if self.task is None else self.task)
 
     def step(self, t: int, x: Array, memory: Any) -> tuple[Array, Any]:
         return self.controller.step(t, self.outputs(x), memory)

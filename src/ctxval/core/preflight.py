@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ctxval._util.arrays import Array, ArrayLike, vector_norm
+from ctxval._util.arrays import ArrayLike, vector_norm
 from ctxval.core.plan import Plan
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.validation import Validation

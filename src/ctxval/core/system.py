@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any, Protocol, runtime_checkable
+from collections.abc import Callable
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from collections.abc import Callable
 from ctxval._util.arrays import Array
 from ctxval._util.registry import part
 from ctxval._util.representation import ShortRepr
@@ -33,45 +33,36 @@ class System(Protocol):
         """
 
 
-@part(functions={"step": "(x, u) -> x_next", "start": "x -> first state"})
+@part(functions={"step": "(x, u) -> x_next"})
 class Simulated(ShortRepr):
     """A step function ``(x, u) -> x_next``, or a model, as the true system.
 
     An object with a method ``step`` takes batches; a plain function does so if it is ``vectorized``.
-
-    Args:
-        start: the system's first state ``(..., s)`` for the initial state ``(..., n)`` of a task, if the two differ.
     """
 
     batched = True
 
-    def __init__(
-        self, step: Step | Model, *, vectorized: bool = False, start: Callable[[Array], Array] | None = None
-    ) -> None:
+    def __init__(self, step: Step | Model, *, vectorized: bool = False) -> None:
         self.model = step if isinstance(step, Model) else Function(step, vectorized=vectorized)
-        self.start = start
-
-    def describe(self) -> dict[str, Any]:
-        """Return what identifies this system in a store."""
-        return {"model": self.model, **({} if self.start is None else {"start": self.start})}
 
     def execute(self, controller: Controller, task: Task) -> Trajectory:
         """Run the closed loop from the initial state of the task over its horizon."""
-        begun = task if self.start is None else task.starting_at(np.asarray(self.start(task.initial_state)))
-        return rollout(self.model.step, controller, begun)
+        return rollout(self.model.step, controller, task)
 
 
-@part(functions={"outputs": "x -> y"})
+@part(functions={"outputs": "x -> y", "start": "x -> first state"})
 class WithOutputs(ShortRepr):
     """A system whose controllers see outputs of its states, and that records them in the place of states.
 
     Args:
         system: the system with all its states.
         outputs: a function ``h(x) -> y`` of these states, or the indices of those that are recorded.
+        start: the system's first state ``(..., s)`` for the initial state ``(..., n)`` of a task, which is one of M, if
+            the two have other states.
     """
 
-    def __init__(self, system: System, outputs: OutputsLike) -> None:
-        self.system, self.outputs = system, Outputs(outputs)
+    def __init__(self, system: System, outputs: OutputsLike, *, start: Callable[[Array], Array] | None = None) -> None:
+        self.system, self.outputs, self.start = system, Outputs(outputs), start
 
     @property
     def batched(self) -> bool:
@@ -80,4 +71,7 @@ class WithOutputs(ShortRepr):
 
     def execute(self, controller: Controller, task: Task) -> Trajectory:
         """Execute the system, and return the inputs and outputs."""
-        return self.outputs.of(self.system.execute(self.outputs.seen_by(controller), task))
+        of_system = task
+        if self.start is not None:
+            of_system = task.starting_at(np.asarray(self.start(task.initial_state), dtype=np.float64))
+        return self.outputs.of(self.system.execute(self.outputs.seen_by(controller, task), of_system))

@@ -134,6 +134,11 @@ class Validation:
         """Return what is recorded in states of M ``(..., n)``: their outputs if there are any, or these states."""
         return x if self.outputs is None else self.outputs(x)
 
+    def require_states(self, what: str) -> None:
+        """Refuse outputs in the place of states for what needs recorded states of M."""
+        if self.outputs is not None:
+            raise InputError(f"{what} needs recorded states of M, and this validation records outputs h(x) of them.")
+
     def _recorded_of(self, task: Task) -> Array:
         try:
             return self.recorded(task.initial_state)

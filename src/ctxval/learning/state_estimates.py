@@ -44,7 +44,7 @@ def with_states_of_model(validation: Validation) -> Validation:
     labels, space = replace(validation.labels, states=()), validation.space
     with contextlib.suppress(Exception):  # the user's task, which is planned with its own errors elsewhere
         n = validation.task(space.parameters(0.5 * (space.low + space.high))).initial_state.shape[-1]
-        names = [f"state {i}" for i in range(n)]
+        names = [f"x{i}" for i in range(n)]
         recorded = outputs.indices or []
         for i, label in zip(recorded, labels_of(validation.names(len(recorded), 0)[0]), strict=True):
             names[i] = label
@@ -105,7 +105,7 @@ class StateEstimates:
         errors = np.sum([np.log(np.maximum(errors, 1e-300)) for _, errors in known[: max(judged, 1)]], axis=(0, 2))
         chosen = int(np.argmin(np.where(np.isfinite(errors), errors, np.inf)))
         return [
-            replace(trajectory, states=states[:, chosen])
+            _without_end(replace(trajectory, states=states[:, chosen]), trajectory.states.shape[-1])
             for (states, _), (_, trajectory) in zip(known, executed, strict=True)
         ]
 
@@ -122,6 +122,13 @@ class StateEstimates:
             while len(self._kept) > _REMEMBERED:
                 self._kept.popitem(last=False)
         return self._kept[key]
+
+
+def _without_end(trajectory: Trajectory, outputs: int) -> Trajectory:
+    """Return a trajectory without the last states, which only later outputs would show."""
+    n, horizon = trajectory.states.shape[-1], trajectory.horizon
+    kept = horizon - min(-(-n // outputs) - 1, horizon - 1)
+    return Trajectory(trajectory.times[: kept + 1], trajectory.states[: kept + 1], trajectory.inputs[:kept])
 
 
 def smoothed_states(

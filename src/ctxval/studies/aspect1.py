@@ -186,7 +186,7 @@ def completion(validation: Validation) -> Distance:
     shared: dict[str, Any] = {"norm": 2}
     if isinstance(distance, StateNorm):
         shared = {name: getattr(distance, name) for name in ("norm", "components", "weights", "scales", "angles")}
-    n = task.initial_state.shape[-1]
+    n = validation.recorded(task.initial_state).shape[-1]
     aimed = aimed_states(validation, n)
     if shared.get("components") is None and shared.get("weights") is None and shared.get("scales") is None:
         shared["components"] = tuple(aimed.tolist()) if 0 < len(aimed) < n else None

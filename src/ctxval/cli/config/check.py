@@ -100,7 +100,7 @@ def _goals(validation: Validation, plans: Sequence[Plan]) -> Findings:
     missed = goal_misses(validation, on_model, goals)
     if missed is None:
         errors = [np.abs(run.final_state - goal).sum() for run, goal in zip(on_model, goals, strict=True)]
-        starts = [np.abs(plan.task.initial_state - plan.task.goal).sum() for plan in plans]
+        starts = [np.abs(plan.model_trajectory.states[0] - plan.task.goal).sum() for plan in plans]
         row, reached = int(np.argmax(errors)), max(errors) <= MISSED * max(starts)
         how = f"{errors[row]:.3g} from the goal (1-norm of the states)"
     else:
@@ -228,7 +228,7 @@ def _executions(validation: Validation, plan: Plan, execute: bool) -> Findings:
         return
     first, second = validation.execute(plan), validation.execute(plan)
     for trajectory in (first, second):
-        gap = float(np.abs(trajectory.states[0] - plan.task.initial_state).max())
+        gap = float(np.abs(trajectory.states[0] - plan.model_trajectory.states[0]).max())
         if gap > 1e-6:
             yield "failed", f"the execution starts {gap:.3g} away from the initial state of the task"
     noise = float(np.abs(first.states - second.states).max())

@@ -31,9 +31,11 @@ from ctxval.cli.config.parts import (
     task_function,
     with_distribution,
 )
+from ctxval.cli.config.references import reference, require_function
 from ctxval.cli.config.signatures import code_named, signed
 from ctxval.core.experiment import Experiment
 from ctxval.core.labels import Labels, labels_of
+from ctxval.core.outputs import OutputsLike
 from ctxval.core.quantiles import QUANTILE
 from ctxval.core.space import TaskSpace
 from ctxval.core.validation import Validation
@@ -146,6 +148,7 @@ class Settings(BaseModel):
         distribution: see :func:`~ctxval.cli.config.parts.with_distribution`; a named experiment may have one too.
         longest: the largest horizon.
         physical: the task parameters that change the dynamics of the system; a named experiment may have some too.
+        outputs: the indices of M's states that are recorded, or the function ``module:attr`` of them.
         explore, within: as the options of ``ctxval run``, so that a store knows the command that made it.
         refined: the file of a model that `ctxval refine` has learned from executions; it replaces the given model.
         folder: the folder of modules and files, which is that of the experiment file; None for the current folder.
@@ -170,6 +173,7 @@ class Settings(BaseModel):
     threshold: float | None = Field(default=None, gt=0, allow_inf_nan=False, strict=True)
     longest: int | None = Field(default=None, ge=1, strict=True)
     physical: list[str] | None = None
+    outputs: str | list[int] | None = None
     explore: bool | None = None
     within: float = Field(default=WITHIN, gt=0, allow_inf_nan=False, strict=True)
     confidence: float = Field(default=CONFIDENCE, ge=LEAST_CONFIDENCE, lt=1, strict=True)
@@ -202,7 +206,7 @@ class Settings(BaseModel):
         return experiment if validation is given else replace(experiment, validation=validation)
 
     def _named(self, experiment: str) -> Experiment:
-        for name in (*_WHOLE, "distance", "name"):
+        for name in (*_WHOLE, "distance", "name", "outputs"):
             if getattr(self, name) is not None:
                 why = f"remove one of them, because a named experiment has its own {name}"
                 raise InputError(f"the file has both 'experiment' and {name!r}: {why}.")
@@ -229,8 +233,16 @@ class Settings(BaseModel):
             synthesizer=part("synthesizer", self.synthesizer or {}, self.folder),
             distance=part("distance", self.distance or "FinalState", self.folder),
             labels=Labels(labels_of(self.states), labels_of(self.inputs), self.units or ""),
+            outputs=self._outputs,
         )
         return Experiment(self.name or "experiment", validation)
+
+    @property
+    def _outputs(self) -> OutputsLike | None:
+        if isinstance(self.outputs, str):
+            function: OutputsLike = require_function("outputs", reference(self.outputs, self.folder), "x -> y")
+            return function
+        return self.outputs
 
     def campaign(
         self,

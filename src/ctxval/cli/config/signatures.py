@@ -150,7 +150,7 @@ def code_named(settings: Mapping[str, Any]) -> list[str]:
         ("certificate", "kind", KINDS),
     ]
     try:
-        code = [_shown("task", settings["task"])] if isinstance(settings.get("task"), str) else []
+        code = [_shown(key, settings[key]) for key in ("task", "outputs") if isinstance(settings.get(key), str)]
         for key, name_key, registry in named:
             given = settings.get(key)
             name = given.get(name_key) if name_key and isinstance(given, Mapping) else given

@@ -72,6 +72,7 @@ def refine(
             f"the campaign has {campaign.executions} executions already, and the budget of {budget} is a total: give "
             "more."
         )
+    campaign.validation.require_states("refine")
     chosen, options = method_of(method, seed=campaign.seed), certificate or CertificateOptions()
 
     def same_settings(validation: Validation, store: Path | None, *_: object) -> Campaign:

@@ -147,6 +147,7 @@ def _seen(model: Model, recordings: Recordings) -> set[int]:
 
 
 def _require_same_step(validation: Validation, recordings: Recordings) -> None:
+    validation.require_states("a replay")
     space = validation.space
     task = validation.task(space.parameters(0.5 * (space.low + space.high)))
     if task.initial_state.shape[-1] != len(recordings.states):

@@ -1,0 +1,125 @@
+"""Feedback of states that are estimated from outputs by a Kalman filter on M."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ctxval._util.arrays import Array, ArrayLike, as_finite
+from ctxval._util.registry import part
+from ctxval._util.representation import ShortRepr
+from ctxval.core.controller import Controller, ControllerWithMemory, Limits, Synthesizer
+from ctxval.core.kalman import Estimate, corrected, predicted
+from ctxval.core.model import Model
+from ctxval.core.outputs import Outputs, OutputsLike
+from ctxval.core.task import Task
+from ctxval.errors import InputError, ShapeError
+
+
+@part(functions={"outputs": "x -> y"})
+class OutputFeedback(ShortRepr):
+    """A state feedback on the estimate of an extended Kalman filter of M, which sees outputs alone.
+
+    The goal or reference of the task is one of the outputs. The state feedback follows the states of least norm that
+    have these outputs, by the linearisation of the outputs at zero states.
+
+    Args:
+        synthesizer: designs the state feedback, as LQR does.
+        outputs: a function ``h(x) -> y`` of M's states, or the indices of the states that are outputs.
+        process: standard deviations of what M misses in each state in one step, a number or ``(n,)``.
+        measurement: standard deviations of the errors of the outputs, a number or ``(p,)``.
+
+    Raises:
+        InputError: if a standard deviation is not positive.
+    """
+
+    def __init__(
+        self, synthesizer: Synthesizer, outputs: OutputsLike, *, process: ArrayLike, measurement: ArrayLike
+    ) -> None:
+        self.synthesizer, self.outputs = synthesizer, Outputs(outputs)
+        self.process, self.measurement = as_finite("process", process), as_finite("measurement", measurement)
+        for name in ("process", "measurement"):
+            if not (getattr(self, name) > 0).all():
+                raise InputError(f"{name} must be positive, got {getattr(self, name).tolist()}.")
+
+    @property
+    def batched(self) -> bool:
+        """Whether the state feedback is designed for a batch of tasks in one call."""
+        return bool(getattr(self.synthesizer, "batched", False))
+
+    def design(self, task: Task, model: Model) -> EstimatedFeedback:
+        """Return the controller, which has memory."""
+        n, p = task.initial_state.shape[-1], self.outputs(task.initial_state).shape[-1]
+        task.require_width(p)
+        zero = np.zeros(n)
+        lift = np.linalg.pinv(self.outputs.jacobian(zero)).T
+        reference = (task.reference - self.outputs(zero)) @ lift if task.has_goal else None
+        of_states = Task(task.initial_state, horizon=task.horizon, dt=task.dt, reference=reference)
+        covariances = tuple(
+            np.diag(np.broadcast_to(_deviations(name, value, size), (size,)) ** 2)
+            for name, value, size in (("process", self.process, n), ("measurement", self.measurement, p))
+        )
+        return EstimatedFeedback(self.synthesizer.design(of_states, model), model, self.outputs, *covariances)
+
+
+def _deviations(name: str, value: Array, size: int) -> Array:
+    if value.shape not in ((), (size,)):
+        raise ShapeError(f"{name} must be a number or have shape ({size},), got {value.shape}.")
+    return value
+
+
+class FilterMemory(NamedTuple):
+    """The estimate before the next outputs, and the memory of the state feedback."""
+
+    prior: Estimate
+    of_feedback: Any
+
+
+@dataclass(frozen=True, eq=False)
+class EstimatedFeedback(ShortRepr):
+    """The state feedback of one task or a batch on the filter's estimates, a controller with memory.
+
+    Attributes:
+        process, measurement: covariances ``(n, n)`` and ``(p, p)``.
+    """
+
+    feedback: Controller
+    model: Model
+    outputs: Outputs
+    process: Array
+    measurement: Array
+
+    @property
+    def limits(self) -> Limits | None:
+        """The limits of the inputs; None if there are none."""
+        return getattr(self.feedback, "limits", None)
+
+    @property
+    def converged(self) -> Any:
+        """Whether the design of the state feedback converged; None if it does not tell."""
+        return getattr(self.feedback, "converged", None)
+
+    def start(self, task: Task) -> FilterMemory:
+        """Return the initial state of the task as the first estimate."""
+        known = np.broadcast_to(self.process, (*task.batch_shape, *self.process.shape))
+        of_feedback = self.feedback.start(task) if isinstance(self.feedback, ControllerWithMemory) else None
+        return FilterMemory(Estimate(np.array(task.initial_state), known), of_feedback)
+
+    def step(self, t: int, y: Array, memory: FilterMemory) -> tuple[Array, FilterMemory]:
+        """Return the inputs ``(..., m)`` for the outputs ``(..., p)`` of step t, and the new memory."""
+        known, _ = corrected(self.outputs, memory.prior, np.asarray(y, dtype=np.float64), self.measurement)
+        of_feedback = memory.of_feedback
+        if isinstance(self.feedback, ControllerWithMemory):
+            u, of_feedback = self.feedback.step(t, known.mean, of_feedback)
+        else:
+            u = self.feedback(t, known.mean)
+        u = np.asarray(u, dtype=np.float64)
+        prior, _ = predicted(self.model, known, u, self.process)
+        return u, FilterMemory(prior, of_feedback)
+
+    def __getitem__(self, index: int) -> EstimatedFeedback:
+        """Return the controller of one task of the batch."""
+        feedback: Any = self.feedback
+        return EstimatedFeedback(feedback[index], self.model, self.outputs, self.process, self.measurement)
