@@ -158,9 +158,7 @@ def test_draws_have_memories_of_their_own(single: bool, monkeypatch: pytest.Monk
     planner = LoopPlanner(validation)
     monkeypatch.setattr(closed_loops, "rollout", lambda *loop: lengths.append(1) or rollout(*loop))
     found = planner.distances(draws, planner.plan(POINTS), len(POINTS))
-    assert len(lengths) == (
-        2 * len(POINTS) if single else 3
-    )  # all draws at once, with one loop of batched tasks to try
+    assert len(lengths) == (len(POINTS) if single else 1)  # all draws at once
     np.testing.assert_allclose(found, expected(validation), rtol=1e-8)
 
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from test_outputs import Swing, swing, swing_validation
 
 from ctxval import Campaign
 from ctxval.core.outputs import Outputs
 from ctxval.learning import DynamicsStudy
 from ctxval.learning.replays import replay_executed
 from ctxval.learning.state_estimates import smoothed_states, with_states_of_model
+from rig_outputs import Swing, swing, swing_validation
 
 POINTS = np.array([[-0.8], [-0.2], [0.5], [1.0]])
 

@@ -190,25 +190,30 @@ class WorstCaseSearch:
             known: tasks to look at in any case, such as those of earlier maxima, points ``(k, d)``.
             globally: whether large distances on a small share of the tasks are looked for.
         """
-        settings, distance = self.settings, partial(self._distances, posterior.mean)
+        noisy = isinstance(posterior, NoisyPosterior)
+        # With few sequences of noise, a search finds the same tasks; these are evaluated with all of them.
+        settings, distance = self.settings, partial(self._distances, posterior.rough_mean if noisy else posterior.mean)
         best = self.pool[np.argsort(-_finite(of_pool), kind="stable")[: settings.elites * 4]]
         starts = np.concatenate([known, best])
         with single_threaded():
             if not globally:
                 budget = min(_SCREENED[1], settings.evaluations)
-                rough = (
-                    None if posterior.rough_mean is posterior.mean else partial(self._distances, posterior.rough_mean)
-                )
+                rough = None if noisy else partial(self._distances, posterior.rough_mean)
                 ascent = Ascent(distance, np.zeros(self.dimension), np.ones(self.dimension), budget, rough)
                 points, values = ascent.run(starts[: len(known) + _SHOWN], rng)
                 apart = separated_rows(points, _APART * np.sqrt(self.dimension), settings.elites)
-                return self._of_mean(float(values[0]), points[apart], len(points))
+                return self._of_mean(posterior, float(values[0]), points[apart], len(points))
             evaluations = max(len(starts) + 50, settings.evaluations - len(self.pool))
             found = search_globally(distance, self.dimension, starts, rng, evaluations=evaluations)
         elites = np.concatenate([found.points[:1], found.elites[: settings.elites]])
-        return self._of_mean(float(found.values[0]), elites, found.evaluations)
+        return self._of_mean(posterior, float(found.values[0]), elites, found.evaluations)
 
-    def _of_mean(self, highest: float, elites: Array, evaluations: int) -> WorstCase:
+    def _of_mean(self, posterior: AnyPosterior, highest: float, elites: Array, evaluations: int) -> WorstCase:
+        if isinstance(posterior, NoisyPosterior) and posterior.is_noisy:
+            with single_threaded():
+                values = self._distances(posterior.mean, elites)
+            order = np.argsort(-values, kind="stable")
+            highest, elites, evaluations = float(values[order[0]]), elites[order], evaluations + len(elites)
         maxima, loops = np.array([highest]), len(self.pool) + evaluations
         return WorstCase(maxima, elites[:1], highest, elites, loops, 0.0, self.unplanned)
 
