@@ -139,13 +139,15 @@ class Validation:
         if self.outputs is not None:
             raise InputError(f"{what} needs recorded states of M, and this validation records outputs h(x) of them.")
 
-    def _recorded_of(self, task: Task) -> Array:
+    def require_goal(self, task: Task) -> None:
+        """Refuse a task whose goal or reference has other components than what is recorded."""
         try:
-            return self.recorded(task.initial_state)
+            width = self.recorded(task.initial_state).shape[-1]
         except CtxvalError:
             raise
         except Exception as error:  # the user's function
             raise InputError(f"the outputs h(x) failed: {reason_of(error)}.") from error
+        task.require_width(width)
 
     def closed_loop(self, controller: Controller, task: Task) -> Trajectory:
         """Return the closed loop of a controller with M, as it is recorded."""
@@ -334,7 +336,7 @@ class Validation:
 
     def plan_of(self, parameters: Parameters, task: Task) -> Plan:
         """Return the plan of a task, or of a batch, that is made already; :meth:`plan` checks more."""
-        task.require_width(self._recorded_of(task).shape[-1])
+        self.require_goal(task)
         try:
             controller = self.synthesizer.design(task, self.model)
         except CtxvalError:

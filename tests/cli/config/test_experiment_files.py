@@ -131,7 +131,7 @@ def test_a_described_experiment_can_be_asked_by_hand(invoke: Any) -> None:
         ("A = [[1.0, 0.05], [0.0, 1.0]]", "A = [[1.0]]", "needs A (n, n), B (n, m)"),
         ('goal = ["goal", 0.0]', 'goal = ["gaol", 0.0]', "did you mean 'goal'"),
         ('goal = ["goal", 0.0]', "goal = 3", "goal of [task] must be a list"),
-        ('goal = ["goal", 0.0]', "goal = [1.0]", "goal must have 2 components"),
+        ('goal = ["goal", 0.0]', "goal = [1.0]", "goal or reference of a task must have 2 components"),
         ('goal = ["goal", 0.0]', 'goal = ["goal[1]", 0.0]', "[task] cannot be used"),
         ("horizon = 60            # number of time steps", "", "[task] needs horizon"),
         ("horizon = 60", "horizonn = 60", "did you mean 'horizon'"),
@@ -565,3 +565,36 @@ def test_a_wrong_file_that_was_told_is_replaced(invoke: Any) -> None:
     store = Store("a.sqlite")
     assert store.trials()[0].distance == 0.2
     assert [change.why for change in store.history()] == ["typing error"]
+
+
+OUTPUTS = """
+outputs = {outputs}
+space = {{ goal = [-1.0, 1.0] }}
+task = {{ initial_state = [0.2, 0.0], goal = ["goal"], horizon = 40, dt = 0.05 }}
+system = "angles:rig"
+model = "angles:model"
+synthesizer = {{ type = "PID", kp = 3.0, ki = 1.0, kd = 1.0 }}
+distance = "MaximumDeviation"
+[states]
+angle = "rad"
+"""
+
+
+@pytest.mark.parametrize("outputs", ["[0]", '"angles:angle"'])
+def test_outputs_are_indices_or_a_function_of_a_module(outputs: str, invoke: Any) -> None:
+    sys.modules.pop("angles", None)
+    Path("angles.py").write_text(
+        "from rig_outputs import Swing as model, swing_validation\n\nrig = swing_validation().system\n\n\n"
+        "def angle(x):\n    return x[..., :1]\n"
+    )
+    Path("e.toml").write_text(OUTPUTS.format(outputs=outputs))
+    result = invoke("run", "e.toml", "--budget", "2", "--explore", "--no-report", "--store", "runs/e.sqlite")
+    assert result.exit_code == 0, result.stderr
+    (first, *_) = Store("runs/e.sqlite").trials()
+    assert first.state == "completed"
+    assert first.distance > 0
+
+
+def test_outputs_of_a_named_experiment_are_its_own(invoke: Any) -> None:
+    Path("e.toml").write_text('experiment = "pendulum"\noutputs = [0]\n')
+    assert "both 'experiment' and 'outputs'" in sentence(invoke("run", "e.toml"))

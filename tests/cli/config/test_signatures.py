@@ -138,6 +138,7 @@ ATTACKS: dict[str, dict[str, Any]] = {
     "class": {**PLAIN, "system": HOSTILE["system"]},
     "module": {**PLAIN, "task": "evil:task"},
     "module alone": {**PLAIN, "task": "evil"},
+    "outputs": {**PLAIN, "outputs": "evil:outputs"},
     "experiment": {"experiment": "evil:experiment"},
     "function": {**PLAIN, "model": {"type": "subprocess:getoutput", "cmd": "id > PWNED"}},
     "argument": {**PLAIN, "system": {"type": "Simulated", "step": {"ref": "evil:step"}}},

@@ -23,6 +23,7 @@ from ctxval.certificates import KINDS, RESOLUTION, CertificateOptions, require_u
 from ctxval.certificates.options import CONFIDENCE, LEAST_CONFIDENCE, MOST_VOLUME, WITHIN
 from ctxval.certificates.prediction_tests import TESTS
 from ctxval.cli.config.parts import (
+    TaskTable,
     argument,
     named_experiment,
     part,
@@ -235,6 +236,8 @@ class Settings(BaseModel):
             labels=Labels(labels_of(self.states), labels_of(self.inputs), self.units or ""),
             outputs=self._outputs,
         )
+        if isinstance(validation.task, TaskTable):
+            validation.require_goal(validation.task(space.parameters(space.low)))
         return Experiment(self.name or "experiment", validation)
 
     @property
