@@ -77,7 +77,12 @@ def truth(key: tuple[str, str]) -> dict[str, Any]:
             points = np.clip(np.concatenate([top, *moves]), 0, 1)
             values = _distances(validation, points)
     best = int(values.argmax())
-    return {"plant": name, "imperfection": imperfection, "distance": float(values[best]), "point": points[best].tolist()}
+    return {
+        "plant": name,
+        "imperfection": imperfection,
+        "distance": float(values[best]),
+        "point": points[best].tolist(),
+    }
 
 
 def _distances(validation: Validation, points: Array) -> Array:

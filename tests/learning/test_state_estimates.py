@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from ctxval import Campaign
+from ctxval import Campaign, TaskSpace, distances
 from ctxval.core.outputs import Outputs
 from ctxval.learning import DynamicsStudy
 from ctxval.learning.replays import replay_executed
@@ -77,3 +79,22 @@ def test_a_campaign_decides_with_the_angle_alone(share: float, answer: str) -> N
     if answer == "validated":
         assert largest <= verdict.bound <= share * largest
         assert "M's state (estimated from outputs)" in str(verdict)
+
+
+class Fragile:
+    """M, which is defined for small rates alone."""
+
+    def step(self, x: np.ndarray, u: np.ndarray) -> np.ndarray:
+        if (np.abs(x[..., 1]) > 1.5).any():
+            raise ValueError("too fast")
+        return Swing.step(x, u)
+
+
+def test_states_that_cannot_be_estimated_leave_the_distance_to_be_learned() -> None:
+    validation = swing_validation(model=Fragile(), space=TaskSpace(goal=(-0.1, 0.1)), distance=distances.FinalState())
+    executed = [(np.array([k / 3]), validation.outcome([0.2 * k / 3 - 0.1]).system_trajectory) for k in range(4)]
+    wild = [(point, replace(run, states=run.states + np.linspace(0, 9, 41)[:, None])) for point, run in executed]
+    study = DynamicsStudy(validation)
+    assert study.learn(executed) is not None
+    assert study.learn(wild) is None
+    assert study.predict(wild) is not None

@@ -142,9 +142,14 @@ class DynamicsStudy(ShortRepr):
         if self._parts is None:
             self._parts = self._state_of_parts()
         extended, logged = self._extended(executed), () if self._needs_tasks else logged
-        learned = self._learn(extended, logged, with_data=True)
+        learned = None if extended is None else self._learn(extended, logged, with_data=True)
         with contextlib.suppress(np.linalg.LinAlgError, InputError, ValueError):
-            if learned is None or len(executed) < _FEWEST_AGAINST or not learned.left_out_error > _WELL:
+            if (
+                extended is None
+                or learned is None
+                or len(executed) < _FEWEST_AGAINST
+                or not learned.left_out_error > _WELL
+            ):
                 return learned
             if (learned.posterior.data.sources == -1).any():
                 without = self._learn(extended, logged, with_data=False)
@@ -177,7 +182,7 @@ class DynamicsStudy(ShortRepr):
         """
         if learned.study is not self:
             return learned.study.as_if_executed(learned, executed, pending, logged)
-        together = [*self._extended(executed), *pending]
+        together = [*(self._extended(executed) or ()), *pending]
         logged = () if self._needs_tasks else logged
         recorded = self._recorded(together, logged, learned.with_data)
         return self._conditioned(learned.posterior.covariances, recorded, together, learned.with_data)
@@ -187,10 +192,15 @@ class DynamicsStudy(ShortRepr):
         """Whether only executions of tasks can be learned from: other recordings tell no parameters and no start."""
         return bool(self.given.physical) or self.given.outputs is not None
 
-    def _extended(self, executed: Executed) -> Executed:
-        """Return executions with states of M, if outputs are recorded, and the physical parameters of their tasks."""
-        if self._estimates is not None:
-            states = self._estimates.of(executed, _scheduled(len(executed)))
+    def _extended(self, executed: Executed) -> Executed | None:
+        """Return executions with states of M, if outputs are recorded, and the physical parameters of their tasks.
+
+        It is None if states of M cannot be estimated.
+        """
+        if self.given.outputs is not None:
+            states = None if self._estimates is None else self._estimates.of(executed, _scheduled(len(executed)))
+            if states is None:
+                return None
             executed = [(point, trajectory) for (point, _), trajectory in zip(executed, states, strict=True)]
         return [(point, with_parameters(self.given, point, trajectory)) for point, trajectory in executed]
 
@@ -333,11 +343,16 @@ class DynamicsStudy(ShortRepr):
         for other in self.given.space.units:
             if other not in self.given.physical:
                 study = self._with_parameter(other)
-                learned = study._learn(study._extended(executed), (), with_data=False)
+                learned = study._learned_alone(executed)
                 if learned is not None and learned.left_out_error < least:
                     name, least = other, learned.left_out_error
-        without_it = self._learn(self._extended(executed), (), with_data=False)
+        without_it = self._learned_alone(executed)
         return name, least, 0.0 if without_it is None else without_it.left_out_error
+
+    def _learned_alone(self, executed: Executed) -> LearnedDynamics | None:
+        """Return what executions teach without the data that M was made from."""
+        extended = self._extended(executed)
+        return None if extended is None else self._learn(extended, (), with_data=False)
 
     def suspected_parameter(self, learned: LearnedDynamics) -> tuple[str, float] | None:
         """Return the task parameter that the dynamics depend on most clearly, and how many times less predictions err.

@@ -96,14 +96,24 @@ class StateEstimates:
         self.steps = np.maximum(steps, 1e-9 * max(float(steps.max(initial=0.0)), 1e-300))
         self._kept: OrderedDict[bytes, tuple[Array, Array]] = OrderedDict()
 
-    def of(self, executed: Executed, judged: int) -> list[Trajectory]:
+    def of(self, executed: Executed, judged: int) -> list[Trajectory] | None:
         """Return the executions, points of the unit cube with recorded outputs, with states ``(H + 1, n)``.
 
-        The first ``judged`` of them choose how much M misses in what is recorded.
+        The first ``judged`` of them choose how much M misses in what is recorded. It is None if some states cannot be
+        estimated, because M or its outputs are not defined or not finite there.
         """
-        known = [self._smoothed(point, trajectory) for point, trajectory in executed]
+        try:
+            with np.errstate(all="ignore"):
+                known = [self._smoothed(point, trajectory) for point, trajectory in executed]
+        except Exception:  # the user's parts, at states that M never reaches by itself
+            return None
+        if not known:
+            return []
         errors = np.sum([np.log(np.maximum(errors, 1e-300)) for _, errors in known[: max(judged, 1)]], axis=(0, 2))
-        chosen = int(np.argmin(np.where(np.isfinite(errors), errors, np.inf)))
+        finite = np.all([np.isfinite(states).all(axis=(0, 2)) for states, _ in known], axis=0)
+        if not finite.any():
+            return None
+        chosen = int(np.argmin(np.where(finite & np.isfinite(errors), errors, np.inf)))
         return [
             _without_end(replace(trajectory, states=states[:, chosen]), trajectory.states.shape[-1])
             for (states, _), (_, trajectory) in zip(known, executed, strict=True)
