@@ -77,12 +77,8 @@ def truth(key: tuple[str, str]) -> dict[str, Any]:
             points = np.clip(np.concatenate([top, *moves]), 0, 1)
             values = _distances(validation, points)
     best = int(values.argmax())
-    return {
-        "plant": name,
-        "imperfection": imperfection,
-        "distance": float(values[best]),
-        "point": points[best].tolist(),
-    }
+    largest, point = float(values[best]), points[best].tolist()
+    return {"plant": name, "imperfection": imperfection, "distance": largest, "point": point}
 
 
 def _distances(validation: Validation, points: Array) -> Array:

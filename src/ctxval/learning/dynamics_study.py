@@ -137,19 +137,17 @@ class DynamicsStudy(ShortRepr):
     def learn(self, executed: Executed, logged: Sequence[Trajectory] = ()) -> LearnedDynamics | None:
         """Return what executions teach, and recordings with the same time step that belong to no task.
 
-        Returns None if there are no recorded transitions, if M explains them, or if no task can be planned.
+        Returns None if there are no recorded transitions, if M explains them, if no task can be planned, or if
+        states of M cannot be estimated from recorded outputs.
         """
         if self._parts is None:
             self._parts = self._state_of_parts()
         extended, logged = self._extended(executed), () if self._needs_tasks else logged
-        learned = None if extended is None else self._learn(extended, logged, with_data=True)
+        if extended is None:
+            return None
+        learned = self._learn(extended, logged, with_data=True)
         with contextlib.suppress(np.linalg.LinAlgError, InputError, ValueError):
-            if (
-                extended is None
-                or learned is None
-                or len(executed) < _FEWEST_AGAINST
-                or not learned.left_out_error > _WELL
-            ):
+            if learned is None or len(executed) < _FEWEST_AGAINST or not learned.left_out_error > _WELL:
                 return learned
             if (learned.posterior.data.sources == -1).any():
                 without = self._learn(extended, logged, with_data=False)
