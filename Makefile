@@ -82,6 +82,7 @@ calibrate: .venv/.test  ## do the bounds hold as often as they say? Writes docs/
 	$(BIN)/python benchmarks/calibrate_noise.py development
 	$(BIN)/python benchmarks/calibrate_noise.py misleading
 	$(BIN)/python benchmarks/calibrate_noise.py reporting
+	$(BIN)/python benchmarks/calibrate_outputs.py
 	$(BIN)/python benchmarks/study_interval.py
 	$(BIN)/python benchmarks/study_time_varying.py
 	$(BIN)/python benchmarks/study_retrain.py

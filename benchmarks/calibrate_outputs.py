@@ -108,17 +108,19 @@ def decide(run: tuple[str, str, int, float]) -> dict[str, Any]:
     }
 
 
-def table() -> list[list[str]]:
-    """Return how campaigns ended by imperfection."""
-    rows = []
+def table_text() -> str:
+    """Return how campaigns ended by imperfection, as a table in Markdown."""
+    rows = [["imperfection", "at 0.95: validated (false), falsified, undecided", "at 1.25: validated", "executions"]]
+    rows.append(["---"] * 4)
     for imperfection in IMPERFECTIONS_TRIED:
         of = {share: STORED.select(rule=RULE, imperfection=imperfection, share=share) for share in SHARES}
         below = [line["answer"] for line in of[0.95]]
         above = [line["executions"] for line in of[1.25] if line["answer"] == "validated"]
         counts = ", ".join(str(below.count(answer)) for answer in ("validated", "falsified", "undecided"))
         median = f"{np.median(above):.0f}" if above else ""
-        rows.append([imperfection, counts, f"{len(above)} of {len(of[1.25])}", median])
-    return rows
+        if below or of[1.25]:
+            rows.append([imperfection, counts, f"{len(above)} of {len(of[1.25])}", median])
+    return "\n".join(f"| {' | '.join(row)} |" for row in rows)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -136,8 +138,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         STORED.append(result)
         shown = ("plant", "imperfection", "share", "answer", "executions", "bound", "seconds")
         print(*(result[key] for key in shown), flush=True)
-    print("| imperfection | at 0.95: validated (false), falsified, undecided | at 1.25: validated | executions |")
-    print("|---|---|---|---|", *(f"| {' | '.join(row)} |" for row in table()), sep="\n")
+    print(table_text())
 
 
 if __name__ == "__main__":

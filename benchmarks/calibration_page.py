@@ -29,6 +29,7 @@ from calibrate import (
 )
 from calibration_dynamics_part import by_dynamics
 from calibration_noise_part import under_noise
+from calibration_outputs_part import from_outputs
 from calibration_strangers_part import of_strangers
 from calibration_verdicts_part import interval, table, until_decided
 from ctxval.certificates import RESOLUTION
@@ -285,6 +286,7 @@ with that value.
 {of_strangers}
 
 {under_noise}
+{from_outputs}
 
 ## Audits after retraining
 
@@ -330,6 +332,7 @@ def main() -> None:
             by_dynamics=by_dynamics(),
             of_strangers=of_strangers(),
             under_noise=under_noise(),
+            from_outputs=from_outputs(),
             retrained=retrained(),
         )
     )

@@ -40,6 +40,14 @@ def test_a_repetition_is_a_bet_on_another_excess_whatever_was_predicted() -> Non
     assert wealth == pytest.approx([1.0, 9.0, 81.0])
 
 
+def test_two_repetitions_of_an_excess_falsify_whatever_was_predicted_wrongly_before() -> None:
+    likely = np.linspace(0.9, 1.6, 200)
+    wrong = [trial(number, 0.5, likely) for number in range(5)]
+    excess = trial(5, 1.2, likely)
+    assert counterexample([*wrong, excess, replace(excess, number=6)], 1.0) is None
+    assert counterexample([*wrong, excess, replace(excess, number=6), replace(excess, number=7)], 1.0) is not None
+
+
 def test_without_noise_one_execution_falsifies() -> None:
     assert counterexample([trial(0, 1.2)], 1.0) is not None
     assert bets_against([trial(0, 1.2)], 1.0) is None
@@ -48,7 +56,7 @@ def test_without_noise_one_execution_falsifies() -> None:
 def test_an_undecided_verdict_says_that_noise_may_explain_an_excess() -> None:
     likely = np.linspace(0.5, 1.3, 200)
     reason = judge([trial(0, 0.9, likely), trial(1, 1.1, likely)], 1.0).reason
-    assert "1 of 2 executions exceeds 1, which noise may explain (evidence 2.61" in reason
+    assert "1 of 2 executions exceeds 1, which noise may explain (evidence 1.81" in reason
 
 
 @pytest.mark.parametrize("quantile", [0.8, 0.9])

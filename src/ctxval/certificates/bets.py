@@ -4,8 +4,10 @@ If in every task a share q of the executions stays below tau, then each executio
 1 - q, whatever its task and whatever came before. Before each execution, a probability pi of an excess is predicted,
 from the learned noise, or from an earlier excess of the same task.
 The product of ``pi / (1 - q)`` for each excess and ``(1 - pi) / q`` for each other execution is then a nonnegative
-supermartingale with the first value 1. It reaches ``1 / (1 - confidence)`` with probability at most 1 - confidence
-(Ville 1939), at any time. So tau is falsified there, without any assumption on the system.
+supermartingale with the first value 1, and so is the mean of two of them. It reaches ``1 / (1 - confidence)`` with
+probability at most 1 - confidence (Ville 1939), at any time. So tau is falsified there, without any assumption on the
+system. Half of the wealth is bet on repetitions of an excess alone: what was predicted before much was learned cannot
+lose it.
 """
 
 from __future__ import annotations
@@ -28,7 +30,7 @@ class Bets:
     """The bets of the trials of a noisy system against a threshold.
 
     Attributes:
-        wealth: the product.
+        wealth: the mean of the product of all bets and that of the bets on repetitions.
         above, executions: numbers of executions above the threshold, and of all.
     """
 
@@ -45,17 +47,18 @@ def bets_against(trials: Sequence[Trial], threshold: float, quantile: float = QU
     """Return the bets of trials against a threshold; None if no execution was predicted to be noisy."""
     if not any(_prediction(trial).get("noise") for trial in trials):
         return None
-    wealth, above, known = 1.0, 0, [trial for trial in trials if trial.distance is not None]
+    whole, repetitions, above, known = 1.0, 1.0, 0, [trial for trial in trials if trial.distance is not None]
     for k, trial in enumerate(known):
         before = executions_of(trial, known[:k])
-        if any((earlier.distance or 0.0) > threshold for earlier in before):
-            chance = _BOLDEST  # it is repeated because it may exceed the threshold again, whatever was predicted
-        else:
-            chance = float(np.clip(_predicted_chance(trial, threshold), 1 - quantile, _BOLDEST))
+        repeated = any((earlier.distance or 0.0) > threshold for earlier in before)
+        # It is repeated because it may exceed the threshold again, whatever was predicted.
+        chance = _BOLDEST if repeated else float(np.clip(_predicted_chance(trial, threshold), 1 - quantile, _BOLDEST))
         exceeds = (trial.distance or 0.0) > threshold
         above += exceeds
-        wealth *= chance / (1 - quantile) if exceeds else (1 - chance) / quantile
-    return Bets(wealth, above, len(known))
+        factor = chance / (1 - quantile) if exceeds else (1 - chance) / quantile
+        whole *= factor
+        repetitions *= factor if repeated else 1.0
+    return Bets(0.5 * (whole + repetitions), above, len(known))
 
 
 def _prediction(trial: Trial) -> dict[str, object]:
