@@ -30,6 +30,7 @@ class Declaration:
     folder: str | None = None
     functions: Mapping[str, str] = field(default_factory=dict)
     aliases: tuple[str, ...] = ()
+    parts: Mapping[str, str] = field(default_factory=dict)
 
 
 _declarations: dict[Any, Declaration] = {}
@@ -43,6 +44,7 @@ def part(
     folder: str | None = None,
     functions: Mapping[str, str] | None = None,
     aliases: tuple[str, ...] = (),
+    parts: Mapping[str, str] | None = None,
 ) -> Callable[[Part], Part]:
     """Declare a class, or a function that makes an object, as a part that is found by name; check its arguments.
 
@@ -55,11 +57,13 @@ def part(
         folder: the argument that is a folder, which is the experiment's by default.
         functions: arguments that are functions, each with its form, such as ``(x, u) -> x_next``.
         aliases: older names by which the part is found too; they are not listed.
+        parts: arguments that are parts themselves, each with its kind, such as ``synthesizer``.
     """
 
     def declare(made: Part) -> Part:
         made = checked(made)
-        _declarations[made] = Declaration(name or made.__name__, runs_code, files, folder, functions or {}, aliases)
+        own = name or made.__name__
+        _declarations[made] = Declaration(own, runs_code, files, folder, functions or {}, aliases, parts or {})
         return made
 
     return declare

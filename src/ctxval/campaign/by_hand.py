@@ -58,7 +58,7 @@ def write_files(folder: Path, experiment: Experiment, opened: OpenTrial) -> list
 def _written(folder: Path, experiment: Experiment, opened: OpenTrial) -> list[str]:
     plan, promised = opened.plan, opened.plan.model_trajectory
     states, inputs = experiment.names(promised.states.shape[-1], promised.inputs.shape[-1])
-    write_task(folder / "task.json", plan.task, states=states)
+    write_task(folder / "task.json", experiment.validation.recorded_task(plan.task), states=states)
     promised.to_csv(folder / "model.csv", states=list(states), inputs=list(inputs))
     if not isinstance(plan.controller, AffineFeedback):
         return ["task.json", "model.csv"]

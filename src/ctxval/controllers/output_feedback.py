@@ -18,7 +18,7 @@ from ctxval.core.task import Task
 from ctxval.errors import InputError, ShapeError
 
 
-@part(functions={"outputs": "x -> y"})
+@part(functions={"outputs": "x -> y"}, parts={"synthesizer": "synthesizer"})
 class OutputFeedback(ShortRepr):
     """A state feedback on the estimate of an extended Kalman filter of M, which sees outputs alone.
 

@@ -50,7 +50,7 @@ class Simulated(ShortRepr):
         return rollout(self.model.step, controller, task)
 
 
-@part(functions={"outputs": "x -> y", "start": "x -> first state"})
+@part(functions={"outputs": "x -> y", "start": "x -> first state"}, parts={"system": "system"})
 class WithOutputs(ShortRepr):
     """A system whose controllers see outputs of its states, and that records them in the place of states.
 

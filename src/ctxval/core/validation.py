@@ -149,6 +149,13 @@ class Validation:
             raise InputError(f"the outputs h(x) failed: {reason_of(error)}.") from error
         task.require_width(width)
 
+    def recorded_task(self, task: Task) -> Task:
+        """Return a task as who executes it knows it: with the outputs of its initial state, if there are any."""
+        if self.outputs is None:
+            return task
+        reference = task.reference if task.has_goal else None
+        return Task(self.recorded(task.initial_state), horizon=task.horizon, dt=task.dt, reference=reference)
+
     def closed_loop(self, controller: Controller, task: Task) -> Trajectory:
         """Return the closed loop of a controller with M, as it is recorded."""
         if self.outputs is None:

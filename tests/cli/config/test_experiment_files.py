@@ -573,21 +573,31 @@ space = {{ goal = [-1.0, 1.0] }}
 task = {{ initial_state = [0.2, 0.0], goal = ["goal"], horizon = 40, dt = 0.05 }}
 system = "angles:rig"
 model = "angles:model"
-synthesizer = {{ type = "PID", kp = 3.0, ki = 1.0, kd = 1.0 }}
+synthesizer = {{ {synthesizer} }}
 distance = "MaximumDeviation"
 [states]
 angle = "rad"
 """
 
 
-@pytest.mark.parametrize("outputs", ["[0]", '"angles:angle"'])
-def test_outputs_are_indices_or_a_function_of_a_module(outputs: str, invoke: Any) -> None:
+PID = 'type = "PID", kp = 3.0, ki = 1.0, kd = 1.0'
+FILTERED = (
+    'type = "OutputFeedback", synthesizer = { type = "LQR", Q = [20.0, 1.0], R = [0.1] }, outputs = [0], '
+    "process = 0.01, measurement = 0.002"
+)
+
+
+@pytest.mark.parametrize(("outputs", "synthesizer"), [("[0]", PID), ('"angles:angle"', PID), ("[0]", FILTERED)])
+def test_outputs_are_indices_or_a_function_of_a_module(outputs: str, synthesizer: str, invoke: Any) -> None:
     sys.modules.pop("angles", None)
     Path("angles.py").write_text(
         "from rig_outputs import Swing as model, swing_validation\n\nrig = swing_validation().system\n\n\n"
         "def angle(x):\n    return x[..., :1]\n"
     )
-    Path("e.toml").write_text(OUTPUTS.format(outputs=outputs))
+    Path("e.toml").write_text(OUTPUTS.format(outputs=outputs, synthesizer=synthesizer))
+    findings = invoke("check", "e.toml").stdout
+    assert "tasks planned: 1 outputs of 2 states, 1 inputs" in findings
+    assert "failed" not in findings
     result = invoke("run", "e.toml", "--budget", "2", "--explore", "--no-report", "--store", "runs/e.sqlite")
     assert result.exit_code == 0, result.stderr
     (first, *_) = Store("runs/e.sqlite").trials()

@@ -133,12 +133,18 @@ HOSTILE = {
 
 EVIL_CALL = {"type": "Subprocess", "command": ["sh", "-c", "id > PWNED"], "timeout": 5.0}
 
+FILTERED = {"type": "OutputFeedback", "outputs": [0], "process": 0.1, "measurement": 0.1}
+
 ATTACKS: dict[str, dict[str, Any]] = {
     "issue": HOSTILE,
     "class": {**PLAIN, "system": HOSTILE["system"]},
     "module": {**PLAIN, "task": "evil:task"},
     "module alone": {**PLAIN, "task": "evil"},
     "outputs": {**PLAIN, "outputs": "evil:outputs"},
+    "inner part": {**PLAIN, "synthesizer": {**FILTERED, "synthesizer": "evil:make"}},
+    "inner class": {**PLAIN, "synthesizer": {**FILTERED, "synthesizer": {"type": "evil:Make"}}},
+    "inner command": {**PLAIN, "system": {"type": "WithOutputs", "system": EVIL_CALL, "outputs": [0]}},
+    "inner inner": {**PLAIN, "synthesizer": {**FILTERED, "synthesizer": {**FILTERED, "synthesizer": "evil:make"}}},
     "experiment": {"experiment": "evil:experiment"},
     "function": {**PLAIN, "model": {"type": "subprocess:getoutput", "cmd": "id > PWNED"}},
     "argument": {**PLAIN, "system": {"type": "Simulated", "step": {"ref": "evil:step"}}},

@@ -22,6 +22,7 @@ from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.validation import Validation
 from ctxval.errors import ConformanceError, CtxvalError
+from ctxval.learning.state_estimates import with_states_of_model
 from ctxval.studies.aspect1 import Aspect1Report
 from ctxval.testing import check_distance, check_model, check_synthesizer
 
@@ -47,13 +48,14 @@ def check_experiment(experiment: Experiment, *, execute: bool = False, seed: int
         return findings
     run = plans[0].model_trajectory
     counts = {"states": run.states.shape[-1], "inputs": run.inputs.shape[-1]}
+    of_model = {**counts, "states": plans[0].task.initial_state.shape[-1]}  # others if outputs are recorded
     return findings + _checked(
         {
             "controller on the model": lambda: _goals(validation, plans),
             "convergence of the designs": lambda: _convergence_of(validation, plans),
             "names": lambda: _names(experiment, counts),
             "system": lambda: _system(validation, plans[0], counts),
-            "model": lambda: _model(validation, counts),
+            "model": lambda: _model(validation, of_model),
             "batches": lambda: _batches(validation, plans),
             "distance": lambda: _distance(experiment, plans),
             "execution": lambda: _executions(validation, plans[1], execute),
@@ -88,7 +90,9 @@ def _tasks(validation: Validation, seed: int, plans: list[Plan]) -> Findings:
     points = np.concatenate([corners, space.iid(8, np.random.default_rng(seed))])
     plans.extend([validation.plan(point) for point in points])
     task, on_model = plans[0].task, plans[0].model_trajectory
-    sizes = f"{on_model.states.shape[-1]} states, {on_model.inputs.shape[-1]} inputs"
+    n, recorded = task.initial_state.shape[-1], on_model.states.shape[-1]
+    states = f"{n} states" if validation.outputs is None else f"{recorded} outputs of {n} states"
+    sizes = f"{states}, {on_model.inputs.shape[-1]} inputs"
     yield "ok", f"{len(plans)} tasks planned: {sizes}, {task.horizon} steps of {task.dt:g} s"
 
 
@@ -188,7 +192,7 @@ def _batches(validation: Validation, plans: Sequence[Plan]) -> Findings:
             yield "failed", f"task {index} of a batch differs from the same task alone: check the task function"
             return
     few = Task(batch.initial_state[:4], horizon=batch.horizon, dt=batch.dt, reference=batch.reference[:4])
-    check_synthesizer(validation.synthesizer, few, validation.model)
+    check_synthesizer(with_states_of_model(validation).synthesizer, few, validation.model)
     yield "ok", "task function and synthesizer give the same results in a batch as alone"
 
 

@@ -58,7 +58,10 @@ def part(kind: str, given: str | Mapping[str, Any], folder: Path | None = None) 
         file = table.get(key)
         if isinstance(file, str) and "<" not in file:  # "<" begins a MuJoCo model that is given as text
             placed[key] = str(Path(folder or "") / file)
-    arguments = {key: argument(value, folder) for key, value in placed.items()}
+    arguments = {
+        key: part(declared.parts[key], value, folder) if key in declared.parts else argument(value, folder)
+        for key, value in placed.items()
+    }
     for key, value in arguments.items():
         if key in declared.functions and isinstance(table[key], Mapping) and not isinstance(value, Model):
             require_function(f"{key} of {what}", value, declared.functions[key])

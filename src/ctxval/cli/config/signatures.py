@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from ctxval import cases, searches
+from ctxval._util.registry import declaration_of
 from ctxval.certificates import KINDS
 from ctxval.cli.config.parts import REGISTRIES
 from ctxval.errors import InputError
@@ -156,9 +157,23 @@ def code_named(settings: Mapping[str, Any]) -> list[str]:
             name = given.get(name_key) if name_key and isinstance(given, Mapping) else given
             if name is not None and not registry.is_data(name):
                 code.append(_shown(key, given))
+            elif isinstance(given, Mapping) and registry.kind in REGISTRIES:
+                code += _parts_of(key, given, registry.find(name) if name is not None else None)
         return [*code, *_references("", settings)]
     except RecursionError:
         return ["settings that are nested too deeply to be checked"]
+
+
+def _parts_of(where: str, given: Mapping[str, Any], made: Any) -> Iterator[str]:
+    """Yield the parts that are arguments of a part and that run code."""
+    declared = declaration_of(made)
+    for key, kind in {} if declared is None else declared.parts.items():
+        inner, registry = given.get(key), REGISTRIES[kind]
+        name = inner.get("type") if isinstance(inner, Mapping) else inner
+        if name is not None and not registry.is_data(name):
+            yield _shown(f"{where}.{key}", inner)
+        elif isinstance(inner, Mapping):
+            yield from _parts_of(f"{where}.{key}", inner, registry.find(name) if name is not None else None)
 
 
 def _references(where: str, value: Any) -> Iterator[str]:
