@@ -8,6 +8,7 @@ import numpy as np
 
 from ctxval._util.arrays import Array
 from ctxval._util.representation import counted
+from ctxval.certificates.bounds import state_of
 from ctxval.core import soundness
 from ctxval.core.distance import ComposedDistance
 from ctxval.report.findings import Answer, asks
@@ -127,9 +128,10 @@ def explained(context: ReportContext) -> Answer | None:
         f"an error of {quantity(error, context.labels.units)} (root mean square), "
         f"{percent(error / max(size, 1e-300))} of the distances."
     )
+    of = "the recorded state" if context.validation.outputs is None else state_of(estimated=True)
     text += (
-        " It explains the distance: the difference is a function of the recorded state and input, and a model that is "
-        "fitted to these data can remove it."
+        f" It explains the distance: the difference is a function of {of} and input, and a model that is fitted to "
+        "these data can remove it."
         if share >= 0.8
         else " It does not explain the distance: a state that is not recorded, a contact, dry friction or noise is the "
         "likely cause, or too few trials."
