@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
 
 from calibrate_outputs import IMPERFECTIONS_TRIED, PLANTS, TRUTHS, recorded, table_text, without_rates
 
