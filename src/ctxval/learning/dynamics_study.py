@@ -6,7 +6,6 @@ import contextlib
 import functools
 import hashlib
 import time
-from collections import OrderedDict
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
@@ -15,6 +14,7 @@ import numpy as np
 from ctxval._util.arrays import Array, Rows, single_threaded
 from ctxval._util.boxes import moves_to_bounds
 from ctxval._util.describe import describe
+from ctxval._util.latest import Latest
 from ctxval._util.representation import ShortRepr
 from ctxval.core.distance import ComposedDistance
 from ctxval.core.quantiles import QUANTILE
@@ -69,8 +69,8 @@ class DynamicsStudy(ShortRepr):
         self.validation = with_parameters_as_states(with_states_of_model(validation))
         self.planner = LoopPlanner(self.validation)
         self._errors = ErrorVectors(self.planner if validation.outputs is None else LoopPlanner(validation))
-        self._covariances: OrderedDict[bytes, LearnedCovariances | None] = OrderedDict()
-        self._structures: OrderedDict[bytes, ChosenStructure] = OrderedDict()
+        self._covariances = Latest[bytes, LearnedCovariances | None](8)
+        self._structures = Latest[bytes, ChosenStructure](8)
         self._found: dict[bytes, str | None] = {}
         self._others: dict[str, DynamicsStudy] = {}
         self._parts: tuple[str, bytes] | None = None
@@ -259,8 +259,6 @@ class DynamicsStudy(ShortRepr):
             if first is None:
                 return None
             self._structures[key] = first[1]
-            while len(self._structures) > 8:
-                self._structures.popitem(last=False)
             if some == len(records):
                 return self._with_effect(first[0])
         again = learn(records, chosen=self._structures[key], seed=(self.seed, len(records)))
@@ -301,8 +299,6 @@ class DynamicsStudy(ShortRepr):
             model, seed = before_refinement(self.validation.model), (self.seed, len(executed), 0)
             settings = PosteriorSettings.for_horizon(self._loops.horizon)
             self._covariances[key] = learn_covariances(model, *recorded, seed, settings)
-            while len(self._covariances) > 8:
-                self._covariances.popitem(last=False)
         return self._covariances[key]
 
     def _recorded(

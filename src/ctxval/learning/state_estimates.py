@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-from collections import OrderedDict
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ctxval._util.arrays import Array
+from ctxval._util.latest import Latest
 from ctxval.core.controller import Controller, Synthesizer
 from ctxval.core.distance import Distance
 from ctxval.core.kalman import Estimate, corrected, predicted, smoothed
@@ -94,7 +94,7 @@ class StateEstimates:
     def __init__(self, validation: Validation, outputs: Outputs, steps: Array) -> None:
         self.validation, self.outputs = validation, outputs
         self.steps = np.maximum(steps, 1e-9 * max(float(steps.max(initial=0.0)), 1e-300))
-        self._kept: OrderedDict[bytes, tuple[Array, Array]] = OrderedDict()
+        self._kept = Latest[bytes, tuple[Array, Array]](_REMEMBERED)
 
     def of(self, executed: Executed, judged: int) -> list[Trajectory] | None:
         """Return the executions, points of the unit cube with recorded outputs, with states ``(H + 1, n)``.
@@ -129,8 +129,6 @@ class StateEstimates:
             self._kept[key] = smoothed_states(
                 self.validation.model, self.outputs, start, trajectory.states, trajectory.inputs, self.steps
             )
-            while len(self._kept) > _REMEMBERED:
-                self._kept.popitem(last=False)
         return self._kept[key]
 
 
