@@ -21,7 +21,7 @@ from ctxval._util.json_lines import JsonLines
 from noise_development import PLANTS as DEVELOPMENT
 from noise_misleading import PLANTS as MISLEADING
 from noise_reporting import PLANTS as REPORTING
-from noise_systems import IMPERFECTIONS, Plant
+from noise_systems import IMPERFECTIONS, Plant, near_best, outcome, random_and_corners
 
 RULE = 1
 """Version of the rule by which campaigns are run. The stored ones at 0.95 on reporting plants were run before a
@@ -47,14 +47,10 @@ def truth(key: tuple[str, str]) -> dict[str, Any]:
     name, imperfection = key
     with single_threaded():
         validation, rng = ALL[name](imperfection).validation, np.random.default_rng(5)
-        d = validation.space.dimension
-        corners = np.stack(np.meshgrid(*[[0.0, 1.0]] * d), axis=-1).reshape(-1, d)
-        points, least, many = np.concatenate([rng.random((2000, d)), corners]), *_repeats(imperfection, name)
+        points, (least, many) = random_and_corners(validation.space.dimension, rng), _repeats(imperfection, name)
         values = _quantiles(validation, points, least)
         for share in (0.1, 0.03, 0.01):
-            top = points[np.argsort(-values)[:40]]
-            moves = [top + share * rng.standard_normal(top.shape) for _ in range(3)]
-            points = np.clip(np.concatenate([top, *moves]), 0, 1)
+            points = near_best(points, values, share, 3, rng)
             values = _quantiles(validation, points, 3 * least)
         top = points[np.argsort(-values)[:10]]
         values = _quantiles(validation, top, many)
@@ -82,22 +78,15 @@ def decide(run: tuple[str, str, int, float]) -> dict[str, Any]:
         campaign = Campaign(ALL[name](imperfection, seed + 1).validation, seed=seed).run(BUDGET, share * largest)
         verdict = campaign.verdict(share * largest)
     details = {} if verdict.certificate is None else verdict.certificate.details
+    key = {"rule": RULE, "plant": name, "imperfection": imperfection, "seed": seed, "share": share}
     return {
-        "rule": RULE,
-        "plant": name,
-        "imperfection": imperfection,
-        "seed": seed,
-        "share": share,
-        "answer": verdict.answer,
-        "executions": campaign.executions,
-        "bound": None if verdict.bound is None else verdict.bound / largest,
+        **key,
+        **outcome(campaign, verdict, largest, started),
         "noise": details.get("noise"),
         "quantile": details.get("quantile"),
         "lags": details.get("lags"),
         "origins": [trial.origin for trial in campaign.trials],
         "distances": [None if trial.distance is None else trial.distance / largest for trial in campaign.trials],
-        "reason": verdict.reason[:300],
-        "seconds": round(time.process_time() - started, 1),
     }
 
 

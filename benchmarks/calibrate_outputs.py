@@ -9,18 +9,18 @@ from __future__ import annotations
 
 import argparse
 import time
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from calibrate import RESULTS, all_of
+from calibration_verdicts_part import table
 from ctxval import Campaign, Parameters, Task, Validation, controllers, systems
 from ctxval._util.arrays import Array, single_threaded
 from ctxval._util.json_lines import JsonLines
 from noise_development import PLANTS as DEVELOPMENT
 from noise_reporting import PLANTS as REPORTING
-from noise_systems import Plant
+from noise_systems import Plant, near_best, outcome, random_and_corners
 
 RULE = 1
 """Version of the rule by which campaigns are run."""
@@ -67,14 +67,10 @@ def truth(key: tuple[str, str]) -> dict[str, Any]:
     name, imperfection = key
     with single_threaded():
         validation, rng = without_rates(PLANTS[name], imperfection), np.random.default_rng(5)
-        d = validation.space.dimension
-        corners = np.stack(np.meshgrid(*[[0.0, 1.0]] * d), axis=-1).reshape(-1, d)
-        points = np.concatenate([rng.random((2000, d)), corners])
+        points = random_and_corners(validation.space.dimension, rng)
         values = _distances(validation, points)
         for share in (0.1, 0.03, 0.01, 0.003):
-            top = points[np.argsort(-values)[:40]]
-            moves = [top + share * rng.standard_normal(top.shape) for _ in range(5)]
-            points = np.clip(np.concatenate([top, *moves]), 0, 1)
+            points = near_best(points, values, share, 5, rng)
             values = _distances(validation, points)
     best = int(values.argmax())
     largest, point = float(values[best]), points[best].tolist()
@@ -93,25 +89,15 @@ def decide(run: tuple[str, str, int, float]) -> dict[str, Any]:
         validation = without_rates(PLANTS[name], imperfection, seed + 1)
         campaign = Campaign(validation, seed=seed).run(BUDGET, share * largest)
         verdict = campaign.verdict(share * largest)
-    return {
-        "rule": RULE,
-        "plant": name,
-        "imperfection": imperfection,
-        "seed": seed,
-        "share": share,
-        "answer": verdict.answer,
-        "executions": campaign.executions,
-        "kind": None if verdict.certificate is None else verdict.certificate.kind,
-        "bound": None if verdict.bound is None else verdict.bound / largest,
-        "reason": verdict.reason[:300],
-        "seconds": round(time.process_time() - started, 1),
-    }
+    kind = None if verdict.certificate is None else verdict.certificate.kind
+    key = {"rule": RULE, "plant": name, "imperfection": imperfection, "seed": seed, "share": share}
+    return {**key, **outcome(campaign, verdict, largest, started), "kind": kind}
 
 
 def table_text() -> str:
     """Return how campaigns ended by imperfection, as a table in Markdown."""
-    rows = [["imperfection", "at 0.95: validated (false), falsified, undecided", "at 1.25: validated", "executions"]]
-    rows.append(["---"] * 4)
+    header = ["imperfection", "at 0.95: validated (false), falsified, undecided", "at 1.25: validated", "executions"]
+    rows = list[list[str]]()
     for imperfection in IMPERFECTIONS_TRIED:
         of = {share: STORED.select(rule=RULE, imperfection=imperfection, share=share) for share in SHARES}
         below = [line["answer"] for line in of[0.95]]
@@ -120,15 +106,15 @@ def table_text() -> str:
         median = f"{np.median(above):.0f}" if above else ""
         if below or of[1.25]:
             rows.append([imperfection, counts, f"{len(above)} of {len(of[1.25])}", median])
-    return "\n".join(f"| {' | '.join(row)} |" for row in rows)
+    return table(header, rows)
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
+def main() -> None:
     """Run what is missing, and print the table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seeds", type=int, default=1)
     parser.add_argument("--workers", type=int, default=2)
-    options = parser.parse_args(arguments)
+    options = parser.parse_args()
     names = [name for name, plant in PLANTS.items() if recorded(plant) and name != "tanks"]
     keys = [(name, imperfection) for imperfection in IMPERFECTIONS_TRIED for name in names]
     for known in all_of(truth, [key for key in keys if key not in TRUTHS], options.workers):

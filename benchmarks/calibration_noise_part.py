@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from calibrate_noise import BUDGET, HALVES, QUANTILE, RULE, STORED, table
-from calibration_verdicts_part import interval
+from calibration_verdicts_part import validated_share
 
 TEXT = """## Noise
 
@@ -37,8 +37,6 @@ def under_noise() -> str:
     if not results:
         return ""
     below = [line["answer"] for line in results if line["share"] == 0.95]
-    false = below.count("validated")
-    low, high = interval(len(below) - false, len(below)) if below else (0.0, 100.0)
 
     def of(half: str, text: str) -> str:
         return text.format(table=table(half)) if any(line["plant"] in HALVES[half] for line in stored) else ""
@@ -48,10 +46,7 @@ def under_noise() -> str:
         quantile=QUANTILE,
         budget=BUDGET,
         count=len(results),
-        false=false,
-        below=len(below),
-        low=low,
-        high=high,
+        **validated_share(below),
         reported=table("reporting"),
         developed=of("development", DEVELOPED),
         misleading=of("misleading", MISLEADING),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from calibrate_outputs import BUDGET, RULE, STORED, table_text
-from calibration_verdicts_part import interval
+from calibration_verdicts_part import validated_share
 
 TEXT = """## Outputs in place of states
 
@@ -24,15 +24,10 @@ def from_outputs() -> str:
     below = [line["answer"] for line in results if line["share"] == 0.95]
     if not below:
         return ""
-    false = below.count("validated")
-    low, high = interval(len(below) - false, len(below))
     return TEXT.format(
         plants=len({line["plant"] for line in results}),
         budget=BUDGET,
         count=len(results),
-        false=false,
-        below=len(below),
-        low=low,
-        high=high,
+        **validated_share(below),
         table=table_text(),
     )

@@ -108,6 +108,13 @@ def interval(missed: int, total: int) -> tuple[float, float]:
     return 100 * float(low), 100 * float(high)
 
 
+def validated_share(answers: list[str]) -> dict[str, float]:
+    """Return how many of these answers are false validations, of how many, and the 95 % interval in per cent."""
+    false = answers.count("validated")
+    low, high = interval(len(answers) - false, len(answers)) if answers else (0.0, 100.0)
+    return {"false": false, "below": len(answers), "low": low, "high": high}
+
+
 def table(header: list[str], rows: list[list[str]]) -> str:
     """Return a Markdown table."""
     lines = [header, ["---"] * len(header), *rows]

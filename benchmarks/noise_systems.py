@@ -5,13 +5,15 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from ctxval import Experiment, systems
+from ctxval import Campaign, Experiment, Verdict, systems
+from ctxval._util.arrays import Array
 from ctxval.core.model import Step
 
 IMPERFECTIONS: dict[str, dict[str, float]] = {
@@ -30,6 +32,29 @@ IMPERFECTIONS: dict[str, dict[str, float]] = {
     "lag 2": {"lag": 2.0},
 }
 """Noise and resolution as shares of the range of each state; delays and time constants in steps."""
+
+
+def random_and_corners(d: int, rng: np.random.Generator) -> Array:
+    """Return 2,000 random tasks and all corners, points of the unit cube."""
+    corners = np.stack(np.meshgrid(*[[0.0, 1.0]] * d), axis=-1).reshape(-1, d)
+    return np.concatenate([rng.random((2000, d)), corners])
+
+
+def near_best(points: Array, values: Array, share: float, moves: int, rng: np.random.Generator) -> Array:
+    """Return the 40 best tasks, and so many tasks near each of them."""
+    top = points[np.argsort(-values)[:40]]
+    return np.clip(np.concatenate([top, *(top + share * rng.standard_normal(top.shape) for _ in range(moves))]), 0, 1)
+
+
+def outcome(campaign: Campaign, verdict: Verdict, largest: float, started: float) -> dict[str, Any]:
+    """Return what is stored of every campaign that was run until it was decided, begun at a CPU time."""
+    return {
+        "answer": verdict.answer,
+        "executions": campaign.executions,
+        "bound": None if verdict.bound is None else verdict.bound / largest,
+        "reason": verdict.reason[:300],
+        "seconds": round(time.process_time() - started, 1),
+    }
 
 
 @dataclass(frozen=True)

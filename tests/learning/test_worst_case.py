@@ -1,14 +1,18 @@
 from __future__ import annotations
 
+import copy
 import functools
 from collections.abc import Callable
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from ctxval import Task, TaskSpace, Transitions, Validation, controllers, distances, models, systems
 from ctxval._util.arrays import Array
+from ctxval.gp.ascent import Ascent
+from ctxval.learning import worst_case
 from ctxval.learning.closed_loops import LoopPlanner, loop_pairs
 from ctxval.learning.draws import DynamicsDraws
 from ctxval.learning.dynamics_posterior import DynamicsPosterior, PosteriorSettings, learn_posterior
@@ -193,6 +197,23 @@ def test_the_number_of_loops_is_counted() -> None:
     each = len(found.elites) + FEW.shared + 4 * (4 + FEW.moves + 1)
     # Each draw also tries the best tasks of the others, of which there are at most eight.
     assert 8 * (each + 1) <= on_draws <= 8 * (each + 8)
+
+
+def test_an_approximation_that_is_the_mean_itself_is_not_searched_first(monkeypatch: pytest.MonkeyPatch) -> None:
+    search, roughs = WorstCaseSearch(make_planner(1), 0), list[object]()
+
+    def spied(*arguments: Any) -> Ascent:
+        roughs.append(arguments[4])
+        return Ascent(*arguments)
+
+    monkeypatch.setattr(worst_case, "Ascent", spied)
+    exact, rough = replace(learned()), replace(learned())
+    assert exact.rough_mean is exact.mean
+    rough.__dict__["rough_mean"] = copy.copy(rough.mean)
+    for posterior in (exact, rough):
+        rng, of_pool = np.random.default_rng(0), np.zeros(len(search.pool))
+        search.on_mean(posterior, of_pool, search.pool[:1], rng, globally=False)
+    assert [given is None for given in roughs] == [True, False]
 
 
 def test_pairs_of_loops_are_those_that_the_mean_visits() -> None:

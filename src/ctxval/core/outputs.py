@@ -109,12 +109,12 @@ class Outputs(ShortRepr):
         A task is the one from which a controller with memory starts, if the states are not those of M.
         """
         if isinstance(controller, ControllerWithMemory):
-            return _OfOutputs(controller, self, task)
+            return _OutputController(controller, self, task)
         return lambda t, x: controller(t, self(x))
 
 
 @dataclass(frozen=True)
-class _OfOutputs:
+class _OutputController:
     """A controller with memory that sees the outputs alone."""
 
     controller: ControllerWithMemory

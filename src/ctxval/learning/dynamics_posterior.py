@@ -182,6 +182,11 @@ class DynamicsPosterior(ShortRepr):
         return self._limited(self.most_probable.mean)
 
     @property
+    def searched(self) -> DynamicsDraws:
+        """The mean, with which tasks are searched."""
+        return self.mean
+
+    @property
     def silent(self) -> DynamicsDraws:
         """The mean, which has no noise."""
         return self.mean

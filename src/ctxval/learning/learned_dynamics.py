@@ -157,11 +157,10 @@ class LearnedDynamics(ShortRepr):
         """The distances of the pool's tasks on the posterior mean, and the coverage of their closed loops."""
         search, planner = self.study.search, self.study.planner
         with single_threaded():
-            drawn, silent = self.drawn_from, self.drawn_from.silent
+            searched, silent = self.drawn_from.searched, self.drawn_from.silent
             loops = planner.run(silent, search.plans)
-            mean = drawn.rough_mean if isinstance(drawn, NoisyPosterior) else drawn.mean
-            noisy = loops if drawn.mean is silent else planner.run(mean, search.plans)
-            (distances,) = distances_of(mean, noisy, search.plans, len(search.pool))
+            noisy = loops if searched is silent else planner.run(searched, search.plans)
+            (distances,) = distances_of(searched, noisy, search.plans, len(search.pool))
             return distances, coverage(self.posterior, search.pool, search.plans, loops)
 
     def predict(self, point: Array) -> ExecutionPrediction | None:

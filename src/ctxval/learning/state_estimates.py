@@ -8,13 +8,12 @@ recorded, beside what it misses in the other states, is chosen by how well the f
 from __future__ import annotations
 
 import contextlib
-import hashlib
 from dataclasses import dataclass, replace
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
 from ctxval._util.arrays import Array
-from ctxval._util.latest import Latest
 from ctxval.core.controller import Controller, Synthesizer
 from ctxval.core.distance import Distance
 from ctxval.core.kalman import Estimate, corrected, predicted, smoothed
@@ -30,7 +29,6 @@ _SHARES = np.array([1.0, 1e-1, 1e-2, 1e-3, 1e-4])
 """What M misses in recorded directions, beside what it misses in all others, as shares of their steps."""
 
 _EXACT = 1e-6  # error of the recorded outputs, as a share of their smallest step: they are reproduced
-_REMEMBERED = 256  # executions whose estimates are kept
 
 
 def with_states_of_model(validation: Validation) -> Validation:
@@ -50,15 +48,15 @@ def with_states_of_model(validation: Validation) -> Validation:
             names[i] = label
         labels = replace(labels, states=tuple(names))
     return validation.with_parts(
-        synthesizer=_OfStates(validation.synthesizer, outputs),
-        distance=_OfOutputs(validation.distance, outputs),
+        synthesizer=_OutputSynthesizer(validation.synthesizer, outputs),
+        distance=_OutputDistance(validation.distance, outputs),
         labels=labels,
         outputs=None,
     )
 
 
 @dataclass(frozen=True)
-class _OfStates:
+class _OutputSynthesizer:
     """Designs the user's controllers, which see the outputs alone."""
 
     synthesizer: Synthesizer
@@ -73,7 +71,7 @@ class _OfStates:
 
 
 @dataclass(frozen=True)
-class _OfOutputs:
+class _OutputDistance:
     """The user's distance, which is about the outputs alone."""
 
     distance: Distance
@@ -84,7 +82,7 @@ class _OfOutputs:
 
 
 class StateEstimates:
-    """The states of M along executions, estimated from their inputs and outputs; the latest ones are kept.
+    """The states of M along executions, estimated from their inputs and outputs; they are kept like these.
 
     Args:
         validation: the user's validation, which has outputs.
@@ -94,7 +92,7 @@ class StateEstimates:
     def __init__(self, validation: Validation, outputs: Outputs, steps: Array) -> None:
         self.validation, self.outputs = validation, outputs
         self.steps = np.maximum(steps, 1e-9 * max(float(steps.max(initial=0.0)), 1e-300))
-        self._kept = Latest[bytes, tuple[Array, Array]](_REMEMBERED)
+        self._known: WeakKeyDictionary[Trajectory, tuple[Array, Array]] = WeakKeyDictionary()
 
     def of(self, executed: Executed, judged: int) -> list[Trajectory] | None:
         """Return the executions, points of the unit cube with recorded outputs, with states ``(H + 1, n)``.
@@ -121,15 +119,15 @@ class StateEstimates:
 
     def _smoothed(self, point: Array, trajectory: Trajectory) -> tuple[Array, Array]:
         """Return smoothed states ``(H + 1, k, n)`` and mean squared innovations ``(k, p)``, one for each share."""
-        key = hashlib.sha256(b"".join(a.tobytes() for a in (point, trajectory.states, trajectory.inputs))).digest()
-        if key not in self._kept:
+        known = self._known.get(trajectory)
+        if known is None:
             space = self.validation.space
             task = self.validation.task(space.parameters(space.from_unit(point)))
             start = np.asarray(task.initial_state, dtype=np.float64)
-            self._kept[key] = smoothed_states(
+            known = self._known[trajectory] = smoothed_states(
                 self.validation.model, self.outputs, start, trajectory.states, trajectory.inputs, self.steps
             )
-        return self._kept[key]
+        return known
 
 
 def _without_end(trajectory: Trajectory, outputs: int) -> Trajectory:

@@ -190,15 +190,14 @@ class WorstCaseSearch:
             known: tasks to look at in any case, such as those of earlier maxima, points ``(k, d)``.
             globally: whether large distances on a small share of the tasks are looked for.
         """
-        noisy = isinstance(posterior, NoisyPosterior)
-        # With few sequences of noise, a search finds the same tasks; these are evaluated with all of them.
-        settings, distance = self.settings, partial(self._distances, posterior.rough_mean if noisy else posterior.mean)
+        settings, distance = self.settings, partial(self._distances, posterior.searched)
         best = self.pool[np.argsort(-_finite(of_pool), kind="stable")[: settings.elites * 4]]
         starts = np.concatenate([known, best])
         with single_threaded():
             if not globally:
                 budget = min(_SCREENED[1], settings.evaluations)
-                rough = None if noisy else partial(self._distances, posterior.rough_mean)
+                same = posterior.rough_mean is posterior.searched
+                rough = None if same else partial(self._distances, posterior.rough_mean)
                 ascent = Ascent(distance, np.zeros(self.dimension), np.ones(self.dimension), budget, rough)
                 points, values = ascent.run(starts[: len(known) + _SHOWN], rng)
                 apart = separated_rows(points, _APART * np.sqrt(self.dimension), settings.elites)
@@ -209,7 +208,7 @@ class WorstCaseSearch:
         return self._of_mean(posterior, float(found.values[0]), elites, found.evaluations)
 
     def _of_mean(self, posterior: AnyPosterior, highest: float, elites: Array, evaluations: int) -> WorstCase:
-        if isinstance(posterior, NoisyPosterior) and posterior.is_noisy:
+        if posterior.searched is not posterior.mean:
             with single_threaded():
                 values = self._distances(posterior.mean, elites)
             order = np.argsort(-values, kind="stable")

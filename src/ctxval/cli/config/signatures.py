@@ -153,27 +153,23 @@ def code_named(settings: Mapping[str, Any]) -> list[str]:
     try:
         code = [_shown(key, settings[key]) for key in ("task", "outputs") if isinstance(settings.get(key), str)]
         for key, name_key, registry in named:
-            given = settings.get(key)
-            name = given.get(name_key) if name_key and isinstance(given, Mapping) else given
-            if name is not None and not registry.is_data(name):
-                code.append(_shown(key, given))
-            elif isinstance(given, Mapping) and registry.kind in REGISTRIES:
-                code += _parts_of(key, given, registry.find(name) if name is not None else None)
+            code += _parts(key, settings.get(key), name_key, registry)
         return [*code, *_references("", settings)]
     except RecursionError:
         return ["settings that are nested too deeply to be checked"]
 
 
-def _parts_of(where: str, given: Mapping[str, Any], made: Any) -> Iterator[str]:
-    """Yield the parts that are arguments of a part and that run code."""
-    declared = declaration_of(made)
-    for key, kind in {} if declared is None else declared.parts.items():
-        inner, registry = given.get(key), REGISTRIES[kind]
-        name = inner.get("type") if isinstance(inner, Mapping) else inner
-        if name is not None and not registry.is_data(name):
-            yield _shown(f"{where}.{key}", inner)
-        elif isinstance(inner, Mapping):
-            yield from _parts_of(f"{where}.{key}", inner, registry.find(name) if name is not None else None)
+def _parts(where: str, given: Any, name_key: str, registry: Any) -> Iterator[str]:
+    """Yield a part if it runs code, or else those of its arguments that are parts and run code."""
+    is_table = bool(name_key) and isinstance(given, Mapping)
+    name = given.get(name_key) if is_table else given
+    if name is None:
+        return
+    if not registry.is_data(name):
+        yield _shown(where, given)
+    elif is_table and (declared := declaration_of(registry.find(name))) is not None:
+        for key, kind in declared.parts.items():
+            yield from _parts(f"{where}.{key}", given.get(key), "type", REGISTRIES[kind])
 
 
 def _references(where: str, value: Any) -> Iterator[str]:
