@@ -23,9 +23,8 @@ from noise_misleading import PLANTS as MISLEADING
 from noise_reporting import PLANTS as REPORTING
 from noise_systems import IMPERFECTIONS, Plant, near_best, outcome, random_and_corners
 
-RULE = 1
-"""Version of the rule by which campaigns are run. The stored ones at 0.95 on reporting plants were run before a
-repetition of an excess was a bet on another one, which falsifies in fewer executions."""
+RULE = 2
+"""Version of the rule by which campaigns are run."""
 
 BUDGET, SEEDS, QUANTILE = 25, 2, 0.9
 SHARES = (0.95, 1.25, 1.1)

@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from ctxval.core.space import Parameters, TaskSpace
     from ctxval.core.task import Task
     from ctxval.core.task_distribution import Normal
+    from ctxval.core.task_suite import TaskSuite
     from ctxval.core.trajectory import Trajectory, Transitions
     from ctxval.core.trial import Trial
     from ctxval.core.truth import Truth, cached_truth, grid_truth, search_truth
@@ -67,6 +68,7 @@ __all__ = [
     "Store",
     "Task",
     "TaskSpace",
+    "TaskSuite",
     "Trajectory",
     "Transitions",
     "Trial",
@@ -120,6 +122,7 @@ _LAZY = {
     "Store": "campaign.storage.store",
     "Task": "core.task",
     "TaskSpace": "core.space",
+    "TaskSuite": "core.task_suite",
     "Trajectory": "core.trajectory",
     "Transitions": "core.trajectory",
     "Trial": "core.trial",

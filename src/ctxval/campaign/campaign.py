@@ -210,7 +210,7 @@ class Campaign:
         by_search = Choice(planned_draws=budget if until is None else 0)
 
         def rule() -> Choice | None:
-            if until is not None and until(self):
+            if not self.recorder.has_tasks or (until is not None and until(self)):
                 return None
             return by_search if decides is None else decides.choose()
 

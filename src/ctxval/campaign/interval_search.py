@@ -40,8 +40,10 @@ from ctxval.certificates.dynamics_diagnostics import (
 from ctxval.certificates.options import WITHIN
 from ctxval.certificates.posterior import Posterior
 from ctxval.certificates.prediction_tests import DRAWN, MANY, TESTS
-from ctxval.certificates.verdict import counterexample, quantile_of
-from ctxval.certificates.verdict_sentences import NO_UNITS
+from ctxval.certificates.sample import SAME
+from ctxval.certificates.suite import WholeSuite
+from ctxval.certificates.verdict import counterexample, quantile_of, require_suite
+from ctxval.certificates.verdict_sentences import Quantities
 from ctxval.core.trial import Trial
 from ctxval.errors import CertificateError, InputError
 
@@ -74,10 +76,16 @@ class IntervalSearch:
 
     def __post_init__(self) -> None:
         require_decisive(self.options)
+        if self._suite is not None:
+            require_suite(self.options.kind)
         if self.threshold is None and isinstance(self.options.kind, AnytimeAudit):
             raise InputError("an anytime audit ends by its threshold; state one, or run another certificate.")
         self.options.kind.require_usable(self.options.confidence, self.budget)
         self.recorder.dynamics.use_quantile(quantile_of(self.options.kind))
+
+    @property
+    def _suite(self) -> Array | None:
+        return self.recorder.validation.space.members
 
     @property
     def limit(self) -> float:
@@ -102,7 +110,9 @@ class IntervalSearch:
         return self.best, None if evidence is None else self._bound(evidence)
 
     def choose(self) -> Choice | None:
-        """Return the next task; None if the interval decides."""
+        """Return the next task; None if the interval decides, or no task of a suite is left."""
+        if not self.recorder.has_tasks:
+            return None
         if self.best > self.limit:
             if (repeated := self._against_noise()) is not None:
                 return repeated
@@ -126,7 +136,7 @@ class IntervalSearch:
             evidence = replace(whole, tests=self.tests)
             if self._decides(evidence):
                 return None
-        if isinstance(self.options.kind, Automatic) and evidence.quantile is None:
+        if isinstance(self.options.kind, Automatic) and evidence.quantile is None and self._suite is None:
             known = self._points(self.recorder.trials)
             patient = sum(trial.origin not in DRAWN for trial in self.recorder.trials) < _PATIENCE
             # In few dimensions, executions soon cover the tasks, and the posterior bound of the distance may decide.
@@ -140,7 +150,8 @@ class IntervalSearch:
     def _is_falsified(self) -> bool:
         """Whether the executed distances falsify the limit; of a noisy system, one above it may not suffice."""
         kind, confidence = self.options.kind, self.options.confidence
-        return counterexample(self.recorder.trials, self.limit, NO_UNITS, confidence, quantile_of(kind)) is not None
+        known = Quantities(space=self.recorder.validation.space)
+        return counterexample(self.recorder.trials, self.limit, known, confidence, quantile_of(kind)) is not None
 
     def _against_noise(self) -> Choice | None:
         """Return a task whose execution tells whether noise explains a distance above the limit.
@@ -149,7 +160,7 @@ class IntervalSearch:
         """
         trials, quantile = self.recorder.trials, quantile_of(self.options.kind)
         bets = bets_against(trials, self.limit, quantile)
-        if not self.predicts or (bets is not None and bets.falsify(self.options.confidence)):
+        if self._suite is not None or not self.predicts or (bets is not None and bets.falsify(self.options.confidence)):
             return None
         learned = self.recorder.dynamics.learned(trials)
         if learned is None or learned.noisy is None or not learned.noisy.is_noisy:
@@ -177,7 +188,7 @@ class IntervalSearch:
             return self._test()
         learned = self.recorder.dynamics.learned(trials)
         steady = Steadiness(self.recorder.dynamics.planner, None if learned is None else learned.expected)
-        point = next_task(evidence, self._points(self._ended), best, limit, confidence, steady)
+        point = next_task(evidence, self._points(self._ended), best, limit, confidence, steady, self._near)
         waiting = waiting_points(trials)
         if len(waiting) and (point is None or np.abs(waiting - point).max(axis=1).min() <= NEAR):
             # It is being executed already. Another worker prepares for the results that are expected.
@@ -186,7 +197,7 @@ class IntervalSearch:
                 best = max(best, float(expected[np.isfinite(expected)].max(initial=0.0)))
                 limit = (1 + self.within) * best if self.threshold is None else limit
             after = self.recorder.dynamics.screening(trials, pending=True) or evidence
-            point = next_task(after, self._points(trials), best, limit, confidence, steady)
+            point = next_task(after, self._points(trials), best, limit, confidence, steady, self._near)
         return Choice(point, "covering", planned_draws=0, rejected=steady.rejected)
 
     def by_dynamics(self) -> Array | None:
@@ -278,15 +289,21 @@ class IntervalSearch:
         for j in [*unseen, *(j for j in range(len(worst)) if j not in unseen)][:6]:
             task = worst.copy()
             task[j] = failed.point[j]
-            if np.abs(known - task).max(axis=1).min() > NEAR:
+            task = task if self._suite is None else self.recorder.validation.space.rounded(task)
+            if np.abs(known - task).max(axis=1).min() > self._near:
                 return task
         return None
+
+    @property
+    def _near(self) -> float:
+        """The largest change of each coordinate to a task that is no new one."""
+        return NEAR if self._suite is None else SAME
 
     def _test(self) -> Choice:
         """Return the next task that tests predictions where nobody chose to look; see ``prediction_tests``."""
         trials = self.recorder.trials
         # A hypercube that was begun is completed, because what a part of it shows must not decide that it is left.
-        if self.tests < MANY or spread_tests(trials) % TESTS:
+        if self.tests < MANY or self._suite is not None or spread_tests(trials) % TESTS:
             return Choice(self.recorder.draws.test(trials), "spread", planned_draws=0, rejected=0)
         # The results decide when the campaign ends, so the number of independent draws is not planned.
         return Choice(self.recorder.draw(), "iid", planned_draws=0, rejected=0)
@@ -303,8 +320,8 @@ class IntervalSearch:
         kind = self.options.kind
         if isinstance(kind, Dynamics):
             return Choice(planned_draws=0)
-        if not self.limit > 0:
-            return Choice(planned_draws=0)  # no distance is known, or all are 0
+        if not self.limit > 0 or self._suite is not None:
+            return Choice(planned_draws=0)  # no distance is known, all are 0, or each task of a suite is executed
         posterior = kind.posterior if isinstance(kind, Automatic) else kind
         rule = StoppingRule(self.limit, replace(self.options, kind=posterior))
         now = rule.decide(self.recorder.trials, self.budget - self.recorder.executions)
@@ -316,7 +333,7 @@ class IntervalSearch:
 
 def is_decisive(options: CertificateOptions) -> bool:
     """Return whether executions can be chosen for a certificate."""
-    return isinstance(options.kind, Automatic | Dynamics | Posterior | AnytimeAudit)
+    return isinstance(options.kind, Automatic | Dynamics | Posterior | AnytimeAudit | WholeSuite)
 
 
 def require_decisive(options: CertificateOptions) -> None:
@@ -324,7 +341,7 @@ def require_decisive(options: CertificateOptions) -> None:
     kind = options.kind
     if not is_decisive(options):
         raise InputError(
-            "a campaign that decides needs one of the certificates auto, dynamics, posterior and anytime, got "
+            "a campaign that decides needs one of the certificates auto, dynamics, posterior, anytime and suite, got "
             f"{kind.name!r}; --explore (explore=True in Python) executes the tasks of the search."
         )
     if isinstance(kind, AnytimeAudit) and not options.volume:
@@ -342,7 +359,7 @@ def with_next_task(verdict: Verdict, recorder: TrialRecorder, options: Certifica
         return verdict
     space = recorder.validation.space
     point = space.from_unit(space.rounded(unit_point))
-    task = with_units(dict(zip(space.labels, point.tolist(), strict=True)))
+    task = with_units(space.labelled(point))
     reason = f"{verdict.reason.removesuffix('.')}; next task: {task}."
     return replace(verdict, reason=reason, next_task=space.describe_point(point))
 
@@ -354,6 +371,7 @@ def next_task(
     limit: float,
     confidence: float,
     steady: Callable[[Array], bool] = lambda point: True,
+    near: float = NEAR,
 ) -> Array | None:
     """Return the task to execute next, a point ``(d,)``; None if all tasks lie next to executed ones.
 
@@ -363,7 +381,8 @@ def next_task(
     Further tasks test the predictions, and if all of these are known, the task that is farthest from all others does.
 
     The known tasks ``(n, d)`` are executed or open, ``best`` is the largest executed distance, and ``limit`` is what
-    the bound must not exceed. A task may be executed only if it is steady: its distance is that of its neighbours.
+    the bound must not exceed. A task may be executed only if it is steady: its distance is that of its neighbours. It
+    is new if one of its coordinates differs by more than ``near`` from those of each known one.
     """
     order = np.argsort(evidence.maxima, kind="stable")
     rank = evidence.rank(confidence)
@@ -386,10 +405,10 @@ def next_task(
         candidates = [highest, farthest] if len(known) % 2 else [farthest, highest]
 
     def is_new(point: Array) -> bool:
-        near = known[np.abs(known - point).max(axis=1) <= NEAR]
+        close = known[np.abs(known - point).max(axis=1) <= near]
         # A start may jump between tasks, so the closed loop next to an executed task may lead elsewhere.
         most = 2 if np.array_equal(point, evidence.coverage.task) else 1
-        return len(near) < most and not (near == point).all(axis=1).any()
+        return len(close) < most and not (close == point).all(axis=1).any()
 
     # Of random tasks, the one farthest from all known tasks comes first.
     spread = np.random.default_rng(len(known)).random((256, known.shape[1]))

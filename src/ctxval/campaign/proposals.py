@@ -65,6 +65,8 @@ class Steadiness:
         After too many tests it is false, and the task does not count as rejected.
         """
         key = point.tobytes()
+        if self.planner.validation.space.members is not None:
+            return True  # there are no tasks next to it
         if key not in self._tested:
             if len(self._tested) >= 24:
                 return False
@@ -135,7 +137,8 @@ class Proposals:
                 expected = prediction.expected
                 steady = Steadiness(self._dynamics.planner, lambda points: expected(points)[0])
                 costs = partial(costs_of, prediction, self._validation, trials)
-                prediction = replace(prediction, costs=costs, steady=steady)
+                left = remaining_tasks(self._validation, trials)
+                prediction = replace(prediction, costs=costs, steady=steady, candidates=left)
             self._search.use_prediction(prediction)
             return self._executable(self._asked(), trials, steady, rejected)
 
@@ -165,7 +168,7 @@ class Proposals:
         steady, point, rejected = Steadiness(self._dynamics.planner), choice.unit_point, choice.rejected
         if rejected is None:
             point, rejected = self._steady(point, trials, steady), steady.rejected
-        return self._validation.space.rounded(point), _with_rejected(choice.note, rejected)
+        return self._allowed(point, trials), _with_rejected(choice.note, rejected)
 
     def _asked(self) -> Array:
         asked, dimension = self._search.ask(1), self._validation.space.dimension
@@ -188,19 +191,27 @@ class Proposals:
         The point of an earlier trial stays, and independent draws are only rounded.
         """
         note = _plain_note(self._search.note())
-        if any(np.array_equal(point, trial.unit_point) for trial in trials):
+        repeats = self._validation.space.members is None
+        if repeats and any(np.array_equal(point, trial.unit_point) for trial in trials):
             return point, note
         if not self._search.iid:
             point = self._steady(point, trials, steady)
-        rounded = self._validation.space.rounded(point)
+        rounded = self._allowed(point, trials)
         if isinstance(self._search, SequentialSearch):
             self._search.amend(rounded)
         return rounded, _with_rejected(note, rejected + steady.rejected)
 
+    def _allowed(self, point: Array, trials: Sequence[Trial]) -> Array:
+        """Return the task to execute for a point ``(d,)``: the point, rounded, or the nearest task left of a suite."""
+        remaining = remaining_tasks(self._validation, trials)
+        if remaining is None:
+            return self._validation.space.rounded(point)
+        return np.asarray(remaining[np.linalg.norm(remaining - point, axis=1).argmin()])
+
     def _steady(self, point: Array, trials: Sequence[Trial], steady: Steadiness) -> Array:
         """Return a steady point: the given one, or one next to it."""
-        if self._validation.is_on_model:
-            return point  # no distance depends on how a controller would react to errors of M
+        if self._validation.is_on_model or self._validation.space.members is not None:
+            return point  # no distance depends on how a controller would react to errors of M; a suite has no others
         return point if steady(point) else steady.moved(point, np.random.default_rng([len(trials), _MOVED]))
 
 
@@ -240,7 +251,15 @@ class IndependentDraws:
         return space.rounded(space.unit_draws(1, self._generator(len(trials), _DRAW))[0])
 
     def test(self, trials: Sequence[Trial]) -> Array:
-        """Return the next point ``(d,)`` of the Latin hypercubes of tests; it depends on no result."""
+        """Return the next point ``(d,)`` of the Latin hypercubes of tests; it depends on no result.
+
+        Of a suite, it is the first task that is left in an order that was drawn once.
+        """
+        members, remaining = self._validation.space.members, remaining_tasks(self._validation, trials)
+        if members is not None and remaining is not None:
+            left = {task.tobytes() for task in remaining}
+            order = self._generator(0, _HYPERCUBE).permutation(len(members))
+            return next(task for task in members[order] if task.tobytes() in left)
         block, row = divmod(spread_tests(trials), TESTS)
         points = latin_hypercube(TESTS, self._validation.space.dimension, self._generator(block, _HYPERCUBE))
         return np.asarray(points[row])
@@ -254,6 +273,12 @@ class IndependentDraws:
         if self._store.draws() is None:
             self._store.keep_draws(_number_of_model(self._validation))
         return self._store.draws() or 0
+
+
+def remaining_tasks(validation: Validation, trials: Sequence[Trial]) -> Array | None:
+    """Return the tasks of a suite that no trial has, points ``(r, d)``; None if tasks fill the box."""
+    known = np.array([trial.unit_point for trial in trials]).reshape(-1, validation.space.dimension)
+    return validation.space.remaining(known)
 
 
 def spread_tests(trials: Sequence[Trial]) -> int:

@@ -18,7 +18,7 @@ from ctxval.campaign.dynamics import CampaignDynamics
 from ctxval.campaign.goals_of_model import GoalsOfModel
 from ctxval.campaign.history import history_of
 from ctxval.campaign.identity import identify, remeasure, with_distance
-from ctxval.campaign.proposals import IndependentDraws, Proposals
+from ctxval.campaign.proposals import IndependentDraws, Proposals, remaining_tasks
 from ctxval.campaign.storage.disks import error_with_fallback
 from ctxval.campaign.storage.store import Store
 from ctxval.certificates import PLANNED
@@ -29,7 +29,7 @@ from ctxval.core.preflight import StartOffset, start_offset, try_distance
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import CONVERGED, Origin, Trial
 from ctxval.core.validation import Validation
-from ctxval.errors import CtxvalError, DistanceError, InputError, StoreAccessError, StoreError
+from ctxval.errors import CertificateError, CtxvalError, DistanceError, InputError, StoreAccessError, StoreError
 from ctxval.models import Refined
 from ctxval.searches import BaseSearch, Search, SequentialSearch
 
@@ -108,7 +108,15 @@ class TrialRecorder:
 
     def draw(self) -> Array:
         """Return the next independent draw of a task, a point of the unit cube ``(d,)``."""
+        if self.validation.space.members is not None:
+            raise CertificateError("a suite of tasks has no independent draws: `ctxval run` executes each task once.")
         return self.draws.point(self._trials)
+
+    @property
+    def has_tasks(self) -> bool:
+        """Whether there is a task that may be executed; each task of a suite is executed once."""
+        remaining = remaining_tasks(self.validation, self._trials)
+        return remaining is None or len(remaining) > 0
 
     # Consistency with the store
 
@@ -217,9 +225,13 @@ class TrialRecorder:
     def _next_trial(self, choice: Choice, attempts: int) -> Trial:
         """Return the trial of a choice, and tell the search that its point has no value yet."""
         note = None
+        if not self.has_tasks and choice.parameters is None:
+            raise InputError("each task of the suite is executed, or is being executed; state one to execute it again.")
         if choice.unit_point is None and self.search.iid and self.validation.space.distribution is not None:
             # The points of such a search are uniform, and the tasks are not.
             choice = replace(choice, unit_point=self.draw(), origin="iid")
+        if choice.unit_point is None and self.search.iid and self.validation.space.members is not None:
+            choice = replace(choice, unit_point=self.draws.test(self._trials), origin="spread")
         if choice.unit_point is None and (spread := self._proposals.spread(self._trials)) is not None:
             choice = replace(choice, unit_point=spread, origin="initial")
         if choice.unit_point is None:

@@ -38,6 +38,7 @@ from ctxval.certificates.scenario import (
     volume_bound,
 )
 from ctxval.certificates.stopping import StoppingDecision, StoppingRule
+from ctxval.certificates.suite import WholeSuite
 from ctxval.certificates.verdict import Assessment, Verdict, assess, judge, judge_by
 
 __all__ = [
@@ -72,6 +73,7 @@ __all__ = [
     "StoppingRule",
     "UntriedParameter",
     "Verdict",
+    "WholeSuite",
     "assess",
     "bare_corners",
     "certify_anytime",

@@ -18,6 +18,7 @@ from ctxval.certificates.forecast import Forecast
 from ctxval.certificates.posterior import Posterior
 from ctxval.certificates.prediction_tests import DRAWN, TESTS, shown_by_tests
 from ctxval.certificates.sample import Sample
+from ctxval.certificates.suite import WholeSuite
 from ctxval.certificates.verdict_sentences import supported as supported_by
 from ctxval.core.quantiles import QUANTILE
 from ctxval.errors import CertificateError
@@ -30,6 +31,7 @@ _Outcome = tuple[Certificate, Forecast | None]
 class Automatic(CertificateKind):
     """The bound from learned dynamics if it keeps the threshold, otherwise the posterior bound of the distance.
 
+    For a suite of tasks, it is the bound from learned dynamics until all tasks were executed.
     The dynamics bound is tried only if the experiment is loaded, the system is declared deterministic, and the
     resolution is the usual one. If neither keeps the threshold, the certificate is the one that is nearer to a
     decision.
@@ -43,6 +45,7 @@ class Automatic(CertificateKind):
 
     name: ClassVar[str] = "auto"
     needs_model: ClassVar[bool] = True
+    takes_suites: ClassVar[bool] = True
     sorts_draws: ClassVar[bool] = True  # its draws are tests, and count at any time
 
     stochastic: bool = False
@@ -71,6 +74,8 @@ class Automatic(CertificateKind):
         return self._first(sample, threshold, confidence)
 
     def _first(self, sample: Sample, threshold: float | None, confidence: float) -> _Outcome:
+        if sample.suite is not None and (not sample.not_executed or not self.uses_dynamics(sample)):
+            return _certified(WholeSuite(), sample, threshold, confidence)
         by_dynamics = None
         if self.uses_dynamics(sample):
             with suppress(CertificateError):
@@ -79,6 +84,8 @@ class Automatic(CertificateKind):
                 )
         if by_dynamics is not None and (_decides(by_dynamics[0], threshold) or _is_noisy(by_dynamics[0])):
             return by_dynamics  # the posterior bound of the distance is about systems without noise
+        if sample.suite is not None:
+            return by_dynamics or _certified(WholeSuite(), sample, threshold, confidence)
         try:
             by_distance = self._tested(_certified(self.posterior, sample, threshold, confidence), sample)
         except CertificateError:
@@ -104,8 +111,8 @@ class Automatic(CertificateKind):
         """Return the posterior bound, withdrawn if tasks of the whole space have not been executed."""
         certificate, expected = outcome
         origins = [origin for origin in sample.origins if self.tests and origin in DRAWN]
-        uniform, dimension = sample.distribution is None, sample.points.shape[1]
-        shown = shown_by_tests(origins, dimension, certificate.confidence, uniform=uniform)
+        dimension = sample.points.shape[1]
+        shown = shown_by_tests(origins, dimension, certificate.confidence, uniform=sample.is_uniform)
         tests = {**shown, "largest_error": None}
         doubt, missing = certificate.doubt, self.missing_tests(sample)
         if doubt is None and missing:

@@ -139,6 +139,9 @@ class CertificateKind(ShortRepr, ABC):
     """Whether it sorts out independent draws whose number depended on results; else these are no draws in its sample.
     """
 
+    takes_suites: ClassVar[bool] = False
+    """Whether it certifies suites of tasks, of which each is executed once and none is drawn at random."""
+
     @classmethod
     def options(cls) -> tuple[str, ...]:
         """Return the names of its options: its fields, and ``volume`` if it validates but for a share of the tasks."""

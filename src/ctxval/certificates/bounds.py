@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from ctxval._util.texts import enumerated, parted
+from ctxval._util.texts import enumerated, parted, quoted
 
 ERRORS = 2.0
 """Number of its standard errors by which a bound from random draws must stay below a threshold."""
@@ -57,10 +57,11 @@ def state_of(estimated: object) -> str:
     return "M's state (estimated from outputs)" if estimated else "recorded state"
 
 
-def with_units(values: Mapping[str, float], digits: int = 2) -> str:
-    """Return numbers with their names; the unit of a label ``name [unit]`` follows its number."""
+def with_units(values: Mapping[str, float | str], digits: int = 2) -> str:
+    """Return numbers with their names; the unit of a label ``name [unit]`` follows its number. Texts are quoted."""
     parts = ((*parted(label), value) for label, value in values.items())
-    return ", ".join(f"{name} {value:.{digits}g} {unit}".rstrip() for name, unit, value in parts)
+    texts = ((name, unit, repr(quoted(v)) if isinstance(v, str) else f"{v:.{digits}g}") for name, unit, v in parts)
+    return ", ".join(f"{name} {text} {unit}".rstrip() for name, unit, text in texts)
 
 
 def as_text(value: object) -> str:

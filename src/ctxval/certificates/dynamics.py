@@ -67,6 +67,7 @@ class Dynamics(CertificateKind):
 
     name: ClassVar[str] = "dynamics"
     needs_model: ClassVar[bool] = True
+    takes_suites: ClassVar[bool] = True
 
     stochastic: bool = False
     tests: NonNegativeInt = TESTS
@@ -178,7 +179,7 @@ def certify_dynamics(sample: Sample, evidence: DynamicsEvidence, confidence: Pro
                 "held": sum(held(prediction, bound) for prediction in last),
             },
             "tests": {
-                **shown_by_tests(origins, sample.points.shape[1], confidence, uniform=sample.distribution is None),
+                **shown_by_tests(origins, sample.points.shape[1], confidence, uniform=sample.is_uniform),
                 "largest_error": max((test.error for test in drawn), default=None),
             },
             "checked": [{**each.to_json(), "held": bool(held(each, bound))} for each in evidence.predictions],

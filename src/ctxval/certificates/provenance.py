@@ -15,6 +15,7 @@ from ctxval.certificates.sample import Sample
 from ctxval.certificates.verdict_sentences import Quantities
 from ctxval.core.space import DISTRIBUTION, TaskSpace
 from ctxval.core.task_distribution import distribution_text
+from ctxval.core.task_suite import SUITE, TaskSuite
 from ctxval.core.trial import Change, StatedThreshold, Trial
 from ctxval.errors import InputError
 
@@ -130,7 +131,8 @@ class Provenance(ShortRepr):
 
     def sample(self, trials: Sequence[Trial]) -> Sample:
         """Return trials as a certificate sees them, with what is known here."""
-        return replace(Sample.of(trials, self.learned), distribution=self.distribution)
+        suite = None if self.space is None else self.space.members
+        return replace(Sample.of(trials, self.learned), distribution=self.distribution, suite=suite)
 
 
 def remarks_on(changes: Iterable[Change]) -> tuple[str, ...]:
@@ -167,6 +169,8 @@ def _table(description: Mapping[str, Any], name: str) -> Mapping[str, Any]:
 def _space_of(described: Mapping[str, Any]) -> TaskSpace | None:
     """Return a task space that is described; None if it cannot be read, as only sentences depend on it."""
     try:
+        if SUITE in described:
+            return TaskSuite.described(described)
         bounds: dict[str, tuple[Any, ...]] = {}
         for name, bound in described.items():
             if name in ("type", DISTRIBUTION):

@@ -15,6 +15,9 @@ from ctxval.certificates.dynamics_evidence import LearnedDistance
 from ctxval.core.trial import TOLD_ALONE, Origin, State, Trial
 from ctxval.errors import CertificateError
 
+SAME = 1e-9
+"""Points of the unit cube that differ by no more than this are the same task."""
+
 PLANNED = "draws"
 """Key of the planned number of draws in the note of an independent draw."""
 
@@ -49,6 +52,7 @@ class Sample(ShortRepr):
         made_good: failures that are left out, because their tasks were executed with success later.
         learned: what the experiment's model predicts; None if the experiment is not loaded.
         distribution: the distribution of tasks as a text; None if it is uniform.
+        suite: the tasks of a suite, points of the unit cube ``(N, d)``; None if tasks fill the box.
 
     Raises:
         CertificateError: if the lengths differ, or a trial is still open.
@@ -63,6 +67,7 @@ class Sample(ShortRepr):
     made_good: tuple[MadeGood, ...] = ()
     learned: LearnedDistance | None = None
     distribution: str | None = None
+    suite: Array | None = None
 
     def __post_init__(self) -> None:
         if not len(self.numbers):
@@ -140,6 +145,24 @@ class Sample(ShortRepr):
         others = [origin == "iid" and row not in kept for row, origin in enumerate(self.origins)]
         origins = ["acquisition" if is_other else each for each, is_other in zip(self.origins, others, strict=True)]
         return replace(self, origins=origins) if any(others) else self
+
+    @property
+    def tasks(self) -> int | None:
+        """The number of tasks of the suite; None if tasks fill the box."""
+        return None if self.suite is None else len(self.suite)
+
+    @property
+    def is_uniform(self) -> bool:
+        """Whether tasks fill the box and are distributed uniformly over it."""
+        return self.distribution is None and self.suite is None
+
+    @property
+    def not_executed(self) -> int | None:
+        """The number of tasks of the suite without a distance; None if tasks fill the box."""
+        if self.suite is None:
+            return None
+        known = self.points[np.isfinite(self.distances)]
+        return sum(not np.abs(known - task).max(axis=1, initial=0.0).min(initial=np.inf) <= SAME for task in self.suite)
 
     @property
     def best(self) -> float:

@@ -42,6 +42,18 @@ FROZEN = (
 ANY_ORDER = "how the tasks were chosen and when the campaign stopped does not matter"
 
 
+EXECUTED_AGAIN = (
+    "an execution of a task again gives the distance that was recorded: its noise is not bounded, and what one "
+    "execution shows is all that is known of its task"
+)
+"""The assumption of a statement about executed tasks alone."""
+
+
+def suite_statement(sample: Sample) -> str:
+    """Return that all tasks of a suite were executed, and what their largest distance is."""
+    return f"All {sample.tasks} tasks of the suite were executed, and their largest distance is {sample.best:.6g}."
+
+
 # Independent draws
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from ctxval._util.checked import PositiveFloat, checked
 from ctxval._util.representation import ShortRepr, call, line, lines, shown, table
 from ctxval.certificates import verdict_sentences as sentences
-from ctxval.certificates.base import KINDS, Certificate
+from ctxval.certificates.base import KINDS, Certificate, CertificateKind
 from ctxval.certificates.bets import bets_against
 from ctxval.certificates.forecast import Forecast
 from ctxval.certificates.options import CONFIDENCE, CertificateOptions, require_confidence, require_volume
@@ -107,9 +107,10 @@ def counterexample(
     """Return the verdict "falsified" by the largest distance above the threshold; None if no distance is above it.
 
     If executions were predicted to be noisy, a single one above it does not suffice: see
-    :mod:`ctxval.certificates.bets`.
+    :mod:`ctxval.certificates.bets`. It suffices for a task of a suite, which is executed once.
     """
-    tau, bets = float(threshold), bets_against(trials, float(threshold), quantile)
+    once = quantities.space is not None and quantities.space.members is not None
+    tau, bets = float(threshold), None if once else bets_against(trials, float(threshold), quantile)
     if bets is not None and not bets.falsify(confidence):
         return None
     above = [trial for trial in trials if trial.distance is not None and trial.distance > tau]
@@ -195,12 +196,24 @@ def _certified(
 ) -> tuple[Certificate, Forecast | None]:
     """Return a certificate, for a threshold if there is one, and a forecast. Most kinds see countable draws only."""
     kind, sample = options.kind, known.sample(trials)
+    if sample.suite is not None:
+        require_suite(kind)
     sample = sample if kind.sorts_draws else sample.with_countable_draws()
     if threshold is None:
         certificate, expected = kind.certify(sample, options.confidence), None
     else:
         certificate, expected = kind.certify_against(sample, threshold, options.confidence)
     return certificate.with_remarks(known.remarks), expected
+
+
+def require_suite(kind: CertificateKind) -> None:
+    """Refuse a kind of certificate that is not for suites of tasks."""
+    if not kind.takes_suites:
+        kinds = ", ".join(name for name in KINDS.imported if KINDS.find(name).takes_suites)
+        raise CertificateError(
+            f"a certificate of the kind {kind.name!r} is not for a suite of tasks, each of which is executed once; use "
+            f"one of {kinds}."
+        )
 
 
 @dataclass(frozen=True, eq=False)

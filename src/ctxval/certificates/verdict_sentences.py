@@ -45,7 +45,11 @@ class Quantities:
     @property
     def ranges(self) -> str:
         """The tasks, such as `` (start 0 to 0.4 m, goal 0.2 to 1.2 m)``; empty if they are not known or too many."""
-        if self.space is None or self.space.dimension > _NAMED:
+        if self.space is None:
+            return ""
+        if self.space.members is not None:
+            return f" of the {len(self.space.members)} of the suite"
+        if self.space.dimension > _NAMED:
             return ""
         ends = zip(self.space.labels, self.space.low.tolist(), self.space.high.tolist(), strict=True)
         ranges = ((*parted(label), low, high) for label, low, high in ends)
@@ -56,13 +60,13 @@ class Quantities:
         space, at = self.space, trial.unit_point
         if space is None or at.shape != (space.dimension,):
             return shown(trial.parameters)
-        values = dict(islice(zip(space.labels, space.from_unit(at).tolist(), strict=True), 6))
-        return with_units(values, digits=4) + (", ..." if len(at) > 6 else "")
+        values = space.labelled(space.from_unit(at))
+        return with_units(dict(islice(values.items(), 6)), digits=4) + (", ..." if len(values) > 6 else "")
 
     def lengths(self, share: float) -> str:
         """Return a share of each range in the units of the task parameters, if they are few and known."""
         space = self.space
-        if space is None or space.dimension > _NAMED:
+        if space is None or space.members is not None or space.dimension > _NAMED:
             return f"{share:.2g} of each parameter's range"
         widths = zip(space.labels, (space.high - space.low).tolist(), strict=True)
         lengths = {label: f"{share * width:.2g} {parted(label)[1]}".rstrip() for label, width in widths}
@@ -138,6 +142,11 @@ def validated(certificate: Certificate, tau: float, quantities: Quantities) -> s
     upper, limit = _bound_and_limit(certificate, tau, quantities)
     level, tests = percent(certificate.confidence), certificate.details.get("tests")
     untested = "" if tests is None or tests["drawn"] else f"{_UNTESTED}; "
+    if certificate.kind == "suite":
+        return (
+            f"all {certificate.details['tasks']} tasks of the suite were executed, and no distance exceeds {limit}: "
+            f"the largest is {upper}."
+        )
     if certificate.volume:
         return (
             f"{untested}with {level} confidence, at most {at_most(100 * certificate.volume, 3)} % "
@@ -346,6 +355,8 @@ def conditions(certificate: Certificate, space: TaskSpace | None) -> list[str]:
             ]
         case "posterior":
             return _posterior_conditions(details, Quantities(space=space))
+        case "suite":
+            return ["an execution of a task again giving the distance that was recorded"]
         case "audit" | "anytime" | "scenario" | "sampling-discarding" | "region":
             draws = (
                 "tasks that were drawn independently, and from which M was not learned (how large the distance is in "

@@ -77,6 +77,7 @@ def write_task(path: str | Path, task: Task, *, states: Names | None = None) -> 
         raise ShapeError(f"the file of a task must hold one task, got a batch of shape {task.batch_shape}.")
     about = {"format": TASK_FORMAT, "version": VERSION, "dt": task.dt, "horizon": task.horizon}
     about |= _named("state", states, task.initial_state.size)
+    about |= {"name": task.name} if task.name else {}
     _write(Path(path), about, {"initial_state": task.initial_state, "reference": task.reference})
 
 
@@ -85,7 +86,8 @@ def read_task(path: str | Path) -> Task:
 
     def build(content: Mapping[str, Any]) -> Task:
         start = as_finite("initial_state", content["initial_state"])
-        return Task(start, horizon=content["horizon"], dt=content["dt"], reference=content["reference"])
+        aim, name = content["reference"], str(content.get("name", ""))
+        return Task(start, horizon=content["horizon"], dt=content["dt"], reference=aim, name=name)
 
     return _read(Path(path), TASK_FORMAT, build)
 

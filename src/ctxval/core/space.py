@@ -15,7 +15,7 @@ from ctxval._util.texts import shortened
 from ctxval.core.task_distribution import ByParameter, BySampler, Continuous, Sampler, TaskDistribution
 from ctxval.errors import InputError, ShapeError, UnknownNameError
 
-Point = float | list[float]
+Point = float | list[float] | str
 
 AxisPoints = Annotated[int, Must("an integer of at least 2", lambda value: value >= 2)]
 
@@ -42,7 +42,7 @@ class Parameters:
         return self[name]
 
     def __getitem__(self, name: str) -> Any:
-        return self.points[..., self._space.columns(name)]
+        return self._space.values_of(name, self.points)
 
     def __repr__(self) -> str:
         if self.points.ndim == 1:
@@ -61,6 +61,9 @@ class TaskSpace:
     >>> space.names
     ('goal', 'offset[0]', 'offset[1]')
     """
+
+    members: Array | None = None
+    """The tasks as points of the unit cube ``(N, d)``, if they are finitely many; None if they fill the box."""
 
     def __init__(self, **bounds: tuple[Any, ...]) -> None:
         if not bounds:
@@ -127,6 +130,10 @@ class TaskSpace:
         except KeyError:
             raise UnknownNameError.among("task parameter", name, self._columns) from None
 
+    def values_of(self, name: str, points: Array) -> Any:
+        """Return the values of a parameter in points ``(..., d)`` of the space, ``(...)`` or ``(..., k)``."""
+        return points[..., self.columns(name)]
+
     # Between points, the unit cube and names
 
     def to_unit(self, points: ArrayLike) -> Array:
@@ -180,6 +187,18 @@ class TaskSpace:
     def describe_point(self, point: Array) -> dict[str, Point]:
         """Return one point ``(d,)`` as ``{name: number or list}``, ready for JSON."""
         return {name: point[columns].tolist() for name, columns in self._columns.items()}
+
+    def labelled(self, point: Array) -> dict[str, float | str]:
+        """Return what a sentence calls the task at a point ``(d,)`` of the space: its parameters by their labels."""
+        return dict(zip(self.labels, point.tolist(), strict=True))
+
+    def remaining(self, known: Array) -> Array | None:
+        """Return the members that are not among points ``(n, d)`` of the unit cube; None if tasks fill the box."""
+        return None
+
+    def task_names_at(self, points: Array) -> Any:
+        """Return the names of the tasks at points ``(..., d)`` of the space, ``(...)``; empty if they have none."""
+        return ""
 
     def unit_function(self, function: Callable[[Parameters], ArrayLike]) -> Callable[[Array], Array]:
         """Return a function of named parameters as one of unit-cube points ``(n, d)``, which searches know."""

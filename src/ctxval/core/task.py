@@ -24,10 +24,19 @@ class Task:
         goal: the state to reach, given like ``initial_state``; a goal is a constant reference. If the validation has
             outputs, it is the outputs to reach, and has their number.
         reference: the states, or outputs, to follow, array ``(..., H + 1, n)``; give this or ``goal``, not both.
+        name: the name of the task, or an array of names over the batch. A task of a :class:`ctxval.TaskSuite` gets
+            that of the suite.
     """
 
     def __init__(
-        self, initial_state: Any, *, horizon: PositiveInt, dt: Seconds, goal: Any = None, reference: Any = None
+        self,
+        initial_state: Any,
+        *,
+        horizon: PositiveInt,
+        dt: Seconds,
+        goal: Any = None,
+        reference: Any = None,
+        name: Any = "",
     ) -> None:
         if goal is not None and reference is not None:
             raise InputError("a task must have a goal or a reference, not both.")
@@ -58,6 +67,8 @@ class Task:
         """Shape ``(..., H + 1, n)``; all zero if the task has neither goal nor reference."""
         self.has_goal: bool = goal is not None or reference is not None
         """Whether a goal or a reference was given."""
+        self.name: Any = name
+        """The name of the task, or those of a batch, ``(...)``; empty if it has none."""
 
     @property
     def goal(self) -> Array:
@@ -77,17 +88,27 @@ class Task:
 
     def __getitem__(self, index: int) -> Task:
         """Return one task of the batch."""
-        reference = self.reference[index] if self.has_goal else None
-        return Task(self.initial_state[index], horizon=self.horizon, dt=self.dt, reference=reference)
+        names = np.broadcast_to(self.name, self.batch_shape)
+        return self._like(self.initial_state[index], self.reference[index], names[index])
 
     def starting_at(self, states: Array) -> Task:
         """Return the task from other initial states ``(..., n)``, which may have further axes in front."""
-        return Task(states, horizon=self.horizon, dt=self.dt, reference=self.reference if self.has_goal else None)
+        return self._like(states, self.reference, self.name)
+
+    def named(self, name: Any) -> Task:
+        """Return the task with a name, or a batch with an array of names."""
+        return self._like(self.initial_state, self.reference, name)
+
+    def _like(self, initial_state: Array, reference: Array, name: Any) -> Task:
+        name = name if np.ndim(name) else str(name)
+        aim = reference if self.has_goal else None
+        return Task(initial_state, horizon=self.horizon, dt=self.dt, reference=aim, name=name)
 
     def describe(self) -> dict[str, Any]:
         """Return what identifies one task in a store."""
-        start = self.initial_state.tolist()
-        return {"horizon": self.horizon, "dt": self.dt, "initial_state": start, "reference": self.reference}
+        start, named = self.initial_state.tolist(), {"name": self.name} if self.name else {}
+        about = {"horizon": self.horizon, "dt": self.dt, "initial_state": start, "reference": self.reference}
+        return about | named
 
     def __repr__(self) -> str:
         if self.batch_shape:
@@ -95,7 +116,8 @@ class Task:
             return call(self, **sizes, horizon=self.horizon, dt=self.dt)
         constant = bool((self.reference == self.goal).all())
         aim = {"goal": self.goal} if constant else {"reference": self.reference}
-        return call(self, initial_state=self.initial_state, **aim, horizon=self.horizon, dt=self.dt)
+        named = {"name": self.name} if self.name else {}
+        return call(self, **named, initial_state=self.initial_state, **aim, horizon=self.horizon, dt=self.dt)
 
 
 def _components(name: str, value: Any) -> Array:

@@ -154,7 +154,8 @@ class Validation:
         if self.outputs is None:
             return task
         reference = task.reference if task.has_goal else None
-        return Task(self.recorded(task.initial_state), horizon=task.horizon, dt=task.dt, reference=reference)
+        start = self.recorded(task.initial_state)
+        return Task(start, horizon=task.horizon, dt=task.dt, reference=reference, name=task.name)
 
     def closed_loop(self, controller: Controller, task: Task) -> Trajectory:
         """Return the closed loop of a controller with M, as it is recorded."""
@@ -371,7 +372,7 @@ class Validation:
         require_time_step(self.model, task.dt, "the task")
         if task.horizon > self.longest or (task.horizon > _LONG and self not in _stated):
             self._state_cost(parameters, task)
-        return task
+        return task if self.space.members is None else task.named(self.space.task_names_at(parameters.points))
 
     def _state_cost(self, parameters: Parameters, task: Task) -> None:
         """State the cost of a long horizon once, from the first steps of a plan; refuse one that is too long."""

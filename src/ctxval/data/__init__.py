@@ -3,6 +3,7 @@
 from ctxval.data.log import Clock, Log, MemoryTable, Signal, Table
 from ctxval.data.mapping import Field, LogMapping
 from ctxval.data.readers import READERS, is_log, read_logs
+from ctxval.data.recorded import Recorded
 from ctxval.data.recordings import Recording, Recordings, read_recordings, recordings_of
 from ctxval.data.sampling import Break, Channel
 from ctxval.data.topics import Message, TopicLog
@@ -17,6 +18,7 @@ __all__ = [
     "LogMapping",
     "MemoryTable",
     "Message",
+    "Recorded",
     "Recording",
     "Recordings",
     "Signal",

@@ -20,6 +20,7 @@ from ctxval._util.extras import require_extra
 from ctxval._util.files import MOST_BYTES, open_regular, read_bytes, read_json, require_regular_file
 from ctxval._util.npz import Archive
 from ctxval._util.texts import quoted, reason_of
+from ctxval.data.json_records import read_json_records
 from ctxval.data.log import Log, MemoryTable, Table, reading
 from ctxval.data.messages import BagLog, McapLog
 from ctxval.errors import InputError
@@ -255,8 +256,15 @@ READERS: dict[str, Callable[[Path], list[Log]]] = {
     ".mcap": lambda path: [McapLog(path)],
     ".db3": lambda path: [BagLog(path)],
     ".bag": lambda path: [BagLog(path)],
+    ".json": read_json_records,
+    ".gz": read_json_records,
 }
 """The reader of each suffix."""
+
+_READABLE = (
+    f"files must end in {', '.join(READERS)}, and folders must be bags of ROS 2 or LeRobot data sets, or contain such "
+    "files"
+)
 
 
 def read_logs(paths: Sequence[str | Path]) -> list[Log]:
@@ -272,10 +280,10 @@ def read_logs(paths: Sequence[str | Path]) -> list[Log]:
 
 
 def is_log(path: Path) -> bool:
-    """Return whether a path can only be a log of a program: no CSV or NPZ file, and no plain folder."""
+    """Return whether a path can only be a log of a program: no CSV, NPZ or JSON file, and no plain folder."""
     if path.is_dir():
         return (path / "metadata.yaml").is_file() or is_lerobot(path)
-    return path.suffix.lower() in READERS and path.suffix.lower() not in (".csv", ".npz")
+    return path.suffix.lower() in READERS and path.suffix.lower() not in (".csv", ".npz", ".json")
 
 
 def is_lerobot(path: Path) -> bool:
@@ -284,22 +292,28 @@ def is_lerobot(path: Path) -> bool:
 
 
 def _logs(path: Path) -> list[Log]:
-    kinds = (
-        f"files must end in {', '.join(READERS)}, and folders must be bags of ROS 2 or LeRobot data sets, or contain "
-        "such files"
-    )
     if path.is_dir():
         if (path / "metadata.yaml").is_file():
             return [BagLog(path)]
         if is_lerobot(path):
             return read_lerobot(path)
-        files = [file for file in sorted(path.iterdir()) if file.suffix.lower() in READERS]
-        if not files:
-            raise InputError(f"the folder {path} has no log: {kinds}.")
-        return [log for file in files for log in _logs(file)]
+        return [log for file in logs_in(path) for log in _logs(file)]
     if not path.exists():
         raise InputError(f"there is no file {path}.")
     reader = READERS.get(path.suffix.lower())
     if reader is None:
-        raise InputError(f"{path} is not a log that can be read: {kinds}.")
+        raise InputError(f"{path} is not a log that can be read: {_READABLE}.")
     return reader(path)
+
+
+def logs_in(folder: Path) -> list[Path]:
+    """Return the files of a folder that are logs, in the order of their names."""
+    files = [file for file in sorted(folder.iterdir()) if file.suffix.lower() in READERS] if folder.is_dir() else []
+    if not files:
+        raise InputError(f"the folder {folder} has no log: {_READABLE}.")
+    return files
+
+
+def task_of(path: Path) -> str:
+    """Return the name of a log without its endings: the name of its task, if there is one file for each."""
+    return path.stem if path.suffix.lower() != ".gz" else Path(path.stem).stem

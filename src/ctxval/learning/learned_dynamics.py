@@ -139,7 +139,11 @@ class LearnedDynamics(ShortRepr):
 
         The gap is a share of the parameter's range; None if there is no such parameter.
         """
-        gaps = [(j, *_widest_gap(self.executed[:, j])) for j in self.study.unseen_parameters]
+        members = self.study.validation.space.members
+        gaps = [
+            (j, *_widest_gap(self.executed[:, j], None if members is None else members[:, j]))
+            for j in self.study.unseen_parameters
+        ]
         if not gaps:
             return None
         j, gap, value = max(gaps, key=lambda one: one[1])
@@ -181,11 +185,14 @@ class LearnedDynamics(ShortRepr):
         return np.random.default_rng([self.study.seed, len(self.executed), purpose])
 
 
-def _widest_gap(values: Array) -> tuple[float, float]:
-    """Return the largest distance from a number in [0, 1] to the nearest value, and that number."""
+def _widest_gap(values: Array, of: Array | None) -> tuple[float, float]:
+    """Return the largest distance from a number in [0, 1], or from one of a suite, to the nearest value; and it."""
     ordered = np.sort(values)
     if not len(ordered):
         return 1.0, 0.5
+    if of is not None:
+        away = np.abs(of[:, None] - ordered).min(axis=1)
+        return float(away.max()), float(of[away.argmax()])
     middles = 0.5 * (ordered[1:] + ordered[:-1])
     places = np.concatenate([[0.0], middles, [1.0]])
     gaps = np.concatenate([[ordered[0]], 0.5 * np.diff(ordered), [1 - ordered[-1]]])

@@ -15,7 +15,7 @@ from functools import partial
 
 import numpy as np
 
-from ctxval._util.arrays import Array, Rows, single_threaded
+from ctxval._util.arrays import Array, Mask, Rows, single_threaded
 from ctxval._util.boxes import latin_hypercube, moves_to_bounds, separated_rows
 from ctxval.gp.ascent import Ascent
 from ctxval.gp.global_search import search_globally
@@ -101,6 +101,9 @@ class WorstCaseSearch:
     def __init__(self, planner: LoopPlanner, seed: int, settings: WorstCaseSettings | None = None) -> None:
         self.planner = planner
         self.settings = WorstCaseSettings() if settings is None else settings
+        self.members = planner.validation.space.members
+        if self.members is not None:  # nothing lies between tasks of a suite
+            self.settings = replace(self.settings, pool=len(self.members), evaluations=len(self.members), rounds=0)
         self._seed = seed
 
     @property
@@ -123,7 +126,12 @@ class WorstCaseSearch:
 
     @functools.cached_property
     def pool(self) -> Array:
-        """Tasks that are spread over the cube, every second one with coordinates at bounds, shape ``(N, d)``."""
+        """Tasks that are spread over the cube, every second one with coordinates at bounds, shape ``(N, d)``.
+
+        Of a suite, they are all tasks.
+        """
+        if self.members is not None:
+            return self.members
         rng = np.random.default_rng([self._seed, 0])
         count = self.settings.pool
         points = latin_hypercube(count, self.dimension, rng)
@@ -148,8 +156,11 @@ class WorstCaseSearch:
     def largest_jump(self, posterior: AnyPosterior) -> float:
         """Return by how much the mean's distance of a task differs at most from the middle of those on both sides.
 
-        The tasks are those of the pool. If the distance is a smooth function of the task, this is hardly anything.
+        The tasks are those of the pool. If the distance is a smooth function of the task, this is hardly anything. It
+        is 0 for a suite, whose tasks are all searched.
         """
+        if self.members is not None:
+            return 0.0
         with single_threaded():
             tasks, planned = self._in_rows
             found = self.planner.distances(posterior.mean, planned, tasks.shape[0] * tasks.shape[1])[0]
@@ -190,6 +201,11 @@ class WorstCaseSearch:
             known: tasks to look at in any case, such as those of earlier maxima, points ``(k, d)``.
             globally: whether large distances on a small share of the tasks are looked for.
         """
+        if self.members is not None:
+            left, values = self._left(known), _finite(of_pool)
+            order = [row for row in np.argsort(-values, kind="stable") if left[row]] or [int(values.argmax())]
+            elites = self.members[order[: self.settings.elites]]
+            return self._of_mean(posterior, float(values[order[0]]), elites, len(values))
         settings, distance = self.settings, partial(self._distances, posterior.searched)
         best = self.pool[np.argsort(-_finite(of_pool), kind="stable")[: settings.elites * 4]]
         starts = np.concatenate([known, best])
@@ -244,13 +260,21 @@ class WorstCaseSearch:
                 # The search has chosen tasks with few sequences of noise, which its own maxima exaggerate.
                 settled = draws.with_replicates(SETTLED, rng)
                 maxima = _finite(self.planner.own_distances(settled, points[:, None]))[:, 0]
-            sharpness = self._sharpness(posterior.mean, of_mean.elites, rng)
+            sharpness = 0.0 if self.members is not None else self._sharpness(posterior.mean, of_mean.elites, rng)
         return self._worst_case(of_mean, draws, maxima, points, loops, sharpness)
 
     def _shared_tasks(self, of_mean: WorstCase, known: Array, count: int, rng: np.random.Generator) -> Array:
-        """Return the tasks that draws share: elites, known tasks and random ones."""
+        """Return the tasks that draws share: elites, known tasks and random ones; of a suite, those not known."""
+        if self.members is not None:
+            left = self.members[self._left(known)]
+            return left if len(left) else of_mean.elites
         random = self.pool[rng.permutation(len(self.pool))[:count]]
         return np.concatenate([of_mean.elites, known, random])
+
+    def _left(self, known: Array) -> Mask:
+        """Return which tasks of a suite are not among points ``(k, d)``: the distance of the others is known."""
+        assert self.members is not None
+        return np.asarray(~(self.members[:, None] == known).all(axis=2).any(axis=1))
 
     def _worst_case(
         self, of_mean: WorstCase, draws: AnyDraws, maxima: Array, points: Array, loops: int, sharpness: float

@@ -72,6 +72,7 @@ class Prediction(ShortRepr):
         rough: an approximation of ``expected`` that is cheaper to evaluate; None if there is none.
         steady: whether a point ``(d,)`` has the value of its neighbours, and may be evaluated; None if all may.
         pending: the points that are being evaluated; None if there are none.
+        candidates: the only points that may be evaluated, ``(r, d)``; None if all may.
     """
 
     expected: Callable[[Array], tuple[Array, Array]]
@@ -82,6 +83,7 @@ class Prediction(ShortRepr):
     rough: Callable[[Array], tuple[Array, Array]] | None = None
     steady: Callable[[Array], bool] | None = None
     pending: Pending | None = None
+    candidates: Array | None = None
 
     def with_rows(self, left_out_of: Callable[[Prediction], Callable[[Rows], Array]]) -> Prediction:
         """Return the prediction, and those that it may turn to, with a function of other rows for each ``left_out``."""

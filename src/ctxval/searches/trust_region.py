@@ -304,9 +304,17 @@ class TrustRegion(SequentialSearch):
         self, value: _OptimisticValue, region: _Region, history: _History, rng: np.random.Generator
     ) -> _Candidate | None:
         """Return the new point of largest optimistic value in a region; None if no point there can be predicted."""
-        budget = min(value.prediction.budget, self._settings.points * self.dimension)
-        ascent = Ascent(value, *region.box(self.dimension), budget, value.rough)
-        points, promised = ascent.run(best_first(history.points, history.values)[:8], rng)
+        points, few = np.empty((0, self.dimension)), value.prediction.candidates
+        if few is not None:
+            low, high = region.box(self.dimension)
+            points = few[((few >= low) & (few <= high)).all(axis=1)]
+            promised = value(points) if len(points) else np.empty(0)
+            order = np.argsort(-np.nan_to_num(promised, nan=-np.inf), kind="stable")
+            points, promised = points[order], promised[order]
+        else:
+            budget = min(value.prediction.budget, self._settings.points * self.dimension)
+            ascent = Ascent(value, *region.box(self.dimension), budget, value.rough)
+            points, promised = ascent.run(best_first(history.points, history.values)[:8], rng)
         points = points[self._is_new(points, history) & np.isfinite(promised)]
         steady = value.prediction.steady or (lambda point: True)
         best = next(filter(steady, points), points[0]) if len(points) else None

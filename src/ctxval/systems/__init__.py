@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from ctxval._util.registry import Registry
 from ctxval.core.system import Simulated, System, WithOutputs
+from ctxval.data.recorded import Recorded
 from ctxval.systems.fmu import FMU
 from ctxval.systems.function import Function
 from ctxval.systems.gymnasium import Gymnasium
@@ -21,6 +22,7 @@ __all__ = [
     "Imperfect",
     "Manual",
     "MuJoCo",
+    "Recorded",
     "Simulated",
     "Subprocess",
     "System",

@@ -1,0 +1,169 @@
+"""A real servo that turns a pendulum: published friction models against 16 recorded closed loops.
+
+The recordings and the models are those of the Rhoban team; see recordings/README.md. A task is a reference trajectory
+at a gain of the servo's firmware, so there are 16. ``ctxval run servo.py:m1`` is a campaign on the model m1.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ctxval import Array, Experiment, Labels, Parameters, Task, TaskSuite, Validation, distances, systems
+from ctxval.core.controller import Controller
+from ctxval.core.model import Model
+from ctxval.data import LogMapping, read_recordings
+
+RECORDINGS = Path(__file__).parent / "recordings"
+DT, HORIZON = 0.01, 599  # s, steps: the recordings have a sample every 5 ms, and the shortest one ends after 5.995 s
+TURN = 4096  # counts of the encoder per turn
+PATHS, GAINS = ("sin_sin", "lift_and_drop", "up_and_down", "sin_time_square"), (100, 200, 400, 800)
+
+
+@dataclass(frozen=True)
+class Friction:
+    """Identified parameters of the servo with one of the published friction models, in SI units.
+
+    Attributes:
+        torque, resistance: the motor's torque constant and its resistance.
+        armature: inertia of the rotor, as the output sees it.
+        offset: the angle at which the pendulum hangs, as the encoder reads it, with the opposite sign.
+        viscous, coulomb: friction in proportion to the rate, and independent of it.
+        load: friction in proportion to the torque that the gears carry.
+        stribeck: the part of the load's friction that vanishes at rates above ``rate``, with the exponent ``shape``.
+    """
+
+    torque: float
+    resistance: float
+    armature: float
+    offset: float
+    viscous: float
+    coulomb: float
+    load: float = 0.0
+    stribeck: float = 0.0
+    rate: float = 1.0
+    shape: float = 1.0
+
+
+PUBLISHED = {
+    "m1": Friction(0.38670, 4.01713, 0.0018142, 0.030871, 0.0036617, 0.012833),
+    "m3": Friction(0.38042, 3.38007, 0.0019178, 0.029440, 0.0043791, 0.0088817, 0.121665),
+    "m4": Friction(0.38617, 3.40257, 0.0018955, 0.028072, 0.0046210, 0.0087586, 0.068034, 0.073812, 2.5577, 0.76012),
+}
+
+
+@dataclass(frozen=True)
+class Servo:
+    """The servo with its pendulum as a model: states angle and rate, inputs duty and whether the torque is on.
+
+    Friction first is the torque that would stop the joint within a step, and then limited to what friction can do; so
+    a joint that friction can hold stays at rest.
+    """
+
+    friction: Friction
+    mass: float = 0.49
+    length: float = 0.1
+    voltage: float = 7.4
+    steps: int = 5
+
+    def step(self, x: Array, u: Array) -> Array:
+        """Return the next states ``(..., 2)``."""
+        f, dt = self.friction, DT / self.steps
+        inertia, weight = self.mass * self.length**2 + f.armature, 9.80665 * self.mass * self.length
+        angle, rate = x[..., 0], x[..., 1]
+        for _ in range(self.steps):
+            volts = self.voltage * u[..., 0] - f.torque * rate
+            motor = np.where(u[..., 1] > 0.5, f.torque / f.resistance * volts, 0.0)
+            pendulum = -weight * np.sin(angle + f.offset)
+            carried = np.abs(motor - pendulum)
+            slow = np.exp(-np.abs(rate / f.rate) ** f.shape)
+            most = f.viscous * np.abs(rate) + f.coulomb + (f.load + slow * f.stribeck) * carried
+            stopping = -(inertia / dt * rate + motor + pendulum)
+            rate = rate + dt / inertia * (motor + pendulum + np.clip(stopping, -most, most))
+            angle = angle + dt * rate
+        return np.stack([angle, rate], axis=-1)
+
+
+@dataclass(frozen=True, eq=False)
+class Firmware:
+    """The servo's firmware: the duty in proportion to the error of the encoder's angle, limited to 1.
+
+    Attributes:
+        reference: the angles to follow, ``(..., H + 1)``.
+        torque: whether the torque is on in each step, ``(..., H + 1)``.
+        gain: the gain as the firmware counts it, ``(...)``.
+    """
+
+    reference: Array
+    torque: Array
+    gain: Array
+
+    def __call__(self, t: int, y: Array) -> Array:
+        """Return duty and torque ``(..., 2)`` for the outputs ``(..., 1)``."""
+        counts = np.rint(TURN / (2 * np.pi) * y[..., 0])
+        error = TURN / (2 * np.pi) * self.reference[..., t] - counts
+        duty = np.clip(self.gain * error / (256 * 885), -1.0, 1.0)
+        return np.stack(np.broadcast_arrays(duty, self.torque[..., t]), axis=-1)
+
+
+class Recordings:
+    """The suite of tasks, and what is recorded of each: reference, switch of the torque, and first angle."""
+
+    def __init__(self, folder: Path = RECORDINGS) -> None:
+        self.suite = TaskSuite({f"{path}-{gain}": {"path": path, "gain": gain} for gain in GAINS for path in PATHS})
+        fields = LogMapping({"angle": "position", "goal": "goal_position", "torque": "torque_enable"}, dt=DT)
+        self.records = {
+            name: read_recordings([folder / f"{name}.json.gz"], fields).runs[0].trajectory.states[: HORIZON + 1]
+            for name in self.suite.task_names
+        }
+
+    def of(self, names: Any) -> Array:
+        """Return the records of one or more tasks, ``(..., H + 1, 3)``: angle, reference, switch of the torque."""
+        return np.stack([self.records[name] for name in np.ravel(names)]).reshape(*np.shape(names), HORIZON + 1, 3)
+
+    def task(self, p: Parameters) -> Task:
+        """Return the task: from the first recorded angle at rest along the reference."""
+        records = self.of(p.task)
+        start = [records[..., 0, 0], np.zeros(records.shape[:-2])]
+        return Task(start, reference=records[..., 1:2], horizon=HORIZON, dt=DT)
+
+    batched = True
+
+    def design(self, task: Task, model: Model) -> Controller:
+        """Return the firmware with the gain of the task; it does not depend on M."""
+        gains = np.reshape([self.suite[name]["gain"] for name in np.ravel(task.name)], np.shape(task.name))
+        return Firmware(task.reference[..., 0], self.of(task.name)[..., 2], gains)
+
+
+def experiment(model: Model, folder: Path = RECORDINGS) -> Experiment:
+    """Return the validation of a model of the servo against the recordings; the distance is the largest deviation."""
+    recordings = Recordings(folder)
+    validation = Validation(
+        space=recordings.suite,
+        task=recordings.task,
+        system=systems.Recorded(folder, LogMapping({"angle": "position"}, dt=DT)),
+        model=model,
+        synthesizer=recordings,
+        distance=distances.MaximumDeviation(),
+        labels=Labels(("angle [rad]",), ("duty", "torque on"), "rad"),
+        outputs=[0],
+    )
+    return Experiment("servo", validation)
+
+
+def m1() -> Experiment:
+    """Return the experiment with the model m1: viscous and Coulomb friction."""
+    return experiment(Servo(PUBLISHED["m1"]))
+
+
+def m3() -> Experiment:
+    """Return the experiment with the model m3, whose friction also depends on the load."""
+    return experiment(Servo(PUBLISHED["m3"]))
+
+
+def m4() -> Experiment:
+    """Return the experiment with the model m4, whose load-dependent friction has a Stribeck term."""
+    return experiment(Servo(PUBLISHED["m4"]))

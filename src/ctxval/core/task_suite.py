@@ -1,0 +1,221 @@
+"""A finite suite of named tasks in the place of a box of task parameters: d* is the largest of finitely many distances.
+
+A suite is a task space whose tasks are members of a list. Each member has a point in the unit cube, so searches and
+predictions see what they see of a box; any other point stands for the nearest member. A category is a coordinate that
+counts its values in the order in which they first occur.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NoReturn
+
+import numpy as np
+
+from ctxval._util.arrays import Array, ArrayLike, Rows, as_finite, as_floats, require_shape
+from ctxval._util.representation import call
+from ctxval._util.texts import enumerated, shortened
+from ctxval.core.space import Parameters, Point, TaskSpace
+from ctxval.core.task_distribution import Continuous, Sampler
+from ctxval.errors import InputError, UnknownNameError
+
+SUITE = "_tasks"
+"""Key of the tasks in the description of a suite; no parameter can have this name."""
+
+_NAME = "task"  # the parameter of a suite whose tasks have names alone, and a word for the name of any task
+
+
+class TaskSuite(TaskSpace):
+    """A finite list of named tasks with parameters, which are numbers or categories.
+
+    The task function gets the parameters of a task as those of a :class:`TaskSpace`: numbers, and texts for
+    categories; for a batch of tasks, arrays of both. ``p.task`` is the name of the task, which the task that it makes
+    gets too.
+
+    Args:
+        tasks: the parameters of each task by its name, with the same parameters for all tasks; or names alone, which
+            are then the category ``task``.
+        units: the units of parameters by name.
+
+    Raises:
+        InputError: if there are fewer than two tasks, their parameters differ in names or kinds, a parameter is the
+            same in all tasks, or two tasks have the same parameters.
+
+    >>> suite = TaskSuite({"slow lift": {"speed": 0.2, "path": "lift"}, "fast turn": {"speed": 1.0, "path": "turn"}})
+    >>> suite.task_names
+    ('slow lift', 'fast turn')
+    """
+
+    def __init__(
+        self, tasks: Mapping[str, Mapping[str, float | str]] | Sequence[str], units: Mapping[str, str] | None = None
+    ) -> None:
+        by_name = _by_name(tasks)
+        self._tasks = by_name
+        self.task_names: tuple[str, ...] = tuple(by_name)
+        names = list(next(iter(by_name.values())))
+        self._categories: dict[str, list[str]] = {}
+        columns = [self._numbers(name, [values[name] for values in by_name.values()]) for name in names]
+        rows = np.stack(columns, axis=-1)
+        super().__init__(
+            **{
+                name: (rows[:, j].min(), rows[:, j].max(), *([units[name]] if units and name in units else []))
+                for j, name in enumerate(names)
+            }
+        )
+        for name in units or {}:
+            self.columns(name)  # refuses units of unknown parameters
+        self._rows = rows
+        self.members: Array = super().to_unit(rows)
+        """The tasks as points of the unit cube, shape ``(N, d)``."""
+        _, first, of_task = np.unique(rows, axis=0, return_index=True, return_inverse=True)
+        for row, same in enumerate(first[of_task.ravel()]):
+            if same != row:
+                raise InputError(
+                    f"the tasks {self.task_names[same]!r} and {self.task_names[row]!r} have the same parameters: give "
+                    "them a parameter that differs, such as a number of the repetition."
+                )
+
+    def _numbers(self, name: str, values: list[Any]) -> Array:
+        """Return a parameter of all tasks as numbers; those of a category count its values."""
+        if all(isinstance(value, str) for value in values):
+            known = self._categories[name] = list(dict.fromkeys(values))
+            column = np.array([known.index(value) for value in values], dtype=np.float64)
+        elif any(isinstance(value, str) for value in values):
+            raise InputError(f"{name} must be a number in all tasks or a text in all tasks, got {values[:6]!r}.")
+        else:
+            column = as_finite(name, values)
+            if column.ndim != 1:
+                raise InputError(f"{name} must be one number or one text in each task, got {values[0]!r}.")
+        if len(set(column.tolist())) == 1:
+            raise InputError(f"{name} is {values[0]!r} in all tasks: leave it out of their parameters.")
+        return column
+
+    def __getitem__(self, name: str) -> dict[str, float | str]:
+        """Return the parameters of the task with a name."""
+        if name not in self._tasks:
+            raise UnknownNameError.among("task", str(name), self.task_names)
+        return dict(self._tasks[name])
+
+    def __len__(self) -> int:
+        return len(self.task_names)
+
+    def __repr__(self) -> str:
+        return call(self, shortened(enumerated(self.task_names, 4), 120), parameters=self.names, tasks=len(self))
+
+    def describe(self) -> dict[str, Any]:
+        """Return what identifies this suite in a store: the parameters of each task by its name, and units."""
+        units = {name: unit for name, unit in self.units.items() if unit}
+        return {SUITE: {name: dict(values) for name, values in self._tasks.items()}, "_units": units}
+
+    @classmethod
+    def described(cls, description: Mapping[str, Any]) -> TaskSuite:
+        """Return the suite of a description."""
+        return cls(description[SUITE], description.get("_units"))
+
+    # Members
+
+    def rows_at(self, unit: ArrayLike) -> Rows:
+        """Return the rows of the members that are nearest to points ``(..., d)`` of the unit cube."""
+        points = require_shape("points", as_floats("points", unit), (self.dimension,))
+        gaps = ((points[..., None, :] - self.members) ** 2).sum(axis=-1)
+        return np.asarray(gaps.argmin(axis=-1))
+
+    def name_at(self, unit: ArrayLike) -> str:
+        """Return the name of the member at one point ``(d,)`` of the unit cube."""
+        return self.task_names[int(self.rows_at(unit))]
+
+    def remaining(self, known: Array) -> Array:
+        gone = set(self.rows_at(known).tolist()) if len(known) else set[int]()
+        return self.members[[row for row in range(len(self)) if row not in gone]]
+
+    # Between points, the unit cube and names
+
+    def from_unit(self, unit: ArrayLike) -> Array:
+        return np.asarray(self._rows[self.rows_at(unit)])
+
+    def rounded(self, unit: ArrayLike) -> Array:
+        return np.asarray(self.members[self.rows_at(unit)])
+
+    def values_of(self, name: str, points: Array) -> Any:
+        if name == _NAME and _NAME not in self.units:
+            return self.task_names_at(points)
+        values = points[..., self.columns(name)]
+        known = self._categories.get(name)
+        if known is None:
+            return values
+        chosen = np.asarray(known)[np.rint(np.clip(values, 0, len(known) - 1)).astype(int)]
+        return chosen if chosen.ndim else str(chosen)
+
+    def parameters(self, points: ArrayLike) -> Parameters:
+        return Parameters(self, self.from_unit(self.to_unit(points)))
+
+    def task_names_at(self, points: Array) -> Any:
+        names = np.asarray(self.task_names)[self.rows_at(self.to_unit(points))]
+        return names if names.ndim else str(names)
+
+    def point(self, values: Mapping[str, Any]) -> Array:
+        if set(values) == {_NAME} and values[_NAME] in self._tasks:
+            values = self._tasks[values[_NAME]]
+        elif set(values) == {_NAME} and _NAME not in self.units:
+            raise UnknownNameError.among("task", str(values[_NAME]), self.task_names)
+        numbers = {name: self._code(name, value) for name, value in values.items()}
+        point = super().point(numbers)
+        if not (self._rows == point).all(axis=1).any():
+            given = ", ".join(f"{name} = {value}" for name, value in values.items())
+            raise InputError(f"the suite has no task with {given}; its tasks are {enumerated(self.task_names, 20)}.")
+        return point
+
+    def _code(self, name: str, value: Any) -> Any:
+        known = self._categories.get(name)
+        if known is None:
+            return value
+        if value not in known:
+            raise UnknownNameError.among(f"value of {name}", str(value), known)
+        return known.index(value)
+
+    def describe_point(self, point: Array) -> dict[str, Point]:
+        values = ((name, self.values_of(name, point)) for name in self.units)
+        return {name: value if isinstance(value, str) else float(value) for name, value in values}
+
+    def labelled(self, point: Array) -> dict[str, float | str]:
+        return {_NAME: self.task_names_at(point)}
+
+    # Sets of points
+
+    def unit_draws(self, n: int, rng: np.random.Generator) -> Array:
+        return np.asarray(self.members[rng.integers(len(self), size=n)])
+
+    def grid(self, per_axis: int) -> Array:
+        """Return all tasks, shape ``(N, d)``, whatever the number of points for each axis is."""
+        return self._rows.copy()
+
+    def distributed(self, **by_name: Continuous) -> NoReturn:
+        raise InputError("a suite of tasks has no distribution: all of its tasks count alike.")
+
+    def sampled(self, sampler: Sampler) -> NoReturn:
+        raise InputError("a suite of tasks has no distribution: all of its tasks count alike.")
+
+
+def _by_name(tasks: Any) -> dict[str, dict[str, Any]]:
+    """Return the parameters of each task by its name, after a check of their shape."""
+    if isinstance(tasks, Mapping):
+        by_name = {str(name): dict(values) for name, values in tasks.items() if isinstance(values, Mapping)}
+    elif isinstance(tasks, Sequence) and not isinstance(tasks, str) and all(isinstance(name, str) for name in tasks):
+        by_name = {name: {_NAME: name} for name in tasks}
+    else:
+        by_name = {}
+    if len(by_name) != len(tasks) or len(by_name) < 2:
+        raise InputError(
+            "a suite needs at least two tasks with different names, such as "
+            f"TaskSuite({{'slow': {{'speed': 0.2}}, 'fast': {{'speed': 1.0}}}}), got {shortened(repr(tasks), 200)}."
+        )
+    first, *others = by_name.items()
+    if not first[1]:
+        raise InputError(f"the task {first[0]!r} of a suite has no parameters.")
+    for name, values in others:
+        if set(values) != set(first[1]):
+            have, wanted = enumerated(values, 6) or "none", enumerated(first[1], 6)
+            raise InputError(
+                f"all tasks of a suite must have the same parameters: {first[0]!r} has {wanted}, {name!r} has {have}."
+            )
+    return by_name
