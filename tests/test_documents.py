@@ -21,6 +21,7 @@ from ctxval.certificates import (
     Sample,
     StateInputCoverage,
     StateInputGap,
+    WholeSuite,
     certify_anytime,
     certify_audit,
     certify_dynamics,
@@ -112,6 +113,7 @@ def test_the_glossary_explains_what_certificates_and_trials_say() -> None:
         certify_anytime(sample, 3.0),
         certify_dynamics(sample, evidence()),
         certify_region(sample, 3.0),
+        WholeSuite().certify(replace(sample, suite=points)),
         certify_posterior(sample, 0.5, found=draw_maxima(sample, draws=4, paths=2)),
     ]
     used = set().union(*(keys(certificate.to_json()) for certificate in certificates))

@@ -1,20 +1,24 @@
 """A real servo that turns a pendulum: published friction models against 16 recorded closed loops.
 
 The recordings and the models are those of the Rhoban team; see recordings/README.md. A task is a reference trajectory
-at a gain of the servo's firmware, so there are 16. ``ctxval run servo.py:m1`` is a campaign on the model m1.
+at a gain of the servo's firmware, so there are 16. ``ctxval run servo:experiment --option friction=m4`` is a
+campaign on the model m4.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.optimize import least_squares
 
-from ctxval import Array, Experiment, Labels, Parameters, Task, TaskSuite, Validation, distances, systems
+from ctxval import Array, Experiment, Labels, Parameters, Task, TaskSuite, Validation, distances, rollout, systems
 from ctxval.core.controller import Controller
 from ctxval.core.model import Model
+from ctxval.core.outputs import Outputs
 from ctxval.data import LogMapping, read_recordings
 
 RECORDINGS = Path(__file__).parent / "recordings"
@@ -79,7 +83,7 @@ class Servo:
             motor = np.where(u[..., 1] > 0.5, f.torque / f.resistance * volts, 0.0)
             pendulum = -weight * np.sin(angle + f.offset)
             carried = np.abs(motor - pendulum)
-            slow = np.exp(-np.abs(rate / f.rate) ** f.shape)
+            slow = np.exp(-(np.abs(rate / f.rate) ** f.shape))
             most = f.viscous * np.abs(rate) + f.coulomb + (f.load + slow * f.stribeck) * carried
             stopping = -(inertia / dt * rate + motor + pendulum)
             rate = rate + dt / inertia * (motor + pendulum + np.clip(stopping, -most, most))
@@ -138,32 +142,38 @@ class Recordings:
         return Firmware(task.reference[..., 0], self.of(task.name)[..., 2], gains)
 
 
-def experiment(model: Model, folder: Path = RECORDINGS) -> Experiment:
-    """Return the validation of a model of the servo against the recordings; the distance is the largest deviation."""
-    recordings = Recordings(folder)
+def fitted(friction: Friction, tasks: Sequence[str], recordings: Recordings) -> Friction:
+    """Return parameters for which the closed loops of M are nearest to the recordings of some tasks."""
+    names = [name for name, value in vars(friction).items() if value > 0 and name not in ("offset", "rate", "shape")]
+    task = recordings.task(recordings.suite.parameters(np.stack([recordings.suite.point({"task": k}) for k in tasks])))
+    task = task.named(np.array(tasks))
+
+    def errors(logarithms: Array) -> Array:
+        model = Servo(replace(friction, **dict(zip(names, np.exp(logarithms), strict=True))))
+        loops = rollout(model.step, outputs.seen_by(recordings.design(task, model)), task)
+        return np.asarray(loops.states[..., 0] - recordings.of(task.name)[..., 0]).ravel()
+
+    outputs = Outputs([0])
+    found = least_squares(errors, np.log([getattr(friction, name) for name in names]), diff_step=1e-3)
+    return replace(friction, **dict(zip(names, np.exp(found.x).tolist(), strict=True)))
+
+
+def experiment(seed: int = 0, friction: str = "m1", fit: str = "") -> Experiment:
+    """Return the validation of a friction model against the recordings, by the largest deviation.
+
+    With ``fit``, such as ``"sin_sin-400,up_and_down-100"``, its parameters are fitted to the recordings of these tasks.
+    """
+    recordings, parameters = Recordings(), PUBLISHED[friction]
+    if fit:
+        parameters = fitted(parameters, fit.split(","), recordings)
     validation = Validation(
         space=recordings.suite,
         task=recordings.task,
-        system=systems.Recorded(folder, LogMapping({"angle": "position"}, dt=DT)),
-        model=model,
+        system=systems.Recorded(RECORDINGS, LogMapping({"angle": "position"}, dt=DT)),
+        model=Servo(parameters),
         synthesizer=recordings,
         distance=distances.MaximumDeviation(),
         labels=Labels(("angle [rad]",), ("duty", "torque on"), "rad"),
         outputs=[0],
     )
-    return Experiment("servo", validation)
-
-
-def m1() -> Experiment:
-    """Return the experiment with the model m1: viscous and Coulomb friction."""
-    return experiment(Servo(PUBLISHED["m1"]))
-
-
-def m3() -> Experiment:
-    """Return the experiment with the model m3, whose friction also depends on the load."""
-    return experiment(Servo(PUBLISHED["m3"]))
-
-
-def m4() -> Experiment:
-    """Return the experiment with the model m4, whose load-dependent friction has a Stribeck term."""
-    return experiment(Servo(PUBLISHED["m4"]))
+    return Experiment(f"servo {friction}{', fitted' if fit else ''}", validation)

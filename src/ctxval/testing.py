@@ -87,8 +87,7 @@ def check_system(
         _require(start <= tolerance, f"the execution starts {start:g} away from the task's initial state")
     _require_close("the first execution", first.states, "the second", second.states, tolerance)
     if getattr(system, "batched", False):
-        starts, references = np.stack([task.initial_state] * 2), np.stack([task.reference] * 2)
-        batch = system.execute(controller, Task(starts, horizon=task.horizon, dt=task.dt, reference=references))
+        batch = system.execute(controller, Task.stacked([task, task]))
         _require_close("an execution in a batch", batch.states[1], "the same alone", first.states, tolerance)
 
 

@@ -144,7 +144,7 @@ def test_a_plain_run_is_certified_by_predictions_that_are_computed_afterwards() 
 
 def test_an_audit_of_a_planned_number_cannot_end_it() -> None:
     validation, _ = linear()
-    with pytest.raises(InputError, match="auto, dynamics, posterior and anytime, got 'audit'"):
+    with pytest.raises(InputError, match="auto, dynamics, posterior, anytime and suite, got 'audit'"):
         Campaign(validation).run(5, 1.0, certificate=CertificateOptions(Audit(), volume=0.1))
     with pytest.raises(InputError, match="needs the volume"):
         Campaign(validation).run(5, 1.0, certificate=CertificateOptions(AnytimeAudit()))

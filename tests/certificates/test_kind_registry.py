@@ -1,7 +1,7 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.metadata import EntryPoint
 from types import ModuleType
 from typing import Any, ClassVar
@@ -39,13 +39,14 @@ def sample(n: int = 9, origin: str = "acquisition") -> Sample:
 
 
 EVERYTHING = sample(30, origin="iid")
+SUITE = replace(EVERYTHING, suite=EVERYTHING.points)
 
 
 def certified(kind: str, confidence: float) -> Certificate:
     chosen = KINDS.find(kind).of({"discard": 2})
     if chosen.needs_threshold:
         return chosen.certify_against(EVERYTHING, 1.5, confidence)[0]
-    return chosen.certify(EVERYTHING, confidence)
+    return chosen.certify(SUITE if kind == "suite" else EVERYTHING, confidence)
 
 
 @pytest.mark.parametrize("kind", [kind for kind in KINDS if kind != "posterior"])
@@ -82,8 +83,8 @@ def test_a_confidence_below_1_is_not_printed_as_1() -> None:
 
 def test_the_kinds_of_this_package_are_listed_by_name() -> None:
     own = ["anytime", "audit", "auto", "dynamics", "posterior", "region"]
-    assert list(KINDS) == [*own, "sampling-discarding", "scenario"]
-    assert len(KINDS) == 8
+    assert list(KINDS) == [*own, "sampling-discarding", "scenario", "suite"]
+    assert len(KINDS) == 9
     assert "posteriour" not in KINDS
     assert KINDS["posterior"] is Posterior
 

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ctxval import TaskSpace
+from ctxval import TaskSpace, TaskSuite
 from ctxval.campaign.telling import ToldResult
 from ctxval.errors import InputError
 from ctxval.web.forms import recording_in, result, task_request
@@ -27,6 +27,14 @@ def test_requests_of_every_kind() -> None:
     again = {"how": "again", "trial": "2", "because": " fuse replaced ", "seen": "3"}
     assert task_request(again, SPACE) == TaskRequest(again=2, because="fuse replaced", trials=3)
     assert task_request({**again, "because": " "}, SPACE) == TaskRequest(again=2, trials=3)
+
+
+def test_a_task_of_a_suite_is_chosen_by_its_name() -> None:
+    suite = TaskSuite({"lift": {"speed": 1.0}, "drop": {"speed": 2.0}})
+    chosen = task_request({"how": "own", "seen": "1", "task": "drop"}, suite)
+    assert chosen == TaskRequest({"task": "drop"}, trials=1)
+    with pytest.raises(InputError, match="no task is called 'fall'"):
+        task_request({"how": "own", "seen": "1", "task": "fall"}, suite)
 
 
 @pytest.mark.parametrize(

@@ -22,6 +22,7 @@ from ctxval.core.exchange import write_controller, write_task
 from ctxval.core.experiment import Experiment
 from ctxval.core.plan import Plan
 from ctxval.core.space import TaskSpace
+from ctxval.core.task_suite import TASK
 from ctxval.core.validation import Validation
 from ctxval.errors import InputError
 
@@ -102,10 +103,11 @@ def read_runs(
 def _table(path: Path, space: TaskSpace, reading: Mapping[str, Any]) -> list[KnownRun]:
     require_file(path)
     table = CsvTable(path, 16 * 2**20)
-    columns = {name: column_of(str(path), table.names, name) for name in space.names}
+    names = space.names if space.members is None else (TASK,)
+    columns = {name: column_of(str(path), table.names, name) for name in names}
     if None in columns.values() or not any(name in table.names for name in _RESULTS):
         raise InputError(
-            f"{path} must be a table with the columns {', '.join(space.names)} and one of {', '.join(_RESULTS)}; "
+            f"{path} must be a table with the columns {', '.join(names)} and one of {', '.join(_RESULTS)}; "
             f"it has {', '.join(filter(None, table.names)) or 'none'}. For one trajectory, give --set NAME=VALUE."
         )
     units = {name: space.units.get(name, space.units.get(name.partition("[")[0], "")) for name in columns}
@@ -114,7 +116,11 @@ def _table(path: Path, space: TaskSpace, reading: Mapping[str, Any]) -> list[Kno
     runs = []
     for line, cells in table.rows():
         where, row = f"{table.path}, line {line}", dict(zip(table.names, cells, strict=True))
-        point = [factor * table.number(line, name, row[column]) for name, (column, factor) in factors.items()]
+        if space.members is None:
+            point = [factor * table.number(line, name, row[column]) for name, (column, factor) in factors.items()]
+            parameters = space.describe_point(space.parameters(point).points)
+        else:
+            parameters = {TASK: unguarded(row[factors[TASK][0]].strip())}
         given = {name: unguarded(row.get(name, "").strip()) for name in _RESULTS}
         if sum(bool(text) for text in given.values()) != 1:
             raise InputError(f"{where}: exactly one of {', '.join(_RESULTS)} must be filled in.")
@@ -124,7 +130,7 @@ def _table(path: Path, space: TaskSpace, reading: Mapping[str, Any]) -> list[Kno
             given["failed"] or None,
             **reading,
         )
-        runs.append(KnownRun(where, space.describe_point(space.parameters(point).points), told))
+        runs.append(KnownRun(where, parameters, told))
     if not runs:
         raise InputError(f"{path} has no run below its header.")
     return runs
@@ -147,6 +153,11 @@ def parameters_from(settings: Sequence[str], space: TaskSpace) -> dict[str, Any]
     The forms are ``goal=1.5``, ``goal = 1.5 rad``, ``goal=[1.5, 0.5]``, ``goal=1.5,0.5``, ``goal[0]=1.5`` together with
     every other component, and several parameters in one text: ``goal = 1.5, load = 0.2``.
     """
+    if space.members is not None:
+        name, equals, task = ",".join(settings).partition("=")
+        if name.strip() != TASK or not equals:
+            raise InputError(f"a task of a suite must be given by its name, as {TASK}=NAME, got {settings[0]!r}.")
+        return {TASK: task.strip()}
     given: dict[str, Any] = {}
     for text in settings:
         # A text after a comma that has no name is a further value of the last name.

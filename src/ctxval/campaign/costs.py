@@ -52,7 +52,7 @@ class ThinkingCosts:
     @classmethod
     def measured(cls, validation: Validation, points: Sequence[Array]) -> ThinkingCosts:
         """Measure the costs at tasks, each ``(d,)``; made-up trajectories take the place of executions of S."""
-        model, task = validation.model, validation.task(validation.space.parameters(points[0]))
+        model, task = validation.model, validation.task_at(validation.space.parameters(points[0]))
         controller = validation.synthesizer.design(task, model)
         design = min(_seconds(lambda: validation.synthesizer.design(task, model)) for _ in range(3))
         loop = min(_seconds(lambda: validation.closed_loop(controller, task)) for _ in range(3))

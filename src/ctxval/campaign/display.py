@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from ctxval._util.representation import Shown, call, counted, lines, named, number, shown, table
 from ctxval.core.space import TaskSpace
+from ctxval.core.task_suite import TASK, TaskSuite
 from ctxval.core.trial import Trial
 from ctxval.errors import InputError
 
@@ -73,11 +74,16 @@ def to_dataframe(trials: Sequence[Trial], space: TaskSpace) -> DataFrame:
     except ImportError as error:
         raise InputError("a table of trials needs pandas, which is not installed: pip install pandas.") from error
     columns: dict[str, list[Any]] = {name: [getattr(trial, name) for trial in trials] for name in _BEFORE}
-    points = [space.point(trial.parameters).tolist() for trial in trials]
-    for axis, name in enumerate(space.names):
-        column = f"parameters.{name}" if name in (*_BEFORE, *_AFTER) else name
-        columns[column] = [point[axis] for point in points]
+    points = [space.point(trial.parameters) for trial in trials]
+    if isinstance(space, TaskSuite):
+        names = [space.task_names_at(point) for point in points]
+        values = {TASK: names} | {name: [space.values_of(name, point) for point in points] for name in space.names}
+    else:
+        values = {name: [point[axis] for point in points] for axis, name in enumerate(space.names)}
+    columns |= {f"parameters.{name}" if name in (*_BEFORE, *_AFTER) else name: of for name, of in values.items()}
     columns |= {name: [getattr(trial, name) for trial in trials] for name in _AFTER}
     frame = DataFrame(columns)
-    numbers = dict.fromkeys(("distance", "seconds", *list(columns)[len(_BEFORE) : -len(_AFTER)]), "float64")
+    texts = [name for name, of in columns.items() if any(isinstance(value, str) for value in of)]
+    asked = ("distance", "seconds", *list(columns)[len(_BEFORE) : -len(_AFTER)])
+    numbers = {name: "float64" for name in asked if name not in texts}
     return frame.astype({"number": "int64", "attempts": "int64", **numbers})

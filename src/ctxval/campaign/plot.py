@@ -17,8 +17,9 @@ import numpy as np
 
 from ctxval._util.arrays import Array
 from ctxval._util.files import MADE_BY, written_whole
-from ctxval._util.representation import ShortRepr
+from ctxval._util.representation import ShortRepr, number
 from ctxval.core.labels import labels_of
+from ctxval.core.space import TaskSpace
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import Trial
 from ctxval.errors import InputError
@@ -52,7 +53,8 @@ def overview(
 
     It is the surrogate if there is one task parameter and two distances are known, and :func:`convergence` otherwise.
     """
-    if campaign.validation.space.dimension == 1 and len(campaign.completed) >= 2:
+    space = campaign.validation.space
+    if space.dimension == 1 and space.members is None and len(campaign.completed) >= 2:
         return surrogate_slice(campaign, units=units, threshold=threshold, bound=bound, ax=ax)
     return convergence(campaign, units=units, threshold=threshold, bound=bound, ax=ax)
 
@@ -96,7 +98,7 @@ def surrogate_slice(
         axis: index of the scalar task parameter, from 0.
         truth: the true distance, which is drawn if the task space has one dimension.
     """
-    space = campaign.validation.space
+    space = _box(campaign)
     if not 0 <= axis < space.dimension:
         raise InputError(f"axis must be from 0 to {space.dimension - 1}, one of {', '.join(space.names)}, got {axis}.")
     axes = _axes(ax)
@@ -113,7 +115,7 @@ def surrogate(
     it shows a slice along each axis through the worst task. This is the converged Gaussian process in the paper's
     figures.
     """
-    fitted, space = campaign.surrogate(), campaign.validation.space
+    space, fitted = _box(campaign), campaign.surrogate()
     columns = min(space.dimension, 4)
     rows = int(np.ceil(space.dimension / columns))
     figure = _figure(max(6.4, 3.2 * columns), max(4.0, 2.6 * rows))
@@ -125,6 +127,14 @@ def surrogate(
             axes.set_ylabel(_distance_label(campaign, units))
     figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=3, fontsize=8)
     return figure
+
+
+def _box(campaign: Campaign) -> TaskSpace:
+    """Return the task space; refuse a suite, which has no tasks between its own."""
+    space = campaign.validation.space
+    if space.members is not None:
+        raise InputError("a suite of tasks has no curve of the distance between its tasks; plot.samples shows them.")
+    return space
 
 
 def _finished(axes: Axes, campaign: Campaign, units: str, threshold: Limit, bound: Limit) -> Axes:
@@ -191,7 +201,7 @@ def worst_trajectories(campaign: Campaign, *, states: Sequence[str] = (), inputs
     figure = trajectories(model, system, reference=reference, states=states, inputs=inputs)
     distance = f"{_known(worst):.4g} {validation.labels.units}".rstrip()
     items = worst.parameters.items()
-    texts = {k: f"[{', '.join(f'{x:.3g}' for x in v)}]" if isinstance(v, list) else f"{v:.4g}" for k, v in items}
+    texts = {k: f"[{', '.join(f'{x:.3g}' for x in v)}]" if isinstance(v, list) else number(v) for k, v in items}
     task = ", ".join(f"{name} = {value}" for name, value in texts.items())
     figure.suptitle(f"worst task executed: {task} (distance {distance})", fontsize=10)
     return figure

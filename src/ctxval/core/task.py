@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -86,8 +87,15 @@ class Task:
         if self.has_goal and got != width:
             raise ShapeError(f"the goal or reference of a task must have {width} components, got {got}.")
 
-    def __getitem__(self, index: int) -> Task:
-        """Return one task of the batch."""
+    @staticmethod
+    def stacked(tasks: Sequence[Task]) -> Task:
+        """Return single tasks with one horizon and one time step as a batch."""
+        first, names = tasks[0], [one.name for one in tasks]
+        starts, references = np.stack([one.initial_state for one in tasks]), np.stack([one.reference for one in tasks])
+        return first._like(starts, references, np.array(names) if any(names) else "")
+
+    def __getitem__(self, index: int | slice) -> Task:
+        """Return one task of the batch, or some of them."""
         names = np.broadcast_to(self.name, self.batch_shape)
         return self._like(self.initial_state[index], self.reference[index], names[index])
 

@@ -22,7 +22,8 @@ from ctxval.errors import InputError, UnknownNameError
 SUITE = "_tasks"
 """Key of the tasks in the description of a suite; no parameter can have this name."""
 
-_NAME = "task"  # the parameter of a suite whose tasks have names alone, and a word for the name of any task
+TASK = "task"
+"""The name of a task, by which trials, tables and command lines call it; and the category of tasks with names alone."""
 
 
 class TaskSuite(TaskSpace):
@@ -137,7 +138,7 @@ class TaskSuite(TaskSpace):
         return np.asarray(self.members[self.rows_at(unit)])
 
     def values_of(self, name: str, points: Array) -> Any:
-        if name == _NAME and _NAME not in self.units:
+        if name == TASK:
             return self.task_names_at(points)
         values = points[..., self.columns(name)]
         known = self._categories.get(name)
@@ -154,31 +155,17 @@ class TaskSuite(TaskSpace):
         return names if names.ndim else str(names)
 
     def point(self, values: Mapping[str, Any]) -> Array:
-        if set(values) == {_NAME} and values[_NAME] in self._tasks:
-            values = self._tasks[values[_NAME]]
-        elif set(values) == {_NAME} and _NAME not in self.units:
-            raise UnknownNameError.among("task", str(values[_NAME]), self.task_names)
-        numbers = {name: self._code(name, value) for name, value in values.items()}
-        point = super().point(numbers)
-        if not (self._rows == point).all(axis=1).any():
-            given = ", ".join(f"{name} = {value}" for name, value in values.items())
-            raise InputError(f"the suite has no task with {given}; its tasks are {enumerated(self.task_names, 20)}.")
-        return point
-
-    def _code(self, name: str, value: Any) -> Any:
-        known = self._categories.get(name)
-        if known is None:
-            return value
-        if value not in known:
-            raise UnknownNameError.among(f"value of {name}", str(value), known)
-        return known.index(value)
+        if set(values) != {TASK}:
+            raise InputError(f"a task of a suite is given by its name, as {{'{TASK}': ...}}, got {dict(values)!r}.")
+        if values[TASK] not in self.task_names:
+            raise UnknownNameError.among("task", str(values[TASK]), self.task_names)
+        return np.array(self._rows[self.task_names.index(values[TASK])])
 
     def describe_point(self, point: Array) -> dict[str, Point]:
-        values = ((name, self.values_of(name, point)) for name in self.units)
-        return {name: value if isinstance(value, str) else float(value) for name, value in values}
+        return {TASK: self.task_names_at(point)}
 
     def labelled(self, point: Array) -> dict[str, float | str]:
-        return {_NAME: self.task_names_at(point)}
+        return {TASK: self.task_names_at(point)}
 
     # Sets of points
 
@@ -201,7 +188,7 @@ def _by_name(tasks: Any) -> dict[str, dict[str, Any]]:
     if isinstance(tasks, Mapping):
         by_name = {str(name): dict(values) for name, values in tasks.items() if isinstance(values, Mapping)}
     elif isinstance(tasks, Sequence) and not isinstance(tasks, str) and all(isinstance(name, str) for name in tasks):
-        by_name = {name: {_NAME: name} for name in tasks}
+        by_name = {name: {TASK: name} for name in tasks}
     else:
         by_name = {}
     if len(by_name) != len(tasks) or len(by_name) < 2:
@@ -212,6 +199,8 @@ def _by_name(tasks: Any) -> dict[str, dict[str, Any]]:
     first, *others = by_name.items()
     if not first[1]:
         raise InputError(f"the task {first[0]!r} of a suite has no parameters.")
+    if isinstance(tasks, Mapping) and TASK in first[1]:
+        raise InputError("a parameter of a suite must not be called 'task': that is the name of each task.")
     for name, values in others:
         if set(values) != set(first[1]):
             have, wanted = enumerated(values, 6) or "none", enumerated(first[1], 6)

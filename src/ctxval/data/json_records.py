@@ -62,7 +62,7 @@ def _records(path: Path, content: Any) -> list[Mapping[str, Any]]:
     tables = [each for each in lists if each and all(isinstance(record, Mapping) for record in each)]
     if len(tables) != 1:
         raise InputError(
-            f'{path} must have one list of records, as [{{"t": 0.0, "x": 1.5}}, ...]; it has {len(tables)} lists of records.'
+            f'{path} must have one list of records, as [{{"t": 0.0, "x": 1.5}}, ...]; it has {len(tables)} such lists.'
         )
     return tables[0]
 

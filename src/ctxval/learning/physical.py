@@ -90,10 +90,13 @@ class _ExtendedTask(Task):
         self.plain, self.values = plain, values
         reference = _joined(plain.reference, values[..., None, :]) if plain.has_goal else None
         start = _joined(plain.initial_state, values)
-        super().__init__(start, horizon=plain.horizon, dt=plain.dt, reference=reference)
+        super().__init__(start, horizon=plain.horizon, dt=plain.dt, reference=reference, name=plain.name)
 
-    def __getitem__(self, index: int) -> Task:
+    def __getitem__(self, index: int | slice) -> Task:
         return _ExtendedTask(self.plain[index], self.values[index])
+
+    def named(self, name: Any) -> Task:
+        return _ExtendedTask(self.plain.named(name), self.values)
 
     def starting_at(self, states: Array) -> Task:
         k = self.values.shape[-1]

@@ -63,7 +63,7 @@ def _replayed(study: DynamicsStudy, model: DrawnModel | None, point: Array) -> R
     validation, space = study.validation, study.validation.space
     try:
         parameters = space.parameters(space.from_unit(point))
-        plain, task = study.given.task(parameters), validation.task(parameters)
+        plain, task = study.given.task_at(parameters), validation.task_at(parameters)
         controller = validation.synthesizer.design(task, validation.model)
     except Exception:  # the user's own parts
         return None

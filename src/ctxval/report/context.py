@@ -20,6 +20,7 @@ from ctxval.campaign.storage.store import Store
 from ctxval.certificates import Certificate, CertificateOptions, Provenance, Verdict, judge
 from ctxval.core.labels import Labels, labels_of
 from ctxval.core.space import TaskSpace
+from ctxval.core.task_suite import TASK, TaskSuite
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import Change, Trial, designs_sentence
 from ctxval.core.validation import Validation
@@ -119,6 +120,23 @@ class ReportContext(ShortRepr):
         """The distances ``(n,)`` of these points."""
         return np.array(list(map(distance_of, self.completed)))
 
+    @property
+    def suite(self) -> TaskSuite | None:
+        """The suite of tasks; None if tasks fill a box."""
+        return self.space if isinstance(self.space, TaskSuite) else None
+
+    @property
+    def task_labels(self) -> tuple[str, ...]:
+        """What heads the columns of :meth:`tasks_of`: the parameters with their units, or ``task``."""
+        return self.space.labels if self.suite is None else (TASK,)
+
+    def tasks_of(self, trials: Sequence[Trial]) -> list[list[float | str]]:
+        """Return one row for each trial: the parameters of its task, or its name if it is one of a suite."""
+        points = self.coordinates(trials)
+        if self.suite is None:
+            return [list(point) for point in points.tolist()]
+        return [[self.suite.task_names_at(point)] for point in points]
+
     def coordinates(self, trials: Sequence[Trial]) -> Array:
         """Return the tasks of trials in the units of the parameters, ``(n, d)``."""
         return self.space.from_unit(self._unit_points(trials))
@@ -204,7 +222,7 @@ class ReportContext(ShortRepr):
     @functools.cached_property
     def distance_model(self) -> DistanceModel | None:
         """The distance over the tasks as the trials show it; None if it cannot be fitted."""
-        return DistanceModel.of(self.completed)
+        return DistanceModel.of(self.completed, self.space.members)
 
     @property
     def batched(self) -> bool:

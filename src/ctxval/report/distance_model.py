@@ -38,15 +38,17 @@ class DistanceModel:
         values: their distances ``(n,)``.
         learned: its hyperparameters and its scale.
         process: the process, conditioned on the distances.
+        suite: the tasks of a suite, points of the unit cube ``(N, d)``; None if tasks fill the box.
     """
 
     points: Array
     values: Array
     learned: Learned
     process: GaussianProcess
+    suite: Array | None = None
 
     @classmethod
-    def of(cls, completed: Sequence[Trial]) -> DistanceModel | None:
+    def of(cls, completed: Sequence[Trial], suite: Array | None = None) -> DistanceModel | None:
         """Return the model of trials with a distance; None if they are fewer than two, or none can be fitted."""
         known = list(completed)
         if len(known) < 2:
@@ -60,7 +62,7 @@ class DistanceModel:
         with single_threaded(), np.errstate(all="ignore"):
             learned = learn(points, values)
             process = learned.condition(points, values)
-        return cls(points, values, learned, process) if np.isfinite(process.alpha).all() else None
+        return cls(points, values, learned, process, suite) if np.isfinite(process.alpha).all() else None
 
     def predict(self, points: Array) -> Band:
         """Return the distances predicted at points of the unit cube ``(m, d)``."""
@@ -80,12 +82,12 @@ class DistanceModel:
 
     @functools.cached_property
     def tasks(self) -> Array:
-        """Random tasks, points of the unit cube ``(m, d)``."""
-        return np.random.default_rng(0).random((4096, self.points.shape[1]))
+        """Random tasks, or all tasks of a suite, points of the unit cube ``(m, d)``."""
+        return self.suite if self.suite is not None else np.random.default_rng(0).random((4096, self.points.shape[1]))
 
     @functools.cached_property
     def over_tasks(self) -> Band:
-        """The distances predicted at the random tasks."""
+        """The distances predicted at these tasks."""
         return self.predict(self.tasks)
 
     @functools.cached_property

@@ -15,7 +15,7 @@ from scipy.spatial import KDTree
 
 from ctxval._util.arrays import Array
 from ctxval._util.representation import ShortRepr, counted
-from ctxval._util.texts import reason_of
+from ctxval._util.texts import enumerated, reason_of
 from ctxval.campaign.dynamics import PREDICTION
 from ctxval.certificates import RESOLUTION
 from ctxval.certificates.bounds import at_most, of_tasks
@@ -131,6 +131,10 @@ def _rests_on_distances(context: ReportContext) -> bool:
 @asks("Tasks covered")
 def tasks_covered(context: ReportContext) -> Answer | None:
     """How far tasks are from every trial."""
+    if context.suite is not None:
+        executed, tasks = len(context.suite) - len(context.suite.remaining(context.points)), len(context.suite)
+        text = f"{executed} of the {tasks} tasks of the suite were executed."
+        return "good" if executed == tasks else "attention", text, {"executed": executed, "tasks": tasks}
     if not len(context.points) or not _rests_on_distances(context):
         return None
     farthest, share = farthest_task(context.points), share_far_from_trials(context.points)
@@ -232,7 +236,12 @@ def not_tested(context: ReportContext) -> list[str]:
     if certificate is not None and certificate.volume:
         left_out = at_most(100 * certificate.volume, 3)
         sentences.append(f"The certificate leaves out {left_out} % {of_tasks(certificate.distribution)}.")
-    if len(context.points):
+    if context.suite is not None:
+        left = context.suite.remaining(context.points)
+        if len(left):
+            names = enumerated(map(context.suite.name_at, left), 20)
+            sentences.append(f"Tasks of the suite without a distance: {names}.")
+    elif len(context.points):
         share, d = share_far_from_trials(context.points), context.space.dimension
         if share:
             sentences.append(
@@ -244,7 +253,7 @@ def not_tested(context: ReportContext) -> list[str]:
         if bare:
             sentences.append(f"{bare} of the {2**d} {where} have no trial next to them.")
     for trial in context.failed[:10]:
-        values = zip(context.space.labels, context.coordinates([trial])[0], strict=True)
+        values = zip(context.task_labels, context.tasks_of([trial])[0], strict=True)
         where = ", ".join(f"{label} = {number(value)}" for label, value in values)
         ended = "failed" if trial.state == "failed" else "could not be measured"
         sentences.append(f"The distance at the task of trial {trial.number} ({where}), because it {ended}.")

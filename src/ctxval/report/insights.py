@@ -8,6 +8,7 @@ import numpy as np
 
 from ctxval._util.arrays import Array
 from ctxval._util.representation import counted
+from ctxval._util.texts import enumerated
 from ctxval.certificates.bounds import state_of
 from ctxval.core import soundness
 from ctxval.core.distance import ComposedDistance
@@ -44,6 +45,8 @@ def weak_region(context: ReportContext) -> Answer | None:
 
 def region_text(context: ReportContext, points: Array) -> str:
     """Return where points of the unit cube ``(m, d)`` lie, by the parameters in which they differ from all tasks."""
+    if context.suite is not None:
+        return f"they are {enumerated(dict.fromkeys(map(context.suite.name_at, points)), 8)}"
     low, high = np.quantile(points, [0.05, 0.95], axis=0)
     width = high - low
     ends = context.space.from_unit(np.stack([low, high]))

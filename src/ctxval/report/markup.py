@@ -44,7 +44,7 @@ def percent(share: float, digits: int = 2) -> str:
     return f"{value:.{max(digits, 3 if value >= 10 else digits)}g} %"
 
 
-def quantity(value: float | None, units: str = "") -> str:
+def quantity(value: float | str | None, units: str = "") -> str:
     """Return a number with its unit; a dash if it is None."""
     return "\u2013" if value is None else f"{number(value)} {units}".rstrip()
 

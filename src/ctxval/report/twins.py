@@ -86,14 +86,18 @@ def junit(context: ReportContext) -> str:
     return f'<?xml version="1.0" encoding="utf-8"?>\n<!-- {MADE_BY} -->\n{content}\n'
 
 
+def _cell(value: float | str) -> str:
+    return markdown_text(value) if isinstance(value, str) else number(value)
+
+
 def markdown(context: ReportContext) -> str:
     """Return the report without its charts as Markdown; texts of the store cannot become markup."""
     units, verdict = context.labels.units, context.verdict
     answer = "No verdict: no threshold was given." if verdict is None else f"{verdict}"
     trials = context.worst_tasks()
     rows = [
-        f"| {trial.number} | {markdown_text(quantity(distance_of(trial), units))} | {' | '.join(map(number, point))} |"
-        for trial, point in zip(trials, context.coordinates(trials).tolist(), strict=True)
+        f"| {trial.number} | {markdown_text(quantity(distance_of(trial), units))} | {' | '.join(map(_cell, task))} |"
+        for trial, task in zip(trials, context.tasks_of(trials), strict=True)
     ]
     entries = [
         f"- **{markdown_text(entry.term)}** ({entry.standard}): {markdown_text(entry.content, UNCUT)}"
@@ -107,12 +111,12 @@ def markdown(context: ReportContext) -> str:
         ]
         return listed or ["Nothing is unusual."]
 
-    head = f"| trial | distance | {' | '.join(map(markdown_text, context.space.labels))} |"
+    head = f"| trial | distance | {' | '.join(map(markdown_text, context.task_labels))} |"
     parts = {
         "Diagnostics": items(context.diagnostics),
         "Insights": items(context.insights),
         "What was not tested": [f"- {markdown_text(sentence)}" for sentence in context.not_tested],
-        "Worst tasks": [head, f"|{'---|' * (2 + context.space.dimension)}", *rows],
+        "Worst tasks": [head, f"|{'---|' * (2 + len(context.task_labels))}", *rows],
         "For the file": entries,
     }
     blocks = [

@@ -175,7 +175,7 @@ def completion(validation: Validation) -> Distance:
     synthesizer does not bring to a goal.
     """
     space, distance = validation.space, validation.distance
-    task = validation.task(space.parameters(0.5 * (space.low + space.high)))
+    task = validation.task_at(space.parameters(0.5 * (space.low + space.high)))
     if not isinstance(task, Task) or not task.has_goal:
         raise InputError(
             "the tasks have neither a goal nor a reference, so the model has nothing to complete: give a goal, or a "

@@ -12,6 +12,7 @@ import numpy as np
 from ctxval._util.checked import NonNegativeFloat, require
 from ctxval.campaign.telling import ToldResult
 from ctxval.core.space import TaskSpace
+from ctxval.core.task_suite import TASK, TaskSuite
 from ctxval.errors import InputError
 from ctxval.web.jobs import TaskRequest
 
@@ -31,6 +32,10 @@ def task_request(fields: Fields, space: TaskSpace) -> TaskRequest:
             return TaskRequest(decides=True, trials=seen)
         case "draw":
             return TaskRequest(draw=True, trials=seen)
+        case "own" if isinstance(space, TaskSuite):
+            named = {TASK: fields.get(TASK, "")}
+            space.point(named)
+            return TaskRequest(named, trials=seen)
         case "own":
             names = zip(space.names, range(space.dimension), strict=True)
             point = np.array([_number(fields, f"parameter-{place}", name) for name, place in names])

@@ -99,7 +99,7 @@ class ServedCampaign:
 
     def _task(self, trial: Trial) -> dict[str, Any]:
         validation = self.campaign.validation
-        task = validation.task(validation.space.parameters(validation.space.point(trial.parameters)))
+        task = validation.task_at(validation.space.parameters(validation.space.point(trial.parameters)))
         start = np.atleast_1d(validation.recorded_task(task).initial_state).tolist()
         states, _ = self.experiment.names(len(start), 0)
         return {"start": list(zip(labels_of(states), start, strict=True)), "horizon": task.horizon, "dt": task.dt}

@@ -16,6 +16,7 @@ from ctxval._util.texts import shortened, visible
 from ctxval.campaign.dynamics import PREDICTION
 from ctxval.campaign.telling import result_sentence
 from ctxval.certificates.bounds import with_error
+from ctxval.core.task_suite import TaskSuite
 from ctxval.core.trial import Trial
 from ctxval.learning import ExecutionPrediction
 from ctxval.web.jobs import Files
@@ -80,6 +81,7 @@ class Page:
             enough=self._enough(),
             shown=shown[::-1],
             parameters=list(zip(space.labels, space.low, space.high, strict=True)),
+            tasks=space.task_names if isinstance(space, TaskSuite) else (),
             certificate=certificate,
             bound=None if certificate is None else with_error(certificate.upper_bound, certificate.error),
             told=None if told is None else self.ended(told),
@@ -185,6 +187,8 @@ def values_of(parameters: Mapping[str, Any], units: Mapping[str, str]) -> list[t
 
 
 def _value(value: Any) -> str:
+    if isinstance(value, str):
+        return line(value, 120)
     return f"[{', '.join(map(_value, value))}]" if isinstance(value, list) else f"{value:.6g}"
 
 

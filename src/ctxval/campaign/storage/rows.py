@@ -51,7 +51,8 @@ def read_trial(row: tuple[Any, ...], checksum: Any) -> Trial | None:
         _count(number) and _count(attempts) and executed in (0, 1),
         state in get_args(State) and origin in get_args(Origin),
         _numbers(unit_point) and all(0 <= value <= 1 for value in unit_point),
-        isinstance(parameters, dict) and all(_number(v) or _numbers(v) for v in parameters.values()),
+        isinstance(parameters, dict)
+        and all(isinstance(v, str) or _number(v) or _numbers(v) for v in parameters.values()),
         distance is None or (isinstance(distance, float) and 0 <= distance < np.inf),
         seconds is None or (isinstance(seconds, float) and 0 <= seconds < np.inf),
         (state == "completed") == (distance is not None),

@@ -10,7 +10,7 @@ import numpy as np
 
 from ctxval._util.arrays import Array
 from ctxval._util.progress import stage
-from ctxval._util.texts import reason_of
+from ctxval._util.texts import quoted, reason_of
 from ctxval.campaign.costs import ThinkingCosts
 from ctxval.certificates.bounds import of_tasks
 from ctxval.core.controller import converged_of
@@ -19,6 +19,7 @@ from ctxval.core.labels import labels_of, names_of
 from ctxval.core.plan import Plan
 from ctxval.core.soundness import MISSED, SATURATED, goal_misses
 from ctxval.core.task import Task
+from ctxval.core.task_suite import TaskSuite
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.validation import Validation
 from ctxval.errors import ConformanceError, CtxvalError
@@ -77,6 +78,9 @@ def _checked(checks: Mapping[str, Callable[[], Findings]]) -> list[Checked]:
 
 def _space(validation: Validation) -> Findings:
     space = validation.space
+    if isinstance(space, TaskSuite):
+        yield "ok", f"{len(space)} tasks with the parameters {', '.join(space.labels)}"
+        return
     without = [name for name, label in zip(space.names, space.labels, strict=True) if name == label]
     missing = f"; no unit for {', '.join(without)}" if without else ""
     text = f"{space.dimension} task parameters: {', '.join(space.labels)}{missing}"
@@ -84,10 +88,13 @@ def _space(validation: Validation) -> Findings:
 
 
 def _tasks(validation: Validation, seed: int, plans: list[Plan]) -> Findings:
-    """Plan the lowest, the middle, the highest and eight random tasks."""
-    space = validation.space
-    corners = np.stack([space.low, 0.5 * (space.low + space.high), space.high])
-    points = np.concatenate([corners, space.iid(8, np.random.default_rng(seed))])
+    """Plan the lowest, the middle, the highest and eight random tasks; of a suite, eleven of its tasks."""
+    space, rng = validation.space, np.random.default_rng(seed)
+    if space.members is not None:
+        points = rng.permutation(space.from_unit(space.members))[:11]
+    else:
+        corners = np.stack([space.low, 0.5 * (space.low + space.high), space.high])
+        points = np.concatenate([corners, space.iid(8, rng)])
     plans.extend([validation.plan(point) for point in points])
     task, on_model = plans[0].task, plans[0].model_trajectory
     n, recorded = task.initial_state.shape[-1], on_model.states.shape[-1]
@@ -138,6 +145,8 @@ def task_text(parameters: dict[str, Any]) -> str:
     """Return the parameters of a task as a text."""
 
     def number(value: Any) -> str:
+        if isinstance(value, str):
+            return quoted(value)
         return f"[{', '.join(map(number, value))}]" if isinstance(value, list) else f"{value:.4g}"
 
     return ", ".join(f"{name} = {number(value)}" for name, value in parameters.items())
@@ -179,7 +188,7 @@ def _model(validation: Validation, counts: Mapping[str, int]) -> Findings:
 def _batches(validation: Validation, plans: Sequence[Plan]) -> Findings:
     points = np.stack([plan.parameters.points for plan in plans])
     try:
-        batch = validation.task(validation.space.parameters(points))
+        batch = validation.task_at(validation.space.parameters(points))
         same = isinstance(batch, Task) and batch.batch_shape == (len(points),)
     except Exception:
         same = False
@@ -191,8 +200,7 @@ def _batches(validation: Validation, plans: Sequence[Plan]) -> Findings:
         if _differ(row.reference, plan.task.reference) or _differ(row.initial_state, plan.task.initial_state):
             yield "failed", f"task {index} of a batch differs from the same task alone: check the task function"
             return
-    few = Task(batch.initial_state[:4], horizon=batch.horizon, dt=batch.dt, reference=batch.reference[:4])
-    check_synthesizer(with_states_of_model(validation).synthesizer, few, validation.model)
+    check_synthesizer(with_states_of_model(validation).synthesizer, batch[:4], validation.model)
     yield "ok", "task function and synthesizer give the same results in a batch as alone"
 
 
@@ -208,11 +216,8 @@ def _distance(experiment: Experiment, plans: Sequence[Plan]) -> Findings:
         yield "noted", mixed_units_sentence(experiment.mixed_units).removesuffix(".")
     states, inputs = (np.stack([getattr(run, name) for run in trajectories]) for name in ("states", "inputs"))
     model, shifted = (Trajectory(trajectories[0].times, states + shift, inputs) for shift in (0.0, 0.01))
-    tasks = [plan.task for plan in plans]
-    starts, references = (np.stack([getattr(task, name) for task in tasks]) for name in ("initial_state", "reference"))
-    task = Task(starts, horizon=tasks[0].horizon, dt=tasks[0].dt, reference=references)
     try:
-        check_distance(validation.distance, model, shifted, task)
+        check_distance(validation.distance, model, shifted, Task.stacked([plan.task for plan in plans]))
         yield "ok", "finite, not negative, and the same in a batch as alone"
     except Exception:
         for plan in plans:

@@ -39,6 +39,7 @@ from ctxval.core.labels import Labels, labels_of
 from ctxval.core.outputs import OutputsLike
 from ctxval.core.quantiles import QUANTILE
 from ctxval.core.space import TaskSpace
+from ctxval.core.task_suite import TaskSuite
 from ctxval.core.validation import Validation
 from ctxval.data import LogMapping
 from ctxval.errors import CertificateError, InputError, UnknownNameError
@@ -146,6 +147,7 @@ class Settings(BaseModel):
     Either ``experiment`` names the experiment, or ``name`` to ``units`` describe it completely.
 
     Attributes:
+        suite: the parameters of each task by its name, in the place of the space, if tasks are a list.
         distribution: see :func:`~ctxval.cli.config.parts.with_distribution`; a named experiment may have one too.
         longest: the largest horizon.
         physical: the task parameters that change the dynamics of the system; a named experiment may have some too.
@@ -161,6 +163,7 @@ class Settings(BaseModel):
     options: dict[str, Any] = Field(default_factory=dict)
     name: str | None = None
     space: dict[str, list[Any]] | None = None
+    suite: dict[str, dict[str, float | str]] | None = None
     distribution: dict[str, dict[str, Any]] | None = None
     task: Part | None = None
     system: Part | None = None
@@ -207,7 +210,7 @@ class Settings(BaseModel):
         return experiment if validation is given else replace(experiment, validation=validation)
 
     def _named(self, experiment: str) -> Experiment:
-        for name in (*_WHOLE, "distance", "name", "outputs"):
+        for name in (*_WHOLE, "suite", "distance", "name", "outputs"):
             if getattr(self, name) is not None:
                 why = f"remove one of them, because a named experiment has its own {name}"
                 raise InputError(f"the file has both 'experiment' and {name!r}: {why}.")
@@ -216,7 +219,10 @@ class Settings(BaseModel):
         return named_experiment(experiment, self.seed, self.options, self.folder)
 
     def _described(self) -> Experiment:
-        missing = ", ".join(name for name in _WHOLE if getattr(self, name) is None)
+        if self.space is not None and self.suite is not None:
+            raise InputError("the file has both [space] and [suite]: tasks fill a box, or they are a list.")
+        whole = [name for name in _WHOLE if name != "space" or self.suite is None]
+        missing = ", ".join(name for name in whole if getattr(self, name) is None)
         if missing:
             how = "name an experiment, as in experiment = 'pendulum', or describe one"
             raise InputError(f"the file must {how}: it has no {missing}.")
@@ -224,7 +230,10 @@ class Settings(BaseModel):
             raise InputError(
                 "[options] is only for a named experiment (experiment = ...); this file describes its own."
             )
-        space = TaskSpace(**{name: tuple(bounds) for name, bounds in (self.space or {}).items()})
+        if self.suite is not None:
+            space: TaskSpace = TaskSuite(self.suite)
+        else:
+            space = TaskSpace(**{name: tuple(bounds) for name, bounds in (self.space or {}).items()})
         system = part("system", self.system or {}, self.folder)
         validation = Validation(
             space=space,

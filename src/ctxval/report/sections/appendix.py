@@ -10,6 +10,7 @@ import numpy as np
 from markupsafe import Markup
 
 from ctxval._util.arrays import Array
+from ctxval._util.texts import enumerated
 from ctxval._util.version import VERSION
 from ctxval.certificates.bounds import at_most, with_error
 from ctxval.report.context import ReportContext
@@ -92,6 +93,8 @@ def _evidence(context: ReportContext) -> Iterator[Entry]:
         )
         points = context.coordinates(context.completed)
         ranges = _box(context, points.min(axis=0), points.max(axis=0))
+        if context.suite is not None:
+            ranges = f"{len(context.suite) - len(context.suite.remaining(context.points))} tasks of the suite"
         executed = f"Executed: {ranges}. Nothing is said about tasks outside the intended use."
     yield Entry("Comparison error E = S \u2212 D (here: M \u2212 S)", _V20, error)
     yield Entry("Domain of validation, and what lies outside it", f"{_NASA}, {_V10}, {_V20}", executed)
@@ -111,7 +114,7 @@ def _limits(context: ReportContext) -> Iterator[Entry]:
             f"not part of it.{withdrawn}"
         )
         assumptions = "; ".join(certificate.assumptions)
-    if model is not None:
+    if model is not None and context.suite is None:
         shares = ((context.space.labels[j], number(float(model.sensitivity[j]), 2)) for j in model.influence[:5])
         listed = "; ".join(f"{label} {share}" for label, share in shares)
         robustness = f"Total Sobol indices of the predicted distance, the largest first: {listed}."
@@ -139,6 +142,8 @@ def _limits(context: ReportContext) -> Iterator[Entry]:
 
 
 def _box(context: ReportContext, low: Array, high: Array) -> str:
+    if context.suite is not None:
+        return f"a suite of {len(context.suite)} tasks, {enumerated(context.suite.task_names, 40)}"
     ends = zip(context.space.labels, low.tolist(), high.tolist(), strict=True)
     return "; ".join(f"{label} from {number(first)} to {number(last)}" for label, first, last in ends)
 

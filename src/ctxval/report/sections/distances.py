@@ -29,7 +29,8 @@ def distances(context: ReportContext) -> Markup:
     if model is None:
         return paragraph("Fewer than two distances are known, so no picture of the distance can be drawn.")
     predicted = _predicted(context, model)
-    if context.space.dimension == 1:  # the distance over the tasks is on the first screen
+    # The distance over one parameter is on the first screen; a suite has no tasks between its own.
+    if context.space.dimension == 1 or context.suite is not None:
         parts = [element("div", predicted, class_="charts")]
     else:
         second = element("div", _sensitivity(context, model), predicted, class_="charts")

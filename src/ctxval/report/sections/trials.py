@@ -62,18 +62,18 @@ def _left_out(context: ReportContext, lines: RecordedLines) -> list[Markup]:
 def _table(context: ReportContext, lines: RecordedLines) -> Markup:
     # Those with the largest distances, and those without a distance.
     shown = [*context.worst_first, *(trial for trial in context.trials if trial.distance is None)][:_ROWS]
-    headers = ("trial", "distance", "state", "origin", *context.space.labels, "time [s]", "attempts", "remarks")
-    points = context.coordinates(shown)
-    rows = [_row(trial, point, trial.number in lines.kept) for trial, point in zip(shown, points, strict=True)]
+    headers = ("trial", "distance", "state", "origin", *context.task_labels, "time [s]", "attempts", "remarks")
+    tasks = context.tasks_of(shown)
+    rows = [_row(trial, task, trial.number in lines.kept) for trial, task in zip(shown, tasks, strict=True)]
     caption = f"Trials, the largest distance first{'' if len(shown) == len(context.trials) else f' ({_ROWS} of them)'}"
     return table(caption, headers, rows, "sortable", id_="trials", label="Table of trials", scroll="scroll tall")
 
 
-def _row(trial: Trial, point: Array, recorded: bool) -> Markup:
+def _row(trial: Trial, task: list[float | str], recorded: bool) -> Markup:
     number, shows = trial.number, f"Show trial {trial.number}"
     button = element("button", str(number), type="button", data_trial=number, aria_label=shows) if recorded else number
     remarks = "; ".join(filter(None, (trial.failure, trial.because)))
-    values = (trial.distance, trial.state, trial.origin, *point.tolist(), trial.seconds, trial.attempts, remarks)
+    values = (trial.distance, trial.state, trial.origin, *task, trial.seconds, trial.attempts, remarks)
     cells = [element("th", cell(button), scope="row", data_value=number)]
     for value in values:
         exact = repr(float(value)) if isinstance(value, int | float) else None
@@ -95,7 +95,7 @@ def _worst(context: ReportContext) -> list[Markup]:
 
 def task_of(context: ReportContext, trial: Trial) -> str:
     """Return the task of a trial: its first parameters with their units."""
-    values, labels = context.coordinates([trial])[0].tolist(), map(parted, context.space.labels)
+    values, labels = context.tasks_of([trial])[0], map(parted, context.task_labels)
     listed = [f"{name} = {quantity(value, unit)}" for (name, unit), value in zip(labels, values, strict=True)]
     return ", ".join(listed[:4]) + (f" and {len(listed) - 4} more" if len(listed) > 4 else "")
 

@@ -31,7 +31,8 @@ def verdict(context: ReportContext) -> Markup:
     """Return the first screen: the verdict, its sentence, the picture, the next step and the numbers."""
     answer = "no verdict" if context.verdict is None else context.verdict.answer
     word = element("p", _shape(answer), " ", answer.capitalize(), class_="word")
-    chart = (distance_over_task(context) if context.space.dimension == 1 else None) or distances_in_order(context)
+    curve = context.space.dimension == 1 and context.suite is None
+    chart = (distance_over_task(context) if curve else None) or distances_in_order(context)
     picture = element("div", chart or paragraph("No distance is known yet."), class_="picture")
     advice, command = _next(context)
     block = markup.code(command, "Next command") if command else None

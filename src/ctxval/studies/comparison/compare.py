@@ -57,7 +57,8 @@ def compare(
     Args:
         candidates: the candidates by name. They must have the same system and the same tasks. A campaign keeps its
             search and its store.
-        question: ``worst`` for d*, ``mean`` for the expected distance, or ``both``.
+        question: ``worst`` for d*, ``mean`` for the expected distance, or ``both``; for a suite of tasks, which has no
+            random draws, ``both`` is ``worst``.
         budget: the largest total number of executions, including earlier ones in the stores.
         confidence: the probability with which all decisions hold together; it is divided between pairs and questions.
         seed: the seed of the random numbers.
@@ -85,7 +86,10 @@ def compare(
 
     made = [Candidate(str(name), campaign(str(name), compared), seed) for name, compared in candidates.items()]
     require_comparable({candidate.name: candidate.campaign.validation for candidate in made})
-    questions: tuple[Question, ...] = ("worst", "mean") if question == "both" else (question,)
+    if question == "mean" and made[0].campaign.validation.space.members is not None:
+        raise InputError("question must be worst for a suite of tasks, which has no random draws, got 'mean'.")
+    both: tuple[Question, ...] = ("worst", "mean") if made[0].campaign.validation.space.members is None else ("worst",)
+    questions: tuple[Question, ...] = both if question == "both" else (question,)
     each = 1 - (1 - confidence) / len(questions)
     executions = Executions(made, largest_possible, on_trial)
     worst = WorstQuestion(executions, each, budget, stochastic)

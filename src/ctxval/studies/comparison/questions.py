@@ -25,6 +25,7 @@ from ctxval.certificates.automatic import Automatic
 from ctxval.certificates.bounds import ERRORS
 from ctxval.certificates.difference import MeanDifference, PairedDifferences, mean_difference
 from ctxval.certificates.dynamics_diagnostics import TESTED
+from ctxval.certificates.sample import SAME
 from ctxval.core.trial import Trial
 from ctxval.studies.comparison.candidates import Candidate, Decision, Executions, TrialNote
 from ctxval.studies.comparison.result import PairResult
@@ -65,14 +66,20 @@ class WorstQuestion:
     def step(self) -> bool:
         """Execute the task that is expected to decide first; return False if all pairs are decided."""
         while self.undecided:
+            pairs = [pair for pair in self.undecided if any(each.recorder.has_tasks for each in pair)]
+            if not pairs:  # all tasks of a suite were executed
+                for candidate in self.candidates:
+                    self._certified(candidate)
+                return False
             expected = self._expected()
             better, worse = max(
-                self.undecided, key=lambda pair: expected[pair[1].name][0] / max(expected[pair[0].name][0], 1e-300)
+                pairs, key=lambda pair: expected[pair[1].name][0] / max(expected[pair[0].name][0], 1e-300)
             )
-            if self._needs_fact(better, worse, expected):
+            if self._needs_fact(better, worse, expected) and worse.recorder.has_tasks:
                 value, task = expected[worse.name]
                 points = np.array([trial.unit_point for trial in worse.trials])
-                if task is None or (len(points) and np.abs(points - task).max(axis=1).min() <= NEAR):
+                near = NEAR if self.candidates[0].campaign.validation.space.members is None else SAME
+                if task is None or (len(points) and np.abs(points - task).max(axis=1).min() <= near):
                     self._execute(worse, Choice())  # no new task: the choice of the search
                 else:
                     self._execute(worse, Choice(task, "covering"), value)
@@ -81,7 +88,7 @@ class WorstQuestion:
             choice = rule.choose()
             if choice is None and self._certified(better):
                 continue
-            self._execute(better, choice or Choice())
+            self._execute(better if better.recorder.has_tasks else worse, choice or Choice())
             return True
         return False
 

@@ -95,7 +95,7 @@ def _typical_cost(validation: Validation) -> float:
                 plans = map(validation.plan, space.from_unit(rng.random((8, space.dimension))))
                 return float(np.median([_cost(validation, plan.task, plan.model_trajectory) for plan in plans]))
             points = space.from_unit(rng.random((len(loops.states), space.dimension)))
-            costs = _cost(validation, validation.task(space.parameters(points)), loops)
+            costs = _cost(validation, validation.task_at(space.parameters(points)), loops)
             return float(np.median(costs)) if np.isfinite(costs).all() else np.inf
     except Exception:  # users' tasks, synthesizers and costs may raise anything, on tasks that may never be executed
         return np.inf

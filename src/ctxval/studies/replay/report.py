@@ -149,7 +149,7 @@ def _seen(model: Model, recordings: Recordings) -> set[int]:
 def _require_same_step(validation: Validation, recordings: Recordings) -> None:
     validation.require_states("a replay")
     space = validation.space
-    task = validation.task(space.parameters(0.5 * (space.low + space.high)))
+    task = validation.task_at(space.parameters(0.5 * (space.low + space.high)))
     if task.initial_state.shape[-1] != len(recordings.states):
         raise InputError(
             f"the tasks have {task.initial_state.shape[-1]} states and the recordings have {len(recordings.states)}: "

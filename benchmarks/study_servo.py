@@ -1,0 +1,87 @@
+"""A real servo: what campaigns on its 16 recorded closed loops find, for each published friction model.
+
+``python benchmarks/study_servo.py`` runs what is not stored yet. Each campaign sees one recording at a time; the
+others judge it. docs/servo.md is written from the results by ``servo_page.py``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calibrate import RESULTS, all_of
+from ctxval import Campaign, Task, Trajectory, Validation
+from ctxval._util.arrays import Array, single_threaded
+from ctxval._util.json_lines import JsonLines
+
+SERVO = Path(__file__).parents[1] / "examples" / "servo"
+sys.path.insert(0, str(SERVO))
+import servo  # noqa: E402  # the example is no package
+
+MODELS, SHARES, SEEDS = tuple(servo.PUBLISHED), (1.1, 0.9), 10
+STORED = JsonLines(RESULTS / "servo.jsonl", ("model", "share", "seed"))
+
+Run = tuple[str, float, int]
+
+
+@cache
+def validation(model: str) -> Validation:
+    """Return the validation of a model."""
+    return servo.experiment(friction=model).validation
+
+
+def root_mean_square(model: Trajectory, system: Trajectory, task: Task) -> Array:
+    """Return the RMS deviation of the angle over time."""
+    return np.asarray(np.sqrt(((model.states - system.states) ** 2).mean(axis=(-2, -1))))
+
+
+@cache
+def all_distances(model: str, rms: bool = False) -> Array:
+    """Return the distances of all recordings in the order of the suite: largest deviations, or RMS deviations."""
+    chosen = validation(model).with_distance(root_mean_square) if rms else validation(model)
+    return chosen.distances(chosen.space.grid(2))
+
+
+def decide(run: Run) -> dict[str, Any]:
+    """Return what is stored of one campaign that was run until it was decided."""
+    model, share, seed = run
+    largest, started = float(all_distances(model).max()), time.process_time()
+    with single_threaded():
+        campaign = Campaign(validation(model), seed=seed).run(len(servo.PATHS) * len(servo.GAINS), share * largest)
+        verdict = campaign.verdict(share * largest)
+    predictions = [campaign.recorder.dynamics.stored_prediction(trial) for trial in campaign.trials]
+    return {
+        "model": model,
+        "share": share,
+        "seed": seed,
+        "answer": verdict.answer,
+        "kind": None if verdict.certificate is None else verdict.certificate.kind,
+        "bound": verdict.bound,
+        "tasks": [trial.parameters["task"] for trial in campaign.trials],
+        "distances": [trial.distance for trial in campaign.trials],
+        "predicted": [None if each is None else each.median for each in predictions],
+        "upper": [None if each is None else each.upper for each in predictions],
+        "seconds": round(time.process_time() - started, 1),
+    }
+
+
+def main() -> None:
+    """Run what is missing."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--seeds", type=int, default=SEEDS)
+    options = parser.parse_args()
+    runs = [(model, share, seed) for seed in range(options.seeds) for model in MODELS for share in SHARES]
+    for result in all_of(decide, [run for run in runs if run not in STORED], options.workers):
+        STORED.append(result)
+        print(*(result[key] for key in ("model", "share", "seed", "answer")), len(result["tasks"]), result["seconds"])
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,163 @@
+"""Campaigns on suites of tasks, each of which is executed once."""
+
+from __future__ import annotations
+
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ctxval import Campaign, Task, TaskSuite, Trajectory, Validation, controllers, distances, models, systems
+from ctxval.certificates import Audit, CertificateOptions, Posterior, WholeSuite
+from ctxval.core.controller import Controller
+from ctxval.errors import CertificateError, InputError
+from ctxval.searches import CMAES, GPUCB, BayesianOptimisation, Random
+
+COARSE = TaskSuite({f"{side} {size}": {"side": side, "size": size} for side in ("left", "right") for size in (1, 2, 3)})
+FINE = TaskSuite({f"go to {goal:g}": {"goal": float(goal)} for goal in np.linspace(-2, 2, 41)})
+
+
+def step(x: np.ndarray, u: np.ndarray) -> np.ndarray:
+    speed = x[..., 1]
+    return np.asarray(x + 0.1 * np.stack([speed, u[..., 0] - 0.4 * speed - 0.2 * speed * np.abs(speed)], axis=-1))
+
+
+def goal_of(p: Any) -> np.ndarray:
+    return np.where(np.asarray(p.side) == "left", -0.9, 1.0) * p.size
+
+
+def validation(suite: TaskSuite = COARSE, goal: Any = goal_of, system: Any = None) -> Validation:
+    return Validation(
+        space=suite,
+        task=lambda p: Task(np.stack([0 * goal(p)] * 2, axis=-1), goal=[goal(p), 0.0], horizon=20, dt=0.1),
+        system=systems.Simulated(step, vectorized=True) if system is None else system,
+        model=models.Linear([[1.0, 0.1], [0.0, 0.97]], [[0.0], [0.1]]),
+        synthesizer=controllers.LQR([1.0, 0.1], [0.1]),
+        distance=distances.MaximumDeviation(components=(0,)),
+    )
+
+
+def names(campaign: Campaign) -> list[Any]:
+    return [trial.parameters["task"] for trial in campaign.trials]
+
+
+def true_distances(given: Validation) -> np.ndarray:
+    return given.distances(given.space.grid(2))
+
+
+SEARCHES = [None, Random(), CMAES(), GPUCB(), BayesianOptimisation()]
+
+
+@pytest.mark.parametrize("search", SEARCHES, ids=lambda search: type(search).__name__)
+@pytest.mark.parametrize("explore", [True, False])
+def test_every_task_is_executed_once_and_then_the_campaign_ends(search: Any, explore: bool) -> None:
+    campaign = Campaign(validation(), search=search, seed=1).run(50, 9.0, explore=explore)
+    assert Counter(names(campaign)) == Counter(COARSE.task_names)
+    verdict, largest = campaign.verdict(9.0), true_distances(campaign.validation).max()
+    assert verdict.answer == "validated"
+    assert verdict.bound == pytest.approx(largest, rel=1e-12)
+
+
+def test_random_searches_have_another_order_for_each_seed() -> None:
+    orders = [names(Campaign(validation(), search=Random(), seed=seed).run(6)) for seed in range(4)]
+    assert len({tuple(order) for order in orders}) > 1
+
+
+def test_a_smooth_suite_is_validated_before_all_of_it_is_executed() -> None:
+    given = validation(FINE, lambda p: p.goal)
+    largest = true_distances(given).max()
+    campaign = Campaign(given, seed=0).run(41, 1.25 * largest)
+    verdict = campaign.verdict(1.25 * largest)
+    assert verdict.answer == "validated"
+    assert campaign.executions <= 20
+    assert largest <= (verdict.bound or 0.0) <= 1.25 * largest
+    assert len(set(names(campaign))) == campaign.executions
+    assert "41 of the suite" in verdict.reason
+    tests = (verdict.certificate.details if verdict.certificate else {})["tests"]
+    assert tests["drawn"] >= 8
+    assert tests["share_missed"] is None  # they are drawn without replacement
+
+
+def test_a_distance_above_the_threshold_ends_the_campaign() -> None:
+    given = validation(FINE, lambda p: p.goal)
+    largest = true_distances(given).max()
+    campaign = Campaign(given, seed=0).run(41, 0.9 * largest)
+    assert campaign.verdict(0.9 * largest).answer == "falsified"
+    assert campaign.executions < 8
+
+
+def test_a_noisy_task_is_not_repeated() -> None:
+    noisy = systems.Imperfect(step, vectorized=True, process=[0.0, 0.02], seed=1)
+    campaign = Campaign(validation(system=noisy), seed=0).run(50, 0.9)
+    assert max(Counter(names(campaign)).values()) == 1
+
+
+def test_a_resumed_campaign_makes_the_same_choices(tmp_path: Path) -> None:
+    whole = Campaign(validation(), seed=3).run(6, 9.0)
+    for budget in (2, 3, 6):
+        Campaign(validation(), seed=3, store=tmp_path / "parts.sqlite").run(budget, 9.0)
+    again = Campaign(validation(), seed=3, store=tmp_path / "parts.sqlite")
+    assert names(again) == names(whole)
+    assert again.validation.space.names == COARSE.names
+
+
+class Failing:
+    """A system that cannot turn left by 3."""
+
+    def execute(self, controller: Controller, task: Task) -> Trajectory:
+        if task.name == "left 3":
+            raise RuntimeError("the motor cut out")
+        return systems.Simulated(step, vectorized=True).execute(controller, task)
+
+
+def test_a_task_that_failed_is_left_to_people() -> None:
+    campaign = Campaign(validation(system=Failing()), seed=0).run(50, 9.0)
+    assert campaign.executions == 6
+    verdict = campaign.verdict(9.0)
+    assert verdict.answer == "undecided"
+    assert "1 of 6 tasks of the suite have no distance yet" in verdict.reason
+    opened = campaign.ask({"task": "left 3"})
+    campaign.tell(opened.number, distance=0.5)
+    assert campaign.verdict(9.0).answer == "validated"
+
+
+def test_workers_execute_each_task_once() -> None:
+    campaign = Campaign(validation(), seed=0).run(50, 9.0, workers=2)
+    assert Counter(names(campaign)) == Counter(COARSE.task_names)
+
+
+def test_people_are_given_each_task_once() -> None:
+    campaign = Campaign(validation(), seed=0)
+    opened = [campaign.ask() for _ in range(6)]
+    assert {each.plan.task.name for each in opened} == set(COARSE.task_names)
+    with pytest.raises(InputError, match="each task of the suite is executed, or is being executed"):
+        campaign.ask()
+    assert campaign.ask({"task": "left 1"}).plan.task.name == "left 1"
+
+
+def test_what_needs_independent_draws_is_refused() -> None:
+    campaign = Campaign(validation(), seed=0)
+    for draw in (lambda: campaign.ask(draw=True), lambda: campaign.audit(3)):
+        with pytest.raises(CertificateError, match="no independent draws"):
+            draw()
+    for kind in (Posterior(), Audit()):
+        with pytest.raises((CertificateError, InputError), match="suite"):
+            campaign.run(5, 1.0, certificate=CertificateOptions(kind))
+    assert not campaign.trials
+
+
+def test_a_campaign_may_ask_for_the_whole_suite() -> None:
+    given = validation(FINE, lambda p: p.goal)
+    campaign = Campaign(given, search=Random(), seed=0).run(50, 9.0, certificate=CertificateOptions(WholeSuite()))
+    assert campaign.executions == len(FINE)
+
+
+def test_tables_have_the_parameters_of_tasks() -> None:
+    pytest.importorskip("pandas")
+    campaign = Campaign(validation(), seed=0).run(3, explore=True)
+    frame = campaign.to_dataframe()
+    assert frame["task"].tolist() == names(campaign)
+    assert frame["size"].tolist() == [COARSE[name]["size"] for name in names(campaign)]
+    assert frame["side"].tolist() == [COARSE[name]["side"] for name in names(campaign)]

@@ -1,0 +1,83 @@
+"""Logs that are JSON lists of records."""
+
+from __future__ import annotations
+
+import gzip
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ctxval.data import LogMapping, read_recordings
+from ctxval.data.json_records import about_json_records, read_json_records
+from ctxval.data.log import Clock
+from ctxval.errors import InputError
+
+RECORDS: list[dict[str, Any]] = [
+    {"timestamp": 0.1 * k, "joint": {"angle": 0.5 * k, "on": k > 1}, "force": [1.0 * k, 2.0 * k], "text": "a"}
+    for k in range(5)
+]
+
+
+def written(path: Path, content: Any) -> Path:
+    text = json.dumps(content).encode()
+    path.write_bytes(gzip.compress(text) if path.suffix == ".gz" else text)
+    return path
+
+
+@pytest.mark.parametrize("name", ["run.json", "run.json.gz"])
+@pytest.mark.parametrize("content", [RECORDS, {"mass": 0.5, "names": [], "entries": RECORDS}])
+def test_records_are_columns(tmp_path: Path, name: str, content: Any) -> None:
+    path = written(tmp_path / name, content)
+    (log,) = read_json_records(path)
+    assert log.fields() == ("timestamp", "joint.angle", "joint.on", "force")
+    mapping = LogMapping({"angle": "joint.angle"}, {"force": "force[1]", "on": "joint.on"})  # type: ignore[dict-item]
+    (run,) = read_recordings([path], mapping).runs
+    assert np.allclose(run.trajectory.states[:, 0], 0.5 * np.arange(5))
+    assert np.allclose(run.trajectory.inputs, [[2.0 * k, k > 1] for k in range(4)])
+    assert about_json_records(path) == ({"mass": 0.5} if isinstance(content, dict) else {})
+
+
+def test_what_is_missing_is_no_number(tmp_path: Path) -> None:
+    records = [dict(record) for record in RECORDS]
+    records[1]["joint"] = None
+    del records[2]["force"]
+    (log,) = read_json_records(written(tmp_path / "run.json", records))
+    signals = log.signals(["joint.angle", "force"], Clock())
+    assert np.isnan(signals["joint.angle"].values[:, 0]).tolist() == [False, True, False, False, False]
+    assert np.isnan(signals["force"].values[:, 1]).tolist() == [False, False, True, False, False]
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ({"a": RECORDS, "b": RECORDS}, "it has 2 such lists"),
+        ({"a": 1.0}, "it has 0 such lists"),
+        ([1, 2, 3], "it has 0 such lists"),
+        ("text", "it has 0 such lists"),
+        ([{"name": "a"}, {"name": "b"}], "no field with numbers"),
+        ([{"x": [1, 2]}, {"x": [1]}], "no field with numbers"),
+    ],
+)
+def test_other_json_is_refused(tmp_path: Path, content: Any, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        read_json_records(written(tmp_path / "run.json", content))
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("run.json", b"{"),
+        ("run.json", b"\xff\xfe"),
+        ("run.json", b"[" * 100_000),
+        ("run.json.gz", b"not compressed"),
+        ("run.json.gz", gzip.compress(b"[{}]")[:-6]),
+    ],
+)
+def test_damaged_files_are_refused(tmp_path: Path, name: str, content: bytes) -> None:
+    path = tmp_path / name
+    path.write_bytes(content)
+    with pytest.raises(InputError, match="cannot be read as JSON"):
+        read_json_records(path)

@@ -1,0 +1,69 @@
+"""Recorded executions in the place of a system."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ctxval import Task, Trajectory, systems
+from ctxval.data import LogMapping
+from ctxval.errors import ExecutionError, InputError
+
+TIMES = 0.1 * np.arange(6)
+RUN = Trajectory(TIMES, np.stack([TIMES, 2 * TIMES], axis=-1), np.ones((5, 1)))
+MAPPING = {"states": {"x": "x", "v": "v"}, "inputs": {"u": "u"}}
+
+
+def task(name: str, horizon: int = 5) -> Task:
+    return Task([0.0, 0.0], horizon=horizon, dt=0.1, name=name)
+
+
+def law(t: int, x: np.ndarray) -> np.ndarray:
+    return np.array([10.0 * t + x[0]])
+
+
+def folder_with(path: Path, *names: str) -> Path:
+    rows = [{"t": t, "x": t, "v": 2 * t, "u": 1.0} for t in TIMES]
+    for name in names:
+        (path / f"{name}.json").write_text(json.dumps(rows))
+    return path
+
+
+def test_the_recording_of_a_task_is_its_execution(tmp_path: Path) -> None:
+    for system in (systems.Recorded({"lift": RUN}), systems.Recorded(folder_with(tmp_path, "lift"), MAPPING)):
+        executed = system.execute(law, task("lift"))
+        assert np.allclose(executed.states, RUN.states)
+        assert np.allclose(executed.inputs, 1.0)
+        assert len(system.execute(law, task("lift", 3)).inputs) == 3
+        assert system.names == ("lift",)
+        assert "tasks=1" in repr(system)
+
+
+def test_inputs_that_are_not_recorded_are_those_of_the_controller(tmp_path: Path) -> None:
+    system = systems.Recorded(folder_with(tmp_path, "lift"), LogMapping({"x": "x", "v": "v"}))  # type: ignore[dict-item]
+    executed = system.execute(law, task("lift"))
+    assert np.allclose(executed.inputs[:, 0], 10.0 * np.arange(5) + TIMES[:-1])
+
+
+def test_other_tasks_and_short_recordings_are_refused(tmp_path: Path) -> None:
+    system = systems.Recorded({"lift": RUN})
+    with pytest.raises(ExecutionError, match="no recording of the task 'turn'; there are those of lift"):
+        system.execute(law, task("turn"))
+    with pytest.raises(ExecutionError, match="has 5 steps, and the task has 6"):
+        system.execute(law, task("lift", 6))
+    with pytest.raises(InputError, match="no recording"):
+        systems.Recorded({})
+    with pytest.raises(InputError, match="has no log"):
+        systems.Recorded(tmp_path)
+
+
+def test_a_log_with_a_gap_is_no_execution(tmp_path: Path) -> None:
+    rows = [{"t": t, "x": t if 0.2 < t < 0.3 else None, "v": t, "u": 0.0} for t in np.arange(0, 1, 0.1)]
+    rows += [{"t": 1 + t, "x": t, "v": t, "u": 0.0} for t in np.arange(0, 1, 0.1)]
+    rows[4]["x"] = rows[5]["x"] = rows[6]["x"] = 1.0
+    (tmp_path / "lift.json").write_text(json.dumps(rows))
+    with pytest.raises(InputError, match=r"lift\.json must have one recording without gaps, and has 2"):
+        systems.Recorded(tmp_path, MAPPING)
