@@ -8,7 +8,7 @@ CAMPAIGNS ?= 120
 # Small dense algebra is faster on one thread.
 export OMP_NUM_THREADS = 1
 
-.PHONY: demo test quick thorough check docs reliability interleavings crash-states attack lowest bench bench-peers study study-refine reproduce search global-search calibrate drawn-tests parts pictures posterior-ranks clean
+.PHONY: demo test quick thorough check docs reliability interleavings crash-states attack lowest bench bench-peers study study-refine reproduce search global-search calibrate drawn-tests parts pictures posterior-ranks servo clean
 
 demo: .venv/.installed
 	$(BIN)/ctxval run pendulum
@@ -91,6 +91,10 @@ calibrate: .venv/.test  ## do the bounds hold as often as they say? Writes docs/
 compare-study: .venv/.test  ## how many executions comparisons need; writes docs/comparison.md, and resumes
 	$(BIN)/python benchmarks/study_compare.py
 	$(BIN)/python benchmarks/compare_page.py
+
+servo: .venv/.test  ## campaigns on the recordings of a real servo; writes docs/servo.md, and resumes
+	$(BIN)/python benchmarks/study_servo.py
+	$(BIN)/python benchmarks/servo_page.py
 
 posterior-ranks: .venv/.test  ## are draws of the learned dynamics as uncertain as they should be? Resumes
 	$(BIN)/python benchmarks/study_posterior_ranks.py

@@ -1,12 +1,14 @@
 """A real servo: what campaigns on its 16 recorded closed loops find, for each published friction model.
 
 ``python benchmarks/study_servo.py`` runs what is not stored yet. Each campaign sees one recording at a time; the
-others judge it. docs/servo.md is written from the results by ``servo_page.py``.
+others judge it. Comparisons of the models see one at a time too. docs/servo.md is written from the results by
+``servo_page.py``.
 """
 
 from __future__ import annotations
 
 import argparse
+import re
 import sys
 import time
 from functools import cache
@@ -16,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from calibrate import RESULTS, all_of
-from ctxval import Campaign, Task, Trajectory, Validation
+from ctxval import Campaign, Task, Trajectory, Validation, compare
 from ctxval._util.arrays import Array, single_threaded
 from ctxval._util.json_lines import JsonLines
 
@@ -24,16 +26,26 @@ SERVO = Path(__file__).parents[1] / "examples" / "servo"
 sys.path.insert(0, str(SERVO))
 import servo  # noqa: E402  # the example is no package
 
-MODELS, SHARES, SEEDS = tuple(servo.PUBLISHED), (1.1, 0.9), 10
+PAIRS = ("sin_sin-200,lift_and_drop-800", "up_and_down-400,sin_time_square-800", "sin_sin-400,lift_and_drop-400")
+"""Pairs of recordings to which models are fitted; they were written down before the first fit."""
+
+MODELS = tuple(servo.PUBLISHED)
+FITTED = tuple(f"{friction} {pair}" for friction in ("m1", "m4") for pair in PAIRS)
+COMPARED = (*MODELS, f"m4 {PAIRS[0]}")
+SHARES, SEEDS, COMPARISONS = (1.1, 0.9), 10, 3
+
 STORED = JsonLines(RESULTS / "servo.jsonl", ("model", "share", "seed"))
+DISTANCES = JsonLines(RESULTS / "servo_distances.jsonl", ("model",))
+COMPARED_STORED = JsonLines(RESULTS / "servo_comparisons.jsonl", ("seed",))
 
 Run = tuple[str, float, int]
 
 
 @cache
 def validation(model: str) -> Validation:
-    """Return the validation of a model."""
-    return servo.experiment(friction=model).validation
+    """Return the validation of a model: the name of a friction model, and the recordings that it is fitted to."""
+    friction, _, pair = model.partition(" ")
+    return servo.experiment(friction=friction, fit=pair).validation
 
 
 def root_mean_square(model: Trajectory, system: Trajectory, task: Task) -> Array:
@@ -71,16 +83,41 @@ def decide(run: Run) -> dict[str, Any]:
     }
 
 
+def of_model(model: str) -> dict[str, Any]:
+    """Return the distances of all recordings from a model."""
+    named = zip(validation(model).space.task_names, all_distances(model), all_distances(model, rms=True), strict=True)
+    return {"model": model, "distances": {name: [float(largest), float(rms)] for name, largest, rms in named}}
+
+
+def comparison(seed: int) -> dict[str, Any]:
+    """Return what a comparison of the models by d* decides, and after how many executions."""
+    started, counts = time.process_time(), list[int]()
+    with single_threaded():
+        found = compare({model: validation(model) for model in COMPARED}, question="worst", budget=16, seed=seed)
+    for pair in found.pairs:
+        after = re.search(r"decided after (\d+) executions", pair.reason)
+        counts.append(0 if after is None else int(after[1]))
+    pairs = [[pair.first, pair.second, pair.smaller, count] for pair, count in zip(found.pairs, counts, strict=True)]
+    seconds = round(time.process_time() - started, 1)
+    return {"seed": seed, "executions": found.executions, "pairs": pairs, "seconds": seconds}
+
+
 def main() -> None:
     """Run what is missing."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--seeds", type=int, default=SEEDS)
     options = parser.parse_args()
+    for model in (*MODELS, *FITTED):
+        if (model,) not in DISTANCES:
+            DISTANCES.append(of_model(model))
     runs = [(model, share, seed) for seed in range(options.seeds) for model in MODELS for share in SHARES]
     for result in all_of(decide, [run for run in runs if run not in STORED], options.workers):
         STORED.append(result)
         print(*(result[key] for key in ("model", "share", "seed", "answer")), len(result["tasks"]), result["seconds"])
+    missing = [seed for seed in range(min(options.seeds, COMPARISONS)) if (seed,) not in COMPARED_STORED]
+    for result in all_of(comparison, missing, options.workers):
+        COMPARED_STORED.append(result)
 
 
 if __name__ == "__main__":

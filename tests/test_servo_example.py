@@ -1,0 +1,99 @@
+"""The example on the recordings of a real servo."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+
+from ctxval import Campaign, compare
+from ctxval.data.json_records import about_json_records
+
+FOLDER = Path(__file__).parents[1] / "examples" / "servo"
+
+
+@pytest.fixture(scope="module")
+def servo() -> Iterator[ModuleType]:
+    sys.path.insert(0, str(FOLDER))
+    try:
+        import servo as module
+
+        yield module
+    finally:
+        sys.path.remove(str(FOLDER))
+        sys.modules.pop("servo", None)
+
+
+def test_the_recordings_are_small_and_state_their_source_and_licence() -> None:
+    files = list((FOLDER / "recordings").iterdir())
+    assert sum(path.stat().st_size for path in files if path.suffix == ".gz") <= 500_000
+    assert "Rhoban" in (FOLDER / "recordings" / "README.md").read_text()
+    assert "Apache License" in (FOLDER / "recordings" / "LICENSE").read_text()
+    for path in files:
+        if path.suffix == ".gz":
+            about = about_json_records(path)
+            assert path.name == f"{about['trajectory']}-{about['kp']}.json.gz"
+
+
+@pytest.mark.parametrize("friction", ["m1", "m3", "m4"])
+def test_friction_holds_what_it_can_and_takes_energy(servo: ModuleType, friction: str) -> None:
+    model, off = servo.Servo(servo.PUBLISHED[friction]), np.zeros(2)
+    hanging = np.array([-servo.PUBLISHED[friction].offset, 0.0])
+    held = np.array([hanging[0] + 0.01, 0.0])  # a slope that friction can hold
+    assert np.array_equal(model.step(hanging, off), hanging)
+    assert np.array_equal(model.step(held, off), held)
+    x = np.array([[1.0, 0.0], [0.5, 3.0]])
+    energy = [np.inf, np.inf]
+    for _ in range(400):
+        height = 1 - np.cos(x[:, 0] + servo.PUBLISHED[friction].offset)
+        inertia = model.mass * model.length**2 + servo.PUBLISHED[friction].armature
+        now = 0.5 * inertia * x[:, 1] ** 2 + 9.80665 * model.mass * model.length * height
+        assert (now <= np.add(energy, 2e-3)).all()
+        energy, x = now, model.step(x, np.zeros((2, 2)))
+    assert np.abs(x[:, 1]).max() < 1e-9
+
+
+def test_the_firmware_is_limited_and_counts(servo: ModuleType) -> None:
+    firmware = servo.Firmware(np.array([[1.0], [0.001]]), np.ones((2, 1)), np.array([800.0, 800.0]))
+    duty = firmware(0, np.array([[0.0], [0.0007]]))[:, 0]
+    assert duty[0] == 1.0
+    assert duty[1] == pytest.approx(800 * 0.001 * 4096 / (2 * np.pi) / (256 * 885))  # 0.0007 rad is less than a count
+
+
+def test_distances_of_published_models_are_those_of_the_page(servo: ModuleType) -> None:
+    for friction, (largest, task) in {"m1": (0.427, "sin_sin-400"), "m4": (0.522, "sin_time_square-800")}.items():
+        validation = servo.experiment(friction=friction).validation
+        known = validation.distances(validation.space.grid(2))
+        assert known.max() == pytest.approx(largest, abs=0.01)
+        assert validation.space.task_names[int(known.argmax())] == task
+
+
+@pytest.mark.slow
+def test_a_campaign_falsifies_m1_and_sees_only_what_it_executes(servo: ModuleType) -> None:
+    validation = servo.experiment(friction="m1").validation
+    revealed: list[str] = []
+    given = validation.system.execute
+
+    class Watched:
+        def execute(self, controller: object, task: object) -> object:
+            revealed.append(task.name)  # type: ignore[attr-defined]
+            return given(controller, task)
+
+    campaign = Campaign(validation.with_system(Watched()), seed=0).run(16, 0.38)
+    verdict = campaign.verdict(0.38)
+    assert verdict.answer == "falsified"
+    assert campaign.executions <= 4
+    assert revealed == [trial.parameters["task"] for trial in campaign.trials]
+
+
+@pytest.mark.slow
+def test_one_recording_counts_for_all_compared_models(servo: ModuleType) -> None:
+    models = {friction: servo.experiment(friction=friction).validation for friction in ("m3", "m4")}
+    found = compare(models, question="worst", budget=2)
+    assert found.executions == 2
+    assert [(result.executions, result.shared) for result in found.candidates].count((0, 0)) == 0
+    assert sum(result.executions + result.shared for result in found.candidates) == 4
