@@ -32,7 +32,9 @@ def written(path: Path, content: Any) -> Path:
 def test_records_are_columns(tmp_path: Path, name: str, content: Any) -> None:
     path = written(tmp_path / name, content)
     (log,) = read_json_records(path)
-    assert log.fields() == ("timestamp", "joint.angle", "joint.on", "force")
+    around = ("mass",) if isinstance(content, dict) else ()
+    assert log.fields() == (*around, "timestamp", "joint.angle", "joint.on", "force")
+    assert all((log.signals(["mass"], Clock())["mass"].values == 0.5).all() for _ in around)
     mapping = LogMapping({"angle": "joint.angle"}, {"force": "force[1]", "on": "joint.on"})  # type: ignore[dict-item]
     (run,) = read_recordings([path], mapping).runs
     assert np.allclose(run.trajectory.states[:, 0], 0.5 * np.arange(5))

@@ -43,23 +43,29 @@ class Logs:
     dt: float | None = None
     delay: float | None = None
 
-    def read(
-        self, logs: Sequence[Path], settings: Settings | None = None, experiment: Experiment | None = None
-    ) -> Recordings:
-        """Return the recordings in files and folders, with the names and units of the experiment if they fit."""
-        mapping = None if settings is None else settings.log_mapping
+    def stated(self) -> LogMapping | None:
+        """Return the mapping of the file or of the fields on the command line; None if none is stated."""
         if self.state or self.input_:
             if self.mapping is not None:
                 raise InputError("--mapping cannot be combined with --state and --input.")
             if not self.state:
                 raise InputError("--input needs --state: name the fields of all states too.")
-            mapping = LogMapping(_fields(self.state), _fields(self.input_ or ()))
-        elif self.mapping is not None:
-            mapping = LogMapping.from_toml(self.mapping)
+            return replace(LogMapping(_fields(self.state), _fields(self.input_ or ())), **self.changes)
+        return None if self.mapping is None else replace(LogMapping.from_toml(self.mapping), **self.changes)
+
+    @property
+    def changes(self) -> dict[str, Any]:
+        """What replaces the values of any mapping."""
         stated = {"time": self.time, "dt": self.dt, "delay": self.delay}
-        changes = {name: value for name, value in stated.items() if value is not None}
+        return {name: value for name, value in stated.items() if value is not None}
+
+    def read(
+        self, logs: Sequence[Path], settings: Settings | None = None, experiment: Experiment | None = None
+    ) -> Recordings:
+        """Return the recordings in files and folders, with the names and units of the experiment if they fit."""
+        mapping = self.stated() or (None if settings is None else settings.log_mapping)
         states, inputs = ({}, {}) if experiment is None else _names(experiment)
-        recordings = read_recordings(logs, mapping, states=states, inputs=inputs, **changes)
+        recordings = read_recordings(logs, mapping, states=states, inputs=inputs, **self.changes)
         same = (len(states), len(inputs)) == (len(recordings.states), len(recordings.inputs))
         if not same or states.keys() & inputs.keys():
             return recordings
@@ -144,7 +150,7 @@ def _print_replay(report: ReplayReport, recordings: Recordings, units: str) -> N
     out.say(f"states: {', '.join(data.states)}; inputs: {', '.join(data.inputs) or 'none'}")
     print_breaks(recordings)
     rows = [
-        (*_error_cells(each), f"{each.lowest:.3g} to {each.highest:.3g}", f"{each.upper:.3g}")
+        (*error_cells(each), f"{each.lowest:.3g} to {each.highest:.3g}", f"{each.upper:.3g}")
         for each in sorted(report.errors, key=lambda error: list(data.states).index(error.state))
     ]
     columns = ["state", "steps", "rms error", "of the change", "of recordings", "95 % below"]
@@ -172,7 +178,7 @@ def _print_replay(report: ReplayReport, recordings: Recordings, units: str) -> N
         out.say(("- ", "bold"), sentence, wrap=True)
 
 
-def _error_cells(error: Any) -> tuple[str, ...]:
+def error_cells(error: Any) -> tuple[str, ...]:
     """Return the state, the number of steps, the error, and its share of the recorded change."""
     rms = f"{error.rms:.3g} {error.unit}".rstrip()
     return error.state, str(error.steps), rms, f"{100 * error.relative:.3g} %"
@@ -264,7 +270,7 @@ def _print_fit(report: FitReport) -> None:
     )
     order = list(held.states).index
     rows = [
-        (model.kind, *_error_cells(each))
+        (model.kind, *error_cells(each))
         for model in report.fitted
         for each in sorted(model.errors, key=lambda error: order(error.state))
     ]

@@ -23,20 +23,27 @@ def read_json_records(path: Path) -> list[Log]:
     """Return the log in a JSON file: a list of records, or an object with one list of records.
 
     A field of a record is a number, true or false, or a list of numbers; ``name.part`` is one of an object in it. What
-    is missing or null in a record is NaN. Files that end in ``.gz`` are decompressed.
+    is missing or null in a record is NaN. Numbers beside the list, such as a gain, hold for all records. Files that end
+    in ``.gz`` are decompressed.
     """
-    records = _records(path, _content(path))
+    content = _content(path)
+    records = _records(path, content)
     rows = [dict(_numbers("", record, _DEPTH)) for record in records]
     columns = {name: _column([row.get(name) for row in rows]) for name in dict.fromkeys(k for row in rows for k in row)}
     kept = {name: column for name, column in columns.items() if column is not None}
     if not kept:
         raise InputError(f"{path} has no field with numbers in its records.")
-    return [MemoryTable(str(path), kept)]
+    around = {name: value for name, value in _around(content).items() if not isinstance(value, str)}
+    constant = {name: np.full(len(records), float(value)) for name, value in around.items()}
+    return [MemoryTable(str(path), {**constant, **kept})]
 
 
 def about_json_records(path: Path) -> dict[str, Any]:
     """Return what the object around the records of a JSON file says of all of them, such as a mass or a gain."""
-    content = _content(path)
+    return _around(_content(path))
+
+
+def _around(content: Any) -> dict[str, Any]:
     if not isinstance(content, Mapping):
         return {}
     return {name: value for name, value in content.items() if isinstance(value, str | int | float)}

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, Literal
 
-from ctxval._util.checked import FiniteFloat, Seconds, checked, require
+from ctxval._util.checked import FiniteFloat, NonNegativeInt, Seconds, checked, require
 from ctxval._util.columns import column_of
 from ctxval._util.files import read_bytes
 from ctxval._util.representation import ShortRepr
@@ -39,17 +39,28 @@ class Field:
         angle: whether it is an angle in radians that the log may keep between -pi and pi: it is continued over turns.
         held: whether a value holds until the next one is logged, however long that takes, such as that of a command
             that is sent only if it changes.
+        derivative_of: the name of a recorded state of which this one is the derivative; it has no path then. It is that
+            of a parabola through ``window`` records, half of which come later.
+        window: the number of these records, an odd number of at least 3.
     """
 
-    path: str
+    path: str = ""
     unit: str = ""
     recorded: str = ""
     factor: FiniteFloat | None = None
     offset: FiniteFloat = 0.0
     angle: bool = False
     held: bool = False
+    derivative_of: str = ""
+    window: int = 7
 
     def __post_init__(self) -> None:
+        if self.derivative_of:
+            if self.path:
+                raise InputError(f"a derivative of {self.derivative_of} has no path, got {self.path!r}.")
+            if self.window < 3 or self.window % 2 == 0:
+                raise InputError(f"window must be an odd number of at least 3, got {self.window!r}.")
+            return
         if not self.path.strip():
             raise InputError(f"the path of a field must be a text, got {self.path!r}.")
         self.scale("")
@@ -79,6 +90,8 @@ class LogMapping(ShortRepr):
         delay: seconds between the time at which an input is logged and the time from which it acts on the states.
         longest_gap: longest time in seconds between two samples of one field over which it is interpolated or held;
             None for 1.5 median periods of the field. A recording is split at longer gaps and at missing values.
+        lags: the number of earlier steps whose states and inputs are further states, if the records at one step do not
+            determine the next ones.
         valid: which rows count, such as ``status == 0``: a field, ``==`` or ``!=``, and a number; None for all rows.
     """
 
@@ -90,13 +103,14 @@ class LogMapping(ShortRepr):
     dt: float | None = None
     delay: float = 0.0
     longest_gap: float | None = None
+    lags: int = 0
     valid: str | None = None
 
     def __post_init__(self) -> None:
         for name in ("states", "inputs"):
             fields = {key: _field(key, item) for key, item in dict(getattr(self, name)).items()}
             object.__setattr__(self, name, fields)
-        if not self.states:
+        if not any(not field.derivative_of for field in self.states.values()):
             raise InputError("a mapping of a log needs at least one state.")
         if both := [name for name in self.states if name in self.inputs]:
             raise InputError(f"{both[0]} is a state and an input: give them different names.")
@@ -107,11 +121,16 @@ class LogMapping(ShortRepr):
         require("dt", Seconds | None, self.dt)
         require("longest_gap", Seconds | None, self.longest_gap)
         require("delay", FiniteFloat, self.delay)
+        require("lags", NonNegativeInt, self.lags)
+        for name, given in self.inputs.items():
+            if given.derivative_of:
+                raise InputError(f"the input {name} cannot be a derivative.")
 
     @property
     def fields(self) -> dict[str, Field]:
-        """All fields by name, the states first."""
-        return {**self.states, **self.inputs}
+        """All recorded fields by name, the states first; derivatives are none of them."""
+        recorded = {name: field for name, field in self.states.items() if not field.derivative_of}
+        return {**recorded, **self.inputs}
 
     @property
     def clock(self) -> Clock:
@@ -221,6 +240,6 @@ def _field(name: str, described: Any) -> Field:
     table = {("path" if key == "field" else key): value for key, value in described.items()}
     _require_known(f"entry of the field {name}", table, Field)
     try:
-        return Field(**{"path": name, **table})
+        return Field(**({} if "derivative_of" in table else {"path": name}) | table)
     except InputError as error:
         raise InputError(f"the field {name}: {error}") from error

@@ -15,6 +15,7 @@ from ctxval._util.columns import FAR, sentinels, time_column, unit_advice
 from ctxval._util.representation import ShortRepr, counted
 from ctxval._util.units import conversion
 from ctxval.core.trajectory import Trajectory, Transitions
+from ctxval.data.derived import with_derived
 from ctxval.data.log import Log, Signal, Table
 from ctxval.data.mapping import LogMapping
 from ctxval.data.readers import is_lerobot, lerobot_names, read_logs
@@ -81,11 +82,16 @@ def read_recordings(
     """
     logs = read_logs(paths)
     chosen = LogMapping.usual(logs[0], states, inputs) if mapping is None else mapping
-    names: Mapping[str, list[str]] = {}
-    if mapping is None and len(paths) == 1 and is_lerobot(Path(paths[0])):
-        with suppress(InputError, AttributeError, TypeError):  # names are only labels
-            names = lerobot_names(Path(paths[0]))
+    names = component_names(paths) if mapping is None else {}
     return recordings_of(logs, replace(chosen.in_units(states or {}, inputs or {}), **changes), names)
+
+
+def component_names(paths: Sequence[str | Path]) -> Mapping[str, list[str]]:
+    """Return the names of the components of vector fields, if a LeRobot data set states them."""
+    if len(paths) == 1 and is_lerobot(Path(paths[0])):
+        with suppress(InputError, AttributeError, TypeError):  # names are only labels
+            return lerobot_names(Path(paths[0]))
+    return {}
 
 
 def recordings_of(
@@ -132,7 +138,8 @@ def recordings_of(
     states, inputs = (
         {channel.name: channel.unit for channel in first if channel.of_input == of_input} for of_input in (False, True)
     )
-    return Recordings(tuple(runs), tuple(breaks), dt, states, inputs, (*how, *dict.fromkeys(notes)))
+    whole = Recordings(tuple(runs), tuple(breaks), dt, states, inputs, (*how, *dict.fromkeys(notes)))
+    return with_derived(whole, chosen)
 
 
 def _channels(log: Log, mapping: LogMapping, names: Mapping[str, list[str]], notes: list[str]) -> list[Channel]:

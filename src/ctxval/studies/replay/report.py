@@ -19,6 +19,7 @@ from ctxval.data.sampling import Break
 from ctxval.errors import InputError
 from ctxval.studies.replay.accuracy import RecordedSteps, Region, StepError, regions, step_errors
 from ctxval.studies.replay.causes import ResidualShare, Suggestion, residual_shares, suggestions
+from ctxval.studies.replay.faults import Fault, faults
 from ctxval.studies.replay.untested import PredictedTasks, predicted_tasks
 
 STEPS = (1, 5, 20, 100)
@@ -61,6 +62,7 @@ class ReplayReport(ShortRepr):
         regions: the one-step error in ranges of each state and input.
         residuals: how much of the one-step residual of each state can be explained.
         suggestions: changes of timing with which the model predicts held-out recordings clearly better.
+        faults: faults of the recordings that look like errors of the model.
         tasks: what the recordings predict of the tasks of an experiment; None without an experiment, or if the
             recordings teach nothing.
         insights: what follows, in sentences, the most important one first.
@@ -71,6 +73,7 @@ class ReplayReport(ShortRepr):
     regions: tuple[Region, ...]
     residuals: tuple[ResidualShare, ...]
     suggestions: tuple[Suggestion, ...]
+    faults: tuple[Fault, ...]
     tasks: PredictedTasks | None
     insights: tuple[str, ...]
 
@@ -111,7 +114,9 @@ def replay(
         errors = step_errors(model, recorded, sorted(set(steps)))
         where = regions(model, recorded)
         residuals = residual_shares(model, recorded, seed)
-        changes = suggestions(model, recorded)
+        wrong = faults(model, recordings, used)
+        # What is wrong with the recordings must not look like a mistake of timing.
+        changes = () if any(fault.explains for fault in wrong) else suggestions(model, recorded)
     tasks = None
     if validation is not None:
         logged = [run.trajectory for run in recordings.runs]
@@ -120,7 +125,7 @@ def replay(
     names = recordings.states, recordings.inputs
     counts = len(recordings.runs), recordings.steps, recordings.dt
     data = RecordedData(sources, *counts, *names, recordings.breaks, recordings.notes, len(seen))
-    report = ReplayReport(data, errors, where, residuals, changes, tasks, ())
+    report = ReplayReport(data, errors, where, residuals, changes, wrong, tasks, ())
     sentences = [*_insights(report, len(used)), *_insights_of_tasks([*data.states, *data.inputs], tasks)]
     if validation is not None and tasks is None:
         sentences.append(
@@ -187,6 +192,7 @@ def _insights(report: ReplayReport, used: int) -> Iterator[str]:
         yield "the model was learned from all of these recordings, so its errors on others are larger"
     elif data.seen:
         yield f"the model was learned from {data.seen} of these recordings; the errors are those of the others"
+    yield from (fault.sentence for fault in report.faults if fault.explains)
     yield from (change.sentence for change in report.suggestions)
     if not single:
         yield "no recording has a single step, so nothing can be compared"
@@ -206,6 +212,8 @@ def _insights(report: ReplayReport, used: int) -> Iterator[str]:
         yield f"{100 * diverged.diverged:.2g} % of the predictions of {diverged.steps} steps diverge"
     if used == 1:
         yield "there is only one recording, so the spread is that over five parts of it"
+    if any(fault.explains for fault in report.faults):
+        return
     # Causes of an error that is small, as a share of the change, are not named.
     not_small = {error.state for error in single if not error.relative < 1e-3}
     for residual in report.residuals:
@@ -237,7 +245,8 @@ def _causes(residual: ResidualShare) -> Iterator[str]:
     if residual.history >= 0.3 and residual.rest > 0.05 * residual.rms:
         yield (
             f"the step before explains {100 * residual.history:.0f} % of what state and input leave of the residual of "
-            f"{residual.state}: the system has a state that is not recorded, a delay, or filtered measurements"
+            f"{residual.state}: the system has a state that is not recorded, a delay, or filtered measurements; "
+            "lags = 1 in the mapping, or a rate as { derivative_of = ... }, gives the model a past"
         )
 
 

@@ -1,0 +1,175 @@
+"""``ctxval start``: from logs to a first statement, a mapping, a model and an experiment file to edit."""
+
+from __future__ import annotations
+
+import json
+import shlex
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ctxval._util.files import write_text
+from ctxval.cli.base import command, out, print_columns
+from ctxval.cli.options import require_outputs
+from ctxval.cli.recordings import Logs, print_breaks
+from ctxval.data import Field, LogMapping
+from ctxval.models import write_model
+from ctxval.report.replay_page import write_replay_page
+from ctxval.studies.survey import Survey, survey
+
+FILES = ("mapping.toml", "model.npz", "experiment.toml", "report.html")
+
+
+@command()
+def start(
+    logs: list[Path],
+    reading: Logs,
+    out_: Path = Path("start"),
+    force: bool = False,
+    seed: int = 0,
+) -> Any:
+    """``ctxval start``."""
+    files = {name: out_ / name for name in FILES}
+    require_outputs({f"--out {name}": path for name, path in files.items()}, [*logs, reading.mapping], force=force)
+    stated = reading.stated()
+    found = survey(logs, stated, dt=reading.dt, seed=seed)
+    _print(found)
+    write_text(files["mapping.toml"], mapping_text(found.mapping, found.recordings.dt))
+    write_model(files["model.npz"], found.best.model)
+    write_replay_page(found.replay, files["report.html"], name=f"the {found.best.kind} model")
+    written = ["mapping.toml", "model.npz", "report.html"]
+    if found.recordings.inputs:
+        write_text(files["experiment.toml"], experiment_text(found))
+        written.insert(2, "experiment.toml")
+    out.say("")
+    out.say(f"{', '.join(written)} in {out_}")
+    where = shlex.quote(str(out_ / "experiment.toml"))
+    if found.recordings.inputs:
+        out.say(f"next: edit {where}, and then ctxval check {where}")
+    return {**found.to_json(), "files": [str(out_ / name) for name in written]}
+
+
+def _print(found: Survey) -> None:
+    recordings = found.recordings
+    out.say(
+        f"{len(found.sources)} logs, {len(recordings.runs)} recordings, {recordings.steps} steps of {recordings.dt:g} s"
+    )
+    rows = [
+        (
+            field.path,
+            field.role or "-",
+            f"{field.period:.3g} s" if field.period else "-",
+            f"{field.low:.4g} to {f'{field.high:.4g} {field.unit}'.rstrip()}" if field.records else "-",
+            field.remark,
+        )
+        for field in found.fields[:24]
+    ]
+    print_columns(["field", "taken as", "every", "values", "remark"], rows, "fields of the logs", left=2)
+    if len(found.fields) > 24:
+        out.say(f"and {len(found.fields) - 24} other fields; --json lists them.")
+    for guess in found.guesses:
+        out.say(("guessed: ", "yellow"), guess, wrap=True)
+    print_breaks(recordings)
+    errors = [
+        (
+            model.kind,
+            each.state,
+            str(each.steps),
+            f"{each.rms:.3g} {each.unit}".rstrip(),
+            f"{100 * each.relative:.3g} %",
+        )
+        for model in found.fit.fitted
+        for each in model.errors
+    ]
+    print_columns(["model", "state", "steps", "rms error", "of the change"], errors, "error on others", left=2)
+    out.say("")
+    for sentence in found.replay.insights:
+        out.say(("- ", "bold"), sentence, wrap=True)
+    out.say((f"{found.statement[:1].upper()}{found.statement[1:]}.", "bold"), wrap=True)
+
+
+def mapping_text(mapping: LogMapping, dt: float) -> str:
+    """Return a mapping as a TOML file to edit."""
+    lines = [f"dt = {dt!r}  # time step of the model, seconds"]
+    for name in ("time", "time_unit", "delay", "longest_gap", "lags", "valid"):
+        if value := getattr(mapping, name):
+            lines.append(f"{name} = {json.dumps(value)}")
+    for kind in ("states", "inputs"):
+        lines += [
+            "",
+            f"[{kind}]",
+            *(f"{json.dumps(name)} = {_field(at)}" for name, at in getattr(mapping, kind).items()),
+        ]
+    return "\n".join(lines) + "\n"
+
+
+def _field(field: Field) -> str:
+    usual = vars(Field("x"))
+    changed = {name: value for name, value in vars(field).items() if value != usual[name] and value != ""}
+    if set(changed) == {"path"}:
+        return json.dumps(field.path)
+    return f"{{ {', '.join(f'{name} = {json.dumps(value)}' for name, value in changed.items())} }}"
+
+
+def experiment_text(found: Survey) -> str:
+    """Return an experiment file to edit: goals within the recorded range of the first state, and LQR on the model."""
+    recordings = found.recordings
+    states, inputs = list(recordings.states), list(recordings.inputs)
+    x = np.concatenate([run.trajectory.states for run in recordings.runs])
+    u = np.concatenate([run.trajectory.inputs for run in recordings.runs])
+    low, high = np.quantile(x[:, 0], [0.05, 0.95])
+    start = np.median([run.trajectory.states[0] for run in recordings.runs], axis=0)
+    horizon = min(max(found.reach[1], 10), 200)
+
+    def numbers(values: Any) -> str:
+        return json.dumps([float(f"{value:.3g}") for value in values])
+
+    def named(names: dict[str, str]) -> str:
+        return "\n".join(f"{json.dumps(name)} = {json.dumps(unit)}" for name, unit in names.items())
+
+    goal = json.dumps(["goal", *(0.0 for _ in states[1:])])
+    unit = recordings.states[states[0]]
+    bounds = [float(f"{low:.3g}"), float(f"{high:.3g}"), *([unit] if unit else [])]
+    return f"""\
+# Made by `ctxval start` from recordings. Edit the tasks, the controller and the distance, and say
+# `ctxval check` and then `ctxval ask` of this file: people execute the tasks (type = "Manual").
+name = "start"
+budget = 20
+units = {json.dumps(unit)}
+# threshold = 0.1  # the largest distance that you accept
+
+[space]
+goal = {json.dumps(bounds)}  # goals of {states[0]}: 90 % of its recorded range
+
+[task]
+initial_state = {numbers(start)}  # {", ".join(states)}
+goal = {goal}
+horizon = {horizon}
+dt = {recordings.dt!r}
+
+[system]
+type = "Manual"
+states = {{ {", ".join(f"{json.dumps(n)} = {json.dumps(of)}" for n, of in recordings.states.items())} }}
+inputs = {{ {", ".join(f"{json.dumps(n)} = {json.dumps(of)}" for n, of in recordings.inputs.items())} }}
+dt = {recordings.dt!r}
+
+[model]
+type = "Saved"
+source = "model.npz"
+
+[synthesizer]
+type = "LQR"
+Q = {numbers(1 / np.maximum(x.var(axis=0), 1e-12))}
+R = {numbers(1 / np.maximum(u.var(axis=0), 1e-12))}  # inputs: {", ".join(inputs)}
+
+[distance]
+type = "MaximumDeviation"
+components = [0]
+
+[states]
+{named(recordings.states)}
+
+[inputs]
+{named(recordings.inputs)}
+"""

@@ -1,0 +1,78 @@
+"""``ctxval start``: from logs to a first statement and files to edit."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from ctxval import load_experiment
+from ctxval.data import LogMapping, read_recordings
+from ctxval.models import read_model
+from rig_cli import calling, report
+from rig_logs import run, write_mat, write_parquet
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture
+def logs(tmp_path: Path) -> Path:
+    (tmp_path / "logs").mkdir()
+    for seed in range(4):
+        write_parquet(tmp_path / "logs" / f"run{seed}.parquet", run(100, seed))
+    return tmp_path / "logs"
+
+
+def test_logs_lead_to_a_statement_and_to_files_that_work(logs: Path, tmp_path: Path) -> None:
+    out, call = tmp_path / "start", calling()
+    done = call("start", str(logs), "--out", str(out))
+    assert done.exit_code == 0, done.output
+    text = " ".join(done.output.split())
+    assert "guessed: the names of the fields tell what they are taken as" in text
+    assert "The linear model errs by less than 10 % of the recorded change" in text
+    mapping = LogMapping.from_toml(out / "mapping.toml")
+    assert list(read_recordings([logs], mapping).states) == ["position", "speed"]
+    assert read_model(out / "model.npz").step([[0.0, 1.0]], [[0.0]]).shape == (1, 2)
+    assert (out / "report.html").read_text().startswith("<!DOCTYPE html>")
+    plan = load_experiment(out / "experiment.toml").validation.plan([0.5])
+    assert plan.model_trajectory.finite
+    assert call("check", str(out / "experiment.toml")).exit_code == 0
+    assert call("fit", str(logs), "--mapping", str(out / "mapping.toml")).exit_code == 0
+
+
+def test_the_answer_is_also_json_and_files_of_others_are_kept(logs: Path, tmp_path: Path) -> None:
+    out, call = tmp_path / "start", calling()
+    found = report(call("start", str(logs), "--out", str(out), "--json"))
+    assert found["states"] == {"position": "", "speed": ""}
+    assert found["close"] == found["compared"] > 10
+    assert {Path(name).name for name in found["files"]} >= {"mapping.toml", "experiment.toml"}
+    (out / "mapping.toml").write_text("mine = true\n")
+    refused = call("start", str(logs), "--out", str(out))
+    assert refused.exit_code == 2
+    assert (out / "mapping.toml").read_text() == "mine = true\n"
+    assert call("start", str(logs), "--out", str(out), "--force").exit_code == 0
+
+
+def test_fields_that_are_stated_are_taken(tmp_path: Path) -> None:
+    write_mat(tmp_path / "run.mat", run(100), version="5")
+    call, out = calling(), str(tmp_path / "start")
+    stated = ("--state", "x=log.state[1]", "--input", "f=force", "--time", "log.time")
+    found = report(call("start", str(tmp_path / "run.mat"), *stated, "--out", out, "--json"))
+    assert (found["states"], found["inputs"], found["guesses"]) == ({"x": ""}, {"f": ""}, [])
+
+
+def test_without_inputs_there_is_no_experiment(tmp_path: Path) -> None:
+    rows = "\n".join(f"{0.1 * k},{0.9**k}" for k in range(60))
+    (tmp_path / "run.csv").write_text(f"time,level\n{rows}\n")
+    found = report(calling()("start", str(tmp_path / "run.csv"), "--out", str(tmp_path / "start"), "--json"))
+    assert not (tmp_path / "start" / "experiment.toml").exists()
+    assert found["inputs"] == {}
+
+
+def test_what_cannot_be_read_is_said_in_one_sentence(tmp_path: Path) -> None:
+    (tmp_path / "run.csv").write_text("time,force\n0,1\n1,2\n")
+    for name, message in (("run.csv", "no field that looks like a state"), ("none.csv", "there is no file")):
+        refused = calling()("start", str(tmp_path / name), "--out", str(tmp_path / "start"))
+        assert refused.exit_code == 2
+        assert message in " ".join(refused.stderr.split())
+    assert not list((tmp_path / "start").glob("*"))

@@ -1,0 +1,88 @@
+"""States that follow from records: derivatives, and records of earlier steps."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ctxval.data import LogMapping, MemoryTable, Recordings, recordings_of
+from ctxval.errors import InputError
+from ctxval.studies.fitting import fit
+
+T = 0.1 * np.arange(40)
+
+
+def read(columns: dict[str, Any], **mapping: Any) -> Recordings:
+    return recordings_of([MemoryTable("run", {"t": T, **columns})], LogMapping.from_table(mapping))
+
+
+@given(st.tuples(*[st.floats(-2, 2)] * 3), st.sampled_from([3, 5, 7, 11]))
+def test_the_derivative_of_a_parabola_is_exact(of: tuple[float, float, float], window: int) -> None:
+    a, b, c = of
+    states = {"rate": {"derivative_of": "angle", "window": window}, "angle": {"path": "q", "unit": "rad"}}
+    recordings = read({"q": a + b * T + c * T**2, "u": T}, states=states, inputs=["u"])
+    (run,) = recordings.runs
+    assert list(recordings.states.items()) == [("rate", "rad/s"), ("angle", "rad")]
+    assert np.allclose(run.trajectory.states[:, 0], b + 2 * c * T, atol=1e-9)
+    assert f"looks {window // 2 * 0.1:.3g} s ahead" in recordings.notes[-1]
+
+
+def test_earlier_records_are_states() -> None:
+    recordings = read({"y": np.sin(T), "u": np.cos(T)}, states=["y"], inputs=["u"], lags=2)
+    (run,) = recordings.runs
+    names = ["y", "y a step before", "y 2 steps before", "u a step before", "u 2 steps before"]
+    assert list(recordings.states) == names
+    assert run.start == pytest.approx(0.2)
+    x = run.trajectory.states
+    assert np.allclose(x[:, 0], np.sin(T[2:]))
+    assert np.allclose(x[:, 2], np.sin(T[:-2]))
+    assert np.allclose(x[:, 3], np.cos(T[1:-1]))
+    assert np.allclose(run.trajectory.inputs[:, 0], np.cos(T[2:-1]))
+    assert run.trajectory.horizon == len(T) - 3
+
+
+def test_a_state_that_is_not_recorded_is_made_good_by_the_past() -> None:
+    rng, logs = np.random.default_rng(0), []
+    for _ in range(4):
+        u, x = rng.normal(size=len(T)), np.zeros((len(T), 2))
+        for k in range(len(T) - 1):
+            x[k + 1] = x[k] + 0.1 * np.array([x[k, 1], u[k] - x[k, 0] - 0.5 * x[k, 1]])
+        logs.append(MemoryTable("run", {"t": T, "y": x[:, 0], "u": u}))
+
+    def error(lags: int) -> float:
+        mapping = LogMapping.from_table({"states": ["y"], "inputs": ["u"], "lags": lags})
+        return fit(recordings_of(logs, mapping), ["linear"]).fitted[0].errors[0].relative
+
+    assert error(0) > 0.1
+    assert error(1) < 1e-9  # output and input of one step before determine a linear state of two
+
+
+def test_recordings_that_are_too_short_are_left_out_and_said() -> None:
+    y = np.sin(T)
+    y[[3, 25]] = np.nan
+    recordings = read({"y": y, "u": T}, states={"y": "y", "v": {"derivative_of": "y", "window": 5}}, inputs=["u"])
+    assert len(recordings.runs) == 2
+    assert "too short for the 5 records of a derivative" in str(recordings.breaks[-1])
+    with pytest.raises(InputError, match="no recording has the 41 records"):
+        read({"y": T, "u": T}, states={"y": "y", "v": {"derivative_of": "y", "window": 41}}, inputs=["u"])
+
+
+@pytest.mark.parametrize(
+    ("mapping", "message"),
+    [
+        ({"states": {"v": {"derivative_of": "y"}}}, "needs at least one state"),
+        ({"states": {"y": "y", "v": {"derivative_of": "z"}}}, "v is the derivative of 'z', which must be a recorded"),
+        ({"states": {"y": "y", "v": {"derivative_of": "y", "path": "u"}}}, "has no path"),
+        ({"states": {"y": "y", "v": {"derivative_of": "y", "window": 4}}}, "window must be an odd number"),
+        ({"states": ["y"], "inputs": {"v": {"derivative_of": "y"}}}, "the input v cannot be a derivative"),
+        ({"states": ["y"], "lags": -1}, "lags"),
+        ({"states": ["y"], "lags": 1.5}, "lags"),
+    ],
+)
+def test_what_cannot_be_derived_is_refused(mapping: dict[str, Any], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        read({"y": T, "u": T}, **mapping)

@@ -1,0 +1,134 @@
+"""A first statement on logs that nobody has described."""
+
+from __future__ import annotations
+
+import gzip
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ctxval import Trajectory
+from ctxval.errors import InputError
+from ctxval.studies.survey import Survey, survey
+from rig_logs import run, write_bag, write_lerobot, write_mat, write_mcap_ros2, write_parquet
+
+RUNS = [run(160, seed) for seed in range(4)]
+
+
+def csv_file(path: Path, one: Trajectory, names: str = "time;position;speed;force", decimal: str = ",") -> None:
+    rows = np.column_stack([1000 * one.times[:-1], one.states[:-1], one.inputs])
+    text = "\n".join(";".join(f"{value:.7f}".replace(".", decimal) for value in row) for row in rows)
+    path.write_text(f"{names}\n{text}\n")
+
+
+def json_file(path: Path, one: Trajectory) -> None:
+    rows = [
+        {"timestamp": t, "position": x[0], "goal_force": u[0], "temp": 20.0 + t}
+        for t, x, u in zip(one.times, one.states, one.inputs, strict=False)
+    ]
+    path.write_bytes(gzip.compress(json.dumps({"kp": 10 * one.inputs[0, 0], "entries": rows}).encode()))
+
+
+def each(folder: Path, write: Callable[[Path, Trajectory], object], ending: str) -> Path:
+    folder.mkdir()
+    for number, one in enumerate(RUNS):
+        write(folder / f"run{number}{ending}", one)
+    return folder
+
+
+def roles(found: Survey) -> dict[str, str]:
+    return {field.path: field.role for field in found.fields}
+
+
+WRITERS: dict[str, Callable[[Path], Path]] = {
+    "semicolons, decimal commas, milliseconds": lambda to: each(
+        to / "csv", lambda path, one: csv_file(path, one, "time [ms];position [m];speed [m/s];force [N]"), ".csv"
+    ),
+    "mcap with header stamps and 4 ms of latency": lambda to: each(
+        to / "mcap", lambda path, one: write_mcap_ros2(path, one, late=0.004), ".mcap"
+    ),
+    "bags": lambda to: each(to / "bags", lambda path, one: write_bag(path, one), ""),
+    "matlab 7.3": lambda to: each(to / "mat", lambda path, one: write_mat(path, one, version="7.3"), ".mat"),
+    "parquet": lambda to: each(to / "parquet", write_parquet, ".parquet"),
+}
+
+
+@pytest.mark.parametrize("kind", WRITERS)
+def test_logs_of_every_kind_are_read_with_the_right_fields_and_steps(kind: str, tmp_path: Path) -> None:
+    folder = WRITERS[kind](tmp_path)
+    found = survey(sorted(folder.iterdir()) if kind == "bags" else [folder])
+    assert len(found.recordings.states) == 2
+    assert len(found.recordings.inputs) == 1
+    assert found.recordings.dt == pytest.approx(0.05, rel=1e-6)
+    assert found.best.kind == "linear"
+    assert found.best.relative < 1e-3
+    assert "as long as was compared" in found.statement
+    assert not found.replay.faults
+    assert not any("delay" in sentence or "not recorded" in sentence for sentence in found.replay.insights)
+
+
+def test_a_lerobot_data_set_has_the_names_of_its_components(tmp_path: Path) -> None:
+    write_lerobot(tmp_path / "set", RUNS)
+    found = survey([tmp_path / "set"])
+    assert list(found.recordings.states) == ["position", "speed"]
+    assert len(found.recordings.runs) == len(RUNS)
+    assert found.best.relative < 1e-3
+
+
+def test_a_rate_that_is_not_recorded_is_derived_and_every_guess_is_said(tmp_path: Path) -> None:
+    found = survey([each(tmp_path / "json", json_file, ".json.gz")])
+    assert roles(found) == {"kp": "", "position": "state", "goal_force": "input", "temp": ""}
+    assert list(found.recordings.states) == ["position", "position rate"]
+    said = " ".join(found.guesses)
+    assert "not used: kp, temp" in said or "not used: temp, kp" in said
+    assert "no rate is recorded" in said
+    assert any("looks 0.15 s ahead" in note for note in found.recordings.notes)
+    assert {field.path: field.remark for field in found.fields}["kp"] == "it has one value in each file"
+
+
+def test_an_angle_that_jumps_is_continued(tmp_path: Path) -> None:
+    def wrapped(path: Path, one: Trajectory) -> None:
+        angle = np.mod(6 * one.states[:, :1] + np.pi, 2 * np.pi) - np.pi
+        csv_file(
+            path,
+            Trajectory(one.times, np.hstack([angle, 6 * one.states[:, 1:]]), one.inputs),
+            "time_ms;angle;rate;torque",
+            ".",
+        )
+
+    found = survey([each(tmp_path / "csv", wrapped, ".csv")])
+    assert found.mapping.states["angle"].angle
+    assert any("jumps by 2 pi" in guess for guess in found.guesses)
+    assert found.best.relative < 1e-3
+
+
+def test_unknown_names_are_states_and_what_stands_still_is_not(tmp_path: Path) -> None:
+    def odd(path: Path, one: Trajectory) -> None:
+        rows = np.column_stack([one.times[:-1], one.states[:-1], one.inputs, np.full(one.horizon, 7.4)])
+        np.savetxt(path, rows, delimiter=",", header="time,foo,bar,u,supply", comments="")
+
+    found = survey([each(tmp_path / "csv", odd, ".csv")])
+    assert roles(found) == {"foo": "state", "bar": "state", "u": "input", "supply": ""}
+
+
+def test_a_model_that_errs_is_said_to_suit_no_task(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+
+    def noise(path: Path, one: Trajectory) -> None:
+        csv_file(path, Trajectory(one.times, rng.normal(size=one.states.shape), one.inputs), decimal=".")
+
+    folder = each(tmp_path / "csv", noise, ".csv")
+    found = survey([folder], dt=50.0)
+    assert found.reach[0] == 0
+    assert "it suits no task yet" in found.statement
+
+
+def test_logs_without_a_state_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "run.csv").write_text("time,force,temp\n0,1,2\n1,2,3\n2,1,4\n")
+    with pytest.raises(InputError, match="no field that looks like a state"):
+        survey([tmp_path / "run.csv"])
+    with pytest.raises(InputError, match="there is no file"):
+        survey([tmp_path / "none.csv"])
