@@ -82,7 +82,7 @@ def test_a_folder_of_logs_and_a_model_are_enough(invoke: Invoke) -> None:
 
 def test_the_result_is_one_json_object(invoke: Invoke) -> None:
     found = report(invoke("logs", *LINEAR, "--json"))
-    assert set(found) == {"data", "errors", "regions", "residuals", "suggestions", "tasks", "insights"}
+    assert set(found) == {"data", "errors", "regions", "residuals", "suggestions", "faults", "tasks", "insights"}
     assert found["data"]["recordings"] == 4
     assert [one["steps"] for one in found["errors"]] == [1, 1, 5, 5, 20, 20]
     assert found["errors"][1]["relative"] == pytest.approx(found["errors"][1]["rms"] / found["errors"][1]["change"])

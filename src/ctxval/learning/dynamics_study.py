@@ -35,7 +35,7 @@ from ctxval.learning.noise_effect import effect_of_noise
 from ctxval.learning.noisy_draws import MATTERS, REPLICATES, NoisyPosterior, learn_noisy
 from ctxval.learning.physical import added_states, with_parameters, with_parameters_as_states, without_parameters
 from ctxval.learning.prediction import predict_distance
-from ctxval.learning.recorded import closed_loops_on_model, recorded_transitions
+from ctxval.learning.recorded import closed_loops_on_model, data_near, recorded_transitions
 from ctxval.learning.state_estimates import StateEstimates, with_states_of_model
 from ctxval.learning.structures import NOISY, ChosenStructure, predicted_by_history
 from ctxval.learning.vector import ErrorVectors, Executed, predict_composed
@@ -306,8 +306,13 @@ class DynamicsStudy(ShortRepr):
     ) -> tuple[Transitions, Rows] | None:
         if self._loops is None:
             return None
-        trajectories = [one for _, one in executed]
-        return recorded_transitions(self.validation.model, trajectories, self._loops, logged, with_data=with_data)
+        data = self._data if with_data else None
+        return recorded_transitions(data, [one for _, one in executed], self._loops, logged)
+
+    @functools.cached_property
+    def _data(self) -> Transitions | None:
+        """The transitions that M was made from, near the tasks."""
+        return None if self._loops is None else data_near(self.validation.model, self._loops)
 
     def _found_parameter(self, executed: Executed) -> str | None:
         """Return a task parameter that explains the errors of predictions; asked in each doubling of the executions."""

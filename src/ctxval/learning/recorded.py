@@ -15,24 +15,29 @@ from ctxval.core.validation import Validation
 from ctxval.models.scaling import standard_deviations
 
 _POOL = 3000  # largest number of transitions that these are chosen from
+_MANY = 30_000  # transitions from which on a tree finds the nearest ones, in less memory than all distances need
+
+
+def data_near(model: Model, loops: Trajectory) -> Transitions | None:
+    """Return the transitions that a model was made from, of many those nearest to closed loops on M; None if none."""
+    data = getattr(model, "data", None)
+    return data[_nearest(data, loops, 600)] if isinstance(data, Transitions) and len(data) else None
 
 
 def recorded_transitions(
-    model: Model,
+    data: Transitions | None,
     executed: Sequence[Trajectory],
     loops: Trajectory,
     logged: Sequence[Trajectory] = (),
-    *,
-    with_data: bool = True,
 ) -> tuple[Transitions, Rows] | None:
     """Return the known transitions of the system and the execution of each; -1 for data that the model was made from.
 
     Returns None if there are none. Of many transitions, a random part is returned.
 
     Args:
+        data: transitions that the model was made from, as :func:`data_near` returns them.
         loops: closed loops on M, which show which of the other data the tasks need.
         logged: recordings that belong to no task; their numbers follow those of the executions.
-        with_data: whether the data that the model was made from are among them.
     """
     parts = [trajectory.transitions() for trajectory in executed]
     sources = [np.full(len(part), k) for k, part in enumerate(parts)]
@@ -43,10 +48,9 @@ def recorded_transitions(
         rows = _nearest(together, loops, 1500, many=True)
         parts.append(together[rows])
         sources.append(of[rows])
-    data = getattr(model, "data", None) if with_data else None
-    if isinstance(data, Transitions) and len(data):
-        parts.append(data[_nearest(data, loops, 600)])
-        sources.append(np.full(len(parts[-1]), -1))
+    if data is not None:
+        parts.append(data)
+        sources.append(np.full(len(data), -1))
     if not parts:
         return None
     together, of = Transitions.joined(parts), np.concatenate(sources)
@@ -84,5 +88,8 @@ def _nearest(data: Transitions, loops: Trajectory, count: int, *, many: bool = F
         return np.arange(len(data))
     here = np.concatenate([data.x, data.u], axis=1)
     scale = standard_deviations(here)
-    gaps = cKDTree(there / scale).query(here / scale)[0] if many else cdist(here / scale, there / scale).min(axis=1)
+    if many or len(here) > _MANY:
+        gaps = cKDTree(there / scale).query(here / scale)[0]
+    else:
+        gaps = cdist(here / scale, there / scale).min(axis=1)
     return np.sort(np.argsort(gaps, kind="stable")[:count])

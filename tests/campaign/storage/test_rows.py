@@ -88,7 +88,7 @@ def test_a_whole_row_is_read() -> None:
         {"parameters": "[1.0]"},
         {"parameters": "null"},
         {"parameters": '"goal"'},
-        {"parameters": '{"a": "x"}'},
+        {"parameters": '{"a": true}'},
         {"parameters": '{"a": NaN}'},
         {"parameters": '{"a": 1' + "0" * 400 + "}"},
         {"parameters": '{"a": {"b": 1.0}}'},
