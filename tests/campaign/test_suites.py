@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ctxval import Campaign, Task, Trajectory, Validation, systems
+from ctxval import Campaign, Task, TaskSuite, Trajectory, Validation, systems
 from ctxval.certificates import Audit, CertificateOptions, Posterior, WholeSuite
 from ctxval.core.controller import Controller
 from ctxval.errors import CertificateError, InputError
@@ -53,6 +53,7 @@ def test_a_smooth_suite_is_validated_before_all_of_it_is_executed() -> None:
     assert largest <= (verdict.bound or 0.0) <= 1.25 * largest
     assert len(set(names(campaign))) == campaign.executions
     assert "41 of the suite" in verdict.reason
+    assert f"{41 - campaign.executions} of the 41 tasks were not executed" in str(verdict)
     tests = (verdict.certificate.details if verdict.certificate else {})["tests"]
     assert tests["drawn"] >= 8
     assert tests["share_missed"] is None  # they are drawn without replacement
@@ -139,3 +140,18 @@ def test_tables_have_the_parameters_of_tasks() -> None:
     assert frame["task"].tolist() == names(campaign)
     assert frame["size"].tolist() == [COARSE[name]["size"] for name in names(campaign)]
     assert frame["side"].tolist() == [COARSE[name]["side"] for name in names(campaign)]
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_tests_are_spread_over_the_values_of_every_parameter(seed: int) -> None:
+    """A load that is other in an eighth of the suite, or in one category of four, is met before a validation."""
+    heavy = TaskSuite(
+        {f"{kind} {goal:g}": {"kind": kind, "goal": goal} for kind in "abcd" for goal in np.linspace(0.2, 2, 10)}
+    )
+    given = validation(heavy, lambda p: p.goal)
+    campaign = Campaign(given, seed=seed).run(40, 9.0)
+    drawn = [heavy[trial.parameters["task"]] for trial in campaign.trials if trial.origin == "spread"]  # type: ignore[index]
+    assert len(drawn) == 8
+    assert {each["kind"] for each in drawn} == set("abcd")
+    goals = np.sort([float(each["goal"]) for each in drawn])
+    assert np.diff([0.2, *goals, 2.0]).max() <= 2 * 1.8 / 8 + 0.2

@@ -253,16 +253,20 @@ class IndependentDraws:
     def test(self, trials: Sequence[Trial]) -> Array:
         """Return the next point ``(d,)`` of the Latin hypercubes of tests; it depends on no result.
 
-        Of a suite, it is the first task that is left in an order that was drawn once.
+        Of a suite, the task that is left and nearest to it is executed.
         """
-        members, remaining = self._validation.space.members, remaining_tasks(self._validation, trials)
-        if members is not None and remaining is not None:
-            left = {task.tobytes() for task in remaining}
-            order = self._generator(0, _HYPERCUBE).permutation(len(members))
-            return next(task for task in members[order] if task.tobytes() in left)
         block, row = divmod(spread_tests(trials), TESTS)
         points = latin_hypercube(TESTS, self._validation.space.dimension, self._generator(block, _HYPERCUBE))
         return np.asarray(points[row])
+
+    def left(self, trials: Sequence[Trial]) -> Array:
+        """Return the first task of a suite that is left in an order that was drawn once, ``(d,)``."""
+        members, remaining = self._validation.space.members, remaining_tasks(self._validation, trials)
+        assert members is not None
+        assert remaining is not None
+        known = {task.tobytes() for task in remaining}
+        order = self._generator(0, _DRAW).permutation(len(members))
+        return next(task for task in members[order] if task.tobytes() in known)
 
     def _generator(self, number: int, stream: int) -> np.random.Generator:
         """Return the random numbers of a draw; the streams of searches have smaller numbers."""

@@ -231,7 +231,7 @@ class TrialRecorder:
             # The points of such a search are uniform, and the tasks are not.
             choice = replace(choice, unit_point=self.draw(), origin="iid")
         if choice.unit_point is None and self.search.iid and self.validation.space.members is not None:
-            choice = replace(choice, unit_point=self.draws.test(self._trials), origin="spread")
+            choice = replace(choice, unit_point=self.draws.left(self._trials), origin="initial")
         if choice.unit_point is None and (spread := self._proposals.spread(self._trials)) is not None:
             choice = replace(choice, unit_point=spread, origin="initial")
         if choice.unit_point is None:

@@ -163,6 +163,7 @@ def certify_dynamics(sample: Sample, evidence: DynamicsEvidence, confidence: Pro
         assumptions=(*dynamics_assumptions(evidence), *sample.remarks, ONE_CAMPAIGN),
         details={
             "best": sample.best,
+            **({} if sample.suite is None else {"tasks": sample.tasks, "not_executed": sample.not_executed}),
             "gap": upper - sample.best,
             "raised_from": None if worst is None else bound,
             "raised_by_trial": None if worst is None else worst.trial,

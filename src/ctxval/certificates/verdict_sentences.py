@@ -167,7 +167,9 @@ def evidence(certificate: Certificate, tau: float, quantities: Quantities) -> st
     best = certificate.details.get("best")
     largest = "" if best is None else f", the largest distance {quantities.of(f'{best:.4g}')}"
     executions = counted(certificate.trials, "execution")
-    shown = f"{executions}{largest}{_tested(certificate, tau)}"
+    left = certificate.details.get("not_executed")
+    missing = f"; {left} of the {certificate.details['tasks']} tasks were not executed" if left else ""
+    shown = f"{executions}{largest}{_tested(certificate, tau)}{missing}"
     return f"{shown}.{_survives(certificate, tau)}{_not_entered(certificate)} "
 
 
