@@ -130,5 +130,8 @@ def test_logs_without_a_state_are_refused(tmp_path: Path) -> None:
     (tmp_path / "run.csv").write_text("time,force,temp\n0,1,2\n1,2,3\n2,1,4\n")
     with pytest.raises(InputError, match="no field that looks like a state"):
         survey([tmp_path / "run.csv"])
+    (tmp_path / "still.csv").write_text("time,x0,u0\n0,1,0\n1,1,1\n2,1,0\n3,1,1\n")
+    with pytest.raises(InputError, match=r"no state ever changes in the logs \(x0\)"):
+        survey([tmp_path / "still.csv"])
     with pytest.raises(InputError, match="there is no file"):
         survey([tmp_path / "none.csv"])

@@ -169,6 +169,10 @@ def survey(
     recordings = recordings_of(logs, chosen, names)
     if mapping is None:
         chosen, recordings = _with_turns(logs, chosen, recordings, names, guesses)
+    if not any(np.ptp(run.trajectory.states, axis=0).any() for run in recordings.runs):
+        raise InputError(
+            f"no state ever changes in the logs ({enumerated(recordings.states, 6)}), so nothing is learned."
+        )
     roles: dict[str, Role] = {field.path: "state" for field in chosen.states.values()}
     roles |= {field.path: "input" for field in chosen.inputs.values()}
     horizons = sorted(run.trajectory.horizon for run in recordings.runs)
@@ -177,7 +181,8 @@ def survey(
     if not fitted.fitted:
         raise InputError(f"no model can be learned: {'; '.join(failure.reason for failure in fitted.failed)}")
     best = fitted.fitted[0]
-    report = replay(best.model, recordings, steps=sorted({1, min(10, whole), whole}), seed=seed)
+    steps = {1, min(10, whole), *np.unique(np.geomspace(1, whole, 8).astype(int)).tolist(), whole}
+    report = replay(best.model, recordings, steps=sorted(steps), seed=seed)
     reach = _reach(best, recordings, whole)
     return Survey(
         tuple(dict.fromkeys(log.source for log in logs)),
