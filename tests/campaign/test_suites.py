@@ -52,7 +52,7 @@ def test_a_smooth_suite_is_validated_before_all_of_it_is_executed() -> None:
     assert campaign.executions <= 20
     assert largest <= (verdict.bound or 0.0) <= 1.25 * largest
     assert len(set(names(campaign))) == campaign.executions
-    assert "41 of the suite" in verdict.reason
+    assert "of the suite of 41" in verdict.reason
     assert f"{41 - campaign.executions} of the 41 tasks were not executed" in str(verdict)
     tests = (verdict.certificate.details if verdict.certificate else {})["tests"]
     assert tests["drawn"] >= 8

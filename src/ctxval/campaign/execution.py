@@ -156,7 +156,9 @@ def _result(recorder: TrialRecorder, ended: Trial) -> str:
     """Return a trial in one line: its task, what was predicted, and what was executed."""
     validation, predicted = recorder.validation, recorder.dynamics.stored_prediction(ended)
     parts = [f"trial {ended.number:<2}", str(named(ended.parameters, validation.space.units))]
-    if predicted is not None:
+    if predicted is not None and predicted.deviation > max(predicted.median, 1e-300):
+        parts.append("hardly predictable yet")
+    elif predicted is not None:
         visible = predicted.deviation >= 5e-4 * predicted.median
         parts.append(f"predicted {predicted.median:.4g}" + (f" ± {predicted.deviation:.1g}" if visible else ""))
     if ended.distance is None:

@@ -48,7 +48,7 @@ class Quantities:
         if self.space is None:
             return ""
         if self.space.members is not None:
-            return f" of the {len(self.space.members)} of the suite"
+            return f" of the suite of {len(self.space.members)}"
         if self.space.dimension > _NAMED:
             return ""
         ends = zip(self.space.labels, self.space.low.tolist(), self.space.high.tolist(), strict=True)
@@ -162,7 +162,7 @@ def validated(certificate: Certificate, tau: float, quantities: Quantities) -> s
 
 def evidence(certificate: Certificate, tau: float, quantities: Quantities) -> str:
     """Return what speaks for a bound on d*: executions, tests of predictions, and what the bound survives."""
-    if certificate.volume:
+    if certificate.volume or certificate.kind == "suite":
         return ""
     best = certificate.details.get("best")
     largest = "" if best is None else f", the largest distance {quantities.of(f'{best:.4g}')}"
@@ -340,7 +340,8 @@ def conditions(certificate: Certificate, space: TaskSpace | None) -> list[str]:
             unchanging = (
                 f"its dynamics changing neither with time nor with the task{except_for(details.get('physical') or ())}"
             )
-            steps = f"the last {details['lags'] + 1} records and inputs"
+            lags = details["lags"]
+            steps = f"the last {lags + 1} records and inputs" if lags else "the last record and input"
             if details["quantile"] is not None:
                 complete = f"{steps} determining the next record up to noise"
                 alike = f"noise being independent from step to step and like that of the records, and {unchanging}"
