@@ -172,9 +172,7 @@ def test_it_needs_the_model_and_executions_that_did_not_fail() -> None:
 def test_the_verdict_names_its_evidence() -> None:
     known = Provenance(learned=Learned(GOOD))
     verdict = judge(trials(), 1.1, CertificateOptions(Dynamics(tests=0)), known)
-    untested = (
-        "validated: no prediction was tested where nobody chose to look (tests = 0); every task stays at or below"
-    )
+    untested = "validated: no prediction was tested at drawn tasks (tests = 0); every task stays at or below"
     assert str(verdict).startswith(untested)
     assert "if what M misses is one smooth function of recorded state and input" in verdict.reason
     assert verdict.rests_on is not None
@@ -285,7 +283,7 @@ def test_a_validation_says_what_it_survives() -> None:
     evidence = replace(GOOD, pushed=PUSHED)
     verdict = judge(trials(), 1.35, CertificateOptions(Dynamics(tests=0)), Provenance(learned=Learned(evidence)))
     assert verdict.answer == "validated"
-    assert "survives" in str(verdict)
+    assert "The verdict holds even if something unknown pushes" in str(verdict)
     assert "1.5 m/s^2 in speed" in str(verdict)
 
 
@@ -297,11 +295,13 @@ def test_a_validation_says_what_it_survives() -> None:
     [
         (
             StatePocket(0.2, {"x [m]": 0.55, "y [m]": -0.35}, {"x [m]": 0.2, "y [m]": 0.2}),
-            "No execution came within 0.2 m of x 0.55 m, y -0.35 m, where predicted runs lead.",
+            "The least tested place is x 0.55 m, y -0.35 m: predicted runs lead there, and no execution came within "
+            "0.2 m.",
         ),
         (
             StatePocket(0.1, {"angle [rad]": 1.0, "z": 2.0}, {"angle [rad]": 0.3, "z": 4.0}),
-            "No execution came within 0.3 rad in angle and 4 in z of angle 1 rad, z 2, where predicted runs lead.",
+            "The least tested place is angle 1 rad, z 2: predicted runs lead there, and no execution came within 0.3 "
+            "rad in angle and 4 in z.",
         ),
     ],
 )

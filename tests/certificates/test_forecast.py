@@ -72,4 +72,4 @@ def test_a_forecast_speaks_in_words() -> None:
     assert "falsified in 90 %" in str(Forecast(1, 0.0, 0.9))
     fewest = Forecast(1, 0.95, 0.05, fewest=True)
     assert str(fewest).startswith("at least 1 more execution is needed to decide: 95 % of the posterior samples")
-    assert str(fewest).endswith("validate the threshold, and the others falsify it")
+    assert str(fewest).endswith("stay below the threshold, and the others exceed it")

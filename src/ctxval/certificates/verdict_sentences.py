@@ -173,7 +173,7 @@ def evidence(certificate: Certificate, tau: float, quantities: Quantities) -> st
     return f"{shown}.{_survives(certificate, tau)}{_not_entered(certificate)} "
 
 
-_UNTESTED = "no prediction was tested where nobody chose to look (tests = 0)"
+_UNTESTED = "no prediction was tested at drawn tasks (tests = 0)"
 
 
 def _condition(certificate: Certificate, quantities: Quantities) -> str:
@@ -245,8 +245,8 @@ def _tested(certificate: Certificate, tau: float) -> str:
         return f"; {tests['drawn']} of them at tasks drawn over the whole task space"
     within = at_most(100 * tests["largest_error"] / tau, 2)
     return (
-        f"; {tests['drawn']} of them predicted beforehand at tasks drawn over the whole task space, all within "
-        f"{within} % of the threshold"
+        f"; {tests['drawn']} of them at tasks drawn over the whole task space, where the predictions made beforehand "
+        f"erred by at most {within} % of the threshold"
     )
 
 
@@ -270,8 +270,8 @@ def _survives(certificate: Certificate, tau: float) -> str:
     everywhere, away = known
     largest = _rate(everywhere.state, everywhere.residual)
     return (
-        f" It survives an unknown push of {_push(everywhere)} at every step, and of {_push(away)} where no record is "
-        f"near; the largest residual seen is {largest}."
+        f" The verdict holds even if something unknown pushes by {_push(everywhere)} at every step, or by "
+        f"{_push(away)} where no record is near; what M misses, and was learned, is up to {largest}."
     )
 
 
@@ -285,7 +285,10 @@ def _not_entered(certificate: Certificate) -> str:
     if len({(unit, radius) for _, unit, radius in radii}) == 1:
         _, unit, radius = radii[0]
         within = f"{radius:.2g} {unit}".rstrip()
-    return f" No execution came within {within} of {with_units(pocket['place'])}, where predicted runs lead."
+    return (
+        f" The least tested place is {with_units(pocket['place'])}: predicted runs lead there, and no execution came "
+        f"within {within}."
+    )
 
 
 def _push(tolerance: Tolerance) -> str:
@@ -337,20 +340,21 @@ def conditions(certificate: Certificate, space: TaskSpace | None) -> list[str]:
         case "dynamics":
             gaps, again = with_units(details["resolution"]), details.get("differing")
             noise = "" if again is None else f" (trials {again[0]} and {again[1]} of one task differ a little)"
-            unchanging = (
-                f"its dynamics changing neither with time nor with the task{except_for(details.get('physical') or ())}"
-            )
+            changing = f"changing neither with time nor with the task{except_for(details.get('physical') or ())}"
             lags = details["lags"]
             steps = f"the last {lags + 1} records and inputs" if lags else "the last record and input"
             if details["quantile"] is not None:
                 complete = f"{steps} determining the next record up to noise"
-                alike = f"noise being independent from step to step and like that of the records, and {unchanging}"
+                alike = (
+                    "noise being independent from step to step and like that of the records, and the system's dynamics "
+                    f"{changing}"
+                )
             else:
                 complete = f"{steps} determining the next record"
                 if not details["lags"]:
                     estimated = details.get("estimated")
                     complete = f"{'' if estimated else 'the '}{state_of(estimated)} being complete"
-                alike = f"the system being deterministic{noise}, and {unchanging}"
+                alike = f"the system being deterministic{noise}, and its dynamics {changing}"
             return [
                 complete,
                 alike,
@@ -436,7 +440,7 @@ def _without_assumptions(certificate: Certificate, tau: float, quantities: Quant
     draws = [f"{counted(tests['spread'], 'test')} drawn as a Latin hypercube"] if tests["spread"] else []
     draws += [counted(tests["independent"], "independent draw")] if tests["independent"] else []
     return (
-        f" Without assumptions: at most {at_most(100 * tests['share_missed'], 2)} % "
+        f" By these tests alone, without the assumptions: at most {at_most(100 * tests['share_missed'], 2)} % "
         f"{of_tasks(certificate.distribution)} exceed {quantities.of(f'{tau:.6g}')} "
         f"({' and '.join(draws)}, {percent(certificate.confidence)})."
     )
@@ -521,8 +525,8 @@ def outlook(forecast: Forecast, horizon: int) -> str:
     many = f"about {forecast.executions}" if forecast.executions is not None else f"more than {horizon}"
     plural = "execution is" if forecast.executions == 1 else "executions are"
     if forecast.fewest:
-        validate = f"{100 * forecast.validated:.0f} % of the posterior samples of the dynamics validate the threshold"
-        others = ", and the others falsify it" if forecast.falsified else ""
+        validate = f"{100 * forecast.validated:.0f} % of the posterior samples of the dynamics stay below the threshold"
+        others = ", and the others exceed it" if forecast.falsified else ""
         return f"at least {forecast.executions} more {plural} needed to decide: {validate}{others}"
     shares = {"validated": forecast.validated, "falsified": forecast.falsified}
     answer = max(shares, key=lambda name: shares[name])
