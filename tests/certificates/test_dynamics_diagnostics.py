@@ -28,10 +28,13 @@ from ctxval.certificates.dynamics_diagnostics import (
     failed,
     fewest_missing,
     missing_tests,
+    only_a_failed_test,
+    only_tests_missing,
     raised,
     uncovered,
     untested,
 )
+from ctxval.core.trial import Origin
 from rig_evidence import COVERED, GOOD, gap, prediction
 
 BEST, BOUND = 0.8, 1.0
@@ -178,3 +181,29 @@ def test_jumps_withdraw_nothing_if_they_are_small_or_searched_more_deeply(jumps:
     assert "use a smoother model, or an audit" in (doubt(**jumps) or "")
     assert doubt(dense=True, **jumps) is None
     assert doubt(**{name: 0.1 * value for name, value in jumps.items()}) is None
+
+
+def test_a_test_that_failed_is_outlived_by_tests_and_not_by_other_executions() -> None:
+    """A vague prediction at the start must not cost more than the tests that replace it."""
+
+    def made(trial: int, distance: float, origin: Origin = "spread") -> CheckedPrediction:
+        point = (trial / 20, 0.5)
+        return CheckedPrediction(trial, 0.5, 0.95, 1.0, distance, stored=True, new=True, origin=origin, point=point)
+
+    early = made(0, 0.5)
+    later = [made(k, 0.95) for k in range(1, 9)]
+    best, bound = 0.95, 1.0
+
+    def with_(predictions: list[CheckedPrediction]) -> DynamicsEvidence:
+        return replace(GOOD, tests=8, predictions=tuple(predictions))
+
+    raised_by_it = with_([early, *later[:7]])
+    assert only_a_failed_test(raised_by_it, best, bound, 2.0)
+    assert not only_tests_missing(raised_by_it, best, bound)
+    assert not only_a_failed_test(raised_by_it, best, bound, 20.0)  # the raised bound keeps this limit already
+    assert not only_a_failed_test(with_([early, *later]), best, bound, 2.0)  # eight later tests outlive it
+    assert not only_a_failed_test(with_([*later[:7], made(9, 0.5)]), best, bound, 2.0)  # the last one failed
+    chosen = made(9, 0.5, "covering")
+    assert not only_a_failed_test(with_([*later, chosen]), best, bound, 2.0)
+    uncovered_ = replace(raised_by_it, coverage=replace(COVERED, beyond=gap(0.5)))
+    assert not only_a_failed_test(uncovered_, best, bound, 2.0)

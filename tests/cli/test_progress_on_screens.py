@@ -26,7 +26,7 @@ class Slow:
     """A synthesizer that takes its time."""
 
     def design(self, task, model):
-        time.sleep(0.008)
+        time.sleep(0.02)
         return controllers.LQR([1.0, 0.1], [1e-2], [10.0, 1.0]).design(task, model)
 
 

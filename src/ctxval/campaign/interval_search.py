@@ -32,6 +32,7 @@ from ctxval.certificates.dynamics_diagnostics import (
     doubt_of,
     held,
     missing_tests,
+    only_a_failed_test,
     only_tests_missing,
     raised,
     uncovered,
@@ -184,7 +185,8 @@ class IntervalSearch:
         """Return the task that the learned dynamics choose, or a test if nothing else is missing."""
         best, limit, confidence, trials = self.best, self.limit, self.options.confidence, self.recorder.trials
         bound = self._bound(evidence)
-        if max(bound, evidence.highest) <= limit and only_tests_missing(evidence, best, bound):
+        missing = only_tests_missing(evidence, best, bound) or only_a_failed_test(evidence, best, bound, limit)
+        if max(bound, evidence.highest) <= limit and missing:
             return self._test()
         learned = self.recorder.dynamics.learned(trials)
         steady = Steadiness(self.recorder.dynamics.planner, None if learned is None else learned.expected)

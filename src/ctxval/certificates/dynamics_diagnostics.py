@@ -80,6 +80,14 @@ def only_tests_missing(evidence: DynamicsEvidence, best: float, bound: float) ->
     return needed and uncovered(evidence) is None and untested(evidence, best, bound) is None
 
 
+def only_a_failed_test(evidence: DynamicsEvidence, best: float, bound: float, limit: float) -> bool:
+    """Return whether an earlier test that failed is all that raises the bound above a limit: later tests outlive it."""
+    worst = failed(evidence, bound)
+    recent = all(held(prediction, bound) for prediction in counted(evidence, bound)[-PREDICTIONS:])
+    outlived = worst is not None and worst.origin in DRAWN and recent and raised(evidence, bound) > limit
+    return outlived and uncovered(evidence) is None and untested(evidence, best, bound) is None
+
+
 def fewest_executions(evidence: DynamicsEvidence) -> int:
     """Return the fewest executions for a bound."""
     return FEWEST if evidence.quantile is None else NOISY_FEWEST
