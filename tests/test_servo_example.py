@@ -93,7 +93,7 @@ def test_a_campaign_falsifies_m1_and_sees_only_what_it_executes(servo: ModuleTyp
 @pytest.mark.slow
 def test_one_recording_counts_for_all_compared_models(servo: ModuleType) -> None:
     models = {friction: servo.experiment(friction=friction).validation for friction in ("m3", "m4")}
-    found = compare(models, question="worst", budget=2)
-    assert found.executions == 2
+    found = compare(models, question="worst", budget=1)
+    assert found.executions == 1
     assert [(result.executions, result.shared) for result in found.candidates].count((0, 0)) == 0
-    assert sum(result.executions + result.shared for result in found.candidates) == 4
+    assert sum(result.executions + result.shared for result in found.candidates) == 2
