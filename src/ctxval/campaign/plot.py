@@ -133,7 +133,7 @@ def _box(campaign: Campaign) -> TaskSpace:
     """Return the task space; refuse a suite, which has no tasks between its own."""
     space = campaign.validation.space
     if space.members is not None:
-        raise InputError("a suite of tasks has no curve of the distance between its tasks; plot.convergence shows them.")
+        raise InputError("a suite has no curve of the distance between its tasks; plot.convergence shows them.")
     return space
 
 

@@ -130,7 +130,7 @@ def test_noise_cannot_be_explained() -> None:
         assert one.history < 0.05
         assert abs(one.correlation) < 0.1
         assert one.rest == pytest.approx(0.02, rel=0.1)
-    assert any("is noise, or has a cause that is not recorded" in text for text in report.insights)
+    assert any("no cause explains half of the residual" in text for text in report.insights)
 
 
 def test_a_state_that_is_not_recorded_is_found_in_the_step_before() -> None:

@@ -19,7 +19,7 @@ from ctxval.data.sampling import Break
 from ctxval.errors import InputError
 from ctxval.studies.replay.accuracy import RecordedSteps, Region, StepError, regions, step_errors
 from ctxval.studies.replay.causes import ResidualShare, Suggestion, residual_shares, suggestions
-from ctxval.studies.replay.faults import Fault, faults
+from ctxval.studies.replay.faults import EXPLAINS, Fault, faults
 from ctxval.studies.replay.untested import PredictedTasks, predicted_tasks
 
 STEPS = (1, 5, 20, 100)
@@ -229,20 +229,21 @@ def _insights(report: ReplayReport, used: int) -> Iterator[str]:
 
 
 def _causes(residual: ResidualShare) -> Iterator[str]:
-    """Yield the causes of the residual of a state: an explanation is named if it is at least 0.3 of it."""
+    """Yield the causes of the residual of a state: an explanation is named if it is at least half of it."""
     left = f"{residual.rest:.3g} {residual.unit}".rstrip()
-    if residual.explained >= 0.3:
+    if residual.explained >= EXPLAINS:
         how = "an affine function" if residual.linear > 0.9 * residual.explained else "a function"
         yield (
             f"{100 * residual.explained:.0f} % of the residual of {residual.state} is {how} of state and input: a "
             f"better model can be learned from these recordings, with {left} of one-step error left"
         )
-    elif residual.history < 0.3:
+    elif residual.history < EXPLAINS:
         yield (
-            f"state and input explain {100 * residual.explained:.0f} % of the residual of {residual.state}: the rest "
-            f"of {left} is noise, or has a cause that is not recorded"
+            f"no cause explains half of the residual of {residual.state}: state and input explain "
+            f"{100 * residual.explained:.0f} % of it, and the step before {100 * residual.history:.0f} % of the rest; "
+            f"what is left, {left}, may be noise, or something that is not recorded"
         )
-    if residual.history >= 0.3 and residual.rest > 0.05 * residual.rms:
+    if residual.history >= EXPLAINS and residual.rest > 0.05 * residual.rms:
         yield (
             f"the step before explains {100 * residual.history:.0f} % of what state and input leave of the residual of "
             f"{residual.state}: the system has a state that is not recorded, a delay, or filtered measurements; "
