@@ -26,6 +26,7 @@ from ctxval.certificates.dynamics_evidence import (
     StatePocket,
     UntriedParameter,
 )
+from ctxval.certificates.prediction_tests import DRAWN
 from ctxval.core.labels import labels_of
 from ctxval.core.quantiles import QUANTILE
 from ctxval.core.trajectory import Trajectory
@@ -248,7 +249,7 @@ class CampaignDynamics:
             len(learned.executed),
             worst.left_out,
             0.0,
-            self.checked(trials),
+            _explained(self.checked(trials), learned),
             _coverage(learned.coverage, self._coordinates(learned)),
             unplanned=worst.unplanned,
             untried=None if untried is None else UntriedParameter(names[untried[0]], *untried[1:]),
@@ -372,6 +373,17 @@ class LearnedFromTrials:
         """Return independent draws of tasks, points of the unit cube ``(count, d)``."""
         # This random stream is none of those of trials.
         return self.validation.space.unit_draws(count, np.random.default_rng([seed, 0x7461]))
+
+
+def _explained(predictions: Sequence[CheckedPrediction], learned: LearnedDynamics) -> tuple[CheckedPrediction, ...]:
+    """Return predictions; those of drawn tests with the distances of their tasks on what is learned by now."""
+    rows = [k for k, each in enumerate(predictions) if each.origin in DRAWN and each.stored and not each.is_noisy]
+    explained = list(predictions)
+    if rows:
+        expected = learned.expected(np.array([predictions[k].point for k in rows]))
+        for k, distance in zip(rows, expected.tolist(), strict=True):
+            explained[k] = replace(predictions[k], explained=float(np.nan_to_num(distance, nan=1e30, posinf=1e30)))
+    return tuple(explained)
 
 
 def _with_jumps(evidence: DynamicsEvidence, learned: LearnedDynamics, bound: float) -> DynamicsEvidence:

@@ -84,7 +84,8 @@ def only_a_failed_test(evidence: DynamicsEvidence, best: float, bound: float, li
     """Return whether an earlier test that failed is all that raises the bound above a limit: later tests outlive it."""
     worst = failed(evidence, bound)
     recent = all(held(prediction, bound) for prediction in counted(evidence, bound)[-PREDICTIONS:])
-    outlived = worst is not None and worst.origin in DRAWN and recent and raised(evidence, bound) > limit
+    outlived = worst is not None and worst.origin in DRAWN and is_explained(worst, bound)
+    outlived = outlived and recent and raised(evidence, bound) > limit
     return outlived and uncovered(evidence) is None and untested(evidence, best, bound) is None
 
 
@@ -155,10 +156,25 @@ def missing_tests(predictions: Sequence[CheckedPrediction], tests: int) -> int:
     return max(tests - sum(each.stored and each.origin in DRAWN for each in predictions), 0)
 
 
+def is_explained(prediction: CheckedPrediction, bound: float) -> bool:
+    """Return whether what is learned by now has the distance that was executed; unknown ones count as explained.
+
+    If the dynamics depend on the task, one function of state and input cannot have the distances of all tasks. Noise
+    explains none of its executions, and may be any of them.
+    """
+    known = prediction.explained
+    return prediction.is_noisy or known is None or agrees(prediction.distance, known, bound)
+
+
 def failed(evidence: DynamicsEvidence, bound: float) -> CheckedPrediction | None:
-    """Return the one that failed most of the tests and of the last predictions that count; None if all of them held."""
+    """Return the one that failed most of the tests and of the last predictions that count; None if all of them held.
+
+    Later tests outlive a test that failed only if it is explained by now.
+    """
+    drawn = [test for test in evidence.predictions if test.stored and test.origin in DRAWN]
     tests = [test for test in tested(evidence.predictions, evidence.tests) if test.origin in DRAWN]
-    last = [*tests, *counted(evidence, bound)[-PREDICTIONS:]]
+    lasting = [test for test in drawn if evidence.tests and not is_explained(test, bound)]
+    last = [*tests, *lasting, *counted(evidence, bound)[-PREDICTIONS:]]
     wrong = (prediction for prediction in last if not held(prediction, bound))
     return max(wrong, key=lambda prediction: prediction.error, default=None)
 

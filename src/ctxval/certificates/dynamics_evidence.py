@@ -33,6 +33,7 @@ class CheckedPrediction(ShortRepr):
         quantiles: quantiles of the predicted distances at ``quantiles.LEVELS`` if the system is noisy; else empty.
         runs: the number of predicted distances that these are of.
         p_values: predicted probabilities of more than what statistics of the trajectory are; empty without noise.
+        explained: the distance of the task on what all executions teach together; None if it is not known.
     """
 
     trial: int
@@ -48,6 +49,7 @@ class CheckedPrediction(ShortRepr):
     quantiles: tuple[float, ...] = ()
     runs: int = 0
     p_values: tuple[float, ...] = ()
+    explained: float | None = None
 
     @property
     def is_noisy(self) -> bool:
