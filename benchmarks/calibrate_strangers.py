@@ -23,9 +23,10 @@ from strangers_diagnostics import JudgedRun
 from strangers_reporting import REPORTING
 from strangers_truths import TRUTHS
 
-RULE = 4
-"""Version of the rule by which campaigns are run: 4 finds task parameters that change the dynamics, and leaves out data
-of M that contradict the executions; 3 learns histories and noise, and tests are points of a hypercube."""
+RULE = 5
+"""Version of the rule by which campaigns are run: 5 tests again after a test that failed, if what is learned explains
+it by now; 4 finds task parameters that change the dynamics, and leaves out data of M that contradict the
+executions; 3 learns histories and noise, and tests are points of a hypercube."""
 
 BUDGET, SEEDS = 25, 2
 FALSE, TRUE = (0.8, 0.95, 0.99), (1.1, 1.25, 1.5)
