@@ -23,7 +23,7 @@ from noise_misleading import PLANTS as MISLEADING
 from noise_reporting import PLANTS as REPORTING
 from noise_systems import IMPERFECTIONS, Plant, near_best, outcome, random_and_corners
 
-RULE = 2
+RULE = 3
 """Version of the rule by which campaigns are run."""
 
 BUDGET, SEEDS, QUANTILE = 25, 2, 0.9

@@ -240,6 +240,7 @@ class CampaignDynamics:
 
     def _evidence(self, learned: LearnedDynamics, trials: Sequence[Trial], worst: WorstCase) -> DynamicsEvidence:
         names, untried, noisy = self._study.validation.space.names, learned.untried_parameter, learned.noisy
+        actuator = learned.study.actuator
         return DynamicsEvidence(
             worst.maxima,
             worst.points,
@@ -257,6 +258,7 @@ class CampaignDynamics:
             dense=worst.points.shape[1] <= DENSE and self._study.planner.batched,
             quantile=noisy.quantile if noisy is not None and noisy.is_noisy else None,
             lags=0 if noisy is None else noisy.fit.history.structure.lags,
+            actuator=None if actuator is None else (actuator.delay, actuator.lag),
             physical=learned.study.given.physical,
             without_data=not learned.with_data,
             estimated=learned.study.given.outputs is not None,

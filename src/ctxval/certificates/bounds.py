@@ -47,6 +47,16 @@ def of_tasks(distribution: str | None) -> str:
     return "of the tasks" if distribution is None else "of the tasks under the stated distribution"
 
 
+def late(actuator: Sequence[float] | None) -> str:
+    """Return how inputs act, given their delay and their time constant in steps; empty if they act at once."""
+    if actuator is None:
+        return ""
+    (delay, lag), at_once = actuator, 0.05
+    parts = [f"{delay:.2g} steps late"] if delay > at_once else []
+    parts += [f"with a time constant of {lag:.2g} steps"] if lag > 5 * at_once else []
+    return f"acting {' and '.join(parts)}" if parts else ""
+
+
 def except_for(physical: Sequence[str]) -> str:
     """Return the task parameters that dynamics may change with, after a comma; empty if there are none."""
     return f", except for {enumerated(physical, 10)}" if physical else ""

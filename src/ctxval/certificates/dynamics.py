@@ -192,6 +192,7 @@ def certify_dynamics(sample: Sample, evidence: DynamicsEvidence, confidence: Pro
             "noise": evidence.noise,
             "quantile": evidence.quantile,
             "lags": evidence.lags,
+            "actuator": evidence.actuator and list(evidence.actuator),
             "physical": list(evidence.physical),
             "suspect": evidence.suspect and list(evidence.suspect),
             "without_model": evidence.without_model,

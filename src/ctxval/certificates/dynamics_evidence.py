@@ -248,6 +248,7 @@ class DynamicsEvidence(ShortRepr):
         quantile: the share of the executions of a task whose distances are below the maxima; None if the system is not
             noisy, so that all are alike.
         lags: number of earlier records and inputs that the learned dynamics depend on.
+        actuator: the delay and the time constant, in steps, with which inputs act; None if they act at once.
         pocket: the largest region that no execution has entered; None if it is not known.
         physical: the task parameters that the learned dynamics depend on.
         suspect: another one that they seem to depend on, and how many times less predictions of executions from the
@@ -279,6 +280,7 @@ class DynamicsEvidence(ShortRepr):
     pushed: PushedDistances | None = None
     quantile: float | None = None
     lags: int = 0
+    actuator: tuple[float, float] | None = None
     pocket: StatePocket | None = None
     physical: tuple[str, ...] = ()
     suspect: tuple[str, float] | None = None
@@ -322,6 +324,7 @@ class DynamicsEvidence(ShortRepr):
                 "pushed": values["pushed"] and PushedDistances.from_json(values["pushed"]),
                 "pocket": values["pocket"] and StatePocket(**values["pocket"]),
                 "physical": tuple(values["physical"]),
+                "actuator": values["actuator"] and tuple(values["actuator"]),
                 "suspect": values["suspect"] and tuple(values["suspect"]),
             }
             return cls(**{**values, **arrays, **parts})

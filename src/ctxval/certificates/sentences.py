@@ -7,7 +7,7 @@ stands beside the test that withdraws it, in the diagnostics.
 from __future__ import annotations
 
 from ctxval._util.representation import counted
-from ctxval.certificates.bounds import at_most, except_for, of_tasks, percent, state_of, with_error, with_units
+from ctxval.certificates.bounds import at_most, except_for, late, of_tasks, percent, state_of, with_error, with_units
 from ctxval.certificates.dynamics_evidence import DynamicsEvidence
 from ctxval.certificates.sample import Sample, listed
 
@@ -235,8 +235,10 @@ def dynamics_assumptions(evidence: DynamicsEvidence) -> tuple[str, ...]:
             "noise is independent from step to step, like that of the records, and the dynamics do not change with "
             f"time or with the task{but}"
         )
+    acting = late(evidence.actuator)
     return (
         complete,
+        *([f"inputs act alike in every task: {acting.removeprefix('acting ')}"] if acting else []),
         alike,
         f"{prior}; its hyperparameters are unknown and integrated over",
         *(_WITHOUT_DATA if evidence.without_data else ()),

@@ -12,7 +12,7 @@ import numpy as np
 from ctxval._util.representation import counted, shown
 from ctxval._util.texts import enumerated, parted, quoted
 from ctxval.certificates.bets import Bets
-from ctxval.certificates.bounds import at_most, except_for, of_tasks, percent, state_of, with_error, with_units
+from ctxval.certificates.bounds import at_most, except_for, late, of_tasks, percent, state_of, with_error, with_units
 from ctxval.certificates.covering import RESOLUTION
 from ctxval.certificates.dynamics_evidence import PushedDistances, Tolerance
 from ctxval.certificates.sample import executions_of
@@ -181,18 +181,19 @@ def _condition(certificate: Certificate, quantities: Quantities) -> str:
     if certificate.kind == "dynamics":
         physical = certificate.details.get("physical") or []  # stores of earlier versions do not have it
         state = state_of(certificate.details.get("estimated"))
-        states = state.replace("state", "states", 1)
+        states, acting = state.replace("state", "states", 1), late(certificate.details.get("actuator"))
+        acting = f" ({acting})" if acting else ""
         if certificate.details["quantile"] is not None:
-            of = enumerated([f"{states} and inputs{_of_lags(certificate)}", *physical], 10)
+            of = enumerated([f"{states} and inputs{_of_lags(certificate)}{acting}", *physical], 10)
             return (
                 "probability under a Gaussian process with noise, if what M misses is a smooth function of "
                 f"{of}, the same in every task and over time, and noise is "
                 "independent from step to step"
             )
         missed = "the system" if certificate.details["without_model"] else "what M misses"
-        recorded = [f"{states} and inputs{_of_lags(certificate)}"]
+        recorded = [f"{states} and inputs{_of_lags(certificate)}{acting}"]
         if not certificate.details["lags"]:
-            recorded = [state, "input"] if physical else [f"{state} and input"]
+            recorded = [state, f"input{acting}"] if physical else [f"{state} and input{acting}"]
         return (
             f"probability under a Gaussian process, if {missed} is one smooth function of "
             f"{enumerated([*recorded, *physical], 10)}, "
@@ -355,8 +356,10 @@ def conditions(certificate: Certificate, space: TaskSpace | None) -> list[str]:
                     estimated = details.get("estimated")
                     complete = f"{'' if estimated else 'the '}{state_of(estimated)} being complete"
                 alike = f"the system being deterministic{noise}, and its dynamics {changing}"
+            acting = late(details.get("actuator"))
             return [
                 complete,
+                *([f"the inputs {acting} in every task, as in the executions"] if acting else []),
                 alike,
                 f"its dynamics being, in gaps of the records of up to {gaps}, like what was seen",
             ]

@@ -12,6 +12,7 @@ from typing import TypeVar
 import numpy as np
 
 from ctxval._util.arrays import Array, Mask, Rows
+from ctxval._util.boxes import moves_to_bounds
 from ctxval._util.progress import advance
 from ctxval.core.controller import Controller, ControllerWithMemory, started
 from ctxval.core.model import Step
@@ -303,6 +304,32 @@ def loop_pairs(planner: LoopPlanner, posterior: DynamicsPosterior, tasks: Array)
         parts.append(visited.reshape(-1, visited.shape[-1]))
     pairs = np.concatenate(parts)
     return np.asarray(pairs[(np.abs(pairs) < 1e3).all(axis=1)])
+
+
+def unseen_parameters(planner: LoopPlanner, some: Array) -> tuple[int, ...]:
+    """Return the indices of the task parameters that change the closed loops of M by less than 2 % of their deviation.
+
+    What they change in the system, such as a payload, is no function of state and input.
+
+    Args:
+        some: tasks, of which one parameter after the other is moved to its bounds, shape ``(q, d)``.
+    """
+    d = some.shape[1]
+    ends = moves_to_bounds(some, np.zeros(d), np.ones(d)).reshape(-1, d)
+    loops: dict[int, Array] = {}
+    for one in planner.plan(ends):
+        promised = np.concatenate([one.promised.states[..., :-1, :], one.promised.inputs], axis=-1)
+        loops.update(zip(one.rows.tolist(), promised.reshape(len(one.rows), *promised.shape[-2:]), strict=True))
+    if not loops:
+        return ()
+    size = np.maximum(np.nanstd(np.concatenate(list(loops.values())), axis=0), 1e-12)
+    effects = np.zeros(d)
+    for first in range(0, len(ends), 2 * d):
+        for j in range(d):
+            low, high = loops.get(first + j), loops.get(first + d + j)
+            if low is not None and high is not None and low.shape == high.shape:
+                effects[j] = max(effects[j], float(np.nanmax(np.abs(high - low) / size)))
+    return tuple(np.flatnonzero(effects < 0.02).tolist())
 
 
 def _own_step(draws: DynamicsDraws, tasks: int, rows: Rows) -> Step:

@@ -42,7 +42,7 @@ class DynamicsDraws(ShortRepr):
                 learned = np.minimum(np.maximum(learned, -self.limit), self.limit)
             residuals = np.zeros_like(x)
             residuals[:, :, self.data.learned] = learned
-            return self.model.step(x, u) + residuals * self.data.units
+            return self.model.step(x, u[..., : self.data.inputs]) + residuals * self.data.units
 
     def reduced(self, distances: Array) -> Array:
         """Return the distances ``(S, q)`` of draws from those of their loops, of which each draw has one."""

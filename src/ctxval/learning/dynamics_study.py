@@ -12,7 +12,6 @@ from dataclasses import replace
 import numpy as np
 
 from ctxval._util.arrays import Array, Rows, single_threaded
-from ctxval._util.boxes import moves_to_bounds
 from ctxval._util.describe import describe
 from ctxval._util.latest import Latest
 from ctxval._util.representation import ShortRepr
@@ -21,7 +20,8 @@ from ctxval.core.quantiles import QUANTILE
 from ctxval.core.trajectory import Trajectory, Transitions
 from ctxval.core.validation import Validation
 from ctxval.errors import InputError
-from ctxval.learning.closed_loops import LoopPlanner
+from ctxval.learning.actuators import Actuator, found_actuator
+from ctxval.learning.closed_loops import LoopPlanner, unseen_parameters
 from ctxval.learning.dynamics_posterior import (
     DynamicsPosterior,
     LearnedCovariances,
@@ -29,19 +29,17 @@ from ctxval.learning.dynamics_posterior import (
     condition,
     learn_covariances,
 )
+from ctxval.learning.extended import ExtendedValidation
 from ctxval.learning.histories import Record
 from ctxval.learning.learned_dynamics import LearnedDynamics
 from ctxval.learning.noise_effect import effect_of_noise
 from ctxval.learning.noisy_draws import MATTERS, REPLICATES, NoisyPosterior, learn_noisy
-from ctxval.learning.physical import added_states, with_parameters, with_parameters_as_states, without_parameters
 from ctxval.learning.prediction import predict_distance
-from ctxval.learning.recorded import closed_loops_on_model, data_near, recorded_transitions
-from ctxval.learning.state_estimates import StateEstimates, with_states_of_model
+from ctxval.learning.recorded import data_near, recorded_transitions
 from ctxval.learning.structures import NOISY, ChosenStructure, predicted_by_history
 from ctxval.learning.vector import ErrorVectors, Executed, predict_composed
 from ctxval.learning.worst_case import WorstCaseSearch, WorstCaseSettings
 from ctxval.models.corrected import before_refinement
-from ctxval.models.scaling import standard_deviations
 from ctxval.searches import Prediction
 
 _TRIED = 32  # tasks of the pool among which those with the largest distances show what noise does
@@ -62,17 +60,28 @@ class DynamicsStudy(ShortRepr):
         validation: the same with the states of M if only outputs are recorded, and with the physical task parameters
             as further states; everything is learned of these.
         quantile: the share of the executions of a task that a distance is about, if the system is noisy.
+        actuator: how the m inputs act; None if they act at once.
     """
 
-    def __init__(self, validation: Validation, seed: int = 0, quantile: float = QUANTILE) -> None:
-        self.given, self.seed, self.quantile = validation, seed, quantile
-        self.validation = with_parameters_as_states(with_states_of_model(validation))
+    def __init__(
+        self,
+        validation: Validation,
+        seed: int = 0,
+        quantile: float = QUANTILE,
+        actuator: Actuator | None = None,
+        inputs: int = 0,
+    ) -> None:
+        self.given, self.seed, self.quantile, self.actuator = validation, seed, quantile, actuator
+        self.extended = ExtendedValidation(validation, actuator, inputs)
+        self.validation = self.extended.validation
         self.planner = LoopPlanner(self.validation)
         self._errors = ErrorVectors(self.planner if validation.outputs is None else LoopPlanner(validation))
         self._covariances = Latest[bytes, LearnedCovariances | None](8)
         self._structures = Latest[bytes, ChosenStructure](8)
         self._found: dict[bytes, str | None] = {}
         self._others: dict[str, DynamicsStudy] = {}
+        self._actuators: dict[bytes, Actuator | None] = {}
+        self._actuated: DynamicsStudy | None = None
         self._parts: tuple[str, bytes] | None = None
 
     def anew(self, quantile: float | None = None) -> DynamicsStudy:
@@ -104,7 +113,7 @@ class DynamicsStudy(ShortRepr):
         """Closed loops on M, and the seconds that they took."""
         with single_threaded():
             started = time.perf_counter()
-            return closed_loops_on_model(self.validation), time.perf_counter() - started
+            return self.extended.loops, time.perf_counter() - started
 
     @property
     def _loops(self) -> Trajectory | None:
@@ -112,27 +121,8 @@ class DynamicsStudy(ShortRepr):
 
     @functools.cached_property
     def unseen_parameters(self) -> tuple[int, ...]:
-        """The indices of the task parameters that change the closed loops of M by less than 2 % of their deviation.
-
-        What they change in the system, such as a payload, is no function of state and input.
-        """
-        d = self.validation.space.dimension
-        some = self.search.pool[:8]
-        ends = moves_to_bounds(some, np.zeros(d), np.ones(d)).reshape(-1, d)
-        loops: dict[int, Array] = {}
-        for one in self.planner.plan(ends):
-            promised = np.concatenate([one.promised.states[..., :-1, :], one.promised.inputs], axis=-1)
-            loops.update(zip(one.rows.tolist(), promised.reshape(len(one.rows), *promised.shape[-2:]), strict=True))
-        if not loops:
-            return ()
-        size = np.maximum(np.nanstd(np.concatenate(list(loops.values())), axis=0), 1e-12)
-        effects = np.zeros(d)
-        for first in range(0, len(ends), 2 * d):
-            for j in range(d):
-                low, high = loops.get(first + j), loops.get(first + d + j)
-                if low is not None and high is not None and low.shape == high.shape:
-                    effects[j] = max(effects[j], float(np.nanmax(np.abs(high - low) / size)))
-        return tuple(np.flatnonzero(effects < 0.02).tolist())
+        """The indices of the task parameters that hardly change the closed loops of M."""
+        return unseen_parameters(self.planner, self.search.pool[:8])
 
     def learn(self, executed: Executed, logged: Sequence[Trajectory] = ()) -> LearnedDynamics | None:
         """Return what executions teach, and recordings with the same time step that belong to no task.
@@ -142,12 +132,17 @@ class DynamicsStudy(ShortRepr):
         """
         if self._parts is None:
             self._parts = self._state_of_parts()
-        extended, logged = self._extended(executed), () if self._needs_tasks else logged
+        extended, logged = self._executions(executed), () if self.extended.needs_tasks else logged
         if extended is None:
             return None
         learned = self._learn(extended, logged, with_data=True)
         with contextlib.suppress(np.linalg.LinAlgError, InputError, ValueError):
-            if learned is None or len(executed) < _FEWEST_AGAINST or not learned.left_out_error > _WELL:
+            if learned is None or len(executed) < _FEWEST_AGAINST:
+                return learned
+            actuator = None if logged else self._found_actuator(learned, extended)
+            if actuator is not None:
+                return self._with_actuator(actuator, extended[0][1].inputs.shape[-1]).learn(executed) or learned
+            if not learned.left_out_error > _WELL:
                 return learned
             if (learned.posterior.data.sources == -1).any():
                 without = self._learn(extended, logged, with_data=False)
@@ -180,40 +175,18 @@ class DynamicsStudy(ShortRepr):
         """
         if learned.study is not self:
             return learned.study.as_if_executed(learned, executed, pending, logged)
-        together = [*(self._extended(executed) or ()), *pending]
-        logged = () if self._needs_tasks else logged
+        together = [*(self._executions(executed) or ()), *pending]
+        logged = () if self.extended.needs_tasks else logged
         recorded = self._recorded(together, logged, learned.with_data)
         return self._conditioned(learned.posterior.covariances, recorded, together, learned.with_data)
 
-    @property
-    def _needs_tasks(self) -> bool:
-        """Whether only executions of tasks can be learned from: other recordings tell no parameters and no start."""
-        return bool(self.given.physical) or self.given.outputs is not None
-
-    def _extended(self, executed: Executed) -> Executed | None:
-        """Return executions with states of M, if outputs are recorded, and the physical parameters of their tasks.
-
-        It is None if states of M cannot be estimated.
-        """
-        if self.given.outputs is not None:
-            states = None if self._estimates is None else self._estimates.of(executed, _scheduled(len(executed)))
-            if states is None:
-                return None
-            executed = [(point, trajectory) for (point, _), trajectory in zip(executed, states, strict=True)]
-        return [(point, with_parameters(self.given, point, trajectory)) for point, trajectory in executed]
-
-    @functools.cached_property
-    def _estimates(self) -> StateEstimates | None:
-        if self.given.outputs is None or self._loops is None:
-            return None
-        states = self._loops.states[..., : self._loops.states.shape[-1] - added_states(self.given)]
-        changes = np.diff(states, axis=-2).reshape(-1, states.shape[-1])
-        return StateEstimates(self.given, self.given.outputs, standard_deviations(changes[np.isfinite(changes).all(1)]))
+    def _executions(self, executed: Executed) -> Executed | None:
+        """Return executions as closed loops of the extended validation; None if states of M cannot be estimated."""
+        return self.extended.executions(executed, _scheduled(len(executed)))
 
     def recorded(self, trajectory: Trajectory) -> Trajectory:
-        """Return a trajectory as the system records it, without physical parameters and with outputs for states."""
-        plain = without_parameters(self.given, trajectory)
-        return plain if self.given.outputs is None else self.given.outputs.of(plain)
+        """Return a closed loop as the system records it."""
+        return self.extended.recorded(trajectory)
 
     def _conditioned(
         self,
@@ -237,16 +210,8 @@ class DynamicsStudy(ShortRepr):
         """
         if self._loops is None or not len(learned.executed):
             return None
-        space, posterior = self.validation.space, learned.posterior
-        tasks = (self.validation.task(space.parameters(space.from_unit(point))) for point in learned.executed)
-        records = [
-            Record(trajectory.states, trajectory.inputs, np.asarray(task.initial_state, dtype=np.float64))
-            for trajectory, task in zip(learned.trajectories_of_system, tasks, strict=True)
-        ]
-        pairs = np.concatenate([self._loops.states[..., :-1, :], self._loops.inputs], axis=-1)
-        pairs = pairs.reshape(-1, pairs.shape[-1])
-        pairs = pairs[np.isfinite(pairs).all(axis=1)]
-        pairs = pairs[:: max(1, len(pairs) // 600)]
+        posterior, pairs = learned.posterior, self.extended.pairs
+        records = self.extended.records(list(zip(learned.executed, learned.trajectories_of_system, strict=True)))
         if not self._needs_history(posterior, records, pairs):
             return None
         some = _scheduled(len(records))
@@ -306,8 +271,10 @@ class DynamicsStudy(ShortRepr):
     ) -> tuple[Transitions, Rows] | None:
         if self._loops is None:
             return None
-        data = self._data if with_data else None
-        return recorded_transitions(data, [one for _, one in executed], self._loops, logged)
+        # The data that M was made from tell no earlier inputs.
+        data = self._data if with_data and self.actuator is None else None
+        loops = [self.extended.with_acting(one) for _, one in executed]
+        return recorded_transitions(data, loops, self._loops, logged)
 
     @functools.cached_property
     def _data(self) -> Transitions | None:
@@ -330,8 +297,27 @@ class DynamicsStudy(ShortRepr):
         """Return the study with another task parameter as a state; it is kept."""
         if name not in self._others:
             given = self.given.with_physical([*self.given.physical, name])
-            self._others[name] = DynamicsStudy(given, self.seed, self.quantile)
+            self._others[name] = DynamicsStudy(given, self.seed, self.quantile, self.actuator, self.extended.inputs)
         return self._others[name]
+
+    def _found_actuator(self, learned: LearnedDynamics, executed: Executed) -> Actuator | None:
+        """Return a delay and a lag of inputs that explain the errors of predictions."""
+        if self.actuator is not None or self.given.outputs is not None:
+            return None
+        some = _scheduled(len(executed))
+        key = _digest(trajectory for _, trajectory in executed[:some])
+        if key not in self._actuators:
+            model, live = before_refinement(self.validation.model), learned.posterior.data.learned
+            records = self.extended.records(executed[:some])
+            with single_threaded(), np.errstate(all="ignore"):
+                self._actuators[key] = found_actuator(model, records, self.extended.pairs, live)
+        return self._actuators[key]
+
+    def _with_actuator(self, actuator: Actuator, inputs: int) -> DynamicsStudy:
+        """Return the study of inputs that act late; it is kept."""
+        if self._actuated is None or self._actuated.actuator != actuator:
+            self._actuated = DynamicsStudy(self.given, self.seed, self.quantile, actuator, inputs)
+        return self._actuated
 
     def _most_telling(self, executed: Executed) -> tuple[str | None, float, float]:
         """Return the task parameter with which predictions err least, and the left-out errors with it and without.
@@ -350,7 +336,7 @@ class DynamicsStudy(ShortRepr):
 
     def _learned_alone(self, executed: Executed) -> LearnedDynamics | None:
         """Return what executions teach without the data that M was made from."""
-        extended = self._extended(executed)
+        extended = self._executions(executed)
         return None if extended is None else self._learn(extended, (), with_data=False)
 
     def suspected_parameter(self, learned: LearnedDynamics) -> tuple[str, float] | None:

@@ -53,8 +53,8 @@ class ResidualData:
         return np.where(self.learned, self.sizes, 0.0)
 
     def standardised(self, x: Array, u: Array) -> Array:
-        """Return standardised pairs ``(..., n + m)`` of states and inputs."""
-        return standardised_pairs(x, u, self.shift, self.scale)
+        """Return standardised pairs ``(..., n + m)`` of states and the first m inputs, which act."""
+        return standardised_pairs(x, u[..., : self.inputs], self.shift, self.scale)
 
 
 def residual_data(model: Model, transitions: Transitions, sources: Rows) -> ResidualData | None:
