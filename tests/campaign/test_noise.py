@@ -19,14 +19,15 @@ def step(x: Array, u: Array) -> Array:
     return np.asarray(x + 0.1 * np.stack([speed, u[..., 0] - 0.4 * speed - 0.2 * speed * np.abs(speed)], axis=-1))
 
 
-def cart(process: float = 0.01, seed: int = 1) -> Validation:
+def cart(process: float = 0.01, seed: int = 1, start: float = 0.0) -> Validation:
     return Validation(
         space=TaskSpace(goal=(-2.0, 2.0)),
         task=lambda p: Task(np.stack([0 * p.goal, 0 * p.goal], axis=-1), goal=[p.goal, 0.0], horizon=20, dt=0.1),
-        system=systems.Imperfect(step, vectorized=True, process=[0.0, process], seed=seed),
+        system=systems.Imperfect(step, vectorized=True, start=start, process=[0.0, process], seed=seed),
         model=models.Linear([[1.0, 0.1], [0.0, 0.97]], [[0.0], [0.1]]),
         synthesizer=controllers.LQR([1.0, 0.1], [0.1]),
         distance=distances.MaximumDeviation(components=(0,)),
+        start_tolerance=1.0,
     )
 
 
@@ -76,3 +77,17 @@ def test_without_noise_nothing_changes() -> None:
     assert verdict.certificate.details["quantile"] is None
     assert verdict.certificate.details["lags"] == 0
     assert "of its executions" not in verdict.reason
+
+
+@pytest.mark.slow
+def test_initial_states_that_scatter_are_noise_too() -> None:
+    validation = cart(0.0, start=0.03)
+    largest = largest_quantile(validation)
+    campaign = Campaign(validation, seed=0).run(20, 1.5 * largest, certificate=FEW_TESTS)
+    verdict = campaign.verdict(1.5 * largest, certificate=FEW_TESTS)
+    assert verdict.answer == "validated"
+    assert verdict.bound is not None
+    assert 0.9 * largest < verdict.bound < 1.5 * largest
+    assert "in at least 90 % of its executions" in verdict.reason
+    falsified = Campaign(validation, seed=0).run(20, 0.8 * largest, certificate=FEW_TESTS)
+    assert falsified.verdict(0.8 * largest, certificate=FEW_TESTS).answer == "falsified"

@@ -58,6 +58,16 @@ def test_noise_has_its_size_and_follows_from_the_seed() -> None:
     assert systems.Imperfect(step, seed=3, **noisy).execute(pi, TASK).states == pytest.approx(first)
 
 
+def test_executions_start_around_the_initial_state_of_their_task() -> None:
+    task = Task(np.full((400, 2), 0.5), horizon=2, dt=0.1)
+    run = systems.Imperfect(step, seed=3, start=[0.02, 0.0], vectorized=True).execute(
+        lambda t, x: np.zeros((400, 1)), task
+    )
+    assert run.states[:, 0].mean(axis=0) == pytest.approx([0.5, 0.5], abs=0.005)
+    assert run.states[:, 0].std(axis=0) == pytest.approx([0.02, 0.0], rel=0.2)
+    assert run.states[:, 1] == pytest.approx(step(run.states[:, 0], np.zeros((400, 1))))
+
+
 def test_bad_numbers_are_named() -> None:
     with pytest.raises(InputError, match=r"process must be finite and not negative, got \[0.1, -1.0\]"):
         systems.Imperfect(step, process=[0.1, -1.0])

@@ -32,8 +32,8 @@ from ctxval.learning.dynamics_posterior import (
 from ctxval.learning.extended import ExtendedValidation
 from ctxval.learning.histories import Record
 from ctxval.learning.learned_dynamics import LearnedDynamics
-from ctxval.learning.noise_effect import effect_of_noise
-from ctxval.learning.noisy_draws import MATTERS, REPLICATES, NoisyPosterior, learn_noisy
+from ctxval.learning.noise_effect import effect_of_noise, effect_of_starts
+from ctxval.learning.noisy_draws import MATTERS, REPLICATES, NoisyPosterior, learn_noisy, scatter_of
 from ctxval.learning.prediction import predict_distance
 from ctxval.learning.recorded import data_near, recorded_transitions
 from ctxval.learning.structures import NOISY, ChosenStructure, predicted_by_history
@@ -233,10 +233,13 @@ class DynamicsStudy(ShortRepr):
         return noisy.with_effect(effect_of_noise(self.planner, noisy, self.search.pool[:_TRIED]))
 
     def _needs_history(self, posterior: DynamicsPosterior, records: Sequence[Record], pairs: Array) -> bool:
-        """Return whether the next state is no function of state and input: noise, or what is not recorded, acts."""
+        """Return whether executions do not follow from task, state and input: noise, or what is not recorded, acts."""
         if float((posterior.most_probable.noise**2).max()) > NOISY:
             return True
         if effect_of_noise(self.planner, posterior, self.search.pool[:_TRIED]) > MATTERS:
+            return True
+        scatter = scatter_of(records)
+        if effect_of_starts(self.planner, posterior, self.search.pool[:_TRIED], scatter) > MATTERS:
             return True
         if len(records) < 3:
             return False

@@ -267,6 +267,10 @@ def learn_noisy(
             fit, chosen = fit_structures(posterior.model, records, pairs, posterior.data.learned, chosen)
     except (np.linalg.LinAlgError, InputError, ValueError):  # numbers that are not finite
         return None
-    differences = np.array([record.states[0] - record.start for record in records])
-    scatter, horizon = np.sqrt((differences**2).mean(axis=0)), max(len(record.inputs) for record in records)
-    return NoisyPosterior(fit, posterior.data, scatter, horizon, replicates, quantile, seed), chosen
+    horizon = max(len(record.inputs) for record in records)
+    return NoisyPosterior(fit, posterior.data, scatter_of(records), horizon, replicates, quantile, seed), chosen
+
+
+def scatter_of(records: Sequence[Record]) -> Array:
+    """Return the standard deviations of first records from the initial states of their tasks, shape ``(n,)``."""
+    return np.asarray(np.sqrt(np.mean([(record.states[0] - record.start) ** 2 for record in records], axis=0)))

@@ -25,7 +25,8 @@ class Imperfect(ShortRepr):
     The controller acts on the records, as on a robot. Executions of one task differ if there is noise.
 
     Attributes:
-        process: standard deviations of the noise of each state in each step, a number or shape ``(n,)``.
+        start: standard deviations of the initial state from that of the task, a number or shape ``(n,)``.
+        process: standard deviations of the noise of each state in each step.
         measurement: standard deviations of the noise of each recorded state.
         resolution: steps to which records are rounded, as an encoder does; 0 for a state that is not rounded.
         delay: steps by which inputs act late; it need not be an integer. Before the first one, the input is 0.
@@ -43,6 +44,7 @@ class Imperfect(ShortRepr):
         self,
         step: Step | Model,
         *,
+        start: ArrayLike = 0.0,
         process: ArrayLike = 0.0,
         measurement: ArrayLike = 0.0,
         resolution: ArrayLike = 0.0,
@@ -52,10 +54,10 @@ class Imperfect(ShortRepr):
         seed: int | None = None,
     ) -> None:
         self.model = step if isinstance(step, Model) else Function(step, vectorized=vectorized)
-        self.process, self.measurement, self.resolution = (
-            np.asarray(value, dtype=np.float64) for value in (process, measurement, resolution)
+        self.start, self.process, self.measurement, self.resolution = (
+            np.asarray(value, dtype=np.float64) for value in (start, process, measurement, resolution)
         )
-        for name in ("process", "measurement", "resolution"):
+        for name in ("start", "process", "measurement", "resolution"):
             if not (np.isfinite(getattr(self, name)) & (getattr(self, name) >= 0)).all():
                 raise InputError(f"{name} must be finite and not negative, got {getattr(self, name).tolist()}.")
         self.delay, self.lag, self.seed = delay, lag, seed
@@ -65,6 +67,8 @@ class Imperfect(ShortRepr):
         """Run the closed loop from the initial state of the task over its horizon; batches have noise of their own."""
         start = np.array(task.initial_state, dtype=np.float64)
         rng = self._rng(task)
+        if self.start.any():
+            start = start + self.start * rng.standard_normal(start.shape)
         truth, late, acting = start, list[Array](), np.zeros(())
 
         def record(x: Array) -> Array:
