@@ -18,6 +18,8 @@ from calibrate import RESULTS, all_of
 from ctxval import Campaign, Validation
 from ctxval._util.arrays import Array, single_threaded
 from ctxval._util.json_lines import JsonLines
+from ctxval.certificates.dynamics import bound_of
+from ctxval.core.quantiles import LEVELS
 from noise_development import PLANTS as DEVELOPMENT
 from noise_misleading import PLANTS as MISLEADING
 from noise_reporting import PLANTS as REPORTING
@@ -25,6 +27,9 @@ from noise_systems import IMPERFECTIONS, Plant, near_best, outcome, random_and_c
 
 RULE = 3
 """Version of the rule by which campaigns are run."""
+
+CONFIDENCES = (0.8, 0.9, 0.95)
+"""Those for which the coverage of bounds is counted."""
 
 BUDGET, SEEDS, QUANTILE = 25, 2, 0.9
 SHARES = (0.95, 1.25, 1.1)
@@ -84,9 +89,32 @@ def decide(run: tuple[str, str, int, float]) -> dict[str, Any]:
         "noise": details.get("noise"),
         "quantile": details.get("quantile"),
         "lags": details.get("lags"),
+        "actuator": details.get("actuator"),
+        "bounds": _bounds(campaign, largest),
+        "ranks": _ranks(campaign),
         "origins": [trial.origin for trial in campaign.trials],
         "distances": [None if trial.distance is None else trial.distance / largest for trial in campaign.trials],
     }
+
+
+def _bounds(campaign: Campaign, largest: float) -> dict[str, float] | None:
+    """Return the bounds at the end of a campaign for several confidences, as shares of d_q*; None if there is none."""
+    evidence = campaign.recorder.dynamics.evidence(campaign.trials, 0.95)
+    if evidence is None:
+        return None
+    best = max((trial.distance or 0.0 for trial in campaign.trials), default=0.0)
+    return {str(each): bound_of(evidence, best, each) / largest for each in CONFIDENCES}
+
+
+def _ranks(campaign: Campaign) -> list[float]:
+    """Return the predicted probabilities of less than each executed distance, of the predictions that know noise."""
+    ranks = []
+    for trial in campaign.trials:
+        prediction = campaign.recorder.dynamics.stored_prediction(trial)
+        if prediction is not None and prediction.noise is not None and trial.distance is not None:
+            quantiles = np.nan_to_num(np.array(prediction.noise.distances), posinf=1e300)
+            ranks.append(float(np.interp(trial.distance, quantiles, LEVELS)))
+    return ranks
 
 
 def table(half: str) -> str:

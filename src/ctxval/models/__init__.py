@@ -5,6 +5,7 @@ from __future__ import annotations
 from ctxval._util.registry import Registry
 from ctxval.core.model import Function, Model, linearize
 from ctxval.models.corrected import Corrected, Correction, Refined
+from ctxval.models.expected import Expected
 from ctxval.models.gaussian_process import GaussianProcessModel, SquaredExponential
 from ctxval.models.linear import Linear, state_space
 from ctxval.models.mujoco import MuJoCo
@@ -19,6 +20,7 @@ __all__ = [
     "REGISTRY",
     "Corrected",
     "Correction",
+    "Expected",
     "FeedforwardReLU",
     "Function",
     "GaussianProcessModel",
