@@ -17,6 +17,7 @@ from ctxval.learning import DynamicsStudy
 from ctxval.learning.actuators import Actuator, found_actuator, with_actuator
 from ctxval.learning.closed_loops import LoopPlanner
 from ctxval.learning.extended import ExtendedValidation
+from ctxval.learning.histories import Record
 
 H, DT = 40, 0.1
 
@@ -44,10 +45,13 @@ def executions(validation: Validation, count: int) -> list[tuple[Array, Any]]:
 
 
 def found(validation: Validation, count: int) -> Actuator | None:
-    extended = ExtendedValidation(validation)
-    return found_actuator(
-        validation.model, extended.records(executions(validation, count)), extended.pairs, np.array([False, True])
-    )
+    executed = executions(validation, count)
+
+    def records_of(actuator: Actuator) -> list[Record]:
+        extended = ExtendedValidation(validation, actuator, 1)
+        return extended.records(extended.executions(executed, count) or [])
+
+    return found_actuator(validation.model, records_of, ExtendedValidation(validation).pairs)
 
 
 @given(st.floats(0, 5), st.sampled_from([0.0, 0.5, 3.0]), st.integers(1, 12))

@@ -8,7 +8,7 @@ and the distance see what was commanded.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -25,12 +25,14 @@ from ctxval.core.validation import Validation
 from ctxval.learning.histories import History, Record, Structure
 from ctxval.learning.hyperparameters import FAMILIES, HyperparameterPosterior, learning_rows, log_posterior
 from ctxval.learning.innovations import fit_usual
+from ctxval.learning.residual_data import NEGLIGIBLE
 from ctxval.models.scaling import standard_deviations
 
 _LONGEST = 6.0  # steps, of a delay and of a time constant
-_TRIED = [(0.5, 0), (1, 0), (1.5, 0), (2, 0), (3, 0), (4, 0), (5, 0), (0, 0.5), (0, 1), (0, 2), (0, 4), (1, 1), (2, 2)]
+_DELAYS, _LAGS = (0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0), (0.5, 1.0, 1.5, 2.0, 3.0, 4.0)
+_TRIED = [*((each, 0.0) for each in _DELAYS), *((0.0, each) for each in _LAGS), (1.0, 1.0), (1.0, 2.0), (2.0, 2.0)]
 _BETTER, _GOOD, _PROMISING, _EXACT = 0.1, 0.05, 0.5, 1e-3  # shares of squared errors; see `found_actuator`
-_LEFT_OUT = 3  # records
+_LEFT_OUT = 4  # records
 _LEARNED_FROM = 150  # transitions
 
 
@@ -55,10 +57,6 @@ class Actuator:
                 due = due + weight * commanded[back]
         return acting + (due - acting) * (1 - np.exp(-1 / self.lag)) if self.lag else due
 
-    def in_place_of_commands(self, records: Sequence[Record]) -> list[Record]:
-        """Return records with the inputs that act."""
-        return [replace(record, inputs=self.acting(record.inputs)) for record in records]
-
     @property
     def remembered(self) -> int:
         """The number of commanded inputs that the next one depends on."""
@@ -74,41 +72,61 @@ class Actuator:
         return result
 
 
-def found_actuator(model: Model, records: Sequence[Record], pairs: Array, live: Mask) -> Actuator | None:
+RecordsOf = Callable[[Actuator], Sequence[Record]]
+"""Returns executions with the inputs that act, and with states that are estimated with these if they must be."""
+
+
+def found_actuator(
+    model: Model,
+    records_of: RecordsOf,
+    pairs: Array,
+    before: Actuator | None = None,
+    evaluations: int = 80,
+) -> Actuator | None:
     """Return the delay and the lag with which each record is best predicted from the others; None if they do not help.
 
-    They help if the squared error of left-out records is at most a tenth of that without them, and at most 5 % of the
-    residual of M.
+    They help if the squared error of left-out records, in the geometric mean, is at most a tenth of that without them,
+    and at most 5 % of the residual of M.
 
     Args:
         pairs: states and inputs of closed loops on M, shape ``(V, n + m)``.
-        live: the states in which M errs, shape ``(n,)``.
+        before: one that was found in fewer executions.
+        evaluations: how often records may be asked for while the actuator is refined, twice.
+
+    Raises:
+        LinAlgError: if states cannot be estimated.
     """
-    history = History(model, Structure(0), np.eye(len(live)))
-    sizes = (history.along(records)[1] ** 2).mean(axis=0)
-    first = len(records) - min(_LEFT_OUT, len(records) - 1)
+    plain = records_of(Actuator())
+    history = History(model, Structure(0), np.eye(plain[0].states.shape[1]))
+    sizes = (history.along(plain)[1] ** 2).mean(axis=0)
+    steps = standard_deviations(np.concatenate([np.diff(record.states, axis=0) for record in plain]))
+    live = np.sqrt(sizes) > NEGLIGIBLE * steps
+    if not live.any():
+        return None
 
     def error(actuator: Actuator) -> float:
-        acting, squares = actuator.in_place_of_commands(records), []
-        for k in range(first, len(records)):
+        acting, squares = records_of(actuator), []
+        for k in range(len(acting) - min(_LEFT_OUT, len(acting) - 1), len(acting)):
             fit = fit_usual(history, [*acting[:k], *acting[k + 1 :]], pairs, live)
-            squares.append(history.along([acting[k]], fit.residual)[2][:, live] ** 2)
-        return float((np.concatenate(squares).mean(axis=0) / sizes[live]).max())
+            squares.append((history.along([acting[k]], fit.residual)[2][:, live] ** 2).mean(axis=0) / sizes[live])
+        # A record that lies outside of the others is badly predicted with every actuator.
+        return float(np.exp(np.log(np.maximum(squares, 1e-300)).mean(axis=0)).max())
 
     without = error(Actuator())
     if not without > _EXACT:
         return None
-    best = min((Actuator(*each) for each in _TRIED), key=error)
+    best = min([*(Actuator(*each) for each in _TRIED), *([before] if before else [])], key=error)
     if not error(best) < _PROMISING * min(without, 1.0):
         return None
     for _ in range(2):  # the noise that a wrong actuator seems to add is less the second time
-        best = _refined(best, history, records, live)
+        best = _refined(best, history, records_of, live, evaluations)
     return best if error(best) < min(_BETTER * without, _GOOD) else None
 
 
-def _refined(start: Actuator, history: History, records: Sequence[Record], live: Mask) -> Actuator:
+def _refined(start: Actuator, history: History, records_of: RecordsOf, live: Mask, evaluations: int) -> Actuator:
     """Return the most likely actuator near one of which the hyperparameters of the residual are learned."""
-    Z, E, _ = history.along(start.in_place_of_commands(records))
+    records = records_of(start)
+    Z, E, _ = history.along(records)
     shift, scale, sizes = Z.mean(axis=0), standard_deviations(Z), np.sqrt((E[:, live] ** 2).mean(axis=0))
     inputs = records[0].inputs.shape[-1]
     rows = learning_rows((Z - shift) / scale, inputs, _LEARNED_FROM)
@@ -117,13 +135,13 @@ def _refined(start: Actuator, history: History, records: Sequence[Record], live:
     place = np.append(mode.theta, np.log(mode.noise))
 
     def unlikely(each: Array) -> float:
-        Z, E, _ = history.along(Actuator(*np.clip(each, 0.0, _LONGEST)).in_place_of_commands(records))
+        Z, E, _ = history.along(records_of(Actuator(*np.clip(each, 0.0, _LONGEST).tolist())))
         Z, E = (Z[rows] - shift) / scale, E[rows][:, live] / sizes
         return -log_posterior(mode.kernel, place, Z, E)[0]
 
     at = np.array([start.delay, start.lag])
     simplex = at + np.array([[0.0, 0.0], [0.25, 0.0], [0.0, 0.25]])
-    options = {"initial_simplex": simplex, "maxfev": 80, "xatol": 1e-5, "fatol": 1e-3}
+    options = {"initial_simplex": simplex, "maxfev": evaluations, "xatol": 1e-5, "fatol": 1e-3}
     return Actuator(*np.clip(minimize(unlikely, at, method="Nelder-Mead", options=options).x, 0.0, _LONGEST).tolist())
 
 
@@ -144,11 +162,10 @@ def with_actuator(validation: Validation, actuator: Actuator | None, inputs: int
     )
 
 
-def with_acting_inputs(actuator: Actuator | None, trajectory: Trajectory) -> Trajectory:
-    """Return a trajectory whose inputs are those that act, followed by those that were commanded."""
-    if actuator is None:
-        return trajectory
-    return replace(trajectory, inputs=np.concatenate([actuator.acting(trajectory.inputs), trajectory.inputs], axis=-1))
+def with_commands(trajectory: Trajectory, commanded: Array) -> Trajectory:
+    """Return a trajectory whose inputs act, with those that were commanded in its steps beside them."""
+    steps = trajectory.inputs.shape[-2]
+    return replace(trajectory, inputs=np.concatenate([trajectory.inputs, commanded[..., :steps, :]], axis=-1))
 
 
 @dataclass(frozen=True)

@@ -45,6 +45,7 @@ from ctxval.searches import Prediction
 _TRIED = 32  # tasks of the pool among which those with the largest distances show what noise does
 _FEWEST_TOLD = 6  # executions from which on a task parameter is suspected of changing the dynamics
 _FEWEST_AGAINST = 3  # executions from which on the data that M was made from may be left out
+_ESTIMATED = 5  # latest executions from which an actuator is found if their states are estimated
 _WELL = 0.1  # left-out error below which neither these data nor task parameters are asked about
 _CLEARLY = 3.0  # factor by which predictions must err less without these data, or with a parameter, and err little
 _SLOW = 0.02  # seconds: if a single closed loop on M takes longer, closed loops are distributed over the cores
@@ -139,9 +140,9 @@ class DynamicsStudy(ShortRepr):
         with contextlib.suppress(np.linalg.LinAlgError, InputError, ValueError):
             if learned is None or len(executed) < _FEWEST_AGAINST:
                 return learned
-            actuator = None if logged else self._found_actuator(learned, extended)
+            actuator = None if logged else self._found_actuator(executed)
             if actuator is not None:
-                return self._with_actuator(actuator, extended[0][1].inputs.shape[-1]).learn(executed) or learned
+                return self._with_actuator(actuator, executed[0][1].inputs.shape[-1]).learn(executed) or learned
             if not learned.left_out_error > _WELL:
                 return learned
             if (learned.posterior.data.sources == -1).any():
@@ -303,17 +304,29 @@ class DynamicsStudy(ShortRepr):
             self._others[name] = DynamicsStudy(given, self.seed, self.quantile, self.actuator, self.extended.inputs)
         return self._others[name]
 
-    def _found_actuator(self, learned: LearnedDynamics, executed: Executed) -> Actuator | None:
+    def _found_actuator(self, executed: Executed) -> Actuator | None:
         """Return a delay and a lag of inputs that explain the errors of predictions."""
-        if self.actuator is not None or self.given.outputs is not None:
-            return None
         some = _scheduled(len(executed))
+        if self.actuator is not None or some < _FEWEST_AGAINST:
+            return None
         key = _digest(trajectory for _, trajectory in executed[:some])
         if key not in self._actuators:
-            model, live = before_refinement(self.validation.model), learned.posterior.data.learned
-            records = self.extended.records(executed[:some])
+            estimated = self.given.outputs is not None
+            # Estimates of states cost as much as hundreds of steps, so few executions have to suffice.
+            among = executed[max(0, some - _ESTIMATED) : some] if estimated else executed[:some]
+            inputs = among[0][1].inputs.shape[-1]
+
+            def records_of(actuator: Actuator) -> list[Record]:
+                extended = ExtendedValidation(self.given, actuator, inputs)
+                known = extended.executions(among, len(among))
+                if known is None:
+                    raise np.linalg.LinAlgError
+                return extended.records(known)
+
+            model, pairs = before_refinement(self.validation.model), self.extended.pairs
             with single_threaded(), np.errstate(all="ignore"):
-                self._actuators[key] = found_actuator(model, records, self.extended.pairs, live)
+                before, evaluations = self._found_actuator(executed[: some - 1]), 30 if estimated else 80
+                self._actuators[key] = found_actuator(model, records_of, pairs, before, evaluations)
         return self._actuators[key]
 
     def _with_actuator(self, actuator: Actuator, inputs: int) -> DynamicsStudy:

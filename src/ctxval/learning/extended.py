@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import functools
 from dataclasses import replace
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
 from ctxval._util.arrays import Array
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.validation import Validation
-from ctxval.learning.actuators import Actuator, commands_of, with_acting_inputs, with_actuator
+from ctxval.learning.actuators import Actuator, commands_of, with_actuator, with_commands
 from ctxval.learning.histories import Record
 from ctxval.learning.physical import added_states, with_parameters, with_parameters_as_states, without_parameters
 from ctxval.learning.recorded import closed_loops_on_model
@@ -32,6 +33,7 @@ class ExtendedValidation:
 
     def __init__(self, given: Validation, actuator: Actuator | None = None, inputs: int = 0) -> None:
         self.given, self.actuator, self.inputs = given, actuator, inputs
+        self._acting = WeakKeyDictionary[Trajectory, Trajectory]()
         self.validation = with_actuator(with_parameters_as_states(with_states_of_model(given)), actuator, inputs)
 
     @property
@@ -58,13 +60,25 @@ class ExtendedValidation:
 
         Estimates are learned from the first ``some`` of them.
         """
+        acting = [(point, self._actuated(trajectory)) for point, trajectory in executed]
         if self.given.outputs is not None:
-            states = None if self._estimates is None else self._estimates.of(executed, some)
+            states = None if self._estimates is None else self._estimates.of(acting, some)
             if states is None:
                 return None
-            executed = [(point, trajectory) for (point, _), trajectory in zip(executed, states, strict=True)]
-        together = ((point, with_parameters(self.given, point, trajectory)) for point, trajectory in executed)
-        return [(point, with_acting_inputs(self.actuator, trajectory)) for point, trajectory in together]
+            acting = [(point, trajectory) for (point, _), trajectory in zip(acting, states, strict=True)]
+        together = []
+        for (point, trajectory), (_, whole) in zip(acting, executed, strict=True):
+            extended = with_parameters(self.given, point, trajectory)
+            together.append((point, with_commands(extended, whole.inputs) if self.actuator else extended))
+        return together
+
+    def _actuated(self, trajectory: Trajectory) -> Trajectory:
+        """Return an execution with the inputs that act alone, the same object each time."""
+        if self.actuator is None:
+            return trajectory
+        if trajectory not in self._acting:
+            self._acting[trajectory] = replace(trajectory, inputs=self.actuator.acting(trajectory.inputs))
+        return self._acting[trajectory]
 
     @functools.cached_property
     def _estimates(self) -> StateEstimates | None:
