@@ -237,16 +237,7 @@ class DynamicsStudy(ShortRepr):
         """
         if self._loops is None or not len(learned.executed):
             return None
-        space, posterior = self.validation.space, learned.posterior
-        tasks = (self.validation.task(space.parameters(space.from_unit(point))) for point in learned.executed)
-        records = [
-            Record(trajectory.states, trajectory.inputs, np.asarray(task.initial_state, dtype=np.float64))
-            for trajectory, task in zip(learned.trajectories_of_system, tasks, strict=True)
-        ]
-        pairs = np.concatenate([self._loops.states[..., :-1, :], self._loops.inputs], axis=-1)
-        pairs = pairs.reshape(-1, pairs.shape[-1])
-        pairs = pairs[np.isfinite(pairs).all(axis=1)]
-        pairs = pairs[:: max(1, len(pairs) // 600)]
+        posterior, records, pairs = learned.posterior, self._records(learned), self._visited
         if not self._needs_history(posterior, records, pairs):
             return None
         some = _scheduled(len(records))
@@ -263,6 +254,54 @@ class DynamicsStudy(ShortRepr):
                 return self._with_effect(first[0])
         again = learn(records, chosen=self._structures[key], seed=(self.seed, len(records)))
         return None if again is None else self._with_effect(again[0])
+
+    def _records(self, learned: LearnedDynamics) -> list[Record]:
+        return [self.record(*pair) for pair in zip(learned.executed, learned.trajectories_of_system, strict=True)]
+
+    def record(self, point: Array, trajectory: Trajectory) -> Record:
+        """Return an execution of a task, a point ``(d,)``, whose trajectory has the states that are learned."""
+        task = self.validation.task(self.validation.space.parameters(self.validation.space.from_unit(point)))
+        return Record(trajectory.states, trajectory.inputs, np.asarray(task.initial_state, dtype=np.float64))
+
+    @functools.cached_property
+    def _visited(self) -> Array:
+        """States and inputs of closed loops on M, ``(V, n + m)``."""
+        assert self._loops is not None
+        pairs = np.concatenate([self._loops.states[..., :-1, :], self._loops.inputs], axis=-1)
+        pairs = pairs.reshape(-1, pairs.shape[-1])
+        pairs = pairs[np.isfinite(pairs).all(axis=1)]
+        return np.asarray(pairs[:: max(1, len(pairs) // 600)])
+
+    def without(self, learned: LearnedDynamics, k: int) -> LearnedDynamics | None:
+        """Return what all executions but one teach, with the same hyperparameters and the same structure of noise.
+
+        It is None if nothing can be learned from them.
+        """
+        executed = list(zip(learned.executed, learned.trajectories_of_system, strict=True))
+        del executed[k]
+        recorded = self._recorded(executed, (), learned.with_data)
+        others = self._conditioned(learned.posterior.covariances, recorded, executed, learned.with_data)
+        noisy = learned.noisy
+        if others is None or noisy is None:
+            return others and others.with_noisy(None)
+        records = self._records(others)
+        chosen = self._structures[_digest(self._records(learned)[: _scheduled(len(executed) + 1)])]
+        again = learn_noisy(
+            others.posterior, records, self._visited, chosen,
+            replicates=noisy.replicates, quantile=noisy.quantile, seed=(self.seed, len(records)),
+        )  # fmt: skip
+        return None if again is None else others.with_noisy(again[0])
+
+    def with_states(self, executed: Executed, point: Array, trajectory: Trajectory) -> Trajectory | None:
+        """Return a later execution with the states that are learned; None if they cannot be estimated.
+
+        Args:
+            executed: the executions that were learned from, as the system recorded them.
+            point: the task of the later one, ``(d,)``.
+            trajectory: what the system recorded.
+        """
+        extended = self._extended([*executed, (point, trajectory)])
+        return None if extended is None else extended[-1][1]
 
     def _with_effect(self, noisy: NoisyPosterior) -> NoisyPosterior:
         return noisy.with_effect(effect_of_noise(self.planner, noisy, self.search.pool[:_TRIED]))
