@@ -11,11 +11,11 @@ from ctxval._util.progress import advance, stage
 from ctxval._util.representation import ShortRepr
 from ctxval.campaign.choices import Execution
 from ctxval.campaign.history import executed_trials
-from ctxval.certificates.expiry import FEWEST, Channel, WatchState
+from ctxval.certificates.expiry import FEWEST, Channel, Slopes, Statistic, WatchState
 from ctxval.core.trajectory import COMPLETE, Trajectory
 from ctxval.core.trial import Trial
 from ctxval.errors import CertificateError, InputError
-from ctxval.learning.run_statistics import DISTANCE, RunStatistics, names
+from ctxval.learning.run_statistics import DISTANCE, RunStatistic, RunStatistics, names
 
 if TYPE_CHECKING:
     from ctxval.campaign.campaign import Campaign
@@ -68,7 +68,10 @@ class Watch(ShortRepr):
         if len(known) < FEWEST:
             raise CertificateError("the executions in the store cannot be predicted from each other.")
         self._states = list(names(learned.study, len(learned.posterior.data.sizes)))
-        channels = tuple(Channel(name, tuple(each[name] for each in known if name in each)) for name in known[0])
+        channels = tuple(
+            _channel(name, [each[name] for each in known if name in each], self._statistics.has_noise)
+            for name in known[0]
+        )
         self.state = WatchState(threshold, false_alarms, channels)
         if state is not None:
             if (state.threshold, state.false_alarms) != (threshold, false_alarms) or [
@@ -115,9 +118,12 @@ class Watch(ShortRepr):
         else:
             self._require_states(trajectory)
         statistics = self._statistics.later(trajectory, point, distance)
-        if not all(0 < value < np.inf for value in statistics.values()):
+        if not all(0 < each.value < np.inf for each in statistics.values()):
             raise InputError(f"the run {name} has values that are too large to be compared with predictions.")
-        self.state = self.state.after(name, statistics)
+        self.state = self.state.after(
+            name,
+            {key: Statistic(each.value, each.slopes and Slopes(*each.slopes)) for key, each in statistics.items()},
+        )
         return self.state
 
     def again(self, count: int = 3) -> list[Trial]:
@@ -131,7 +137,7 @@ class Watch(ShortRepr):
         cause, (channel,) = self.state.cause, [c for c in self.state.channels if c.name == self.state.cause]
         if cause != DISTANCE:
             state = next(i for i, each in enumerate(self._states) if cause and cause.endswith(f"{each} residuals"))
-            later = [value for value in channel.later[(self.state.since or 1) - 1 :] if value is not None]
+            later = [each.value for each in channel.later[(self.state.since or 1) - 1 :] if each is not None]
             size = self._statistics.floors[state] * np.sqrt(np.mean(later))
             distances = distances + self._statistics.influences[state] * size
         order: Sequence[int] = np.argsort(-distances, kind="stable").tolist()
@@ -156,3 +162,11 @@ class Watch(ShortRepr):
 
     def __repr__(self) -> str:
         return f"Watch({self.state.sentence})"
+
+
+def _channel(name: str, certified: Sequence[RunStatistic], has_noise: bool) -> Channel:
+    """Return the channel of a statistic before the first later run."""
+    freedom = float(np.median([each.freedom for each in certified])) if has_noise else None
+    known = [each.slopes[1] for each in certified if each.slopes is not None]
+    information = np.sum(known, axis=0) if known else None
+    return Channel(name, tuple(each.value for each in certified), freedom, information)

@@ -29,9 +29,11 @@ from ctxval._util.arrays import Array, Rows
 from ctxval._util.representation import ShortRepr
 from ctxval.errors import InputError
 
-_SCALES = np.array([1.5, 2.0, 3.0, 4.0, 6.0, 10.0, 30.0, 100.0])  # c, alternatives of equal weight
+_SCALES = np.array([1.3, 1.6, 2.0, 3.0, 4.0, 8.0, 30.0, 100.0])  # c, alternatives of equal weight
+_EXPECTED = 40.0  # runs that a statistic with a known law of noise weighs as much as
 _FREEDOMS = np.geomspace(0.25, 64.0, 17)  # m; more would call statistics that a floor makes equal surprising
 _OUTLIERS = 0.005  # share of runs that may be anything although nothing has changed: no run alone raises an alarm
+_WIDER = np.array([3.0, 10.0, 30.0, 100.0])  # variances of changed coefficients beside those that are left uncertain
 _WINDOW = 200  # latest runs at which a change may have begun; fewer starts make the sum smaller
 
 FEWEST = 3
@@ -45,22 +47,59 @@ class _Known:
     sums: Array
     logs: Array
     count: int
+    freedom: float | None
 
     def _log_evidence(self) -> Array:
         """Return the logarithms of the likelihoods of each m ``(..., m)``, with the scale integrated out."""
-        a, K = 0.5 * _FREEDOMS, self.count
-        return np.asarray(
-            gammaln(a * K) - K * gammaln(a) - a * K * np.log(self.sums)[..., None] + a * self.logs[..., None]
-        )
+        a, K, k = 0.5 * _FREEDOMS, self.count, 0.0
+        prior = np.zeros(len(a))
+        if self.freedom is not None:
+            # Statistics of noise alone are known beforehand: near 1, with these degrees of freedom.
+            k = _EXPECTED
+            prior = a * k * math.log(k) - gammaln(a * k) - 0.5 * (np.log(_FREEDOMS / self.freedom) / 0.5) ** 2
+        scale = -a * (K + k) * np.log(self.sums + k)[..., None]
+        return np.asarray(prior + gammaln(a * (K + k)) - K * gammaln(a) + scale + a * self.logs[..., None])
 
     def with_value(self, value: Array) -> _Known:
         """Return what is known with one more value ``(...)``."""
-        return _Known(self.sums + value, self.logs + np.log(value), self.count + 1)
+        return _Known(self.sums + value, self.logs + np.log(value), self.count + 1, self.freedom)
 
     def log_density(self, value: Array) -> Array:
         """Return the logarithm of the predictive density of the logarithm of the next value."""
         after = self.with_value(value)
         return np.asarray(logsumexp(after._log_evidence(), axis=-1) - logsumexp(self._log_evidence(), axis=-1))
+
+
+@dataclass(frozen=True, eq=False)
+class Slopes:
+    """What one run says of coefficients w, by which residuals depend on state and input, if there is noise.
+
+    Its likelihood is proportional to ``exp(w' gradient - w' information w / 2)``.
+
+    Attributes:
+        gradient: shape ``(k,)``.
+        information: shape ``(k, k)``.
+    """
+
+    gradient: Array
+    information: Array
+
+    def to_json(self) -> dict[str, Any]:
+        """Return both, ready for JSON."""
+        return {"gradient": self.gradient.tolist(), "information": self.information.tolist()}
+
+    @classmethod
+    def from_json(cls, values: Mapping[str, Any] | None) -> Slopes | None:
+        """Return what :meth:`to_json` returned, or None."""
+        return values and cls(*(np.array(values[name], dtype=np.float64) for name in ("gradient", "information")))
+
+
+@dataclass(frozen=True)
+class Statistic:
+    """The statistic of one run in a channel, and what the run says of coefficients; None if there is no noise."""
+
+    value: float
+    slopes: Slopes | None = None
 
 
 @dataclass(frozen=True)
@@ -70,32 +109,45 @@ class Channel(ShortRepr):
     Attributes:
         name: what it is, as the subject of a sentence in the plural.
         certified: those of the certified runs, each predicted from the others; positive.
+        freedom: the degrees of freedom that noise gives it; None if there is no noise, and nothing is known beforehand.
+        information: that of all certified runs on coefficients, shape ``(k, k)``; None if there is no noise.
         later: those of later runs; None for a run that does not have it.
     """
 
     name: str
     certified: tuple[float, ...]
-    later: tuple[float | None, ...] = ()
+    freedom: float | None = None
+    information: Array | None = field(default=None, compare=False)
+    later: tuple[Statistic | None, ...] = ()
     _bets: _Bets | None = field(default=None, compare=False, repr=False)
+    _slopes: _SlopeBets | None = field(default=None, compare=False, repr=False)
 
-    def after(self, value: float | None) -> Self:
+    def after(self, statistic: Statistic | None) -> Self:
         """Return the channel after another run."""
-        later = (*self.later, value)
-        if value is None:
-            return replace(self, later=later)
-        return replace(self, later=later, _bets=(self._bets or _Bets.before(self.certified)).after(value))
+        after = replace(self, later=(*self.later, statistic))
+        if statistic is None:
+            return after
+        bets = (self._bets or _Bets.before(self.certified, self.freedom)).after(statistic.value)
+        slopes = None
+        if statistic.slopes is not None and self.information is not None:
+            before = self._slopes or _SlopeBets.before(self.information, max(1.0, float(np.mean(self.certified))))
+            slopes = before.after(statistic.slopes)
+        return replace(after, _bets=bets, _slopes=slopes)
 
     def evidence(self) -> tuple[float, int]:
         """Return the logarithm of the sum over all starts, and the run, counted from 1, at which it is likeliest."""
         if self._bets is None:
             return -math.inf, 1
         of_starts = logsumexp(self._bets.products, axis=0) - math.log(len(_SCALES))
+        if self._slopes is not None:
+            of_slopes = logsumexp(self._slopes.products, axis=0) - math.log(len(_WIDER))
+            of_starts = np.logaddexp(of_starts, of_slopes) - math.log(2)
         known = [k for k, value in enumerate(self.later) if value is not None][-len(of_starts) :]
         return float(logsumexp(of_starts)), known[int(of_starts.argmax())] + 1
 
     def ratio(self, since: int) -> float:
         """Return how many times as large as those certified the statistics are since a run, in root mean squares."""
-        later = [value for value in self.later[since - 1 :] if value is not None]
+        later = [statistic.value for statistic in self.later[since - 1 :] if statistic is not None]
         return math.sqrt(float(np.mean(later)) / float(np.mean(self.certified)))
 
 
@@ -115,12 +167,12 @@ class _Bets:
     changed: _Known
 
     @classmethod
-    def before(cls, certified: Sequence[float]) -> _Bets:
+    def before(cls, certified: Sequence[float], freedom: float | None) -> _Bets:
         """Return the bets before the first later run."""
         none = np.empty((len(_SCALES), 0))
         K = len(certified)
-        base = _Known(np.array(math.fsum(certified)), np.log(certified).sum(), K)
-        return cls(none, base, _Known(none, none, K), _Known(none, none, K))
+        base = _Known(np.array(math.fsum(certified)), np.log(certified).sum(), K, freedom)
+        return cls(none, base, _Known(none, none, K, freedom), _Known(none, none, K, freedom))
 
     def after(self, value: float) -> _Bets:
         """Return the bets after another run."""
@@ -134,7 +186,7 @@ class _Bets:
                   for part, own in ((each.sums, self.base.sums), (each.logs, self.base.logs))),
             )
         )  # fmt: skip
-        same, changed = (_Known(*pair, self.base.count) for pair in (known[:2], known[2:]))
+        same, changed = (_Known(*pair, self.base.count, self.base.freedom) for pair in (known[:2], known[2:]))
         ordinary = same.log_density(np.full_like(products, value)) + math.log(1 - _OUTLIERS)
         other = changed.log_density(value / np.broadcast_to(squares, products.shape))
         outlying = other + math.log(_OUTLIERS)
@@ -149,6 +201,54 @@ class _Bets:
             same.with_value(value * squares**-share),
             changed.with_value(value / np.broadcast_to(squares, products.shape)),
         )
+
+
+@dataclass(frozen=True, eq=False)
+class _SlopeBets:
+    """The bets on changed coefficients, for each prior of the change and each start ``(p, j)``.
+
+    If nothing has changed, the coefficients are 0 but for what the certified runs left uncertain. If something has, the
+    prior is as many times wider as ``_WIDER`` says.
+
+    Attributes:
+        products: logarithms of the products of the bets, shape ``(p, j)``.
+        gradients, informations: sums over the runs since each start, shapes ``(j, k)`` and ``(j, k, k)``.
+        priors: the inverse covariances if nothing has changed, and for each prior of a change, ``(1 + p, k, k)``.
+        scale: variance of the noise relative to what was learned.
+    """
+
+    products: Array
+    gradients: Array
+    informations: Array
+    priors: Array
+    scale: float
+
+    @classmethod
+    def before(cls, certified: Array, scale: float) -> _SlopeBets:
+        """Return the bets before the first later run, from the information of the certified ones."""
+        k = len(certified)
+        known = certified / scale + 1e-9 * max(np.trace(certified), 1e-300) * np.eye(k)
+        priors = known / np.array([1.0, *_WIDER])[:, None, None]
+        return cls(np.empty((len(_WIDER), 0)), np.empty((0, k)), np.empty((0, k, k)), priors, scale)
+
+    def after(self, run: Slopes) -> _SlopeBets:
+        """Return the bets after another run."""
+        products = np.pad(self.products, ((0, 0), (0, 1)))[:, -_WINDOW:]
+        gradients = np.pad(self.gradients, ((0, 1), (0, 0)))[-_WINDOW:]
+        informations = np.pad(self.informations, ((0, 1), (0, 0), (0, 0)))[-_WINDOW:]
+        before = self._ratios(gradients, informations)
+        gradients, informations = gradients + run.gradient / self.scale, informations + run.information / self.scale
+        change = self._ratios(gradients, informations) - before
+        bets = change - np.logaddexp(math.log(1 - _OUTLIERS), math.log(_OUTLIERS) + change)
+        return replace(self, products=products + bets, gradients=gradients, informations=informations)
+
+    def _ratios(self, gradients: Array, informations: Array) -> Array:
+        """Return logarithms of likelihood ratios of a change, with the coefficients integrated out, ``(p, j)``."""
+        known = self.priors[:, None] + informations
+        solved = np.linalg.solve(known, np.broadcast_to(gradients[..., None], (len(known), *gradients.shape, 1)))[..., 0]
+        likelihoods = 0.5 * (gradients * solved).sum(axis=-1) - 0.5 * np.linalg.slogdet(known)[1]
+        likelihoods += 0.5 * np.linalg.slogdet(self.priors)[1][:, None]
+        return np.asarray(likelihoods[1:] - likelihoods[0])
 
 
 @dataclass(frozen=True)
@@ -177,7 +277,7 @@ class WatchState(ShortRepr):
     cause: str | None = None
     ratio: float | None = None
 
-    def after(self, run: str, statistics: Mapping[str, float]) -> Self:
+    def after(self, run: str, statistics: Mapping[str, Statistic]) -> Self:
         """Return the state after another run; a channel without a statistic of it says nothing of it."""
         channels = tuple(
             channel.after(statistics.get(channel.name)) for channel in self.channels
@@ -211,7 +311,16 @@ class WatchState(ShortRepr):
     def to_json(self) -> dict[str, Any]:
         """Return all attributes and the sentence, ready for JSON."""
         channels = [
-            {"name": each.name, "certified": list(each.certified), "later": list(each.later)} for each in self.channels
+            {
+                "name": each.name,
+                "certified": list(each.certified),
+                "freedom": each.freedom,
+                "information": None if each.information is None else each.information.tolist(),
+                "later": [
+                    one and {"value": one.value, "slopes": one.slopes and one.slopes.to_json()} for one in each.later
+                ],
+            }
+            for each in self.channels
         ]
         own = {each.name: getattr(self, each.name) for each in fields(self)}
         return {**own, "channels": channels, "runs": list(self.runs), "expired": self.expired, "sentence": self.sentence}
@@ -224,17 +333,28 @@ class WatchState(ShortRepr):
             InputError: if these are not its values.
         """
         try:
+            listed = values["channels"]
             channels = tuple(
-                Channel(str(each["name"]), _numbers(each["certified"]), tuple(each["later"]))
-                for each in values["channels"]
+                Channel(
+                    str(each["name"]),
+                    tuple(float(value) for value in each["certified"]),
+                    None if each["freedom"] is None else float(each["freedom"]),
+                    None if each["information"] is None else np.array(each["information"], dtype=np.float64),
+                )
+                for each in listed
             )
             state = cls(float(values["threshold"]), float(values["false_alarms"]), channels)
             for number, run in enumerate(values["runs"]):
-                state = state.after(run, {c.name: c.later[number] for c in channels if c.later[number] is not None})
+                later = {str(each["name"]): each["later"][number] for each in listed}
+                state = state.after(
+                    str(run),
+                    {
+                        name: Statistic(float(one["value"]), Slopes.from_json(one["slopes"]))
+                        for name, one in later.items()
+                        if one is not None
+                    },
+                )
         except (KeyError, TypeError, ValueError, IndexError) as error:
             raise InputError(f"the state of a watch must be what to_json returned, and lacks {error}.") from error
         return state
 
-
-def _numbers(values: Sequence[Any]) -> tuple[float, ...]:
-    return tuple(float(value) for value in values)

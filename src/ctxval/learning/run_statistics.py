@@ -53,7 +53,12 @@ class RunStatistics:
         largest = np.maximum(self.influences.max(axis=1), 1e-300)
         return np.clip(NEGLIGIBLE * self.threshold / largest, _LEAST * steps, _MOST * steps)
 
-    def certified(self, k: int, distance: float) -> dict[str, float] | None:
+    @property
+    def has_noise(self) -> bool:
+        """Whether residuals are noise, whose law is known, rather than what a function has left unknown."""
+        return self.learned.noisy is not None
+
+    def certified(self, k: int, distance: float) -> dict[str, RunStatistic] | None:
         """Return the statistics of one of the executions, predicted from the others; None if nothing predicts it."""
         others = self.learned.study.without(self.learned, k)
         if others is None:
@@ -61,7 +66,7 @@ class RunStatistics:
         point, trajectory = self.learned.executed[k], self.learned.trajectories_of_system[k]
         return self._of(others, trajectory, point, distance)
 
-    def later(self, trajectory: Trajectory, point: Array | None, distance: float | None) -> dict[str, float]:
+    def later(self, trajectory: Trajectory, point: Array | None, distance: float | None) -> dict[str, RunStatistic]:
         """Return the statistics of a later run, with the states that are learned.
 
         Without its task, ``(d,)``, and its distance, only those of the residuals are known.
@@ -70,7 +75,7 @@ class RunStatistics:
 
     def _of(
         self, learned: LearnedDynamics, trajectory: Trajectory, point: Array | None, distance: float | None
-    ) -> dict[str, float]:
+    ) -> dict[str, RunStatistic]:
         study, floors = learned.study, self.floors**2
         start = trajectory.states[0] if point is None else study.record(point, trajectory).start
         with single_threaded(), np.errstate(all="ignore"):
@@ -78,21 +83,43 @@ class RunStatistics:
                 learned, Record(trajectory.states, trajectory.inputs, start)
             )
         H = len(residuals)
-        basis = _orthonormal(regressors)
+        columns = np.concatenate([np.ones((H, 1)), regressors], axis=1)
+        basis = _orthonormal(columns)
+        rank = basis.shape[1]
         linear = ((basis.T @ residuals) ** 2).sum(axis=0) / H
         whole = ((residuals**2).mean(axis=0) + floors) / (doubt + noise + floors)
-        trend = (linear + floors) / (doubt + noise * basis.shape[1] / H + floors)
+        trend = (linear + floors) / (doubt + noise * rank / H + floors)
+        gradients = columns.T @ (residuals / (noise + floors))  # (k, n)
+        information = columns.T @ columns
         found = {}
-        for name, of_whole, of_trend in zip(names(study, len(whole)), whole, trend, strict=True):
-            found[f"{name} residuals"] = float(of_whole)
-            found[f"systematic {name} residuals"] = float(of_trend)
+        for i, name in enumerate(names(study, len(whole))):
+            found[f"{name} residuals"] = RunStatistic(float(whole[i]), float(H))
+            known = gradients[:, i], information / (noise + floors)[i]
+            found[f"systematic {name} residuals"] = RunStatistic(
+                float(trend[i]), float(rank), known if self.has_noise else None
+            )
         if point is not None and distance is not None:
             predicted = learned.predict(point)
             if predicted is not None and np.isfinite(predicted.median):
                 least = (NEGLIGIBLE * self.threshold) ** 2
                 error = (distance - predicted.median) ** 2
-                found[DISTANCE] = float((error + least) / (predicted.deviation**2 + least))
+                found[DISTANCE] = RunStatistic(float((error + least) / (predicted.deviation**2 + least)), 1.0)
         return found
+
+
+@dataclass(frozen=True)
+class RunStatistic:
+    """One statistic of a run.
+
+    Attributes:
+        value: positive.
+        freedom: the degrees of freedom that white noise gives it.
+        slopes: gradient ``(k,)`` and information ``(k, k)`` of the coefficients of state and input; None without noise.
+    """
+
+    value: float
+    freedom: float
+    slopes: tuple[Array, Array] | None = None
 
 
 DISTANCE = "errors of the predicted distance"
@@ -145,9 +172,8 @@ def _residuals(learned: LearnedDynamics, record: Record) -> tuple[Array, Array, 
     return residuals, values.var(axis=0).mean(axis=0), fit.noise**2 * relative, pairs
 
 
-def _orthonormal(regressors: Array) -> Array:
-    """Return an orthonormal basis ``(H, r)`` of constants and regressors ``(H, k)`` over the steps of a run."""
-    columns = np.concatenate([np.ones((len(regressors), 1)), regressors], axis=1)
+def _orthonormal(columns: Array) -> Array:
+    """Return an orthonormal basis ``(H, r)`` of columns ``(H, k)``."""
     columns = columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
     U, S, _ = np.linalg.svd(columns, full_matrices=False)
     return np.asarray(U[:, S > 1e-3 * S[0]])
