@@ -21,7 +21,7 @@ from watch_systems import DEVELOPMENT, REPORTING, Watched
 
 STORED = JsonLines(Path(__file__).parent / "results" / "watch.jsonl", ("system", "imperfection", "part"))
 
-IMPERFECT = ("none", "process 0.1 %", "measurement 0.5 %")
+IMPERFECT = ("none", "process 0.1 %", "measurement 0.1 %", "measurement 0.5 %")
 FALSE_ALARMS = 1e-3
 MARGIN = 1.5  # tau over the largest true distance
 BUDGET = 40  # executions of a campaign
@@ -133,9 +133,10 @@ def main() -> None:
     parser.add_argument("systems", choices=("development", "reporting"))
     parser.add_argument("--tasks", type=int, default=100, help="tasks of each cell in which nothing has changed")
     parser.add_argument("--only", nargs="*", help="names of systems")
+    parser.add_argument("--imperfections", nargs="*", default=IMPERFECT)
     arguments = parser.parse_args()
     listed = DEVELOPMENT if arguments.systems == "development" else REPORTING
-    for imperfection in IMPERFECT:
+    for imperfection in arguments.imperfections:
         for name, watched in listed.items():
             if arguments.only and name not in arguments.only:
                 continue

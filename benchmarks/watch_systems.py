@@ -9,10 +9,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-import noise_development
-import noise_reporting
 import numpy as np
 
+import noise_development
+import noise_reporting
 from ctxval import Experiment, systems
 from ctxval._util.arrays import Array
 from ctxval.core.model import Step

@@ -11,7 +11,7 @@ from ctxval._util.progress import advance, stage
 from ctxval._util.representation import ShortRepr
 from ctxval.campaign.choices import Execution
 from ctxval.campaign.history import executed_trials
-from ctxval.certificates.expiry import FEWEST, Channel, Slopes, Statistic, WatchState
+from ctxval.certificates.expiry import FEWEST, Channel, Statistic, WatchState
 from ctxval.core.trajectory import COMPLETE, Trajectory
 from ctxval.core.trial import Trial
 from ctxval.errors import CertificateError, InputError
@@ -77,7 +77,9 @@ class Watch(ShortRepr):
             if (state.threshold, state.false_alarms) != (threshold, false_alarms) or [
                 (each.name, each.certified) for each in state.channels
             ] != [(each.name, each.certified) for each in channels]:
-                raise InputError("the state of the watch belongs to another campaign, threshold or rate of false alarms.")
+                raise InputError(
+                    "the state of the watch belongs to another campaign, threshold or rate of false alarms."
+                )
             self.state = state
 
     def update(
@@ -104,7 +106,9 @@ class Watch(ShortRepr):
         trajectory, validation, study = execution.trajectory, self.campaign.validation, self._statistics.learned.study
         name = str(len(self.state.runs) + 1) if name is None else name
         if trajectory is None:
-            raise InputError("a watch needs the trajectory of an execution; a distance or a failure alone says nothing.")
+            raise InputError(
+                "a watch needs the trajectory of an execution; a distance or a failure alone says nothing."
+            )
         point, distance = None, execution.distance
         if parameters is not None:
             place = validation.space.point(parameters)
@@ -122,7 +126,7 @@ class Watch(ShortRepr):
             raise InputError(f"the run {name} has values that are too large to be compared with predictions.")
         self.state = self.state.after(
             name,
-            {key: Statistic(each.value, each.slopes and Slopes(*each.slopes)) for key, each in statistics.items()},
+            {key: Statistic(each.value, each.gradient, each.information) for key, each in statistics.items()},
         )
         return self.state
 
@@ -140,18 +144,18 @@ class Watch(ShortRepr):
             later = [each.value for each in channel.later[(self.state.since or 1) - 1 :] if each is not None]
             size = self._statistics.floors[state] * np.sqrt(np.mean(later))
             distances = distances + self._statistics.influences[state] * size
-        order: Sequence[int] = np.argsort(-distances, kind="stable").tolist()
-        chosen = dict.fromkeys(self._trials[k].unit_point.tobytes() for k in order)
-        first = {key: next(self._trials[k] for k in order if self._trials[k].unit_point.tobytes() == key) for key in chosen}
-        return list(first.values())[:count]
+        of_tasks: dict[bytes, Trial] = {}
+        for k in np.argsort(-distances, kind="stable"):
+            of_tasks.setdefault(self._trials[k].unit_point.tobytes(), self._trials[k])
+        return list(of_tasks.values())[:count]
 
     def _require_states(self, trajectory: Trajectory) -> None:
         """Refuse a recording without a task that cannot be compared with predictions."""
         validation, data = self.campaign.validation, self._statistics.learned.posterior.data
         if self._statistics.learned.study.given.physical or validation.outputs is not None:
             raise InputError(
-                "a recording without the parameters of its task cannot be judged: the learned dynamics depend on a task "
-                "parameter, or only outputs are recorded."
+                "a recording needs the parameters of its task, because the learned dynamics depend on a task parameter, "
+                "or because only outputs are recorded."
             )
         wanted = len(data.sizes), data.inputs
         if (trajectory.states.shape[-1], trajectory.inputs.shape[-1]) != wanted or trajectory.ended != COMPLETE:
@@ -167,6 +171,6 @@ class Watch(ShortRepr):
 def _channel(name: str, certified: Sequence[RunStatistic], has_noise: bool) -> Channel:
     """Return the channel of a statistic before the first later run."""
     freedom = float(np.median([each.freedom for each in certified])) if has_noise else None
-    known = [each.slopes[1] for each in certified if each.slopes is not None]
+    known = [each.information for each in certified if each.information is not None]
     information = np.sum(known, axis=0) if known else None
     return Channel(name, tuple(each.value for each in certified), freedom, information)

@@ -41,7 +41,9 @@ def watch(
     opened = open_store(store, allowed)
     limit = limit_of(opened.experiment, opened.settings, threshold)
     if limit is None:
-        raise InputError("a threshold is needed: give --threshold, because neither the store nor the experiment has one.")
+        raise InputError(
+            "a threshold is needed: give --threshold, because neither the store nor the experiment has one."
+        )
     how = {"resample": resample, "start_tolerance": start_tolerance}
     runs = list(_runs(opened, logs, reading, parameters, how))  # all are read before any is judged
     watching = opened.campaign.watch(limit, false_alarms)
@@ -56,7 +58,9 @@ def watch(
                 judged.append(_judged(state))
             advance(1)
     for each in judged:
-        out.say(f"{each['run']}: {each['statistic']} {each['ratio']:.2g} times those certified, evidence {each['evidence']:.2g}")
+        out.say(
+            f"{each['run']}: {each['statistic']} {each['ratio']:.2g} times those certified, evidence {each['evidence']:.2g}"
+        )
     for failure in skipped:
         notes.say((f"{failure['run']} is not judged", "yellow"), f": {failure['reason']}")
     if not judged:
@@ -137,9 +141,7 @@ def _without_task(opened: Opened, path: Path, reading: Logs) -> Iterator[_Run]:
             continue
         for piece in range(pieces):
             first, last = piece * task.horizon, min((piece + 1) * task.horizon, whole.horizon)
-            part = Trajectory(
-                whole.times[first : last + 1], whole.states[first : last + 1], whole.inputs[first:last]
-            )
+            part = Trajectory(whole.times[first : last + 1], whole.states[first : last + 1], whole.inputs[first:last])
             yield _Run(name if pieces == 1 else f"{name}, part {piece + 1}", Execution(part), None)
 
 

@@ -1,8 +1,8 @@
 """How far single executions are from what others predict: positive statistics of each run, one of each kind.
 
 Each statistic is about 1 or less if the learned dynamics and their doubt are right, and if what is missing moves
-distances by less than ``NEGLIGIBLE`` of the threshold. The residuals of a state give two: their mean square, and that of
-their part that is linear in state and input, which shows what noise hides of a heavier load or a weaker motor.
+distances by less than ``NEGLIGIBLE`` of the threshold. The residuals of a state give two: their mean square, and that
+of their part that is linear in state and input, which shows what noise hides of a heavier load or a weaker motor.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class RunStatistics:
         """The residuals of each state that move no distance by more than a negligible share, shape ``(n,)``."""
         steps = self.learned.posterior.data.steps
         largest = np.maximum(self.influences.max(axis=1), 1e-300)
-        return np.clip(NEGLIGIBLE * self.threshold / largest, _LEAST * steps, _MOST * steps)
+        return np.asarray(np.clip(NEGLIGIBLE * self.threshold / largest, _LEAST * steps, _MOST * steps))
 
     @property
     def has_noise(self) -> bool:
@@ -94,10 +94,8 @@ class RunStatistics:
         found = {}
         for i, name in enumerate(names(study, len(whole))):
             found[f"{name} residuals"] = RunStatistic(float(whole[i]), float(H))
-            known = gradients[:, i], information / (noise + floors)[i]
-            found[f"systematic {name} residuals"] = RunStatistic(
-                float(trend[i]), float(rank), known if self.has_noise else None
-            )
+            known = (gradients[:, i], information / (noise + floors)[i]) if self.has_noise else (None, None)
+            found[f"systematic {name} residuals"] = RunStatistic(float(trend[i]), float(rank), *known)
         if point is not None and distance is not None:
             predicted = learned.predict(point)
             if predicted is not None and np.isfinite(predicted.median):
@@ -114,12 +112,13 @@ class RunStatistic:
     Attributes:
         value: positive.
         freedom: the degrees of freedom that white noise gives it.
-        slopes: gradient ``(k,)`` and information ``(k, k)`` of the coefficients of state and input; None without noise.
+        gradient, information: of the coefficients of 1, state and input, ``(k,)`` and ``(k, k)``; None without noise.
     """
 
     value: float
     freedom: float
-    slopes: tuple[Array, Array] | None = None
+    gradient: Array | None = None
+    information: Array | None = None
 
 
 DISTANCE = "errors of the predicted distance"
@@ -176,4 +175,4 @@ def _orthonormal(columns: Array) -> Array:
     """Return an orthonormal basis ``(H, r)`` of columns ``(H, k)``."""
     columns = columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
     U, S, _ = np.linalg.svd(columns, full_matrices=False)
-    return np.asarray(U[:, S > 1e-3 * S[0]])
+    return np.asarray(U[:, 1e-3 * S[0] < S])
