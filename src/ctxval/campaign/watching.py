@@ -154,8 +154,8 @@ class Watch(ShortRepr):
         validation, data = self.campaign.validation, self._statistics.learned.posterior.data
         if self._statistics.learned.study.given.physical or validation.outputs is not None:
             raise InputError(
-                "a recording needs the parameters of its task, because the learned dynamics depend on a task parameter, "
-                "or because only outputs are recorded."
+                "a recording needs the parameters of its task: the learned dynamics depend on a task parameter, or "
+                "only outputs are recorded."
             )
         wanted = len(data.sizes), data.inputs
         if (trajectory.states.shape[-1], trajectory.inputs.shape[-1]) != wanted or trajectory.ended != COMPLETE:

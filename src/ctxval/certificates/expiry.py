@@ -47,7 +47,7 @@ class Channel(ShortRepr):
     Attributes:
         name: what they are of, as the subject of a sentence in the plural.
         certified: those of the certified runs, each predicted from the others; positive.
-        freedom: the degrees of freedom that noise gives them; None if there is no noise, and nothing is known beforehand.
+        freedom: the degrees of freedom that noise gives them; None if there is no noise.
         information: that of all certified runs on coefficients, shape ``(k, k)``; None if there is no noise.
         later: those of later runs; None for a run that does not have it.
     """

@@ -58,9 +58,8 @@ def watch(
                 judged.append(_judged(state))
             advance(1)
     for each in judged:
-        out.say(
-            f"{each['run']}: {each['statistic']} {each['ratio']:.2g} times those certified, evidence {each['evidence']:.2g}"
-        )
+        differs = f"{each['statistic']} {each['ratio']:.2g} times those certified"
+        out.say(f"{each['run']}: {differs}, evidence of a change {each['evidence']:.2g}")
     for failure in skipped:
         notes.say((f"{failure['run']} is not judged", "yellow"), f": {failure['reason']}")
     if not judged:
