@@ -74,12 +74,8 @@ class Watch(ShortRepr):
         )
         self.state = WatchState(threshold, false_alarms, channels)
         if state is not None:
-            if (state.threshold, state.false_alarms) != (threshold, false_alarms) or [
-                (each.name, each.certified) for each in state.channels
-            ] != [(each.name, each.certified) for each in channels]:
-                raise InputError(
-                    "the state of the watch belongs to another campaign, threshold or rate of false alarms."
-                )
+            if not _is_same_watch(state, self.state):
+                raise InputError("the state belongs to a watch of another campaign, threshold or rate of false alarms.")
             self.state = state
 
     def update(
@@ -174,3 +170,16 @@ def _channel(name: str, certified: Sequence[RunStatistic], has_noise: bool) -> C
     known = [each.information for each in certified if each.information is not None]
     information = np.sum(known, axis=0) if known else None
     return Channel(name, tuple(each.value for each in certified), freedom, information)
+
+
+def _is_same_watch(state: WatchState, begun: WatchState) -> bool:
+    """Return whether a state follows from the beginning of a watch, up to the rounding of another processor."""
+    pairs = list(zip(state.channels, begun.channels, strict=False))
+    same = all(
+        one.name == other.name
+        and len(one.certified) == len(other.certified)
+        and np.allclose(one.certified, other.certified, rtol=1e-4)
+        for one, other in pairs
+    )
+    lengths = len(state.channels) == len(begun.channels)
+    return same and lengths and (state.threshold, state.false_alarms) == (begun.threshold, begun.false_alarms)
