@@ -13,8 +13,8 @@ Noise hides a small change in any single run, but not that it is the same in all
 residuals of a run depend on state and input are bet on too: they are 0, up to what the certified runs left uncertain,
 or they come from a wider prior. Both likelihoods are known in closed form.
 
-A share of the runs may be anything although nothing has changed. As this is part of both hypotheses, no run multiplies
-a product by more than the inverse of this share, and no run alone raises an alarm. The expectation of each product is
+A share of the runs may be anything although nothing has changed. So no run multiplies a product by more than the
+inverse of this share. The expectation of each product is
 at most 1 if nothing has changed, so the sum over all starts, stopped when it reaches :math:`1/\alpha`, runs for at
 least :math:`1/\alpha` runs on average until a false alarm (Shin, Ramdas, Rinaldo 2023).
 """
