@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -12,7 +13,9 @@ from ctxval import Campaign, Task, TaskSpace, Trajectory, Validation, controller
 from ctxval._util.arrays import Array
 from ctxval.campaign.choices import Execution
 from ctxval.campaign.watching import Watch
-from ctxval.certificates.expiry import WatchState
+from ctxval.certificates import WatchState
+from ctxval.core.controller import Controller
+from ctxval.core.rollout import rollout
 from ctxval.errors import CertificateError, ExecutionError, InputError
 
 THRESHOLD = 0.5
@@ -129,3 +132,66 @@ def test_too_few_executions_and_a_certain_alarm_are_refused(campaign: Campaign) 
         Campaign(cart(), search=searches.Random()).watch(THRESHOLD)
     with pytest.raises(InputError, match=r"false_alarms must be less than 1, such as 0.001, got 2"):
         campaign.watch(THRESHOLD, false_alarms=2.0)
+
+
+class Loaded:
+    """A cart whose drag grows with the load, a task parameter, which the task hides in its name."""
+
+    def __init__(self, mass: float) -> None:
+        self.mass = mass
+
+    def execute(self, controller: Controller, task: Task) -> Trajectory:
+        drag = np.array([0.0, 0.05 * float(task.name)])
+        return rollout(lambda x, u: step(x, u, self.mass) - drag * x[..., 1:], controller, task)
+
+
+def recording_outputs(mass: float = 1.0) -> Validation:
+    """Return the cart of which the position alone is recorded."""
+    plain = cart(mass)
+    return Validation(
+        space=plain.space,
+        task=lambda p: Task(np.stack([0 * p.goal, 0 * p.goal], axis=-1), goal=p.goal[..., None], horizon=20, dt=0.1),
+        system=systems.WithOutputs(plain.system, [0]),
+        model=plain.model,
+        synthesizer=controllers.Policy(lambda t, x, task: 1.6 * (task.reference[..., t, :1] - x[..., :1])),
+        distance=distances.MaximumDeviation(components=(0,)),
+        outputs=[0],
+    )
+
+
+def with_load(mass: float = 1.0) -> Validation:
+    """Return the cart whose load changes its drag."""
+    plain = cart()
+    return Validation(
+        space=TaskSpace(goal=(-2.0, 2.0), load=(0.0, 1.0)),
+        task=lambda p: Task([0.0, 0.0], goal=[float(p.goal), 0.0], horizon=20, dt=0.1, name=str(float(p.load))),
+        system=Loaded(mass),
+        model=plain.model,
+        synthesizer=plain.synthesizer,
+        distance=plain.distance,
+        physical=["load"],
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("make", [recording_outputs, with_load])
+def test_outputs_and_physical_parameters_are_watched(make: Callable[..., Validation]) -> None:
+    def run(validation: Validation, goal: float, load: float) -> tuple[Trajectory, dict[str, float]]:
+        task = {"goal": goal, "load": load} if "load" in validation.space.names else {"goal": goal}
+        return validation.execute(validation.plan(validation.space.point(task))), task
+
+    plain, heavier = make(), make(1.3)
+    campaign = Campaign(plain, search=searches.Random(), seed=0)
+    tasks = [(-1.9, 0.1), (-1.2, 0.9), (-0.5, 0.5), (0.4, 0.0), (0.8, 1.0), (1.1, 0.3), (1.9, 0.8), (-1.7, 0.6)]
+    for goal, load in tasks:
+        trajectory, task = run(plain, goal, load)
+        campaign.add(task, trajectory)
+    watch = campaign.watch(THRESHOLD)
+    for goal, load in [(1.0, 0.4), (-1.5, 0.7), (1.6, 0.2)]:
+        assert not watch.update(*run(plain, goal, load)).expired
+    with pytest.raises(InputError, match="a recording needs the parameters of its task"):
+        watch.update(run(heavier, 1.0, 0.4)[0])
+    for goal, load in [(1.6, 0.4), (-1.5, 0.7), (1.7, 0.2)]:
+        state = watch.update(*run(heavier, goal, load))
+    assert state.expired
+    assert state.since == 4

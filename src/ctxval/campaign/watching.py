@@ -68,10 +68,9 @@ class Watch(ShortRepr):
         if len(known) < FEWEST:
             raise CertificateError("the executions in the store cannot be predicted from each other.")
         self._states = list(names(learned.study, len(learned.posterior.data.sizes)))
-        channels = tuple(
-            _channel(name, [each[name] for each in known if name in each], self._statistics.has_noise)
-            for name in known[0]
-        )
+        named = {name: [each[name] for each in known if name in each] for name in max(known, key=len)}
+        noise = self._statistics.has_noise
+        channels = tuple(_channel(name, of_runs, noise) for name, of_runs in named.items() if len(of_runs) >= FEWEST)
         self.state = WatchState(threshold, false_alarms, channels)
         if state is not None:
             if not _is_same_watch(state, self.state):

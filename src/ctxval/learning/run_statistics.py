@@ -7,6 +7,7 @@ of their part that is linear in state and input, which shows what noise hides of
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -97,7 +98,9 @@ class RunStatistics:
             known = (gradients[:, i], information / (noise + floors)[i]) if self.has_noise else (None, None)
             found[f"systematic {name} residuals"] = RunStatistic(float(trend[i]), float(rank), *known)
         if point is not None and distance is not None:
-            predicted = learned.predict(point)
+            predicted = None
+            with contextlib.suppress(Exception):  # the user's parts, at states that no execution has reached
+                predicted = learned.predict(point)
             if predicted is not None and np.isfinite(predicted.median):
                 least = (NEGLIGIBLE * self.threshold) ** 2
                 error = (distance - predicted.median) ** 2
