@@ -7,7 +7,7 @@ import json
 import numpy as np
 import pytest
 
-from ctxval.certificates.expiry import Channel, Statistic, WatchState
+from ctxval.certificates.expiry import EXCEEDED, Channel, Statistic, WatchState
 from ctxval.errors import InputError
 
 
@@ -91,3 +91,15 @@ def test_it_is_data() -> None:
 def test_other_data_is_refused(change: dict[str, object]) -> None:
     with pytest.raises(InputError, match="the state of a watch must be what to_json returned"):
         WatchState.from_json({**watched(begun(), 1.0, 1).to_json(), **change})
+
+
+def test_an_executed_distance_above_the_threshold_is_a_fact_unless_there_is_noise() -> None:
+    statistics = {"rate residuals": Statistic(1.0)}
+    exact = WatchState(0.5, 1e-3, (Channel("rate residuals", (1.0, 1.1, 0.9)),))
+    state = exact.after("a", statistics, 0.5).after("b", statistics, 0.75)
+    assert (state.alarm, state.cause, state.ratio) == (2, EXCEEDED, 1.5)
+    assert state.sentence == "expired: run 2 has the distance 0.75, above the threshold 0.5"
+    assert WatchState.from_json(state.to_json()).sentence == state.sentence
+    noisy = begun().after("a", statistics, 0.75)
+    assert noisy.has_noise
+    assert not noisy.expired

@@ -11,7 +11,7 @@ from ctxval._util.progress import advance, stage
 from ctxval._util.representation import ShortRepr
 from ctxval.campaign.choices import Execution
 from ctxval.campaign.history import executed_trials
-from ctxval.certificates.expiry import FEWEST, Channel, Statistic, WatchState
+from ctxval.certificates.expiry import EXCEEDED, FEWEST, Channel, Statistic, WatchState
 from ctxval.core.trajectory import COMPLETE, Trajectory
 from ctxval.core.trial import Trial
 from ctxval.errors import CertificateError, InputError
@@ -122,6 +122,7 @@ class Watch(ShortRepr):
         self.state = self.state.after(
             name,
             {key: Statistic(each.value, each.gradient, each.information) for key, each in statistics.items()},
+            distance,
         )
         return self.state
 
@@ -133,8 +134,9 @@ class Watch(ShortRepr):
         if not self.state.expired:
             return []
         distances = np.array([trial.distance or 0.0 for trial in self._trials])
-        cause, (channel,) = self.state.cause, [c for c in self.state.channels if c.name == self.state.cause]
-        if cause != DISTANCE:
+        cause = self.state.cause
+        if cause not in (DISTANCE, EXCEEDED):
+            channel = next(each for each in self.state.channels if each.name == cause)
             state = next(i for i, each in enumerate(self._states) if cause and cause.endswith(f"{each} residuals"))
             later = [each.value for each in channel.later[(self.state.since or 1) - 1 :] if each is not None]
             size = self._statistics.floors[state] * np.sqrt(np.mean(later))

@@ -21,6 +21,9 @@ from ctxval._util.representation import ShortRepr
 from ctxval.certificates.change_bets import SCALES, WIDER, ScaleBets, SlopeBets
 from ctxval.errors import InputError
 
+EXCEEDED = "distances above the threshold"
+"""Cause of an alarm that needs no evidence: without noise, an executed distance above the threshold is a fact."""
+
 FEWEST = 3
 """Fewest certified runs from which later ones are judged."""
 
@@ -98,35 +101,41 @@ class WatchState(ShortRepr):
         false_alarms: largest rate of false alarms, such as one in 1,000 runs.
         channels: the statistics.
         runs: the names of the later runs.
+        distances: their distances; None if they are unknown.
         evidence: the e-detector; the alarm is raised when it reaches ``1 / false_alarms``, and stays.
         alarm: the run, counted from 1, at which the alarm was raised; None if the certificate still holds.
         since: the run, counted from 1, from which on the change is likeliest to have acted.
-        cause: the name of the channel with the largest evidence.
-        ratio: how many times as large as those certified its statistics are since that run.
+        cause: the name of the channel with the largest evidence, or ``EXCEEDED``.
+        ratio: how many times as large as those certified its statistics are since that run, or the distance as a
+            multiple of the threshold.
     """
 
     threshold: float
     false_alarms: float
     channels: tuple[Channel, ...]
     runs: tuple[str, ...] = ()
+    distances: tuple[float | None, ...] = ()
     evidence: float = 0.0
     alarm: int | None = None
     since: int | None = None
     cause: str | None = None
     ratio: float | None = None
 
-    def after(self, run: str, statistics: Mapping[str, Statistic]) -> Self:
+    def after(self, run: str, statistics: Mapping[str, Statistic], distance: float | None = None) -> Self:
         """Return the state after another run; a channel without a statistic of it says nothing of it."""
         channels = tuple(channel.after(statistics.get(channel.name)) for channel in self.channels)
         of_channels = [channel.evidence() for channel in channels]
         logs = np.array([log for log, _ in of_channels])
         evidence = math.exp(min(700.0, float(logsumexp(logs)) - math.log(len(logs))))
-        after = replace(self, channels=channels, runs=(*self.runs, run), evidence=evidence)
+        runs, distances = (*self.runs, run), (*self.distances, distance)
+        after = replace(self, channels=channels, runs=runs, distances=distances, evidence=evidence)
         if self.expired:
             return after  # an alarm is a fact, and so is what it was raised for
+        if distance is not None and distance > self.threshold and not self.has_noise:
+            return replace(after, alarm=len(runs), since=len(runs), cause=EXCEEDED, ratio=distance / self.threshold)
         largest = int(logs.argmax())
         cause, since = channels[largest], of_channels[largest][1]
-        alarm = len(after.runs) if evidence >= 1 / self.false_alarms else None
+        alarm = len(runs) if evidence >= 1 / self.false_alarms else None
         return replace(after, alarm=alarm, since=since, cause=cause.name, ratio=cause.ratio(since))
 
     @property
@@ -135,8 +144,16 @@ class WatchState(ShortRepr):
         return self.alarm is not None
 
     @property
+    def has_noise(self) -> bool:
+        """Whether executions of one task differ, so that a threshold is about a share of them."""
+        return any(channel.freedom is not None for channel in self.channels)
+
+    @property
     def sentence(self) -> str:
         """What the runs say, in one sentence without its full stop."""
+        if self.cause == EXCEEDED and self.alarm is not None:
+            distance = self.distances[self.alarm - 1]
+            return f"expired: run {self.alarm} has the distance {distance:.4g}, above the threshold {self.threshold:g}"
         if self.ratio is not None and self.expired:
             times = f"{self.ratio:.2g}" if self.ratio < 100 else f"{self.ratio:.0f}"
             return f"expired: {self.cause} since run {self.since} are {times} times those certified"
@@ -172,6 +189,7 @@ class WatchState(ShortRepr):
             **own,
             "channels": channels,
             "runs": list(self.runs),
+            "distances": list(self.distances),
             "expired": self.expired,
             "sentence": self.sentence,
         }
@@ -202,7 +220,8 @@ class WatchState(ShortRepr):
                     for name, one in later
                     if one is not None
                 }
-                state = state.after(str(run), statistics)
+                distance = values["distances"][number]
+                state = state.after(str(run), statistics, None if distance is None else float(distance))
         except (KeyError, TypeError, ValueError, IndexError) as error:
             raise InputError(f"the state of a watch must be what to_json returned ({error!r}).") from error
         return state

@@ -58,7 +58,8 @@ def watch(
                 judged.append(_judged(state))
             advance(1)
     for each in judged:
-        differs = f"{each['statistic']} {each['ratio']:.2g} times those certified"
+        distance = "" if each["distance"] is None else f"distance {each['distance']:.4g}, "
+        differs = f"{distance}{each['statistic']} {each['ratio']:.2g} times those certified"
         out.say(f"{each['run']}: {differs}, evidence of a change {each['evidence']:.2g}")
     for failure in skipped:
         notes.say((f"{failure['run']} is not judged", "yellow"), f": {failure['reason']}")
@@ -148,4 +149,5 @@ def _judged(state: WatchState) -> dict[str, Any]:
     """Return the statistic of the latest run that differs most from those certified."""
     ratios = {each.name: each.ratio(len(state.runs)) for each in state.channels if each.later[-1] is not None}
     name = max(ratios, key=lambda key: ratios[key])
-    return {"run": state.runs[-1], "statistic": name, "ratio": ratios[name], "evidence": state.evidence}
+    latest = {"run": state.runs[-1], "distance": state.distances[-1]}
+    return {**latest, "statistic": name, "ratio": ratios[name], "evidence": state.evidence}
