@@ -43,7 +43,7 @@ of one cell share its certified runs.
 
 What noise hides takes longer. A change is noticed soon if it moves the residuals of a run by more than noise does in a
 whole run, and a load that is {heavier} % heavier need not do so. A watch that has seen nothing yet needs two tasks at
-least.
+least, unless a distance exceeds the threshold: that is a fact, and one task is enough.
 """
 
 

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ctxval._util.progress import advance, stage
-from ctxval._util.representation import ShortRepr
 from ctxval.campaign.choices import Execution
 from ctxval.campaign.history import executed_trials
 from ctxval.certificates.expiry import EXCEEDED, FEWEST, Channel, Statistic, WatchState
@@ -27,7 +26,7 @@ _MOST = 24
 """Certified executions that are predicted from the others, the latest ones: each is learned from anew."""
 
 
-class Watch(ShortRepr):
+class Watch:
     """Tests one execution after the other against the predictions of the dynamics that a campaign has learned.
 
     Nothing is executed, and nothing is stored; the state is plain numbers. With the same campaign and the same
@@ -118,7 +117,7 @@ class Watch(ShortRepr):
             self._require_states(trajectory)
         statistics = self._statistics.later(trajectory, point, distance)
         if not all(0 < each.value < np.inf for each in statistics.values()):
-            raise InputError(f"the run {name} has values that are too large to be compared with predictions.")
+            raise InputError(f"the run {name} has values that are missing, or too large for a comparison.")
         self.state = self.state.after(
             name,
             {key: Statistic(each.value, each.gradient, each.information) for key, each in statistics.items()},
@@ -137,7 +136,8 @@ class Watch(ShortRepr):
         cause = self.state.cause
         if cause not in (DISTANCE, EXCEEDED):
             channel = next(each for each in self.state.channels if each.name == cause)
-            state = next(i for i, each in enumerate(self._states) if cause and cause.endswith(f"{each} residuals"))
+            kinds = [(f"{each} residuals", f"systematic {each} residuals") for each in self._states]
+            state = next(i for i, each in enumerate(kinds) if cause in each)
             later = [each.value for each in channel.later[(self.state.since or 1) - 1 :] if each is not None]
             size = self._statistics.floors[state] * np.sqrt(np.mean(later))
             distances = distances + self._statistics.influences[state] * size

@@ -57,7 +57,7 @@ class RunStatistics:
     @property
     def has_noise(self) -> bool:
         """Whether residuals are noise, whose law is known, rather than what a function has left unknown."""
-        return self.learned.noisy is not None
+        return self.learned.noisy is not None and self.learned.noisy.is_noisy
 
     def certified(self, k: int, distance: float) -> dict[str, RunStatistic] | None:
         """Return the statistics of one of the executions, predicted from the others; None if nothing predicts it."""
