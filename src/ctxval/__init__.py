@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from ctxval.campaign import plot as plot
     from ctxval.campaign.campaign import Campaign, OpenTrial
     from ctxval.campaign.storage.store import Store
+    from ctxval.campaign.watching import Watch
     from ctxval.certificates.verdict import Verdict
     from ctxval.cli.config.settings import load_experiment
     from ctxval.core.experiment import Experiment
@@ -75,6 +76,7 @@ __all__ = [
     "Truth",
     "Validation",
     "Verdict",
+    "Watch",
     "cached_truth",
     "compare",
     "grid_truth",
@@ -129,6 +131,7 @@ _LAZY = {
     "Truth": "core.truth",
     "Validation": "core.validation",
     "Verdict": "certificates.verdict",
+    "Watch": "campaign.watching",
     "cached_truth": "core.truth",
     "compare": "studies.comparison",
     "grid_truth": "core.truth",

@@ -22,8 +22,10 @@ from ctxval.campaign.plot import overview
 from ctxval.campaign.provenance import provenance_of
 from ctxval.campaign.storage.store import Store
 from ctxval.campaign.trials import TrialRecorder
+from ctxval.campaign.watching import FALSE_ALARMS, Watch
 from ctxval.campaign.workers import worker_pool
 from ctxval.certificates import RESOLUTION, Certificate, CertificateOptions, Provenance, Verdict, assess, judge
+from ctxval.certificates.expiry import WatchState
 from ctxval.certificates.options import CONFIDENCE, WITHIN
 from ctxval.core.distance import Distance
 from ctxval.core.plan import Plan
@@ -507,6 +509,32 @@ class Campaign:
             certified = assess(self.trials, options, provenance=self.provenance).certificate
         assert certified is not None  # without a threshold, a refusal is raised
         return certified
+
+    @checked
+    def watch(
+        self,
+        threshold: PositiveFloat,
+        false_alarms: PositiveFloat = FALSE_ALARMS,
+        *,
+        state: WatchState | None = None,
+        progress: bool | None = None,
+    ) -> Watch:
+        """Return a watch, which tests later executions against what the executions of this campaign predict.
+
+        Args:
+            threshold: tau; what moves no distance by 1 % of it is no change.
+            false_alarms: largest rate of false alarms, such as one in 1,000 executions.
+            state: the state of an earlier watch of the same campaign, to go on with.
+            progress: as in :meth:`run`.
+
+        Raises:
+            CertificateError: if too little can be learned from the executions.
+            InputError: if the rate is not below 1, or the state belongs to another watch.
+        """
+        if not false_alarms < 1:
+            raise InputError(f"false_alarms must be less than 1, such as 0.001, got {false_alarms:g}.")
+        with progress_shown(progress):
+            return Watch(self, threshold, false_alarms, state)
 
     def surrogate(self) -> Surrogate:
         """Return the Gaussian process of the distance over the task space, for every search, from two distances on."""

@@ -20,6 +20,7 @@ from ctxval.certificates.dynamics_evidence import (
     StateInputGap,
     UntriedParameter,
 )
+from ctxval.certificates.expiry import WatchState
 from ctxval.certificates.forecast import Forecast, forecast
 from ctxval.certificates.maxima import Maxima, draw_maxima, settle_maxima
 from ctxval.certificates.options import CertificateOptions
@@ -73,6 +74,7 @@ __all__ = [
     "StoppingRule",
     "UntriedParameter",
     "Verdict",
+    "WatchState",
     "WholeSuite",
     "assess",
     "bare_corners",

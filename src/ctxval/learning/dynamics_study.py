@@ -211,8 +211,7 @@ class DynamicsStudy(ShortRepr):
         """
         if self._loops is None or not len(learned.executed):
             return None
-        posterior, pairs = learned.posterior, self.extended.pairs
-        records = self.extended.records(list(zip(learned.executed, learned.trajectories_of_system, strict=True)))
+        posterior, pairs, records = learned.posterior, self.extended.pairs, self._records(learned)
         if not self._needs_history(posterior, records, pairs):
             return None
         some = _scheduled(len(records))
@@ -229,6 +228,40 @@ class DynamicsStudy(ShortRepr):
                 return self._with_effect(first[0])
         again = learn(records, chosen=self._structures[key], seed=(self.seed, len(records)))
         return None if again is None else self._with_effect(again[0])
+
+    def _records(self, learned: LearnedDynamics) -> list[Record]:
+        return self.extended.records(list(zip(learned.executed, learned.trajectories_of_system, strict=True)))
+
+    def without(self, learned: LearnedDynamics, k: int) -> LearnedDynamics | None:
+        """Return what all executions but one teach, with the same hyperparameters and the same structure of noise.
+
+        It is None if nothing can be learned from them.
+        """
+        executed = list(zip(learned.executed, learned.trajectories_of_system, strict=True))
+        del executed[k]
+        recorded = self._recorded(executed, (), learned.with_data)
+        others = self._conditioned(learned.posterior.covariances, recorded, executed, learned.with_data)
+        noisy = learned.noisy
+        if others is None or noisy is None:
+            return others and others.with_noisy(None)
+        records = self._records(others)
+        chosen = self._structures[_digest(self._records(learned)[: _scheduled(len(executed) + 1)])]
+        again = learn_noisy(
+            others.posterior, records, self.extended.pairs, chosen,
+            replicates=noisy.replicates, quantile=noisy.quantile, seed=(self.seed, len(records)),
+        )  # fmt: skip
+        return None if again is None else others.with_noisy(again[0])
+
+    def with_states(self, executed: Executed, point: Array, trajectory: Trajectory) -> Trajectory | None:
+        """Return a later execution with the states that are learned; None if they cannot be estimated.
+
+        Args:
+            executed: the executions that were learned from, as the system recorded them.
+            point: the task of the later one, ``(d,)``.
+            trajectory: what the system recorded.
+        """
+        extended = self._executions([*executed, (point, trajectory)])
+        return None if extended is None else extended[-1][1]
 
     def _with_effect(self, noisy: NoisyPosterior) -> NoisyPosterior:
         return noisy.with_effect(effect_of_noise(self.planner, noisy, self.search.pool[:_TRIED]))

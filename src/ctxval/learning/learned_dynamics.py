@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -48,6 +48,12 @@ class LearnedDynamics(ShortRepr):
         """The dynamics with noise and histories, if the next state does not follow from state and input; else None."""
         with single_threaded():
             return self.study.noisy(self)
+
+    def with_noisy(self, noisy: NoisyPosterior | None) -> LearnedDynamics:
+        """Return the same with dynamics with noise that were learned otherwise, or without noise."""
+        other = replace(self)
+        vars(other)["noisy"] = noisy  # where functools keeps what the property would compute
+        return other
 
     @property
     def drawn_from(self) -> DynamicsPosterior | NoisyPosterior:

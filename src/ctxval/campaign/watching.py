@@ -1,0 +1,186 @@
+"""A watch over a certificate: later executions are tested against what the certified ones predict."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ctxval._util.progress import advance, stage
+from ctxval.campaign.choices import Execution
+from ctxval.campaign.history import executed_trials
+from ctxval.certificates.expiry import EXCEEDED, FEWEST, Channel, Statistic, WatchState
+from ctxval.core.trajectory import COMPLETE, Trajectory
+from ctxval.core.trial import Trial
+from ctxval.errors import CertificateError, InputError
+from ctxval.learning.run_statistics import DISTANCE, RunStatistic, RunStatistics, names
+
+if TYPE_CHECKING:
+    from ctxval.campaign.campaign import Campaign
+
+FALSE_ALARMS = 1e-3
+"""Usual rate of false alarms: one in 1,000 executions."""
+
+_MOST = 24
+"""Certified executions that are predicted from the others, the latest ones: each is learned from anew."""
+
+
+class Watch:
+    """Tests one execution after the other against the predictions of the dynamics that a campaign has learned.
+
+    Nothing is executed, and nothing is stored; the state is plain numbers. With the same campaign and the same
+    executions, it is the same.
+
+    Attributes:
+        state: what the executions say so far.
+
+    Raises:
+        CertificateError: if the campaign has too few executions with trajectories, or if nothing can be learned from
+            them.
+        InputError: if a state belongs to another watch.
+    """
+
+    def __init__(
+        self, campaign: Campaign, threshold: float, false_alarms: float, state: WatchState | None = None
+    ) -> None:
+        self.campaign, dynamics = campaign, campaign.recorder.dynamics
+        executed = executed_trials(campaign.store, campaign.trials)
+        self._trials = [trial for trial, _ in executed]
+        self._executed = [(trial.unit_point, trajectory) for trial, trajectory in executed]
+        if len(executed) < FEWEST:
+            raise CertificateError(
+                f"a watch needs at least {FEWEST} executions with trajectories in the store, got {len(executed)}."
+            )
+        learned = dynamics.learned(campaign.trials, alone=True)
+        if learned is None:
+            why = dynamics.failure or "the model explains them all, or they cannot be predicted"
+            raise CertificateError(f"nothing can be learned from the executions in the store: {why}.")
+        latest = range(max(0, len(executed) - _MOST), len(executed))
+        certified = []
+        with stage("predicting the certified runs", len(latest), "runs"):
+            self._statistics = RunStatistics.of(learned, threshold)
+            for k in latest:
+                certified.append(self._statistics.certified(k, self._trials[k].distance or 0.0))
+                advance(1)
+        known = [each for each in certified if each]
+        if len(known) < FEWEST:
+            raise CertificateError("the executions in the store cannot be predicted from each other.")
+        self._states = list(names(learned.study, len(learned.posterior.data.sizes)))
+        named = {name: [each[name] for each in known if name in each] for name in max(known, key=len)}
+        noise = self._statistics.has_noise
+        channels = tuple(_channel(name, of_runs, noise) for name, of_runs in named.items() if len(of_runs) >= FEWEST)
+        self.state = WatchState(threshold, false_alarms, channels)
+        if state is not None:
+            if not _is_same_watch(state, self.state):
+                raise InputError("the state belongs to a watch of another campaign, threshold or rate of false alarms.")
+            self.state = state
+
+    def update(
+        self,
+        run: Trajectory | Execution,
+        parameters: Mapping[str, Any] | None = None,
+        *,
+        name: str | None = None,
+        start_tolerance: float | None = None,
+    ) -> WatchState:
+        """Return the state after another execution.
+
+        Args:
+            run: the trajectory of the system, or an execution.
+            parameters: those of its task. Without them, only the steps of the run are tested, not its distance.
+            name: the name of the run in sentences; its number by default.
+            start_tolerance: replaces the start tolerance of the validation.
+
+        Raises:
+            InputError: if the trajectory does not belong to the task.
+            ExecutionError: if it is not a complete execution of the task.
+        """
+        execution = Execution(run) if isinstance(run, Trajectory) else run
+        trajectory, validation, study = execution.trajectory, self.campaign.validation, self._statistics.learned.study
+        name = str(len(self.state.runs) + 1) if name is None else name
+        if trajectory is None:
+            raise InputError(
+                "a watch needs the trajectory of an execution; a distance or a failure alone says nothing."
+            )
+        point, distance = None, execution.distance
+        if parameters is not None:
+            place = validation.space.point(parameters)
+            point = validation.space.to_unit(place)
+            if distance is None:
+                distance = execution.measured(validation, validation.plan(place), start_tolerance).distance
+            extended = study.with_states(self._executed, point, trajectory)
+            if extended is None:
+                raise InputError("the states of the model cannot be estimated along the run.")
+            trajectory = extended
+        else:
+            self._require_states(trajectory)
+        statistics = self._statistics.later(trajectory, point, distance)
+        if not all(0 < each.value < np.inf for each in statistics.values()):
+            raise InputError(f"the run {name} has values that are missing, or too large for a comparison.")
+        self.state = self.state.after(
+            name,
+            {key: Statistic(each.value, each.gradient, each.information) for key, each in statistics.items()},
+            distance,
+        )
+        return self.state
+
+    def again(self, count: int = 3) -> list[Trial]:
+        """Return the trials to execute again if the certificate has expired, the most telling first; else none.
+
+        These are the executed tasks whose distance the change may move most towards the threshold, or beyond.
+        """
+        if not self.state.expired:
+            return []
+        distances = np.array([trial.distance or 0.0 for trial in self._trials])
+        cause = self.state.cause
+        if cause not in (DISTANCE, EXCEEDED):
+            channel = next(each for each in self.state.channels if each.name == cause)
+            kinds = [(f"{each} residuals", f"systematic {each} residuals") for each in self._states]
+            state = next(i for i, each in enumerate(kinds) if cause in each)
+            later = [each.value for each in channel.later[(self.state.since or 1) - 1 :] if each is not None]
+            size = self._statistics.floors[state] * np.sqrt(np.mean(later))
+            distances = distances + self._statistics.influences[state] * size
+        of_tasks: dict[bytes, Trial] = {}
+        for k in np.argsort(-distances, kind="stable"):
+            of_tasks.setdefault(self._trials[k].unit_point.tobytes(), self._trials[k])
+        return list(of_tasks.values())[:count]
+
+    def _require_states(self, trajectory: Trajectory) -> None:
+        """Refuse a recording without a task that cannot be compared with predictions."""
+        validation, data = self.campaign.validation, self._statistics.learned.posterior.data
+        if self._statistics.learned.study.given.physical or validation.outputs is not None:
+            raise InputError(
+                "a recording needs the parameters of its task: the learned dynamics depend on a task parameter, or "
+                "only outputs are recorded."
+            )
+        wanted = len(data.sizes), data.inputs
+        if (trajectory.states.shape[-1], trajectory.inputs.shape[-1]) != wanted or trajectory.ended != COMPLETE:
+            raise InputError(
+                f"a recording must have {wanted[0]} states and {wanted[1]} inputs of complete runs, got "
+                f"{trajectory.states.shape[-1]} and {trajectory.inputs.shape[-1]} ({trajectory.ended})."
+            )
+
+    def __repr__(self) -> str:
+        return f"Watch({self.state.sentence})"
+
+
+def _channel(name: str, certified: Sequence[RunStatistic], has_noise: bool) -> Channel:
+    """Return the channel of a statistic before the first later run."""
+    freedom = float(np.median([each.freedom for each in certified])) if has_noise else None
+    known = [each.information for each in certified if each.information is not None]
+    information = np.sum(known, axis=0) if known else None
+    return Channel(name, tuple(each.value for each in certified), freedom, information)
+
+
+def _is_same_watch(state: WatchState, begun: WatchState) -> bool:
+    """Return whether a state follows from the beginning of a watch, up to the rounding of another processor."""
+    pairs = list(zip(state.channels, begun.channels, strict=False))
+    same = all(
+        one.name == other.name
+        and len(one.certified) == len(other.certified)
+        and np.allclose(one.certified, other.certified, rtol=1e-4)
+        for one, other in pairs
+    )
+    lengths = len(state.channels) == len(begun.channels)
+    return same and lengths and (state.threshold, state.false_alarms) == (begun.threshold, begun.false_alarms)

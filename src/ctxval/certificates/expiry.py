@@ -1,0 +1,235 @@
+"""Whether a certificate still holds: the statistics of later runs, in channels, and the alarm that they raise.
+
+Each channel has one statistic of each run, such as the mean square of the residuals of a state. The runs are the units
+of the test, so little is assumed of the steps within a run. The evidence is the mean over the channels of their
+e-detectors (:mod:`ctxval.certificates.change_bets`). With few certified runs, its rate of false alarms is as reliable
+as the assumed law of the statistics; ``docs/how-to/watch.md`` shows measured rates.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, Self
+
+import numpy as np
+from scipy.special import logsumexp
+
+from ctxval._util.arrays import Array
+from ctxval._util.representation import ShortRepr
+from ctxval.certificates.change_bets import SCALES, WIDER, ScaleBets, SlopeBets
+from ctxval.errors import InputError
+
+EXCEEDED = "distances above the threshold"
+"""Cause of an alarm that needs no evidence: without noise, an executed distance above the threshold is a fact."""
+
+FEWEST = 3
+"""Fewest certified runs from which later ones are judged."""
+
+
+@dataclass(frozen=True, eq=False)
+class Statistic:
+    """The statistic of one run in a channel.
+
+    Attributes:
+        value: positive.
+        gradient, information: what the run says of coefficients w, whose likelihood is proportional to
+            ``exp(w' gradient - w' information w / 2)``, shapes ``(k,)`` and ``(k, k)``; None if there is no noise.
+    """
+
+    value: float
+    gradient: Array | None = None
+    information: Array | None = None
+
+
+@dataclass(frozen=True)
+class Channel(ShortRepr):
+    """One kind of statistics.
+
+    Attributes:
+        name: what they are of, as the subject of a sentence in the plural.
+        certified: those of the certified runs, each predicted from the others; positive.
+        freedom: the degrees of freedom that noise gives them; None if there is no noise.
+        information: that of all certified runs on coefficients, shape ``(k, k)``; None if there is no noise.
+        later: those of later runs; None for a run that does not have it.
+    """
+
+    name: str
+    certified: tuple[float, ...]
+    freedom: float | None = None
+    information: Array | None = field(default=None, compare=False)
+    later: tuple[Statistic | None, ...] = ()
+    _scales: ScaleBets | None = field(default=None, compare=False)
+    _slopes: SlopeBets | None = field(default=None, compare=False)
+
+    def after(self, statistic: Statistic | None) -> Self:
+        """Return the channel after another run."""
+        after = replace(self, later=(*self.later, statistic))
+        if statistic is None:
+            return after
+        scales = (self._scales or ScaleBets.before(self.certified, self.freedom)).after(statistic.value)
+        slopes = None
+        if self.information is not None and statistic.gradient is not None and statistic.information is not None:
+            before = self._slopes or SlopeBets.before(self.information, max(1.0, float(np.mean(self.certified))))
+            slopes = before.after(statistic.gradient, statistic.information)
+        return replace(after, _scales=scales, _slopes=slopes)
+
+    def evidence(self) -> tuple[float, int]:
+        """Return the logarithm of the sum over all starts, and the run, counted from 1, at which it is likeliest."""
+        if self._scales is None:
+            return -math.inf, 1
+        of_starts = logsumexp(self._scales.products, axis=0) - math.log(len(SCALES))
+        if self._slopes is not None:
+            of_slopes = logsumexp(self._slopes.products, axis=0) - math.log(len(WIDER))
+            of_starts = np.logaddexp(of_starts, of_slopes) - math.log(2)
+        known = [k for k, statistic in enumerate(self.later) if statistic is not None][-len(of_starts) :]
+        return float(logsumexp(of_starts)), known[int(of_starts.argmax())] + 1
+
+    def ratio(self, since: int) -> float:
+        """Return how many times as large as those certified the statistics are since a run, in root mean squares."""
+        later = [statistic.value for statistic in self.later[since - 1 :] if statistic is not None]
+        return math.sqrt(float(np.mean(later)) / float(np.mean(self.certified)))
+
+
+@dataclass(frozen=True)
+class WatchState(ShortRepr):
+    """What later runs say of a certificate: plain numbers, which can be stored as JSON.
+
+    Attributes:
+        threshold: tau.
+        false_alarms: largest rate of false alarms, such as one in 1,000 runs.
+        channels: the statistics.
+        runs: the names of the later runs.
+        distances: their distances; None if they are unknown.
+        evidence: the e-detector; the alarm is raised when it reaches ``1 / false_alarms``, and stays.
+        alarm: the run, counted from 1, at which the alarm was raised; None if the certificate still holds.
+        since: the run, counted from 1, from which on the change is likeliest to have acted.
+        cause: the name of the channel with the largest evidence, or ``EXCEEDED``.
+        ratio: how many times as large as those certified its statistics are since that run, or the distance as a
+            multiple of the threshold.
+    """
+
+    threshold: float
+    false_alarms: float
+    channels: tuple[Channel, ...]
+    runs: tuple[str, ...] = ()
+    distances: tuple[float | None, ...] = ()
+    evidence: float = 0.0
+    alarm: int | None = None
+    since: int | None = None
+    cause: str | None = None
+    ratio: float | None = None
+
+    def after(self, run: str, statistics: Mapping[str, Statistic], distance: float | None = None) -> Self:
+        """Return the state after another run; a channel without a statistic of it says nothing of it."""
+        channels = tuple(channel.after(statistics.get(channel.name)) for channel in self.channels)
+        of_channels = [channel.evidence() for channel in channels]
+        logs = np.array([log for log, _ in of_channels])
+        evidence = math.exp(min(700.0, float(logsumexp(logs)) - math.log(len(logs))))
+        runs, distances = (*self.runs, run), (*self.distances, distance)
+        after = replace(self, channels=channels, runs=runs, distances=distances, evidence=evidence)
+        if self.expired:
+            return after  # an alarm is a fact, and so is what it was raised for
+        if distance is not None and distance > self.threshold and not self.has_noise:
+            return replace(after, alarm=len(runs), since=len(runs), cause=EXCEEDED, ratio=distance / self.threshold)
+        largest = int(logs.argmax())
+        cause, since = channels[largest], of_channels[largest][1]
+        alarm = len(runs) if evidence >= 1 / self.false_alarms else None
+        return replace(after, alarm=alarm, since=since, cause=cause.name, ratio=cause.ratio(since))
+
+    @property
+    def expired(self) -> bool:
+        """Whether the system is no longer that of the certificate."""
+        return self.alarm is not None
+
+    @property
+    def has_noise(self) -> bool:
+        """Whether executions of one task differ, so that a threshold is about a share of them."""
+        return any(channel.freedom is not None for channel in self.channels)
+
+    @property
+    def sentence(self) -> str:
+        """What the runs say, in one sentence without its full stop."""
+        if self.cause == EXCEEDED and self.alarm is not None:
+            distance = self.distances[self.alarm - 1]
+            return f"expired: run {self.alarm} has the distance {distance:.4g}, above the threshold {self.threshold:g}"
+        if self.ratio is not None and self.expired:
+            times = f"{self.ratio:.2g}" if self.ratio < 100 else f"{self.ratio:.0f}"
+            return f"expired: {self.cause} since run {self.since} are {times} times those certified"
+        agree = "1 run agrees" if len(self.runs) == 1 else f"{len(self.runs)} runs agree"
+        limit = f"{1 / self.false_alarms:.4g}"
+        return f"holds: {agree} with the certified ones (evidence of a change {self.evidence:.2g}, alarm at {limit})"
+
+    def to_json(self) -> dict[str, Any]:
+        """Return all attributes and the sentence, ready for JSON."""
+        own = {
+            name: getattr(self, name)
+            for name in ("threshold", "false_alarms", "evidence", "alarm", "since", "cause", "ratio")
+        }
+        channels = [
+            {
+                "name": channel.name,
+                "certified": list(channel.certified),
+                "freedom": channel.freedom,
+                "information": _listed(channel.information),
+                "later": [
+                    statistic
+                    and {
+                        "value": statistic.value,
+                        "gradient": _listed(statistic.gradient),
+                        "information": _listed(statistic.information),
+                    }
+                    for statistic in channel.later
+                ],
+            }
+            for channel in self.channels
+        ]
+        return {
+            **own,
+            "channels": channels,
+            "runs": list(self.runs),
+            "distances": list(self.distances),
+            "expired": self.expired,
+            "sentence": self.sentence,
+        }
+
+    @classmethod
+    def from_json(cls, values: Mapping[str, Any]) -> Self:
+        """Return the state that :meth:`to_json` returned.
+
+        Raises:
+            InputError: if these are not its values.
+        """
+        try:
+            listed = values["channels"]
+            channels = tuple(
+                Channel(
+                    str(each["name"]),
+                    tuple(float(value) for value in each["certified"]),
+                    None if each["freedom"] is None else float(each["freedom"]),
+                    _array(each["information"]),
+                )
+                for each in listed
+            )
+            state = cls(float(values["threshold"]), float(values["false_alarms"]), channels)
+            for number, run in enumerate(values["runs"]):
+                later = ((str(each["name"]), each["later"][number]) for each in listed)
+                statistics = {
+                    name: Statistic(float(one["value"]), _array(one["gradient"]), _array(one["information"]))
+                    for name, one in later
+                    if one is not None
+                }
+                distance = values["distances"][number]
+                state = state.after(str(run), statistics, None if distance is None else float(distance))
+        except (KeyError, TypeError, ValueError, IndexError) as error:
+            raise InputError(f"the state of a watch must be what to_json returned ({error!r}).") from error
+        return state
+
+
+def _listed(array: Array | None) -> list[Any] | None:
+    return None if array is None else array.tolist()
+
+
+def _array(listed: Any) -> Array | None:
+    return None if listed is None else np.array(listed, dtype=np.float64)

@@ -1,0 +1,153 @@
+"""``ctxval watch``: whether a certificate still holds, by recordings that were made after it."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from ctxval._util.checked import NonNegativeFloat, require
+from ctxval._util.csv_table import CsvTable
+from ctxval._util.progress import advance, stage
+from ctxval.campaign.by_hand import parameters_from, read_runs
+from ctxval.campaign.choices import Execution
+from ctxval.campaign.watching import FALSE_ALARMS, Watch
+from ctxval.certificates.expiry import WatchState
+from ctxval.cli.base import FALSIFIED, command, notes, out
+from ctxval.cli.config.check import task_text
+from ctxval.cli.config.stored_settings import Opened, limit_of, open_store
+from ctxval.cli.options import Allowed
+from ctxval.cli.recordings import Logs
+from ctxval.core.trajectory import Trajectory
+from ctxval.errors import ExecutionError, InputError
+
+
+@command(false_alarms=f"{FALSE_ALARMS:g}")
+def watch(
+    store: Path,
+    logs: list[Path],
+    reading: Logs,
+    allowed: Allowed,
+    threshold: float | None = None,
+    false_alarms: float = FALSE_ALARMS,
+    parameters: list[str] | None = None,
+    resample: bool = False,
+    start_tolerance: float | None = None,
+) -> Any:
+    """``ctxval watch``."""
+    require("start tolerance", NonNegativeFloat | None, start_tolerance)
+    opened = open_store(store, allowed)
+    limit = limit_of(opened.experiment, opened.settings, threshold)
+    if limit is None:
+        raise InputError(
+            "a threshold is needed: give --threshold, because neither the store nor the experiment has one."
+        )
+    how = {"resample": resample, "start_tolerance": start_tolerance}
+    runs = list(_runs(opened, logs, reading, parameters, how))  # all are read before any is judged
+    watching = opened.campaign.watch(limit, false_alarms)
+    judged, skipped = list[dict[str, Any]](), list[dict[str, str]]()
+    with stage("judging", len(runs), "runs"):
+        for run in runs:
+            try:
+                state = run.judged_by(watching)
+            except ExecutionError as error:
+                skipped.append({"run": run.name, "reason": str(error)})
+            else:
+                judged.append(_judged(state))
+            advance(1)
+    for each in judged:
+        distance = "" if each["distance"] is None else f"distance {each['distance']:.4g}, "
+        differs = f"{distance}{each['statistic']} {each['ratio']:.2g} times those certified"
+        out.say(f"{each['run']}: {differs}, evidence of a change {each['evidence']:.2g}")
+    for failure in skipped:
+        notes.say((f"{failure['run']} is not judged", "yellow"), f": {failure['reason']}")
+    if not judged:
+        raise InputError("no run can be judged: a trajectory of at least one complete execution is needed.")
+    state, again = watching.state, watching.again()
+    first, colon, rest = state.sentence.partition(":")
+    out.say((first.upper(), "bold red" if state.expired else "bold green"), f"{colon}{rest}.", wrap=True)
+    for trial in again:
+        out.say(f"execute again: trial {trial.number}, {task_text(trial.parameters)}")
+    if again:
+        out.say(f"next: ctxval ask {shlex.quote(str(store))} --again {again[0].number} --because REASON")
+    report = {
+        "runs": judged,
+        "skipped": skipped,
+        "again": [{"trial": trial.number, "task": trial.parameters} for trial in again],
+        "watch": state.to_json(),
+        "store": str(store),
+    }
+    return report, FALSIFIED if state.expired else 0
+
+
+class _Run(NamedTuple):
+    """A recording in a file, with its task if it is known, or the reason why it cannot be judged."""
+
+    name: str
+    execution: Execution
+    parameters: Mapping[str, Any] | None
+
+    def judged_by(self, watching: Watch) -> WatchState:
+        if self.execution.trajectory is None:
+            raise ExecutionError(self.execution.failed or "it has no trajectory")
+        return watching.update(self.execution, self.parameters, name=self.name)
+
+
+def _runs(
+    opened: Opened, logs: Sequence[Path], reading: Logs, parameters: list[str] | None, how: Mapping[str, Any]
+) -> Iterator[_Run]:
+    """Yield the runs in tables, in a trajectory whose task is given, and in recordings whose tasks are unknown."""
+    experiment, validation = opened.experiment, opened.campaign.validation
+    mapping = reading.stated() or opened.settings.log_mapping
+    if mapping is not None:
+        mapping = replace(mapping, **reading.changes)
+    space = validation.space
+    given = parameters_from(parameters, space) if parameters else None
+    if given is not None and len(logs) != 1:
+        raise InputError(f"--set gives the parameters of one trajectory, got {len(logs)} files.")
+    for path in logs:
+        if given is None and not _is_table(path):
+            yield from _without_task(opened, path, reading)
+            continue
+        for run in read_runs([path], given, space, mapping=mapping, **how):
+            try:
+                _, execution = run.checked(validation, experiment)
+            except InputError as error:
+                raise InputError(f"{run.where}: {error}") from error
+            except ExecutionError as error:
+                execution = Execution(failed=str(error))
+            yield _Run(run.where, execution, run.parameters)
+
+
+def _is_table(path: Path) -> bool:
+    """Return whether a file is a table of runs, which names their trajectories."""
+    return path.suffix == ".csv" and path.is_file() and "trajectory" in CsvTable(path, 16 * 2**20).names
+
+
+def _without_task(opened: Opened, path: Path, reading: Logs) -> Iterator[_Run]:
+    """Yield recordings in pieces that are as long as a task, because a statistic of a longer run has another law."""
+    validation = opened.campaign.validation
+    task = validation.plan(0.5 * (validation.space.low + validation.space.high)).task
+    recordings = replace(reading, dt=reading.dt or task.dt).read([path], opened.settings, opened.experiment)
+    for number, recording in enumerate(recordings.runs):
+        whole = recording.trajectory
+        name = str(path) if len(recordings.runs) == 1 else f"{path}, recording {number + 1}"
+        pieces = max(1, whole.horizon // task.horizon)
+        if 2 * whole.horizon < task.horizon:
+            short = f"it has {whole.horizon} steps, and a task has {task.horizon}"
+            yield _Run(name, Execution(failed=short), None)
+            continue
+        for piece in range(pieces):
+            first, last = piece * task.horizon, min((piece + 1) * task.horizon, whole.horizon)
+            part = Trajectory(whole.times[first : last + 1], whole.states[first : last + 1], whole.inputs[first:last])
+            yield _Run(name if pieces == 1 else f"{name}, part {piece + 1}", Execution(part), None)
+
+
+def _judged(state: WatchState) -> dict[str, Any]:
+    """Return the statistic of the latest run that differs most from those certified."""
+    ratios = {each.name: each.ratio(len(state.runs)) for each in state.channels if each.later[-1] is not None}
+    name = max(ratios, key=lambda key: ratios[key])
+    latest = {"run": state.runs[-1], "distance": state.distances[-1]}
+    return {**latest, "statistic": name, "ratio": ratios[name], "evidence": state.evidence}

@@ -1,0 +1,183 @@
+"""How far single executions are from what others predict: positive statistics of each run, one of each kind.
+
+Each statistic is about 1 or less if the learned dynamics and their doubt are right, and if what is missing moves
+distances by less than ``NEGLIGIBLE`` of the threshold. The residuals of a state give two: their mean square, and that
+of their part that is linear in state and input, which shows what noise hides of a heavier load or a weaker motor.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ctxval._util.arrays import Array, single_threaded
+from ctxval.core.trajectory import Trajectory
+from ctxval.learning.dynamics_study import DynamicsStudy
+from ctxval.learning.histories import Record
+from ctxval.learning.learned_dynamics import LearnedDynamics
+from ctxval.learning.tolerance import PushedDynamics
+
+NEGLIGIBLE = 0.01
+"""Share of the threshold: what moves no distance by so much is no change."""
+
+_PUSH = 0.1  # sizes of the pushes that show what a residual does to distances, as shares of the residuals
+_LEAST, _MOST = 1e-6, 0.3  # limits of negligible residuals, as shares of a state's typical step
+
+
+@dataclass(frozen=True, eq=False)
+class RunStatistics:
+    """The statistics of runs beside what was learned.
+
+    Attributes:
+        learned: from the certified executions.
+        threshold: tau.
+        influences: what a unit of a constant residual of each state moves the distance of each executed task by,
+            shape ``(n, q)``.
+    """
+
+    learned: LearnedDynamics
+    threshold: float
+    influences: Array
+
+    @classmethod
+    def of(cls, learned: LearnedDynamics, threshold: float) -> RunStatistics:
+        """Return the statistics of runs beside what executions teach."""
+        return cls(learned, threshold, influences(learned))
+
+    @property
+    def floors(self) -> Array:
+        """The residuals of each state that move no distance by more than a negligible share, shape ``(n,)``."""
+        steps = self.learned.posterior.data.steps
+        largest = np.maximum(self.influences.max(axis=1), 1e-300)
+        return np.asarray(np.clip(NEGLIGIBLE * self.threshold / largest, _LEAST * steps, _MOST * steps))
+
+    @property
+    def has_noise(self) -> bool:
+        """Whether residuals are noise, whose law is known, rather than what a function has left unknown."""
+        return self.learned.noisy is not None and self.learned.noisy.is_noisy
+
+    def certified(self, k: int, distance: float) -> dict[str, RunStatistic] | None:
+        """Return the statistics of one of the executions, predicted from the others; None if nothing predicts it."""
+        others = self.learned.study.without(self.learned, k)
+        if others is None:
+            return None
+        point, trajectory = self.learned.executed[k], self.learned.trajectories_of_system[k]
+        return self._of(others, trajectory, point, distance)
+
+    def later(self, trajectory: Trajectory, point: Array | None, distance: float | None) -> dict[str, RunStatistic]:
+        """Return the statistics of a later run, with the states that are learned.
+
+        Without its task, ``(d,)``, and its distance, only those of the residuals are known.
+        """
+        return self._of(self.learned, trajectory, point, distance)
+
+    def _of(
+        self, learned: LearnedDynamics, trajectory: Trajectory, point: Array | None, distance: float | None
+    ) -> dict[str, RunStatistic]:
+        study, floors = learned.study, self.floors**2
+        if point is None:
+            inputs = trajectory.inputs if study.actuator is None else study.actuator.acting(trajectory.inputs)
+            record = Record(trajectory.states, inputs, trajectory.states[0])
+        else:
+            (record,) = study.extended.records([(point, trajectory)])
+        with single_threaded(), np.errstate(all="ignore"):
+            residuals, doubt, noise, regressors = _residuals(learned, record)
+        H = len(residuals)
+        columns = np.concatenate([np.ones((H, 1)), regressors], axis=1)
+        basis = _orthonormal(columns)
+        rank = basis.shape[1]
+        linear = ((basis.T @ residuals) ** 2).sum(axis=0) / H
+        whole = ((residuals**2).mean(axis=0) + floors) / (doubt + noise + floors)
+        trend = (linear + floors) / (doubt + noise * rank / H + floors)
+        gradients = columns.T @ (residuals / (noise + floors))  # (k, n)
+        information = columns.T @ columns
+        found = {}
+        for i, name in enumerate(names(study, len(whole))):
+            found[f"{name} residuals"] = RunStatistic(float(whole[i]), float(H))
+            known = (gradients[:, i], information / (noise + floors)[i]) if self.has_noise else (None, None)
+            found[f"systematic {name} residuals"] = RunStatistic(float(trend[i]), float(rank), *known)
+        if point is not None and distance is not None:
+            predicted = None
+            with contextlib.suppress(Exception):  # the user's parts, at states that no execution has reached
+                predicted = learned.predict(point)
+            if predicted is not None and np.isfinite(predicted.median):
+                least = (NEGLIGIBLE * self.threshold) ** 2
+                error = (distance - predicted.median) ** 2
+                found[DISTANCE] = RunStatistic(float((error + least) / (predicted.deviation**2 + least)), 1.0)
+        return found
+
+
+@dataclass(frozen=True)
+class RunStatistic:
+    """One statistic of a run.
+
+    Attributes:
+        value: positive.
+        freedom: the degrees of freedom that white noise gives it.
+        gradient, information: of the coefficients of 1, state and input, ``(k,)`` and ``(k, k)``; None without noise.
+    """
+
+    value: float
+    freedom: float
+    gradient: Array | None = None
+    information: Array | None = None
+
+
+DISTANCE = "errors of the predicted distance"
+"""Name of the statistic of the executed distance: its squared error, standardised by the draws of the dynamics."""
+
+
+def names(study: DynamicsStudy, states: int) -> Sequence[str]:
+    """Return the names of the states that are learned."""
+    return list(study.validation.names(states, 0)[0])
+
+
+def influences(learned: LearnedDynamics) -> Array:
+    """Return what a unit of a constant residual of each state moves the distance of executed tasks by, ``(n, q)``."""
+    posterior, planner = learned.posterior, learned.study.planner
+    data, mean, n = posterior.data, posterior.mean, len(posterior.data.sizes)
+    sizes = np.maximum(_PUSH * data.sizes, 1e-3 * data.steps)
+    pushes = np.concatenate([np.zeros((1, n)), np.diag(sizes), -np.diag(sizes)])
+    pushed = PushedDynamics(
+        model=posterior.model, data=data, expansions=mean.expansions, limit=mean.limit, pushes=pushes,
+        widths=np.ones(n),
+    )  # fmt: skip
+    with single_threaded():
+        distances = planner.distances(pushed, planner.plan(learned.executed), len(learned.executed))
+    moved = np.abs(distances[1:] - distances[0]).reshape(2, n, -1).max(axis=0)
+    return np.asarray(np.where(np.isfinite(moved), moved, 0.0) / sizes[:, None])
+
+
+def _residuals(learned: LearnedDynamics, record: Record) -> tuple[Array, Array, Array, Array]:
+    """Return residuals ``(H, n)`` of a record, and the regressors ``(H, k)``.
+
+    Between them are the mean squares of the doubt and of the noise, ``(n,)``.
+    """
+    noisy, posterior = learned.noisy, learned.posterior
+    if noisy is None:
+        data, most = posterior.data, posterior.most_probable
+        residuals = record.states[1:] - posterior.mean.alone(record.states[:-1], record.inputs)
+        Z = data.standardised(record.states[:-1], record.inputs)
+        doubt, noise = np.zeros(len(data.sizes)), np.zeros(len(data.sizes))
+        sizes = data.sizes[data.learned]
+        doubt[data.learned] = most.variance(Z).mean() * most.squares / len(most.centres) * sizes**2
+        noise[data.learned] = (most.noise * sizes) ** 2
+        return residuals, doubt, noise, Z
+    fit = noisy.fit
+    Z, _, residuals = fit.history.along([record], fit.residual)
+    z = (Z - fit.scaled.shift) / fit.scaled.scale
+    pairs = z[:, : record.states.shape[1] + record.inputs.shape[1]]
+    drawn = fit.draw(4, 5, np.random.default_rng(0))
+    values = np.concatenate([features(z) @ weights for features, weights, _ in drawn])  # (k, H, n)
+    relative = 1.0 if fit.local is None else float((fit.local(pairs) ** 2).mean())
+    return residuals, values.var(axis=0).mean(axis=0), fit.noise**2 * relative, pairs
+
+
+def _orthonormal(columns: Array) -> Array:
+    """Return an orthonormal basis ``(H, r)`` of columns ``(H, k)``."""
+    columns = columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
+    U, S, _ = np.linalg.svd(columns, full_matrices=False)
+    return np.asarray(U[:, 1e-3 * S[0] < S])

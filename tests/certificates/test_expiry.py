@@ -1,0 +1,105 @@
+"""The state of a watch: evidence, alarm, sentence and JSON."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from ctxval.certificates.expiry import EXCEEDED, Channel, Statistic, WatchState
+from ctxval.errors import InputError
+
+
+def begun(channels: int = 2, false_alarms: float = 1e-3) -> WatchState:
+    certified = np.random.default_rng(0).chisquare(4, (channels, 12)) / 4
+    names = ["rate residuals", "errors of the predicted distance", "angle residuals"]
+    listed = [Channel(name, tuple(row), 4.0, 12.0 * np.eye(2)) for name, row in zip(names, certified, strict=False)]
+    return WatchState(0.5, false_alarms, tuple(listed))
+
+
+def watched(state: WatchState, scale: float, runs: int, seed: int = 1) -> WatchState:
+    """Return the state after runs whose rate residuals are so many times as large as those certified."""
+    rng = np.random.default_rng(seed)
+    for _ in range(runs):
+        rate, other = np.array([scale**2, 1.0]) * rng.chisquare(4, 2) / 4
+        gradient = rng.standard_normal(2)
+        statistics = {
+            "rate residuals": Statistic(float(rate), gradient, np.eye(2)),
+            "errors of the predicted distance": Statistic(float(other)),
+        }
+        state = state.after(str(len(state.runs) + 1), statistics)
+    return state
+
+
+@pytest.mark.slow
+def test_it_says_what_has_changed_and_since_when() -> None:
+    calm = watched(begun(), 1.0, 40)
+    assert not calm.expired
+    assert calm.sentence.startswith("holds: 40 runs agree with the certified ones (evidence of a change ")
+    state = watched(calm, 3.0, 6, seed=2)
+    assert state.expired
+    assert state.cause == "rate residuals"
+    assert state.alarm is not None
+    assert state.since is not None
+    assert 39 <= state.since <= state.alarm <= 46
+    assert (
+        state.sentence == f"expired: rate residuals since run {state.since} are {state.ratio:.2g} times those certified"
+    )
+    assert 2 < (state.ratio or 0) < 4.5
+
+
+def test_an_alarm_stays() -> None:
+    state = watched(begun(), 4.0, 8)
+    after = watched(state, 1.0, 30, seed=3)
+    assert (after.alarm, after.sentence) == (state.alarm, state.sentence)
+
+
+@pytest.mark.slow
+def test_the_rate_of_false_alarms_decides_how_much_evidence_is_needed() -> None:
+    alarms = [watched(begun(false_alarms=rate), 2.0, 30).alarm or 99 for rate in (0.1, 1e-3, 1e-6)]
+    assert alarms == sorted(alarms)
+    assert alarms[0] < alarms[-1]
+
+
+@pytest.mark.slow
+def test_unchanged_runs_hardly_ever_raise_an_alarm() -> None:
+    """Eight watches of 60 runs at a rate of one in 100 runs: an e-detector is far below what it may be."""
+    alarms = [watched(begun(false_alarms=0.01), 1.0, 60, seed=10 + k).expired for k in range(8)]
+    assert sum(alarms) <= 2
+
+
+def test_a_run_without_a_statistic_says_nothing_of_it() -> None:
+    state = begun()
+    only = state.after("a", {"rate residuals": Statistic(1.0)})
+    assert only.channels[1].later == (None,)
+    assert only.channels[1].evidence()[0] == -np.inf
+    both = only.after("b", {name: Statistic(1.0) for name in ("rate residuals", "errors of the predicted distance")})
+    assert both.channels[1].evidence()[1] == 2
+
+
+def test_it_is_data() -> None:
+    state = watched(begun(), 2.5, 9)
+    text = json.dumps(state.to_json(), allow_nan=False)
+    again = WatchState.from_json(json.loads(text))
+    assert json.dumps(again.to_json()) == text
+    assert watched(again, 1.0, 2).evidence == watched(state, 1.0, 2).evidence
+    assert json.loads(text)["expired"] is state.expired
+
+
+@pytest.mark.parametrize("change", [{"channels": None}, {"runs": ["a", "b"]}, {"threshold": "large"}])
+def test_other_data_is_refused(change: dict[str, object]) -> None:
+    with pytest.raises(InputError, match="the state of a watch must be what to_json returned"):
+        WatchState.from_json({**watched(begun(), 1.0, 1).to_json(), **change})
+
+
+def test_an_executed_distance_above_the_threshold_is_a_fact_unless_there_is_noise() -> None:
+    statistics = {"rate residuals": Statistic(1.0)}
+    exact = WatchState(0.5, 1e-3, (Channel("rate residuals", (1.0, 1.1, 0.9)),))
+    state = exact.after("a", statistics, 0.5).after("b", statistics, 0.75)
+    assert (state.alarm, state.cause, state.ratio) == (2, EXCEEDED, 1.5)
+    assert state.sentence == "expired: run 2 has the distance 0.75, above the threshold 0.5"
+    assert WatchState.from_json(state.to_json()).sentence == state.sentence
+    noisy = begun().after("a", statistics, 0.75)
+    assert noisy.has_noise
+    assert not noisy.expired
