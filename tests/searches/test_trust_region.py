@@ -262,8 +262,8 @@ def test_settings_leave_parts_of_the_search_out() -> None:
 def test_a_store_has_the_settings_if_they_are_not_the_usual_ones() -> None:
     assert describe(TrustRegion()) == {"type": "TrustRegion", "optimism": 2.0, "misses": 3}
     assert describe(Auto()) == {"type": "Auto", "optimism": 2.0, "misses": 3, "thinking": "balanced"}
-    other = describe(TrustRegion(settings=TrustRegionSettings(first_radius=0.3)))
-    assert other["settings"]["first_radius"] == 0.3
+    other = describe(TrustRegion(settings=TrustRegionSettings(boldness=1.0)))
+    assert other["settings"]["boldness"] == 1.0
 
 
 def asked_while_pending(at: list[float], after: Function) -> Array:

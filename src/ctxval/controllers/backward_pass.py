@@ -16,26 +16,17 @@ from ctxval.core.controller import Limits
 
 
 @dataclass(frozen=True, eq=False)
-class Change:
-    """The expected change of the cost, ``length * slope + length^2 / 2 * curvature``; both of shape ``(N,)``."""
-
-    slope: Array
-    curvature: Array
-
-    def at(self, length: float | Array) -> Array:
-        return length * self.slope + 0.5 * length**2 * self.curvature
-
-
-@dataclass(frozen=True, eq=False)
 class InputStep:
     """A step of the inputs with its feedback, and the expected change of the cost.
 
     The gains K have shape ``(H, N, m, n)``, or ``(H, m, n)`` if all tasks share them, the feedforward k ``(H, N, m)``.
+    A step of some length changes the cost by ``length * slope + length^2 / 2 * curvature``, both of shape ``(N,)``.
     """
 
     K: Array
     k: Array
-    change: Change
+    slope: Array
+    curvature: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +74,7 @@ def _linear(cost: QuadraticCost, around: Expansion) -> InputStep:
     Q_u = weighed + slopes @ around.B
     k = -Q_u @ known.inverses
     slope = _inner(k, Q_u)
-    return InputStep(known.gains, k, Change(slope, -slope))
+    return InputStep(known.gains, k, slope, -slope)
 
 
 def _recursion(cost: QuadraticCost, around: Expansion, stage: _Stage) -> InputStep:
@@ -112,7 +103,7 @@ def _recursion(cost: QuadraticCost, around: Expansion, stage: _Stage) -> InputSt
             v += times(Q_uu_k[t] + Q_u, K)
             V = V + _T(K) @ (Q_uu @ K + Q_ux)
         V = 0.5 * (V + _T(V))
-    return InputStep(K_all, k_all, Change(_inner(k_all, slopes), _inner(k_all, Q_uu_k)))
+    return InputStep(K_all, k_all, _inner(k_all, slopes), _inner(k_all, Q_uu_k))
 
 
 def _joined(around: Expansion, shape: tuple[int, int]) -> tuple[Array, Array]:

@@ -118,7 +118,7 @@ class _Descent:
 
     def advance(self, rows: Rows) -> None:
         around, policy = self._step(rows)
-        gain = -policy.change.at(1.0)
+        gain = -(policy.slope + 0.5 * policy.curvature)
         arrived = gain <= self.settings.tolerance * (np.abs(self.J[rows]) + self.settings.tolerance)
         # A damped step is always small, so only an undamped step may mark a task as converged.
         self.converged[rows] = arrived & (self.damping[rows] == 0)
@@ -190,7 +190,7 @@ class _Descent:
         index = np.arange(len(of)) - np.repeat(np.cumsum(counts) - counts - tried, counts)
         lengths, tasks = _STEP_LENGTHS[index], waiting[of]
         X, U, J = self._forward(rows[tasks], policy, tasks, lengths)
-        expected = lengths * policy.change.slope[tasks] + 0.5 * lengths**2 * policy.change.curvature[tasks]
+        expected = lengths * policy.slope[tasks] + 0.5 * lengths**2 * policy.curvature[tasks]
         good = np.flatnonzero(self.J[rows[tasks]] - J >= -1e-4 * expected)
         moved, first = np.unique(of[good], return_index=True)
         chosen, to = good[first], rows[waiting[moved]]

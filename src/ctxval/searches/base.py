@@ -13,7 +13,6 @@ from ctxval._util.arrays import Array, ArrayLike, Rows, as_floats
 from ctxval._util.checked import NonNegativeInt, PositiveInt, checked
 from ctxval._util.representation import ShortRepr, call, options
 from ctxval.errors import InputError, ShapeError
-from ctxval.gp.ascent import Effort
 from ctxval.gp.surrogate import Surrogate
 
 Note = dict[str, Any]
@@ -35,11 +34,6 @@ class Costs:
     evaluation: float | None
     rough: float | None = None
     batch: float = 0.0
-
-    def thinking(self, effort: Effort) -> float:
-        """Return the seconds of CPU time of so many predictions."""
-        rough = self.prediction if self.rough is None else self.rough
-        return effort.batches * self.batch + effort.exact * self.prediction + effort.rough * rough
 
 
 @dataclass(frozen=True, eq=False)

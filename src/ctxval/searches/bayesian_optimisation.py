@@ -57,7 +57,7 @@ class _Branch:
         return low, high
 
 
-@part("bayesian-optimisation", aliases=("scalar",))
+@part("bayesian-optimisation")
 class BayesianOptimisation(SequentialSearch):
     """Bayesian optimisation from values alone: expected improvement and upper confidence bounds, with branches.
 

@@ -35,6 +35,12 @@ _ENGINE = "climb"
 """The name of this search in notes. Existing stores contain it, so it differs from the name of the class."""
 
 
+POINTS = 400  # largest number of points that are predicted for one suggestion, for each dimension
+_IMPROVEMENT = 1e-3  # least predicted improvement worth an execution, as a share of the largest value
+_COMPARED_FROM = 6  # number of known values from which on the prediction must be better than the surrogate
+_COMPARED_ON = 24  # largest number of known values, the latest ones, on which the two are compared
+
+
 @dataclass(frozen=True)
 class TrustRegionSettings:
     """Settings of :class:`TrustRegion` that its studies vary (``benchmarks/study_ablations.py``).
@@ -42,40 +48,14 @@ class TrustRegionSettings:
     Attributes:
         compare_with_surrogate: whether a prediction is used only if leave-one-out errors show that it is good.
         restrict: whether there are trust regions; if not, the whole cube is searched each time.
-        accurate: largest relative error of a prediction that counts as right.
-        points: largest number of points that are predicted for one suggestion, for each dimension.
-        first_radius: half the width of a new region.
-        least_radius: half the width below which a region is left.
-        improvement: least predicted improvement worth an execution, as a share of the largest value.
-        patience: factor of the optimism in the test whether a region may still lead to a value larger than all others.
         boldness: factor by which the optimism grows with each new region that has found nothing larger.
-        compared_from: number of known values from which on the prediction must be better than the surrogate.
-        compared_on: largest number of known values, the latest ones, on which the two are compared.
-        good_enough: mean error of the logarithm up to which a prediction needs no comparison.
         hedge: whether a prediction that may mislead alternates with the surrogate.
-        far_off: relative error of the last two predictions from which on the search hedges if the doubt exceeds 1.
-        fruitless: number of executions that found nothing larger, from which on it hedges in any case.
-        distinct: least distance of a suggestion from each known point, in at least one coordinate.
-        apart: least distance of a suggestion from pending and failed points, as a share of the cube's diagonal.
     """
 
     compare_with_surrogate: bool = True
     restrict: bool = True
-    accurate: float = 0.1
-    points: int = 400
-    first_radius: float = 0.4
-    least_radius: float = 0.02
-    improvement: float = 1e-3
-    patience: float = 10.0
     boldness: float = 4.0
-    compared_from: int = 6
-    compared_on: int = 24
-    good_enough: float = 0.1
     hedge: bool = True
-    far_off: float = 0.5
-    fruitless: int = 6
-    distinct: float = 1e-6
-    apart: float = 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,7 +130,7 @@ class _History:
     others: Array
 
 
-@part("trust-region", aliases=("climbs",))
+@part("trust-region")
 class TrustRegion(SequentialSearch):
     """Trust-region search with restarts on a prediction of the values; Bayesian optimisation if no prediction is good.
 
@@ -206,19 +186,19 @@ class TrustRegion(SequentialSearch):
     @property
     def predicted_besides(self) -> int:
         """The number of known points that are predicted for a choice, besides those of the budget."""
-        known, settings = int(np.isfinite(self.values).sum()), self._settings
-        return min(known, settings.compared_on) if known >= settings.compared_from else 0
+        known = int(np.isfinite(self.values).sum())
+        return min(known, _COMPARED_ON) if known >= _COMPARED_FROM else 0
 
     # How good the prediction is
 
     def _why_not(self, prediction: Prediction, surrogate_error: Callable[[], float]) -> str | None:
         """Return why the prediction is not used; None if it is."""
         values = self.values[np.isfinite(self.values)]
-        if not self._settings.compare_with_surrogate or len(values) < self._settings.compared_from:
+        if not self._settings.compare_with_surrogate or len(values) < _COMPARED_FROM:
             return None
-        rows = np.arange(len(values))[-self._settings.compared_on :]
+        rows = np.arange(len(values))[-_COMPARED_ON:]
         error = _log_error(prediction.left_out(rows), values[rows])
-        if error <= self._settings.good_enough or error <= surrogate_error():
+        if error <= 0.1 or error <= surrogate_error():  # a small error needs no comparison
             return None
         return (
             f"leaving one out, the prediction errs by {error:.2g} where the surrogate errs by {surrogate_error():.2g}"
@@ -231,7 +211,7 @@ class TrustRegion(SequentialSearch):
         kept = kept_rows(points, values, 150, long=150)  # they end with the latest values, which are compared
         surrogate = fit_surrogate(points[kept], values[kept])
         left_out = surrogate.shift + surrogate.scale * surrogate.process.left_out()[0]
-        latest = slice(-min(len(values), self._settings.compared_on), None)
+        latest = slice(-min(len(values), _COMPARED_ON), None)
         return _log_error(left_out[latest], values[latest])
 
     def _why_hedge(self) -> str | None:
@@ -243,14 +223,12 @@ class TrustRegion(SequentialSearch):
             return None
         last = [(self.values[row], (self.notes[row] or {})["expected"]) for row in rows[-2:]]
         error = min(abs(value - expected) / max(value, expected, 1e-300) for value, expected in last)
-        if len(last) == 2 and (self._last_note or {})["doubt"] > 1 and error > self._settings.far_off:
+        if len(last) == 2 and (self._last_note or {})["doubt"] > 1 and error > 0.5:
             return f"the last two predictions erred by {100 * error:.0f} % or more and the next one is in doubt"
         values = self.values[np.isfinite(self.values)]
-        gains = values[1:] > (1 + self._settings.improvement) * np.maximum.accumulate(values)[:-1]
+        gains = values[1:] > (1 + _IMPROVEMENT) * np.maximum.accumulate(values)[:-1]
         fruitless = len(gains) - int(np.flatnonzero(gains).max(initial=-1)) - 1
-        if fruitless >= self._settings.fruitless:
-            return f"the last {fruitless} executions found nothing larger"
-        return None
+        return f"the last {fruitless} executions found nothing larger" if fruitless >= 6 else None
 
     # Where to execute next
 
@@ -281,24 +259,21 @@ class TrustRegion(SequentialSearch):
         self, prediction: Prediction, history: _History, rng: np.random.Generator
     ) -> tuple[_Candidate | None, _Region]:
         """Return the next candidate after a history, None if no point can be predicted, and its region."""
-        settings, value = self._settings, _OptimisticValue(prediction, self.optimism)
-        if not settings.restrict:
+        value = _OptimisticValue(prediction, self.optimism)
+        if not self._settings.restrict:
             return self._best(value, _Region(), history, rng), _Region()
         region = self._state(history)
-        if region.misses < self.misses and region.radius >= settings.least_radius:
+        if region.misses < self.misses and region.radius >= 0.02:
             found = self._best(value, region, history, rng)
-            if found is not None and self._is_worth(found, region.best, float(np.nanmax(history.values, initial=0.0))):
-                return found, region
+            if found is not None:
+                # It may exceed the region's best value and, with ten times the optimism, the largest value of all.
+                least, largest = 1 + _IMPROVEMENT, float(np.nanmax(history.values, initial=0.0))
+                patient = found.optimistic(10.0 * self.optimism)
+                if found.optimistic(self.optimism) > region.best * least and patient > largest * least:
+                    return found, region
         # The optimism grows with every region that finds nothing larger, so the search explores more.
-        bold = replace(value, optimism=self.optimism * settings.boldness ** (1 + region.stale))
-        new = _Region(region.number + 1, settings.first_radius)
-        return self._best(bold, _Region(), history, rng), new
-
-    def _is_worth(self, found: _Candidate, best: float, largest: float) -> bool:
-        """Return whether a value may exceed a region's best value and, with more optimism, the largest of all."""
-        optimism, least = self.optimism, 1 + self._settings.improvement
-        patient = self._settings.patience * optimism
-        return found.optimistic(optimism) > best * least and found.optimistic(patient) > largest * least
+        bold = replace(value, optimism=self.optimism * self._settings.boldness ** (1 + region.stale))
+        return self._best(bold, _Region(), history, rng), _Region(region.number + 1, radius=0.4)
 
     def _best(
         self, value: _OptimisticValue, region: _Region, history: _History, rng: np.random.Generator
@@ -312,7 +287,7 @@ class TrustRegion(SequentialSearch):
             order = np.argsort(-np.nan_to_num(promised, nan=-np.inf), kind="stable")
             points, promised = points[order], promised[order]
         else:
-            budget = min(value.prediction.budget, self._settings.points * self.dimension)
+            budget = min(value.prediction.budget, POINTS * self.dimension)
             ascent = Ascent(value, *region.box(self.dimension), budget, value.rough)
             points, promised = ascent.run(best_first(history.points, history.values)[:8], rng)
         points = points[self._is_new(points, history) & np.isfinite(promised)]
@@ -335,10 +310,10 @@ class TrustRegion(SequentialSearch):
 
     def _is_new(self, points: Array, history: _History) -> Mask:
         """Return which of some points ``(m, d)`` are far enough from all known, pending and failed ones."""
-        known, reach = np.isfinite(history.values), self._settings.apart * np.sqrt(self.dimension)
+        known, reach = np.isfinite(history.values), 0.05 * np.sqrt(self.dimension)
         gaps = cdist(points, history.points[known], "chebyshev").min(axis=1, initial=np.inf)
         others = cdist(points, history.others).min(axis=1, initial=np.inf)
-        return np.asarray((gaps > self._settings.distinct) & (others > reach))
+        return np.asarray((gaps > 1e-6) & (others > reach))
 
     def _state(self, history: _History) -> _Region:
         """Return the state of the last region after a history."""
@@ -350,7 +325,7 @@ class TrustRegion(SequentialSearch):
                 region = self._after(region, point, value, note)
             elif value > region.best:
                 region = replace(region, best=value, point=point)
-            if value > largest * (1 + self._settings.improvement) or largest == -np.inf:
+            if value > largest * (1 + _IMPROVEMENT) or largest == -np.inf:
                 region = replace(region, stale=0)
             largest = max(largest, value) if np.isfinite(value) else largest
         return region
@@ -359,13 +334,12 @@ class TrustRegion(SequentialSearch):
         """Return a region after one of its executions."""
         if not np.isfinite(value):
             return replace(region, misses=region.misses + 1)
-        right = abs(value - note["expected"]) <= self._settings.accurate * max(value, note["expected"])
-        if value > region.best * (1 + self._settings.improvement) or region.point is None:
-            first = region.point is None
-            grown = region.radius if first else min(1.0, 2 * region.radius)
+        if value > region.best * (1 + _IMPROVEMENT) or region.point is None:
+            grown = region.radius if region.point is None else min(1.0, 2 * region.radius)
             return replace(region, best=value, point=point, misses=0, radius=grown)
         if value > region.best:
             region = replace(region, best=value, point=point)
+        right = abs(value - note["expected"]) <= 0.1 * max(value, note["expected"])
         return replace(region, misses=region.misses + 1, radius=region.radius if right else region.radius / 2)
 
 
