@@ -351,7 +351,7 @@ print("alive")
 @pytest.mark.parametrize("path", ["fmi2", *more("fmi3")], indirect=True)
 def test_the_unpacked_files_go_with_the_system(path: Path) -> None:
     system = FMU(path, **NAMES)
-    folder = system._unpacked.path
+    folder = Path(system._unpacked)
     assert folder.exists()
     del system
     assert not folder.exists()

@@ -6,7 +6,7 @@ import importlib
 import inspect
 import sys
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import KW_ONLY, dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from ctxval._util.checked import checked
@@ -22,33 +22,11 @@ Made = TypeVar("Made")
 
 @dataclass(frozen=True)
 class Declaration:
-    """What a registry must know of a part beyond its class; :func:`part` explains the fields."""
-
-    name: str
-    runs_code: bool = False
-    files: tuple[str, ...] = ()
-    folder: str | None = None
-    functions: Mapping[str, str] = field(default_factory=dict)
-    parts: Mapping[str, str] = field(default_factory=dict)
-
-
-_declarations: dict[Any, Declaration] = {}
-
-
-def part(
-    name: str | None = None,
-    *,
-    runs_code: bool = False,
-    files: tuple[str, ...] = (),
-    folder: str | None = None,
-    functions: Mapping[str, str] | None = None,
-    parts: Mapping[str, str] | None = None,
-) -> Callable[[Part], Part]:
-    """Declare a class, or a function that makes an object, as a part that is found by name; check its arguments.
+    """Declares a class, or a function that makes an object, as a part that is found by name; checks its arguments.
 
     A part of this package is found once its package exports it in ``__all__``.
 
-    Args:
+    Attributes:
         name: the name of the class by default.
         runs_code: whether plain arguments, such as a text, can make the part run code: a program, a library, a module.
         files: arguments that are paths of files.
@@ -57,13 +35,22 @@ def part(
         parts: arguments that are parts themselves, each with its kind, such as ``synthesizer``.
     """
 
-    def declare(made: Part) -> Part:
+    name: str = ""
+    _: KW_ONLY
+    runs_code: bool = False
+    files: tuple[str, ...] = ()
+    folder: str | None = None
+    functions: Mapping[str, str] = field(default_factory=dict)
+    parts: Mapping[str, str] = field(default_factory=dict)
+
+    def __call__(self, made: Part) -> Part:
         made = checked(made)
-        own = name or made.__name__
-        _declarations[made] = Declaration(own, runs_code, files, folder, functions or {}, parts or {})
+        _declarations[made] = replace(self, name=self.name or made.__name__)
         return made
 
-    return declare
+
+part = Declaration
+_declarations: dict[Any, Declaration] = {}
 
 
 def declaration_of(made: Any) -> Declaration | None:

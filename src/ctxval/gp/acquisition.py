@@ -41,7 +41,6 @@ class UpperConfidenceBound:
     beta: float = 2.0
 
     def __call__(self, X: Array) -> Array:
-        """Return the bound at ``(m, d)``, shape ``(m,)``."""
         mean, variance = self.process.predict(X)
         return np.asarray(mean + np.sqrt(self.beta * variance))
 
@@ -66,13 +65,11 @@ class LogExpectedImprovement:
     best: float
 
     def __call__(self, X: Array) -> Array:
-        """Return the logarithm at ``(m, d)``, shape ``(m,)``."""
         mean, variance = self.process.predict(X)
         sigma = np.maximum(np.sqrt(variance), _CERTAIN)
         return np.asarray(log_improvement((mean - self.best) / sigma) + np.log(sigma))
 
     def with_gradient(self, X: Array) -> tuple[Array, Array]:
-        """Return the logarithm ``(m,)`` and its gradient ``(m, d)``."""
         mean, variance, d_mean, d_variance = self.process.predict_with_gradient(X)
         sigma = np.maximum(np.sqrt(variance), _CERTAIN)
         d_sigma = np.where(np.sqrt(variance) > _CERTAIN, d_variance.T / (2 * sigma), 0.0).T
@@ -104,11 +101,9 @@ class Uncertainty:
     process: GaussianProcess
 
     def __call__(self, X: Array) -> Array:
-        """Return the variance at ``(m, d)``, shape ``(m,)``."""
         return self.process.predict(X)[1]
 
     def with_gradient(self, X: Array) -> tuple[Array, Array]:
-        """Return the variance ``(m,)`` and its gradient ``(m, d)``."""
         _, variance, _, d_variance = self.process.predict_with_gradient(X)
         return variance, d_variance
 

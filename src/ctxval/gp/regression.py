@@ -69,10 +69,6 @@ class GaussianProcess:
         """Return mean and variance ``(n,)`` of each observation given all others (Rasmussen and Williams, eq. 5.12)."""
         return self.y - self.alpha / self.factor.precisions, 1 / self.factor.precisions
 
-    def log_marginal_likelihood(self) -> float:
-        """Return log p(y | X, theta)."""
-        return _log_likelihood(self.factor, self.alpha, self.y - self.mean(self.X))
-
 
 @dataclass(frozen=True, eq=False)
 class MultiOutputProcess:
@@ -138,11 +134,6 @@ def condition(
     return GaussianProcess(kernel, np.asarray(theta, dtype=np.float64), noise, mean, X, y, factor, alpha)
 
 
-def _log_likelihood(factor: CholeskyFactor, alpha: Array, residual: Array) -> float:
-    fit = -0.5 * residual @ alpha
-    return float(fit - factor.half_log_determinant() - 0.5 * len(alpha) * np.log(2 * np.pi))
-
-
 def log_likelihood_of_outputs(K: Array, noise: float, Y: Array) -> tuple[float, Array]:
     """Return ``sum_o log p(Y[:, o])`` up to a constant, and its derivative W with respect to K.
 
@@ -172,7 +163,8 @@ def log_marginal_likelihood(
     W -= np.outer(alpha, alpha)
     W *= -0.5
     gradient = kernel.weighted_gradient(theta, X, W)
-    return _log_likelihood(factor, alpha, residual), np.append(gradient, noise * np.trace(W))
+    value = -0.5 * residual @ alpha - factor.half_log_determinant() - 0.5 * len(alpha) * np.log(2 * np.pi)
+    return float(value), np.append(gradient, noise * np.trace(W))
 
 
 def fit(
