@@ -152,7 +152,6 @@ class _Descent:
         self._keep(policy, np.flatnonzero(finite), rows)
 
     def _step(self, rows: Rows) -> tuple[Expansion, InputStep]:
-        """Return the expansion at the iterates of these tasks, and the step that minimises it."""
         X, U = self.X[:, rows], self.U[:, rows]
         known = self.latest  # the derivatives of unchanged iterates are kept
         if known is None or not self.refused[rows].all() or not np.array_equal(known[0], rows):
@@ -223,7 +222,6 @@ class _Descent:
         return inputs if self.limits is None else self.limits.clip(inputs)
 
     def solution(self, batch_shape: tuple[int, ...]) -> ILQRSolution:
-        """Return the iterates as a solution, batch first."""
 
         def batch_first(array: Array) -> Array:
             return np.moveaxis(array, 0, 1).reshape(*batch_shape, len(array), *array.shape[2:])

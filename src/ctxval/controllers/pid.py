@@ -99,7 +99,6 @@ class PIDFeedback(ShortRepr):
 
     @property
     def limits(self) -> Limits | None:
-        """The limits of the inputs; None if there are none."""
         return self.pid.limits
 
     def start(self, task: Task) -> PIDMemory:
@@ -126,7 +125,6 @@ class PIDFeedback(ShortRepr):
         return (u if pid.limits is None else pid.limits.clip(u)), new
 
     def __getitem__(self, index: int) -> PIDFeedback:
-        """Return the controller of one task of the batch."""
         return replace(self, reference=self.reference[index])
 
 

@@ -75,7 +75,6 @@ def _records(path: Path, content: Any) -> list[Mapping[str, Any]]:
 
 
 def _numbers(before: str, record: Mapping[str, Any], depth: int) -> Iterator[tuple[str, Any]]:
-    """Yield the fields of a record that may hold numbers, by their paths."""
     for name, value in record.items():
         path = f"{before}.{name}".removeprefix(".")
         if isinstance(value, Mapping):

@@ -48,7 +48,6 @@ class AtCrossing(ErrorNorm):
         return np.asarray(np.linalg.norm(gap, self.norm, axis=-1).max(axis=-1))
 
     def _states(self, trajectory: Trajectory) -> Array:
-        """Return the states at the crossings, shape ``(..., crossings, n)``."""
         states = trajectory.states
         n = states.shape[-1]
         [state] = require_indices("state", [self.state], n)

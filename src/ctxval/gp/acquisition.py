@@ -10,7 +10,7 @@ from scipy.spatial.distance import cdist
 from scipy.special import erfcx, log_ndtr, ndtr
 
 from ctxval._util.arrays import Array, Mask
-from ctxval._util.boxes import climb, moves_to_bounds, separated_rows
+from ctxval._util.boxes import Box, climb, polish, separated_rows
 from ctxval.gp.regression import GaussianProcess
 
 
@@ -108,10 +108,6 @@ class Uncertainty:
         return variance, d_variance
 
 
-Box = tuple[Array, Array]
-"""The lower and upper bounds ``(d,)`` of a part of the unit cube."""
-
-
 def maximise(
     acquisition: Acquisition,
     dimension: int,
@@ -156,23 +152,13 @@ def maximise(
     starts = best[separated_rows(best, 0.05 * diagonal, 4)]
     climbed, _ = climb(acquisition.with_gradient, starts, low, high, iterations=20)
     if corners:
-        climbed = np.concatenate([climbed, _polish(acquisition, climbed, low, high)])
+        heights = acquisition(climbed)
+        row = [int(heights.argmax())]
+        top, _ = polish(lambda Z: acquisition(Z[0])[None], climbed[row], heights[row], (low, high), 2 * dimension)
+        climbed = np.concatenate([climbed, top])
     finalists = np.concatenate([climbed, candidates[order[:16]]])
     is_new = cdist(finalists, known, "chebyshev").min(axis=1, initial=np.inf) > 1e-6
     values = np.where(is_new & is_apart(finalists), acquisition(finalists), -np.inf)
     if not np.isfinite(values).any():
         return np.asarray(low + rng.random(dimension) * (high - low))
     return np.asarray(finalists[np.argmax(values)])
-
-
-def _polish(acquisition: Acquisition, points: Array, low: Array, high: Array) -> Array:
-    """Move one coordinate of the best point at a time to a bound, while that increases the value."""
-    values = acquisition(points)
-    point, value = points[np.argmax(values)], float(values.max())
-    for _ in range(2 * len(low)):
-        moved = moves_to_bounds(point, low, high)
-        values = acquisition(moved)
-        if values.max() <= value:
-            break
-        point, value = moved[np.argmax(values)], float(values.max())
-    return np.asarray(point[None])

@@ -57,7 +57,6 @@ class Ascent:
 
     @property
     def _left(self) -> int:
-        """How many evaluations the budget still allows."""
         used = 0 if self._rough is self._exact else self._rough.budget - self._rough.left
         return self._exact.left - used
 
@@ -136,7 +135,6 @@ def usual_effort(dimension: int, budget: int) -> Effort:
 
 
 def _best(done: Evaluations, count: int, share: float = 0.1) -> Array:
-    """Return some of the best points, each at a distance from all better ones."""
     points, values = done.found()
     finite = points[np.isfinite(values)]
     reach = share * float(np.linalg.norm(done.high - done.low))

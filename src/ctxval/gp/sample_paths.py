@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ctxval._util.arrays import Array
-from ctxval._util.boxes import climb, moves_to_bounds
+from ctxval._util.boxes import climb, polish
 from ctxval.gp.hyperposterior import EXACT, Conditioned
 
 WAVES = 512
@@ -129,7 +129,9 @@ def maxima(paths: Paths, known: Array, rng: np.random.Generator) -> tuple[Array,
     heights = paths.own(points)
     best, rows = np.argmax(heights, axis=1), np.arange(len(paths))
     tops, where = heights[rows, best], points[rows, best]
-    return _polish(paths, tops, where) if d > 2 else (tops, where)
+    if d > 2:
+        where, tops = polish(paths.own, where, tops, (np.zeros(d), np.ones(d)), d, 1e-9 * paths.scales)
+    return tops, where
 
 
 def _climb(paths: Paths, starts: Array, steps: int) -> Array:
@@ -141,19 +143,3 @@ def _climb(paths: Paths, starts: Array, steps: int) -> Array:
         return values / units, gradients / units[..., None]
 
     return climb(sloped, starts, np.zeros(d), np.ones(d), iterations=steps)[0]
-
-
-def _polish(paths: Paths, tops: Array, where: Array) -> tuple[Array, Array]:
-    """Move one coordinate of each path's maximum at a time to a bound, the best move first."""
-    s, d = where.shape
-    for _ in range(d):
-        moved = moves_to_bounds(where, np.zeros(d), np.ones(d))
-        heights = paths.own(moved)
-        best = heights.argmax(axis=1)
-        rows = np.arange(s)
-        better = heights[rows, best] > tops + 1e-9 * paths.scales
-        if not better.any():
-            break
-        tops = np.where(better, heights[rows, best], tops)
-        where = np.where(better[:, None], moved[rows, best], where)
-    return tops, where

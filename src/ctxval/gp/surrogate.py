@@ -74,7 +74,6 @@ def _scaled(mean: Mean, scale: float, X: Array) -> Array:
 
 
 def _scale(residual: Array) -> float:
-    """Return the residual's root mean square, or 1 if it vanishes."""
     size = float(np.sqrt((residual**2).mean()))
     return size if size > 1e-12 else 1.0
 

@@ -264,7 +264,6 @@ class SequentialSearch(BaseSearch):
 
     @property
     def dimension(self) -> int:
-        """The dimension d of the unit cube."""
         return self._dimension
 
     @property
@@ -296,5 +295,4 @@ def best_first(points: Array, values: Array) -> Array:
 
 
 def _key(point: Array) -> bytes:
-    """Return a key that is the same for equal points."""
     return (point + 0.0).tobytes()  # minus zero is zero

@@ -17,9 +17,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ctxval._util.arrays import Array, single_threaded
+from ctxval._util.boxes import Box
 from ctxval._util.checked import NonNegativeFloat, PositiveInt
 from ctxval._util.registry import part
-from ctxval.gp.acquisition import Acquisition, Box, LogExpectedImprovement, UpperConfidenceBound, maximise
+from ctxval.gp.acquisition import Acquisition, LogExpectedImprovement, UpperConfidenceBound, maximise
 from ctxval.gp.regression import GaussianProcess
 from ctxval.gp.subset import kept_rows
 from ctxval.gp.surrogate import Learned, learn
@@ -51,7 +52,6 @@ class _Branch:
     misses: int = 0
 
     def box(self, dimension: int) -> Box:
-        """Return the bounds of this half."""
         low, high = np.zeros(dimension), np.ones(dimension)
         (low if self.upper else high)[self.coordinate] = 0.5
         return low, high

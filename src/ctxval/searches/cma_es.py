@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ctxval._util.arrays import Array, single_threaded
 from ctxval._util.checked import PositiveFloat, PositiveInt
+from ctxval._util.extras import require_extra
 from ctxval._util.registry import part
 from ctxval.errors import InputError
 from ctxval.searches.base import SequentialSearch
 
 if TYPE_CHECKING:
     from cmaes import CMA
+
+_library = partial(require_extra, "cmaes", "searches", "CMA-ES searches")
 
 
 @part("cma-es")
@@ -33,7 +37,7 @@ class CMAES(SequentialSearch):
     def __init__(self, sigma: PositiveFloat = 0.3, population: PositiveInt | None = None) -> None:
         if population is not None and population < 4:
             raise InputError(f"CMA-ES needs a population of at least 4, got {population!r}.")
-        _cma_class()
+        _library()
         self.sigma = sigma
         self.population = population
 
@@ -66,7 +70,7 @@ class CMAES(SequentialSearch):
 
     def _started(self, mean: Array, population: int | None) -> CMA:
         bounds = np.tile([0.0, 1.0], (self.dimension, 1))
-        return _cma_class()(mean=mean, sigma=self.sigma, bounds=bounds, population_size=population)
+        return _library().CMA(mean=mean, sigma=self.sigma, bounds=bounds, population_size=population)
 
 
 def _learn(distribution: CMA, points: Array, values: Array) -> None:
@@ -77,12 +81,3 @@ def _learn(distribution: CMA, points: Array, values: Array) -> None:
     losses = np.where(known, -values, -values[known].min())
     order = np.argsort(-values, kind="stable")  # NaN last
     distribution.tell([(points[i], float(losses[i])) for i in order])
-
-
-def _cma_class() -> type[CMA]:
-    try:
-        import cmaes  # here, and not above: it is an extra
-    except ImportError as error:
-        raise InputError('cmaes is not installed: pip install "ctxval[searches]".') from error
-    found: type[CMA] = cmaes.CMA
-    return found

@@ -22,9 +22,9 @@ import numpy as np
 from scipy.spatial.distance import cdist
 
 from ctxval._util.arrays import Array, Mask, single_threaded
+from ctxval._util.boxes import Box
 from ctxval._util.checked import NonNegativeFloat, PositiveInt
 from ctxval._util.registry import part
-from ctxval.gp.acquisition import Box
 from ctxval.gp.ascent import Ascent
 from ctxval.gp.subset import kept_rows
 from ctxval.gp.surrogate import fit_surrogate
@@ -67,7 +67,6 @@ class _Candidate:
     doubt: float
 
     def optimistic(self, optimism: float) -> float:
-        """Return the optimistic value with this kappa."""
         return self.expected * (1 + optimism * self.doubt)
 
 
@@ -90,7 +89,6 @@ class _OptimisticValue:
         return np.asarray(expected * (1 + self.optimism * doubt))
 
     def at(self, point: Array) -> _Candidate:
-        """Return a point ``(d,)`` with what is predicted there."""
         expected, doubt = self.prediction.expected(point[None])
         return _Candidate(point, float(expected[0]), float(doubt[0]))
 
@@ -115,7 +113,6 @@ class _Region:
     stale: int = 0
 
     def box(self, dimension: int) -> Box:
-        """Return the bounds of the region within the unit cube."""
         centre = np.full(dimension, 0.5) if self.point is None else self.point
         return np.clip(centre - self.radius, 0, 1), np.clip(centre + self.radius, 0, 1)
 
@@ -192,7 +189,6 @@ class TrustRegion(SequentialSearch):
     # How good the prediction is
 
     def _why_not(self, prediction: Prediction, surrogate_error: Callable[[], float]) -> str | None:
-        """Return why the prediction is not used; None if it is."""
         values = self.values[np.isfinite(self.values)]
         if not self._settings.compare_with_surrogate or len(values) < _COMPARED_FROM:
             return None
@@ -309,14 +305,12 @@ class TrustRegion(SequentialSearch):
         return found.point
 
     def _is_new(self, points: Array, history: _History) -> Mask:
-        """Return which of some points ``(m, d)`` are far enough from all known, pending and failed ones."""
         known, reach = np.isfinite(history.values), 0.05 * np.sqrt(self.dimension)
         gaps = cdist(points, history.points[known], "chebyshev").min(axis=1, initial=np.inf)
         others = cdist(points, history.others).min(axis=1, initial=np.inf)
         return np.asarray((gaps > 1e-6) & (others > reach))
 
     def _state(self, history: _History) -> _Region:
-        """Return the state of the last region after a history."""
         region, largest = _Region(), -np.inf
         for point, value, note in zip(history.points, history.values.tolist(), history.notes, strict=True):
             if note is not None and note.get("engine") == _ENGINE:
@@ -331,7 +325,6 @@ class TrustRegion(SequentialSearch):
         return region
 
     def _after(self, region: _Region, point: Array, value: float, note: Note) -> _Region:
-        """Return a region after one of its executions."""
         if not np.isfinite(value):
             return replace(region, misses=region.misses + 1)
         if value > region.best * (1 + _IMPROVEMENT) or region.point is None:
