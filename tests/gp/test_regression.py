@@ -9,7 +9,7 @@ from sklearn.exceptions import ConvergenceWarning
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process import kernels as oracle
 
-from ctxval.errors import InputError, ShapeError
+from ctxval.errors import InputError
 from ctxval.gp import regression
 from ctxval.gp.kernels import Kernel, Linear, Matern, Sum
 
@@ -302,14 +302,6 @@ def test_the_fit_uses_the_prior_mean() -> None:
 
 
 # What is refused
-
-
-def test_observations_that_do_not_fit_are_refused_with_both_shapes() -> None:
-    X, y = data()
-    with pytest.raises(ShapeError, match=r"got \(14, 2\) and \(13,\)"):
-        regression.condition(Matern(), THETA["matern32"], X, y[:-1])
-    with pytest.raises(ShapeError, match=r"got \(14,\) and \(14,\)"):
-        regression.condition(Matern(), THETA["matern32"], X[:, 0], y)
 
 
 def test_a_covariance_that_is_not_positive_definite_is_refused() -> None:

@@ -9,7 +9,7 @@ import pytest
 
 from ctxval._util.arrays import Array, Rows
 from ctxval._util.describe import describe
-from ctxval.errors import InputError, ShapeError
+from ctxval.errors import InputError
 from ctxval.searches import Auto, BayesianOptimisation, Prediction, Random, TrustRegion, TrustRegionSettings
 from ctxval.searches.base import Note, Pending
 from ctxval.testing import check_search
@@ -213,13 +213,6 @@ def test_told_its_history_with_its_notes_it_asks_for_the_same_point(told: int) -
     fresh.use_prediction(predicting(lambda X: 0.5 * hill(X - 0.1), known=whole.points[:told]))
     np.testing.assert_array_equal(fresh.ask(1)[0], whole.points[told])
     assert fresh.note() == whole.notes[told]
-
-
-def test_notes_must_fit_the_history() -> None:
-    search = TrustRegion()
-    search.reset(2, 0)
-    with pytest.raises(ShapeError, match="one note for each of 0 points, got 1"):
-        search.remember([None])
 
 
 def test_a_reset_forgets_the_prediction() -> None:

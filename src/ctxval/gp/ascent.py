@@ -99,17 +99,11 @@ class Ascent:
 
 @dataclass(frozen=True)
 class Effort:
-    """What a search usually evaluates; one that goes on improving evaluates up to half as much again.
+    """What a search usually evaluates; one that goes on improving evaluates up to half as much again."""
 
-    Attributes:
-        exact: number of points at which the function itself is evaluated.
-        rough: number of points at which its approximation is evaluated.
-        batches: number of calls in which all of these are evaluated.
-    """
-
-    exact: int
-    rough: int
-    batches: int
+    exact: int  # number of points at which the function itself is evaluated
+    rough: int  # number of points at which its approximation is evaluated
+    batches: int  # number of calls in which all of these are evaluated
 
     @property
     def points(self) -> int:

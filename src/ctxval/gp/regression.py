@@ -11,7 +11,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 from ctxval._util.arrays import Array, Rows
-from ctxval.errors import InputError, ShapeError
+from ctxval.errors import InputError
 from ctxval.gp.cholesky import CholeskyFactor, factorise
 from ctxval.gp.kernels import Bounds, Kernel
 
@@ -127,8 +127,6 @@ def condition(
     kernel: Kernel, theta: Array, X: Array, y: Array, *, noise: float = NOISE, mean: Mean = zero_mean
 ) -> GaussianProcess:
     """Return the process with these hyperparameters, conditioned on observations ``(n, d)``, ``(n,)``."""
-    if X.ndim != 2 or y.shape != (len(X),):
-        raise ShapeError(f"observations need X (n, d) and y (n,), got {X.shape} and {y.shape}.")
     factor = factorise(kernel(theta, X, X), noise)
     alpha = factor.solve(y - mean(X))
     return GaussianProcess(kernel, np.asarray(theta, dtype=np.float64), noise, mean, X, y, factor, alpha)

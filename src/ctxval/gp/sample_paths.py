@@ -22,23 +22,15 @@ path's maximum much smaller."""
 
 @dataclass(frozen=True, eq=False)
 class Paths:
-    """Paths under one draw of hyperparameters, as functions on the unit cube.
-
-    Attributes:
-        X: the data's points ``(n, d)``.
-        frequencies: frequencies of the waves, shape ``(F, d)``.
-        amplitudes: amplitudes of cosines and sines, shape ``(2 F, s)``.
-        corrections: weights of the correlations with the data, shape ``(n, s)``.
-        means, scales: mu and sigma of each path, shapes ``(s,)``.
-    """
+    """Paths under one draw of hyperparameters, as functions on the unit cube."""
 
     conditioned: Conditioned
-    X: Array
-    frequencies: Array
-    amplitudes: Array
-    corrections: Array
-    means: Array
-    scales: Array
+    X: Array  # the data's points (n, d)
+    frequencies: Array  # of the waves (F, d)
+    amplitudes: Array  # of cosines and sines (2 F, s)
+    corrections: Array  # weights of the correlations with the data (n, s)
+    means: Array  # mu of each path (s,)
+    scales: Array  # sigma of each path (s,)
 
     def __len__(self) -> int:
         return len(self.means)

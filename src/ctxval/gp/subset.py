@@ -45,17 +45,11 @@ def pivoted_rows(kernel: Covariance, theta: Array, X: Array, count: int, least: 
 
 @dataclass(frozen=True, eq=False)
 class PivotedCholesky:
-    """A part of a positive semidefinite matrix of which each row has the largest variance given the rows before it.
+    """A part of a positive semidefinite matrix of which each row has the largest variance given the rows before it."""
 
-    Attributes:
-        rows: the rows, shape ``(k,)``.
-        L: the Cholesky factor of the matrix of these rows, shape ``(k, k)``.
-        left: the variances of all n rows given these, shape ``(n,)``.
-    """
-
-    rows: Rows
-    L: Array
-    left: Array
+    rows: Rows  # (k,)
+    L: Array  # the Cholesky factor of the matrix of these rows (k, k)
+    left: Array  # the variances of all n rows given these (n,)
 
 
 def pivoted_cholesky(

@@ -243,9 +243,6 @@ class SequentialSearch(BaseSearch):
         return self._last_note
 
     def remember(self, notes: Sequence[Note | None]) -> None:
-        self._require_reset()
-        if len(notes) != len(self._points):
-            raise ShapeError(f"there must be one note for each of {len(self._points)} points, got {len(notes)}.")
         self._notes = list(notes)
 
     def _append(self, point: Array, value: float, note: Note | None) -> None:

@@ -37,19 +37,12 @@ _ENGINE = "scalar"
 
 @dataclass(frozen=True, eq=False)
 class _Branch:
-    """A restriction of the search to half of the cube.
-
-    Attributes:
-        coordinate: the axis that is halved.
-        upper: whether it is the upper half.
-        best: the largest value found in this half since the branch began; minus infinity at first.
-        misses: number of successive executions in the branch without improvement.
-    """
+    """A restriction of the search to the upper or lower half of the cube along one coordinate."""
 
     coordinate: int
     upper: bool
-    best: float = -np.inf
-    misses: int = 0
+    best: float = -np.inf  # the largest value in this half since the branch began
+    misses: int = 0  # number of successive executions in the branch without improvement
 
     def box(self, dimension: int) -> Box:
         low, high = np.zeros(dimension), np.ones(dimension)

@@ -95,22 +95,14 @@ class _OptimisticValue:
 
 @dataclass(frozen=True, eq=False)
 class _Region:
-    """The state of a trust region, computed from notes and values.
-
-    Attributes:
-        number: the number of the region, from 0.
-        radius: half its width; 1 for the whole cube.
-        best, point: its largest value and the point with this value; minus infinity and None before there is one.
-        misses: number of successive executions without improvement.
-        stale: number of successive regions that have not improved the largest value of all.
-    """
+    """The state of a trust region, computed from notes and values."""
 
     number: int = 0
-    radius: float = 1.0
-    best: float = -np.inf
+    radius: float = 1.0  # half its width; 1 for the whole cube
+    best: float = -np.inf  # its largest value, at the point
     point: Array | None = None
-    misses: int = 0
-    stale: int = 0
+    misses: int = 0  # number of successive executions without improvement
+    stale: int = 0  # number of successive regions that have not improved the largest value of all
 
     def box(self, dimension: int) -> Box:
         centre = np.full(dimension, 0.5) if self.point is None else self.point
