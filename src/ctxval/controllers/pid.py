@@ -70,17 +70,11 @@ class PID(ShortRepr):
 
 
 class PIDMemory(NamedTuple):
-    """What a PID controller remembers of earlier steps.
+    """What a PID controller remembers of earlier steps."""
 
-    Attributes:
-        integral: the integral part of each input, ``(..., m)``.
-        states: the chosen states at the last step, ``(..., k)``.
-        derivative: the filtered derivative of the chosen states, ``(..., k)``.
-    """
-
-    integral: Array
-    states: Array
-    derivative: Array
+    integral: Array  # the integral part of each input (..., m)
+    states: Array  # the chosen states at the last step (..., k)
+    derivative: Array  # the filtered derivative of the chosen states (..., k)
 
 
 @dataclass(frozen=True, eq=False)

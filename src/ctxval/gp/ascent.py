@@ -136,11 +136,10 @@ def _best(done: Evaluations, count: int, share: float = 0.1) -> Array:
 
 
 def _pool(dimension: int, count: int) -> Array:
-    """Return points that fill the unit cube evenly and reach its faces, shape ``(count, d)``.
+    """Return points ``(count, d)`` that fill the unit cube evenly and reach its faces.
 
-    Source:
-        Roberts 2018, "The unreasonable effectiveness of quasirandom sequences": a Kronecker sequence of generalised
-        golden ratios.
+    A Kronecker sequence of generalised golden ratios (Roberts 2018, "The unreasonable effectiveness of quasirandom
+    sequences").
     """
     ratio = 2.0
     for _ in range(30):

@@ -72,19 +72,13 @@ class GaussianProcess:
 
 @dataclass(frozen=True, eq=False)
 class MultiOutputProcess:
-    """Gaussian processes of zero mean for several outputs that share a covariance, conditioned on observations.
-
-    Attributes:
-        X, Y: observations, shapes ``(n, d)`` and ``(n, k)``.
-        noises: variances of the observations' noise, which are tried in this order until the covariance matrix is
-            positive definite.
-    """
+    """Gaussian processes of zero mean for several outputs that share a covariance, conditioned on observations."""
 
     kernel: Kernel
     theta: Array
-    X: Array
-    Y: Array
-    noises: Sequence[float] = (NOISE,)
+    X: Array  # (n, d)
+    Y: Array  # (n, k)
+    noises: Sequence[float] = (NOISE,)  # tried in this order until the covariance matrix is positive definite
 
     @functools.cached_property
     def factor(self) -> CholeskyFactor:
@@ -147,13 +141,9 @@ def log_likelihood_of_outputs(K: Array, noise: float, Y: Array) -> tuple[float, 
 def log_marginal_likelihood(
     kernel: Kernel, theta: Array, noise: float, X: Array, residual: Array
 ) -> tuple[float, Array]:
-    """Return log p(residual | X, theta, noise) and its gradient with respect to (theta, log noise).
+    """Return log p(residual | X, theta, noise) and its gradient by (theta, log noise), eq. 5.9.
 
-    Args:
-        residual: the observations minus the prior mean, ``(n,)``.
-
-    Source:
-        Rasmussen and Williams 2006, eq. 5.9.
+    The residual ``(n,)`` is the observations minus the prior mean.
     """
     factor = factorise(kernel(theta, X, X), noise)
     alpha = factor.solve(residual)

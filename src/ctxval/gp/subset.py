@@ -57,10 +57,8 @@ def pivoted_cholesky(
 ) -> PivotedCholesky:
     """Return the Cholesky factor of those rows of a covariance matrix that represent all of it.
 
-    Args:
-        variances: the diagonal of the matrix, shape ``(n,)``.
-        covariances: a row of the matrix -> its n entries, in an array that may be overwritten.
-        count, least: as in :func:`pivoted_rows`.
+    The matrix has the diagonal ``variances`` ``(n,)``, and ``covariances`` returns one of its rows in an array that may
+    be overwritten; count and least are as in :func:`pivoted_rows`.
     """
     left = np.array(variances)
     columns = np.empty((min(count, len(left)), len(left)))
