@@ -12,7 +12,7 @@ from ctxval.searches.cma_es import CMAES
 from ctxval.searches.gp_ucb import GPUCB
 from ctxval.searches.random import Random, SamplingDiscarding
 from ctxval.searches.repeated import Repeated
-from ctxval.searches.trust_region import TrustRegion, TrustRegionSettings
+from ctxval.searches.trust_region import TrustRegion
 
 __all__ = [
     "CMAES",
@@ -31,7 +31,6 @@ __all__ = [
     "Search",
     "SequentialSearch",
     "TrustRegion",
-    "TrustRegionSettings",
     "by_name",
 ]
 

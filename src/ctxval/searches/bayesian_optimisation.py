@@ -21,7 +21,6 @@ from ctxval._util.boxes import Box
 from ctxval._util.checked import NonNegativeFloat, PositiveInt
 from ctxval._util.registry import part
 from ctxval.gp.acquisition import Acquisition, LogExpectedImprovement, UpperConfidenceBound, maximise
-from ctxval.gp.regression import GaussianProcess
 from ctxval.gp.subset import kept_rows
 from ctxval.gp.surrogate import Learned, learn
 from ctxval.searches.base import Note, SequentialSearch, best_first
@@ -91,8 +90,18 @@ class BayesianOptimisation(SequentialSearch):
         rows = kept_rows(points, values, 1000)
         process = learned.condition(points[rows], values[rows])
         branch = None if len(values) % _EVERYWHERE == 0 else _branch(points[known], values[known])
-        believed = process.y[int(known[rows].sum()) :].max(initial=-np.inf)
-        acquisition = self._acquisition(learned, process, values, branch, float(believed))
+        if branch is not None and not np.isfinite(branch.best):
+            # Be bold, far from the maximum that was left: near it, the branch would only lead back to it.
+            acquisition: Acquisition = UpperConfidenceBound(process, 100.0)
+        elif len(values) % _BOUND == _BOUND - 1:
+            acquisition = UpperConfidenceBound(process, self.beta)
+        elif branch is not None:
+            acquisition = LogExpectedImprovement(process, _worthwhile(learned, values, branch.best))
+        else:
+            # Predicted values of pending points count, so that the points of one batch do not all improve on one value.
+            believed = float(process.y[int(known[rows].sum()) :].max(initial=-np.inf))
+            best = _worthwhile(learned, values, float(np.nanmax(values)))
+            acquisition = LogExpectedImprovement(process, max(best, believed))
         box = None if branch is None else branch.box(self.dimension)
         known_first, away = best_first(points, values), points[~known]
         point = maximise(acquisition, self.dimension, known_first, rng, box=box, corners=True, away=away)
@@ -102,20 +111,6 @@ class BayesianOptimisation(SequentialSearch):
             "branch": None if branch is None else [branch.coordinate, branch.upper],
             "logarithm": bool(np.isfinite(learned.warp.offset)),
         }
-
-    def _acquisition(
-        self, learned: Learned, process: GaussianProcess, values: Array, branch: _Branch | None, believed: float
-    ) -> Acquisition:
-        if branch is not None and not np.isfinite(branch.best):
-            # Be bold, far from the maximum that was left: near it, the branch would only lead back to it.
-            return UpperConfidenceBound(process, 100.0)
-        if len(values) % _BOUND == _BOUND - 1:
-            return UpperConfidenceBound(process, self.beta)
-        if branch is not None:
-            return LogExpectedImprovement(process, _worthwhile(learned, values, branch.best))
-        # Predicted values of pending points count, so that the points of one batch do not all improve on one value.
-        best = _worthwhile(learned, values, float(np.nanmax(values)))
-        return LogExpectedImprovement(process, max(best, believed))
 
     def _learned(self, points: Array, values: Array) -> Learned:
         """Return hyperparameters learned from the first values; a fixed schedule says how many of them are used.

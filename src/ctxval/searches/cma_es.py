@@ -60,8 +60,13 @@ class CMAES(SequentialSearch):
         if not np.array_equal(values[: len(self._learned)], self._learned, equal_nan=True):
             self._begin()  # a late value belongs to a generation that was learned without it
         while (last := (first := len(self._learned)) + self._distribution.population_size) <= len(points):
-            _learn(self._distribution, points[first:last], values[first:last])
-            if self._distribution.should_stop() or (np.ptp(points[first:last], axis=0) < 1e-4).all():
+            generation, results = points[first:last], values[first:last]
+            known = np.isfinite(results)
+            if known.any():  # failures rank last, and a generation of failures alone is left out
+                losses = np.where(known, -results, -results[known].min())
+                order = np.argsort(-results, kind="stable")  # NaN last
+                self._distribution.tell([(generation[i], float(losses[i])) for i in order])
+            if self._distribution.should_stop() or (np.ptp(generation, axis=0) < 1e-4).all():
                 # Trial k draws from [seed, k]; the third number of the seed separates the restart from it.
                 rng = np.random.default_rng(np.random.SeedSequence([self._seed, last, 1]))
                 population = 2 * self._distribution.population_size
@@ -71,13 +76,3 @@ class CMAES(SequentialSearch):
     def _started(self, mean: Array, population: int | None) -> CMA:
         bounds = np.tile([0.0, 1.0], (self.dimension, 1))
         return _library().CMA(mean=mean, sigma=self.sigma, bounds=bounds, population_size=population)
-
-
-def _learn(distribution: CMA, points: Array, values: Array) -> None:
-    """Tell one generation to CMA-ES; failures rank last, and a generation of failures alone is left out."""
-    known = np.isfinite(values)
-    if not known.any():
-        return
-    losses = np.where(known, -values, -values[known].min())
-    order = np.argsort(-values, kind="stable")  # NaN last
-    distribution.tell([(points[i], float(losses[i])) for i in order])

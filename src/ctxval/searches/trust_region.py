@@ -15,8 +15,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.distance import cdist
@@ -39,23 +38,6 @@ POINTS = 400  # largest number of points that are predicted for one suggestion, 
 _IMPROVEMENT = 1e-3  # least predicted improvement worth an execution, as a share of the largest value
 _COMPARED_FROM = 6  # number of known values from which on the prediction must be better than the surrogate
 _COMPARED_ON = 24  # largest number of known values, the latest ones, on which the two are compared
-
-
-@dataclass(frozen=True)
-class TrustRegionSettings:
-    """Settings of :class:`TrustRegion` that its studies vary (``benchmarks/study_ablations.py``).
-
-    Attributes:
-        compare_with_surrogate: whether a prediction is used only if leave-one-out errors show that it is good.
-        restrict: whether there are trust regions; if not, the whole cube is searched each time.
-        boldness: factor by which the optimism grows with each new region that has found nothing larger.
-        hedge: whether a prediction that may mislead alternates with the surrogate.
-    """
-
-    compare_with_surrogate: bool = True
-    restrict: bool = True
-    boldness: float = 4.0
-    hedge: bool = True
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,18 +112,15 @@ class TrustRegion(SequentialSearch):
 
     initial = 1
 
-    def __init__(
-        self, optimism: NonNegativeFloat = 2.0, misses: PositiveInt = 3, *, settings: TrustRegionSettings | None = None
-    ) -> None:
+    # What is set otherwise to study the parts of the search (benchmarks/study_ablations.py).
+    compare_with_surrogate = True  # whether a prediction is used only if leave-one-out errors show that it is good
+    restrict = True  # whether there are trust regions; if not, the whole cube is searched each time
+    boldness = 4.0  # factor by which the optimism grows with each new region that has found nothing larger
+    hedge = True  # whether a prediction that may mislead alternates with the surrogate
+
+    def __init__(self, optimism: NonNegativeFloat = 2.0, misses: PositiveInt = 3) -> None:
         self.optimism = optimism
         self.misses = misses
-        self._settings = TrustRegionSettings() if settings is None else settings
-
-    def describe(self) -> dict[str, Any]:
-        """Return the options that identify this search in a store, and the settings if they are not the defaults."""
-        options = {name: value for name, value in vars(self).items() if not name.startswith("_")}
-        usual = self._settings == TrustRegionSettings()
-        return options if usual else {**options, "settings": asdict(self._settings)}
 
     def reset(self, dimension: int, seed: int) -> None:
         super().reset(dimension, seed)
@@ -159,10 +138,17 @@ class TrustRegion(SequentialSearch):
         while prediction is not None:
             with single_threaded():
                 doubtful = self._why_not(prediction, surrogate_error)
-                point = self._promising(prediction, rng) if doubtful is None else None
-            if point is not None:
+                found, region = self._promising(prediction, rng) if doubtful is None else (None, _Region())
+            if found is not None:
+                self._last_note = {
+                    "engine": _ENGINE,
+                    "climb": region.number,
+                    "radius": region.radius,
+                    "expected": found.expected,
+                    "doubt": found.doubt,
+                }
                 why_hedge = self._why_hedge()
-                return point if why_hedge is None else self._without_prediction(rng, why_hedge)
+                return found.point if why_hedge is None else self._without_prediction(rng, why_hedge)
             why = doubtful or "nothing is predicted anywhere"
             prediction = None if prediction.otherwise is None else prediction.otherwise()
         return self._without_prediction(rng, why)
@@ -182,7 +168,7 @@ class TrustRegion(SequentialSearch):
 
     def _why_not(self, prediction: Prediction, surrogate_error: Callable[[], float]) -> str | None:
         values = self.values[np.isfinite(self.values)]
-        if not self._settings.compare_with_surrogate or len(values) < _COMPARED_FROM:
+        if not self.compare_with_surrogate or len(values) < _COMPARED_FROM:
             return None
         rows = np.arange(len(values))[-_COMPARED_ON:]
         error = _log_error(prediction.left_out(rows), values[rows])
@@ -207,7 +193,7 @@ class TrustRegion(SequentialSearch):
         rows = [
             row for row in np.flatnonzero(np.isfinite(self.values)) if (self.notes[row] or {}).get("engine") == _ENGINE
         ]
-        if not rows or not self._settings.hedge or (self.notes[-1] or {}).get("engine") != _ENGINE:
+        if not rows or not self.hedge or (self.notes[-1] or {}).get("engine") != _ENGINE:
             return None
         last = [(self.values[row], (self.notes[row] or {})["expected"]) for row in rows[-2:]]
         error = min(abs(value - expected) / max(value, expected, 1e-300) for value, expected in last)
@@ -220,8 +206,8 @@ class TrustRegion(SequentialSearch):
 
     # Where to execute next
 
-    def _promising(self, prediction: Prediction, rng: np.random.Generator) -> Array | None:
-        """Return the next point of the last region or of a new one; None if no point can be predicted.
+    def _promising(self, prediction: Prediction, rng: np.random.Generator) -> tuple[_Candidate | None, _Region]:
+        """Return the next point of the last region or of a new one, None if no point can be predicted, and the region.
 
         The point that follows from the known values alone comes first. If it is being evaluated already, the next one
         is chosen as if all pending points had the expected values.
@@ -230,25 +216,25 @@ class TrustRegion(SequentialSearch):
         whole = _History(points, values, notes, points[~np.isfinite(values)])
         pending = prediction.pending
         if pending is None:
-            return self._noted(*self._next(prediction, whole, rng))
+            return self._next(prediction, whole, rng)
         waiting = np.isnan(values) & (points[:, None] == pending.points).all(axis=2).any(axis=1)
         ended = [note for note, waits in zip(notes, waiting, strict=True) if not waits]
         known = _History(points[~waiting], values[~waiting], tuple(ended), points[np.isnan(values) & ~waiting])
         found, region = self._next(prediction, known, rng)
         if found is None or self._is_new(found.point[None], whole)[0]:
-            return self._noted(found, region)
+            return found, region
         expected = values.copy()
         expected[waiting] = prediction.expected(points[waiting])[0]
         as_if = pending.prediction()
         after = replace(prediction, expected=as_if.expected, rough=as_if.rough)
-        return self._noted(*self._next(after, replace(whole, values=expected), rng))
+        return self._next(after, replace(whole, values=expected), rng)
 
     def _next(
         self, prediction: Prediction, history: _History, rng: np.random.Generator
     ) -> tuple[_Candidate | None, _Region]:
         """Return the next candidate after a history, None if no point can be predicted, and its region."""
         value = _OptimisticValue(prediction, self.optimism)
-        if not self._settings.restrict:
+        if not self.restrict:
             return self._best(value, _Region(), history, rng), _Region()
         region = self._state(history)
         if region.misses < self.misses and region.radius >= 0.02:
@@ -260,7 +246,7 @@ class TrustRegion(SequentialSearch):
                 if found.optimistic(self.optimism) > region.best * least and patient > largest * least:
                     return found, region
         # The optimism grows with every region that finds nothing larger, so the search explores more.
-        bold = replace(value, optimism=self.optimism * self._settings.boldness ** (1 + region.stale))
+        bold = replace(value, optimism=self.optimism * self.boldness ** (1 + region.stale))
         return self._best(bold, _Region(), history, rng), _Region(region.number + 1, radius=0.4)
 
     def _best(
@@ -282,19 +268,6 @@ class TrustRegion(SequentialSearch):
         steady = value.prediction.steady or (lambda point: True)
         best = next(filter(steady, points), points[0]) if len(points) else None
         return None if best is None else value.at(best)
-
-    def _noted(self, found: _Candidate | None, region: _Region) -> Array | None:
-        """Return the next point of a region, and record the prediction for it in the note; None if there is none."""
-        if found is None:
-            return None
-        self._last_note = {
-            "engine": _ENGINE,
-            "climb": region.number,
-            "radius": region.radius,
-            "expected": found.expected,
-            "doubt": found.doubt,
-        }
-        return found.point
 
     def _is_new(self, points: Array, history: _History) -> Mask:
         known, reach = np.isfinite(history.values), 0.05 * np.sqrt(self.dimension)
