@@ -25,10 +25,10 @@ from ctxval import (
     Validation,
     controllers,
     models,
-    searches,
     systems,
 )
 from ctxval._util.json_lines import JsonLines
+from named_searches import search_named
 
 TRIALS = 10_000
 SEARCHES = ("random", "gp-ucb", "scalar")
@@ -60,7 +60,7 @@ def landscape(model: Trajectory, system: Trajectory, task: Task) -> np.ndarray:
 
 
 def campaign(path: Path, search: str) -> Campaign:
-    return Campaign(validation(), search=searches.by_name(search), store=path)
+    return Campaign(validation(), search=search_named(search), store=path)
 
 
 def height(points: np.ndarray) -> np.ndarray:
@@ -125,7 +125,7 @@ def measure(path: Path, search: str) -> dict[str, float]:
 
 def suggestions_alone(count: int, dimension: int) -> dict[str, float]:
     """Return the CPU seconds of the scalar search's suggestions after so many values, without a store."""
-    search = searches.by_name("scalar")
+    search = search_named("scalar")
     search.reset(dimension, 0)
     points = np.random.default_rng(0).random((count, dimension))
     search.tell(points, height(points))

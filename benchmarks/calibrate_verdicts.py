@@ -17,12 +17,13 @@ import numpy as np
 
 from calibrate import FAMILIES, REPRODUCED, RESULTS, SYSTEMS, Values, all_of, maximum
 from calibration_functions import DEVELOPMENT, REPORTING, generator
-from ctxval import Campaign, Trial, cases, searches
+from ctxval import Campaign, Trial, cases
 from ctxval._util.arrays import Array, single_threaded
 from ctxval._util.json_lines import JsonLines
 from ctxval.certificates import RESOLUTION, CertificateOptions, StoppingRule, covering
 from ctxval.certificates.verdict import counterexample
 from ctxval.paper.reproduce.jobs import Job, Results
+from named_searches import search_named
 
 RULE = 2
 """Of coverage, by which campaigns are run now."""
@@ -103,7 +104,7 @@ def _of_function(one: Decision) -> dict[str, Any]:
     # A distance is not negative.
     lowest = float(values(np.random.default_rng(0).random((2000, one.dimension))).min())
     threshold, budget = one.share * (maximum(values, one.dimension) - lowest), BUDGETS[one.dimension]
-    search = searches.by_name(one.search)
+    search = search_named(one.search)
     search.reset(one.dimension, one.seed)
     rule = StoppingRule(threshold)
     trials: list[Trial] = []
@@ -143,7 +144,7 @@ def _of_system(one: Decision) -> dict[str, Any]:
     best_known = Results(REPRODUCED)[Job("truth", system.case, one.seed, system.options)]["distance"]
     experiment = cases.by_name(system.case, one.seed, **dict(system.options))
     threshold, budget = one.share * best_known, BUDGETS[one.dimension]
-    campaign = Campaign(experiment.validation, search=searches.by_name(one.search), seed=one.seed)
+    campaign = Campaign(experiment.validation, search=search_named(one.search), seed=one.seed)
     campaign.run(budget, threshold, certificate=CertificateOptions.posterior())
     return _summary(
         list(campaign.trials), threshold, decided=StoppingRule(threshold).decide(campaign.trials, 0).decided

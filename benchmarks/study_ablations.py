@@ -18,7 +18,7 @@ import misleading
 import study_auto
 from ctxval import Experiment, searches
 from ctxval._util.json_lines import JsonLines
-from ctxval.searches import BayesianOptimisation, TrustRegion, TrustRegionSettings
+from ctxval.searches import BayesianOptimisation, TrustRegion
 from dynamics_development_misleading import MISLEADING
 from plants import PLANTS
 from plants.truths import truth as plant_truth
@@ -40,7 +40,9 @@ SYSTEMS = [*CASES, *ON_PLANTS, *CHOSEN_BY, *OTHERS]
 
 def trust_region(**settings: Any) -> TrustRegion:
     """Return the search with other settings than the usual ones."""
-    return TrustRegion(settings=TrustRegionSettings(**settings))
+    search = TrustRegion()
+    vars(search).update(settings)
+    return search
 
 
 # Bayesian optimisation that starts as the trust region does, with one random point, is all of it but the residual.

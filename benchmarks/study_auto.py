@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+import named_searches
 from ctxval import Campaign, Experiment, Truth, Validation, cached_truth, cases, grid_truth, search_truth, searches
 from ctxval._util.json_lines import JsonLines
 from ctxval.paper.reproduce.revision import AUTO, provenance
@@ -94,7 +95,7 @@ def campaign(validation: Validation, search: searches.Search, seed: int, budget:
 
 def search_named(name: str) -> searches.Search:
     """Return a search; ``auto`` thinks thoroughly, so that its choices do not depend on the speed of the machine."""
-    return searches.by_name(name, **({"thinking": "thorough"} if name == "auto" else {}))
+    return named_searches.search_named(name, **({"thinking": "thorough"} if name == "auto" else {}))
 
 
 def results_of(study: str) -> JsonLines:

@@ -15,13 +15,14 @@ from typing import Any
 import numpy as np
 
 from calibrate import RESULTS, all_of
-from ctxval import Campaign, searches
+from ctxval import Campaign
 from ctxval._util.arrays import single_threaded
 from ctxval._util.json_lines import JsonLines
 from dynamics_development import DEVELOPMENT
 from dynamics_reporting import REPORTING
 from dynamics_truths import truth
 from hedge_systems import HEDGE
+from named_searches import search_named
 
 BUDGET, SEEDS, WITHIN = 30, 3, 0.99
 STORED = JsonLines(RESULTS / "hedge.jsonl", ("entry", "seed", "search"))
@@ -35,7 +36,7 @@ def study(run: tuple[int, str, str]) -> dict[str, Any]:
     largest = float(truth(ENTRIES[entry], seed)["distance"])
     started = time.process_time()
     with single_threaded():
-        chosen = searches.by_name(search.partition("-")[0])
+        chosen = search_named(search.partition("-")[0])
         campaign = Campaign(ENTRIES[entry](seed).validation, search=chosen, seed=seed)
         campaign.run(BUDGET, explore=True, until=lambda running: (running.estimate or 0) >= WITHIN * largest)
     return {

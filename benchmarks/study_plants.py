@@ -10,9 +10,9 @@ import argparse
 from functools import partial
 from pathlib import Path
 
-from ctxval import searches
 from ctxval._util.json_lines import JsonLines
 from ctxval.paper.reproduce.revision import AUTO, provenance
+from named_searches import search_named
 from plants import PLANTS
 from plants.truths import TRUTHS, require_known, truth
 from study_auto import RESULTS, Result, campaign, print_table
@@ -37,7 +37,7 @@ def run(version: str, case: str, seed: int, search: str, results: JsonLines, tru
         plant = PLANTS[case]
         found = plant(seed)
         best_known = truth(plant, seed, found, truths)["distance"]
-        result = campaign(found.validation, searches.by_name(search), seed, plant.budget, best_known)
+        result = campaign(found.validation, search_named(search), seed, plant.budget, best_known)
         results.append({**dict(zip(results.key, key, strict=True)), **result, **provenance(AUTO)})
     return results[key]
 

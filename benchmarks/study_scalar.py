@@ -21,6 +21,7 @@ from ctxval._util.arrays import Array
 from ctxval._util.json_lines import JsonLines
 from ctxval.distances import ComposedDistance
 from ctxval.learning.vector import predict_composed
+from named_searches import search_named
 from study_auto import Result, add_options, experiment, first_within, print_rows, stored, truth
 
 BUDGETS = {"pendulum": 25, "dubins-basin": 100, "dubins-heavy-tail": 100}
@@ -30,7 +31,7 @@ SEARCHES = ("scalar", "gp-ucb", "random", "vector")
 
 
 def suggest_by_value(name: str, validation: Validation, seed: int) -> Callable[[list[Array], list[float]], Array]:
-    search = searches.by_name(name)
+    search = search_named(name)
     search.reset(validation.space.dimension, seed)
 
     def suggest(points: list[Array], values: list[float]) -> Array:

@@ -301,7 +301,6 @@ EXAMPLES: dict[str, Callable[[], object]] = {
     "searches.Repeated": lambda: searches.Repeated(searches.Random(), 3),
     "searches.SamplingDiscarding": searches.SamplingDiscarding,
     "searches.TrustRegion": searches.TrustRegion,
-    "searches.TrustRegionSettings": searches.TrustRegionSettings,
     "systems.FMU": fmu,
     "systems.Function": lambda: systems.Function(no_execution),
     "systems.Gymnasium": gymnasium,

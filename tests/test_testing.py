@@ -157,7 +157,7 @@ def test_distances_that_are_negative_or_mix_tasks_are_named() -> None:
         testing.check_distance(lambda a, b, task: np.float64(1.0), *pair(), TASKS)
 
 
-@pytest.mark.parametrize("name", sorted(searches.NAMES))
+@pytest.mark.parametrize("name", sorted(searches.REGISTRY.built_in))
 def test_every_search_conforms(name: str) -> None:
     testing.check_search(searches.by_name(name))
     testing.check_search(searches.by_name(name), dimension=1, budget=9)

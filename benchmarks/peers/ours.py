@@ -72,7 +72,7 @@ def suggest_by(name: str, dimension: int, seed: int) -> Suggest:
     return suggest
 
 
-scalar = Suggesting(lambda dimension, seed: suggest_by("scalar", dimension, seed))
+scalar = Suggesting(lambda dimension, seed: suggest_by("bayesian-optimisation", dimension, seed))
 gp_ucb = Suggesting(lambda dimension, seed: suggest_by("gp-ucb", dimension, seed))
 cma_es = Suggesting(lambda dimension, seed: suggest_by("cma-es", dimension, seed))
 random = Suggesting(lambda dimension, seed: suggest_by("random", dimension, seed))

@@ -2,9 +2,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
-from hypothesis.extra.numpy import array_shapes, arrays
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from ctxval._util.arrays import (
@@ -14,11 +11,8 @@ from ctxval._util.arrays import (
     require_shape,
     rows_of,
     single_threaded,
-    vector_norm,
 )
 from ctxval.errors import InputError, ShapeError
-
-VECTORS = arrays(np.float64, array_shapes(min_dims=1, max_dims=3, max_side=4), elements=st.floats(-1e6, 1e6))
 
 
 def test_numbers_become_float64() -> None:
@@ -83,12 +77,6 @@ def test_rounding_does_not_make_a_gram_matrix_an_invalid_weight(scale: float) ->
     factor = np.random.default_rng(0).normal(size=(5, 2))
     gram = scale * factor @ factor.T
     np.testing.assert_array_equal(as_weight("Q", gram), gram)
-
-
-@pytest.mark.parametrize("order", [1, 2, np.inf])
-@given(vectors=VECTORS)
-def test_the_norm_is_that_of_numpy_over_the_last_axis(order: float, vectors: np.ndarray) -> None:
-    np.testing.assert_allclose(vector_norm(vectors, order), np.linalg.norm(vectors, order, axis=-1), rtol=1e-12)
 
 
 @pytest.mark.parametrize("shape", [(), (1,), (5,), (2, 3), (0,)])

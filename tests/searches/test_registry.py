@@ -3,10 +3,10 @@ from __future__ import annotations
 import pytest
 
 from ctxval.errors import InputError, UnknownNameError
-from ctxval.searches import GPUCB, NAMES, Random, SamplingDiscarding, Search, by_name
+from ctxval.searches import GPUCB, REGISTRY, Random, SamplingDiscarding, Search, by_name
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", REGISTRY.built_in)
 def test_every_name_makes_a_search(name: str) -> None:
     search = by_name(name)
     assert isinstance(search, Search)
@@ -18,11 +18,6 @@ def test_names_stand_for_their_classes() -> None:
     assert type(by_name("gp-ucb")) is GPUCB
     assert type(by_name("random")) is Random
     assert type(by_name("sampling-discarding")) is SamplingDiscarding
-
-
-@pytest.mark.parametrize(("old", "present"), [("scalar", "bayesian-optimisation"), ("climbs", "trust-region")])
-def test_older_names_stand_for_the_same_searches(old: str, present: str) -> None:
-    assert type(by_name(old)) is type(by_name(present))
 
 
 def test_options_reach_the_search() -> None:

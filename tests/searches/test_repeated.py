@@ -106,7 +106,9 @@ class Shaky:
 
 @pytest.mark.thorough
 def test_a_campaign_estimates_the_largest_mean_distance() -> None:
-    campaign = Campaign(make_validation(system=Shaky()), search=by_name("scalar", repeats=3), seed=2).run(15)
+    campaign = Campaign(
+        make_validation(system=Shaky()), search=by_name("bayesian-optimisation", repeats=3), seed=2
+    ).run(15)
     goals = np.array([trial.unit_point for trial in campaign.trials]).reshape(5, 3)
     assert (goals == goals[:, :1]).all()
     means = np.array([trial.distance for trial in campaign.trials], dtype=float).reshape(5, 3).mean(axis=1)

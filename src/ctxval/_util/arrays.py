@@ -86,15 +86,6 @@ def rows_of(array: Array) -> Array:
     return array.reshape(math.prod(array.shape[:-1]), array.shape[-1])
 
 
-def vector_norm(vectors: Array, order: float) -> Array:
-    magnitudes = np.abs(vectors)
-    if order == 1:
-        return np.asarray(magnitudes.sum(axis=-1))
-    if order == np.inf:
-        return np.asarray(magnitudes.max(axis=-1))
-    return np.asarray(np.sqrt((magnitudes**2).sum(axis=-1)))
-
-
 _thread_pools = functools.cache(ThreadpoolController)
 
 

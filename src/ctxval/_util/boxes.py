@@ -9,6 +9,8 @@ import scipy
 
 from ctxval._util.arrays import Array
 
+Box = tuple[Array, Array]
+"""The lower and upper bounds ``(d,)`` of a box."""
 Sloped = Callable[[Array], tuple[Array, Array]]
 """Points ``(..., d)`` -> values ``(...)`` and gradients ``(..., d)``."""
 
@@ -56,6 +58,26 @@ def moves_to_bounds(points: Array, low: Array, high: Array) -> Array:
     moves = np.tile(np.eye(d, dtype=bool), (2, 1))
     ends = np.repeat([low, high], d, axis=0)
     return np.where(moves, ends, points[..., None, :])
+
+
+def polish(
+    function: Callable[[Array], Array], points: Array, values: Array, box: Box, rounds: int, least: Array | float = 0.0
+) -> tuple[Array, Array]:
+    """Move coordinates of each point to bounds of a box, the best move first, while the value grows by the least.
+
+    The function maps points ``(s, q, d)`` to values ``(s, q)``; the points ``(s, d)`` have the values ``(s,)``.
+    """
+    rows = np.arange(len(points))
+    for _ in range(rounds):
+        moved = moves_to_bounds(points, *box)
+        heights = function(moved)
+        best = heights.argmax(axis=1)
+        better = heights[rows, best] > values + least
+        if not better.any():
+            break
+        values = np.where(better, heights[rows, best], values)
+        points = np.where(better[:, None], moved[rows, best], points)
+    return points, values
 
 
 def separated_rows(points: Array, reach: float, count: int) -> list[int]:

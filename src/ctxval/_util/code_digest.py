@@ -16,8 +16,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-_OWN = __name__.partition(".")[0]
-
 _SKIPPED = ("ctx", "kind", "type_comment", "returns", "annotation")
 """Fields of a syntax tree that do not affect the computation."""
 
@@ -65,8 +63,9 @@ def module_digest(source: str) -> str:
 
 
 def is_own(value: Any) -> bool:
-    """Return whether a function or class belongs to this package."""
-    return _top_level(value) == _OWN
+    """Return whether a module, function or class belongs to this package."""
+    name = value.__name__ if inspect.ismodule(value) else getattr(value, "__module__", None) or ""
+    return str(name).partition(".")[0] == __name__.partition(".")[0]
 
 
 def is_library(value: Any) -> bool:
@@ -75,14 +74,9 @@ def is_library(value: Any) -> bool:
     if module is None or module.__name__ == "__main__":
         return False
     file = getattr(module, "__file__", None)
-    if file is None or _top_level(module) == _OWN or {"site-packages", "dist-packages"} & set(Path(file).parts):
+    if file is None or is_own(module) or {"site-packages", "dist-packages"} & set(Path(file).parts):
         return True
     return any(Path(file).is_relative_to(sysconfig.get_path(name)) for name in ("stdlib", "platstdlib"))
-
-
-def _top_level(value: Any) -> str:
-    name = value.__name__ if inspect.ismodule(value) else getattr(value, "__module__", None) or ""
-    return str(name).partition(".")[0]
 
 
 def enclosed(function: types.FunctionType) -> list[Any]:
@@ -112,7 +106,14 @@ def _reached_from(item: Any) -> list[Any]:
         used = [] if is_library(item) else _globals(sys.modules.get(item.__module__), _names(item.__code__))
         return [*enclosed(item), *defaults, *used]
     if isinstance(item, type):
-        return [] if is_library(item) else [*item.__bases__, *_of_class(item)]
+        if is_library(item):
+            return []
+        functions = [function for member in vars(item).values() for function in functions_in(member)]
+        if (node := _class_node(item)) is None:
+            return [*item.__bases__, *functions]
+        # The functions of the class without generated ones, and the definitions that its body uses.
+        written = [function for function in functions if not function.__code__.co_filename.startswith("<")]
+        return [*item.__bases__, *written, *_globals(sys.modules.get(item.__module__), _loaded([node]))]
     if isinstance(item, _Global):
         known = _source_of(item.module)
         body = known.assigned.get(item.name, ())
@@ -126,16 +127,6 @@ def _reached_from(item: Any) -> list[Any]:
     if is_library(type(item)) and not is_own(type(item)):
         return [attributes["__wrapped__"]] if "__wrapped__" in attributes else []  # e.g. functools.cache
     return [type(item), *attributes.values()]
-
-
-def _of_class(cls: type) -> list[Any]:
-    """Return the functions of a class, without generated ones, and the definitions that its body uses."""
-    node = _class_node(cls)
-    functions = [function for member in vars(cls).values() for function in functions_in(member)]
-    if node is None:
-        return functions
-    written = [function for function in functions if not function.__code__.co_filename.startswith("<")]
-    return [*written, *_globals(sys.modules.get(cls.__module__), _loaded([node]))]
 
 
 def functions_in(item: Any) -> list[types.FunctionType]:

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from ctxval._util.code_digest import enclosed, is_library, is_own, source_digest
+from ctxval._util.representation import cut
 
 
 def describe(value: Any, depth: int = 6) -> Any:
@@ -107,16 +108,11 @@ def differences(stored: Any, present: Any, path: str = "") -> Iterator[tuple[str
     elif isinstance(stored, list) and isinstance(present, list) and len(stored) == len(present):
         for i, (a, b) in enumerate(zip(stored, present, strict=True)):
             yield from differences(a, b, f"{path}[{i}]")
-    elif not (_close(stored, present) if {type(stored), type(present)} <= {int, float, bool} else stored == present):
-        yield path, f"{path} was {_short(stored)} and is now {_short(present)}"
-
-
-def _close(stored: float, present: float) -> bool:
-    """Return whether numbers agree; settings that are computed differ by less than 1e-6 on two machines."""
-    both_nan = math.isnan(stored) and math.isnan(present)
-    return both_nan or math.isclose(stored, present, rel_tol=1e-6, abs_tol=1e-13)
-
-
-def _short(value: Any) -> str:
-    text = repr(value)
-    return text if len(text) <= 60 else f"{text[:57]}..."
+    else:
+        same = stored == present
+        if {type(stored), type(present)} <= {int, float, bool}:
+            # Settings that are computed differ by less than 1e-6 on two machines.
+            both_nan = math.isnan(stored) and math.isnan(present)
+            same = both_nan or math.isclose(stored, present, rel_tol=1e-6, abs_tol=1e-13)
+        if not same:
+            yield path, f"{path} was {cut(repr(stored), 60)} and is now {cut(repr(present), 60)}"

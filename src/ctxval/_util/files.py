@@ -13,6 +13,7 @@ import os
 import secrets
 import stat
 import sys
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -118,6 +119,12 @@ def written_whole(path: str | Path, *, text: bool = False) -> Iterator[IO[Any]]:
     finally:
         with suppress(OSError):
             beside.unlink(missing_ok=True)
+
+
+@contextmanager
+def temporary_folder() -> Iterator[Path]:
+    with tempfile.TemporaryDirectory(prefix="ctxval-", ignore_cleanup_errors=True) as name:
+        yield Path(name).resolve()
 
 
 def write_text(path: str | Path, content: str) -> Path:

@@ -8,7 +8,7 @@ import sys
 import threading
 import traceback
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from types import FrameType
 from typing import NoReturn
 
@@ -48,19 +48,12 @@ class Interrupts:
 
     @contextmanager
     def shielded(self, shielded: bool = True) -> Iterator[None]:
+        """Shield code, or let a SIGINT stop a part of shielded code at once."""
         before, self._shielded = self._shielded, shielded
         try:
             yield
         finally:
             self._shielded = before
-
-    def at_once(self) -> AbstractContextManager[None]:
-        """A part of shielded code in which a SIGINT raises KeyboardInterrupt."""
-        return self.shielded(False)
-
-    def raise_if_asked(self) -> None:
-        if self.asked:
-            raise KeyboardInterrupt
 
 
 def raised_by_signal(error: BaseException) -> bool:

@@ -93,7 +93,6 @@ class Archive:
 
 @contextlib.contextmanager
 def _damage() -> Iterator[None]:
-    """Turn the many exceptions of zipfile, zlib and numpy for damaged or hostile bytes into one error."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of headers that Python 2 wrote

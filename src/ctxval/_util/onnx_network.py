@@ -32,7 +32,14 @@ class OnnxNetwork(ShortRepr):
     """
 
     def __init__(self, source: str | Path | bytes, recurrent: bool = False) -> None:
-        contents = [source] if isinstance(source, bytes) else _contents(Path(source))
+        contents = [source] if isinstance(source, bytes) else []
+        if not isinstance(source, bytes):
+            path, weights = Path(source), Path(f"{source}.data")  # PyTorch may write weights into a second file
+            try:
+                # The largest size refuses endless files, not large networks.
+                contents = [read_bytes(file, most=2**34) for file in (path, weights) if file == path or file.exists()]
+            except InputError as error:
+                raise InputError(f"the ONNX file {path} cannot be read: {error}.") from error
         # A single file goes to other processes as its bytes. Weights in a second file are found only by the path.
         self._source: bytes | str = contents[0] if len(contents) == 1 else str(Path(str(source)).absolute())
         self._digest = hashlib.sha256(b"".join(contents)).hexdigest()[:16]
@@ -123,16 +130,6 @@ class _Port:
         if self.layers is None or array.ndim != 3:
             return array
         return np.moveaxis(array, 0, 1).reshape(array.shape[1], -1)
-
-
-def _contents(path: Path) -> list[bytes]:
-    """Return the bytes of the file, and of the file of weights that PyTorch may write beside it."""
-    weights = path.with_name(f"{path.name}.data")
-    try:
-        # The largest size refuses endless files, not large networks.
-        return [read_bytes(file, most=2**34) for file in (path, weights) if file == path or file.exists()]
-    except InputError as error:
-        raise InputError(f"the ONNX file {path} cannot be read: {error}.") from error
 
 
 def _session(source: bytes | str) -> Any:

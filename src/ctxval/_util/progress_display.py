@@ -86,7 +86,6 @@ class OnScreen:
 
 
 def _bars(console: Console) -> Bars:
-    """Return a display of stages that leaves out those which have just begun."""
     from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
     from rich.progress import Progress as Bars
 

@@ -6,7 +6,7 @@ import importlib
 import inspect
 import sys
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import KW_ONLY, dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from ctxval._util.checked import checked
@@ -22,51 +22,35 @@ Made = TypeVar("Made")
 
 @dataclass(frozen=True)
 class Declaration:
-    """What a registry must know of a part beyond its class; :func:`part` explains the fields."""
-
-    name: str
-    runs_code: bool = False
-    files: tuple[str, ...] = ()
-    folder: str | None = None
-    functions: Mapping[str, str] = field(default_factory=dict)
-    aliases: tuple[str, ...] = ()
-    parts: Mapping[str, str] = field(default_factory=dict)
-
-
-_declarations: dict[Any, Declaration] = {}
-
-
-def part(
-    name: str | None = None,
-    *,
-    runs_code: bool = False,
-    files: tuple[str, ...] = (),
-    folder: str | None = None,
-    functions: Mapping[str, str] | None = None,
-    aliases: tuple[str, ...] = (),
-    parts: Mapping[str, str] | None = None,
-) -> Callable[[Part], Part]:
-    """Declare a class, or a function that makes an object, as a part that is found by name; check its arguments.
+    """Declares a class, or a function that makes an object, as a part that is found by name; checks its arguments.
 
     A part of this package is found once its package exports it in ``__all__``.
 
-    Args:
+    Attributes:
         name: the name of the class by default.
         runs_code: whether plain arguments, such as a text, can make the part run code: a program, a library, a module.
         files: arguments that are paths of files.
         folder: the argument that is a folder, which is the experiment's by default.
         functions: arguments that are functions, each with its form, such as ``(x, u) -> x_next``.
-        aliases: older names by which the part is found too; they are not listed.
         parts: arguments that are parts themselves, each with its kind, such as ``synthesizer``.
     """
 
-    def declare(made: Part) -> Part:
+    name: str = ""
+    _: KW_ONLY
+    runs_code: bool = False
+    files: tuple[str, ...] = ()
+    folder: str | None = None
+    functions: Mapping[str, str] = field(default_factory=dict)
+    parts: Mapping[str, str] = field(default_factory=dict)
+
+    def __call__(self, made: Part) -> Part:
         made = checked(made)
-        own = name or made.__name__
-        _declarations[made] = Declaration(own, runs_code, files, folder, functions or {}, aliases, parts or {})
+        _declarations[made] = replace(self, name=self.name or made.__name__)
         return made
 
-    return declare
+
+part = Declaration
+_declarations: dict[Any, Declaration] = {}
 
 
 def declaration_of(made: Any) -> Declaration | None:
@@ -94,7 +78,6 @@ class Registry(Mapping[str, Any], Generic[Made]):
         self, kind: str, package: str, *, method: str | None = None, modules: Mapping[str, str] | None = None
     ) -> None:
         self.kind, self.group, self.method = kind, package, method
-        self.aliases: dict[str, str] = {}
         self._built_in: dict[str, Any] = {}
         self._modules = dict(modules or {})
         if modules is None and "__all__" in vars(sys.modules[package]):
@@ -106,7 +89,6 @@ class Registry(Mapping[str, Any], Generic[Made]):
         for made in map(exported.get, exported["__all__"]):
             if (declared := declaration_of(made)) is not None:
                 self._built_in[declared.name] = made
-                self.aliases |= dict.fromkeys(declared.aliases, declared.name)
 
     @property
     def built_in(self) -> tuple[str, ...]:
@@ -116,7 +98,7 @@ class Registry(Mapping[str, Any], Generic[Made]):
     def installed(self) -> tuple[str, ...]:
         """The names of the parts that other installed packages add, sorted; none if their metadata is damaged."""
         try:
-            return tuple(sorted({point.name for point in self._entry_points()} - {*self.built_in, *self.aliases}))
+            return tuple(sorted({point.name for point in self._entry_points()} - {*self.built_in}))
         except InputError:
             return ()
 
@@ -125,14 +107,14 @@ class Registry(Mapping[str, Any], Generic[Made]):
 
         No package is looked at, and nothing is imported.
         """
-        present = self.aliases.get(name, name) if isinstance(name, str) else ""
-        declared = declaration_of(self._built_in.get(present))
-        return present in self.built_in and (declared is None or not declared.runs_code)
+        if not isinstance(name, str) or name not in self.built_in:
+            return False
+        declared = declaration_of(self._built_in.get(name))
+        return declared is None or not declared.runs_code
 
     def find(self, name: str) -> Any:
-        present = self.aliases.get(name, name)
-        if present in self._built_in:
-            return self._built_in[present]
+        if name in self._built_in:
+            return self._built_in[name]
         if name in self._modules:
             module, _, attribute = self._modules[name].partition(":")
             return getattr(importlib.import_module(module), attribute)
@@ -178,7 +160,7 @@ class Registry(Mapping[str, Any], Generic[Made]):
         return len(self.built_in) + len(self.installed)
 
     def __contains__(self, name: object) -> bool:
-        return name in self.built_in or name in self.aliases or name in self.installed
+        return name in self.built_in or name in self.installed
 
     def __repr__(self) -> str:
         return f"Registry({self.kind}: {', '.join(self)})"

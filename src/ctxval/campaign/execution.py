@@ -95,12 +95,13 @@ class _Loop:
                 self.pool.close()
         if self.stopped is not None:
             raise self.stopped
-        interrupts.raise_if_asked()
+        if interrupts.asked:
+            raise KeyboardInterrupt
 
     def _fill_pool(self, interrupts: Interrupts) -> None:
         while self.stopped is None and not interrupts.asked and len(self.running) < self.pool.size:
             try:
-                with interrupts.at_once():  # a choice may take long, and nothing is lost with it
+                with interrupts.shielded(False):  # a choice may take long, and nothing is lost with it
                     chosen = self.schedule.next()
                 if chosen is None:
                     return

@@ -18,7 +18,7 @@ from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import REDEFINED, TOLD_ALONE, Change, Trial
 from ctxval.core.validation import Validation
 from ctxval.errors import CtxvalError, DistanceError, InputError, StoreMismatchError
-from ctxval.searches import DEFAULT, NAMES, Repeated, Search, by_name
+from ctxval.searches import DEFAULT, REGISTRY, Repeated, Search, by_name
 
 _QUESTION = ("name", "seed", "search", "validation.space")
 """Parts of the description that must not differ, whatever reason the user gives."""
@@ -51,7 +51,7 @@ def _ready_made(described: Any) -> Search | None:
     if not isinstance(described, dict):
         return None
     name = described.get("type")
-    kind = next((kind for kind in NAMES.values() if kind.__name__ == name), None)
+    kind = next((kind for kind in map(REGISTRY.find, REGISTRY.built_in) if kind.__name__ == name), None)
     try:
         if name == Repeated.__name__:
             repeated = _ready_made(described.get("search"))

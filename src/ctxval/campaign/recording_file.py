@@ -15,7 +15,7 @@ import numpy as np
 from ctxval._util.arrays import Array
 from ctxval._util.columns import sentinels
 from ctxval._util.confinement import MOST_MEMORY
-from ctxval._util.temporary import temporary_folder
+from ctxval._util.files import temporary_folder
 from ctxval.core.experiment import Experiment
 from ctxval.core.labels import labels_of
 from ctxval.core.plan import Plan

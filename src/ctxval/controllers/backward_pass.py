@@ -16,26 +16,17 @@ from ctxval.core.controller import Limits
 
 
 @dataclass(frozen=True, eq=False)
-class Change:
-    """The expected change of the cost, ``length * slope + length^2 / 2 * curvature``; both of shape ``(N,)``."""
-
-    slope: Array
-    curvature: Array
-
-    def at(self, length: float | Array) -> Array:
-        return length * self.slope + 0.5 * length**2 * self.curvature
-
-
-@dataclass(frozen=True, eq=False)
 class InputStep:
     """A step of the inputs with its feedback, and the expected change of the cost.
 
     The gains K have shape ``(H, N, m, n)``, or ``(H, m, n)`` if all tasks share them, the feedforward k ``(H, N, m)``.
+    A step of some length changes the cost by ``length * slope + length^2 / 2 * curvature``, both of shape ``(N,)``.
     """
 
     K: Array
     k: Array
-    change: Change
+    slope: Array
+    curvature: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,12 +52,11 @@ def minimise(cost: QuadraticCost, around: Expansion, limits: Limits | None, damp
 
     The damping ``(N,)`` is added to the curvature of the inputs of each task.
     """
-    damped = bool(damping.any())
-    if limits is None and around.linear and not damped:
+    if damping.any():
+        return _recursion(cost, around, limits, damping[:, None, None] * np.eye(len(cost.R)))
+    if limits is None and around.linear:
         return _linear(cost, around)
-    ridge = damping[:, None, None] * np.eye(len(cost.R)) if damped else None
-    box = None if limits is None else (limits.low - around.inputs, limits.high - around.inputs)
-    return _recursion(cost, around, _Stage(ridge, box))
+    return _recursion(cost, around, limits, None)
 
 
 def _linear(cost: QuadraticCost, around: Expansion) -> InputStep:
@@ -83,18 +73,23 @@ def _linear(cost: QuadraticCost, around: Expansion) -> InputStep:
     Q_u = weighed + slopes @ around.B
     k = -Q_u @ known.inverses
     slope = _inner(k, Q_u)
-    return InputStep(known.gains, k, Change(slope, -slope))
+    return InputStep(known.gains, k, slope, -slope)
 
 
-def _recursion(cost: QuadraticCost, around: Expansion, stage: _Stage) -> InputStep:
+def _recursion(cost: QuadraticCost, around: Expansion, limits: Limits | None, ridge: Array | None) -> InputStep:
     """Expand the cost-to-go as ``v'dx + 1/2 dx'V dx`` from the horizon to the start.
 
     With z = (x, u) and F = (A, B), its expansion in z is ``q'dz + 1/2 dz'M dz`` with q = (Q_x, Q_u) and M of the blocks
     Q_xx, Q_ux and Q_uu.
     """
     horizon, batch, m = around.inputs.shape
-    F, F_T = _joined(around, (horizon, batch))
-    n = F.shape[-2]
+    n = around.B.shape[-2]
+    F = np.empty((n, n + m) if around.linear else (horizon, batch, n, n + m))
+    F[..., :n], F[..., n:] = around.A, around.B
+    F_T = np.ascontiguousarray(_T(F))  # products of contiguous matrices are twice as fast
+    if around.linear:
+        F, F_T = (np.broadcast_to(part, (horizon, *part.shape)) for part in (F, F_T))
+    box = None if limits is None else (limits.low - around.inputs, limits.high - around.inputs)
     weights = np.block([[cost.Q, np.zeros((n, m))], [np.zeros((m, n)), cost.R]])
     pulls = np.concatenate([around.deviations[:-1] @ cost.Q, around.inputs @ cost.R], axis=-1)
     v, V = around.deviations[-1] @ cost.Q_final, cost.Q_final
@@ -105,54 +100,30 @@ def _recursion(cost: QuadraticCost, around: Expansion, stage: _Stage) -> InputSt
         M += weights
         q = pulls[t] + times(v, F[t])
         Q_u, Q_ux, Q_uu = q[:, n:], M[..., n:, :n], M[..., n:, n:]
-        K, k = stage.solve(t, Q_uu, Q_u, Q_ux)
+        damped = Q_uu if ridge is None else Q_uu + ridge
+        K, k = _solved(damped, Q_u, Q_ux, None if box is None else (box[0][t], box[1][t]))
         slopes[t], Q_uu_k[t], k_all[t], K_all[t] = Q_u, times(k, Q_uu), k, K
         v, V = q[:, :n] + times(k, Q_ux), M[..., :n, :n] + _T(Q_ux) @ K
-        if not stage.exact:  # otherwise K'(Q_uu k + Q_u) and K'(Q_uu K + Q_ux) are zero
+        if ridge is not None:  # otherwise K'(Q_uu k + Q_u) and K'(Q_uu K + Q_ux) are zero
             v += times(Q_uu_k[t] + Q_u, K)
             V = V + _T(K) @ (Q_uu @ K + Q_ux)
         V = 0.5 * (V + _T(V))
-    return InputStep(K_all, k_all, Change(_inner(k_all, slopes), _inner(k_all, Q_uu_k)))
+    return InputStep(K_all, k_all, _inner(k_all, slopes), _inner(k_all, Q_uu_k))
 
 
-def _joined(around: Expansion, shape: tuple[int, int]) -> tuple[Array, Array]:
-    """Return F = (A, B), shape ``(H, N, n, n + m)`` or ``(H, n, n + m)`` if it is constant, and its transpose."""
-    A, B = around.A, around.B
-    n, m = B.shape[-2:]
-    F = np.empty((n, n + m) if around.linear else (*shape, n, n + m))
-    F[..., :n], F[..., n:] = A, B
-    F_T = np.ascontiguousarray(_T(F))  # products of contiguous matrices are twice as fast
-    if around.linear:
-        return np.broadcast_to(F, (shape[0], *F.shape)), np.broadcast_to(F_T, (shape[0], *F_T.shape))
-    return F, F_T
-
-
-@dataclass(frozen=True, eq=False)
-class _Stage:
-    """The minimisation over the inputs of one step, with damping ``(N, m, m)`` and limits of k ``(H, N, m)``."""
-
-    ridge: Array | None
-    box: tuple[Array, Array] | None
-
-    @property
-    def exact(self) -> bool:
-        return self.ridge is None
-
-    def solve(self, t: int, Q_uu: Array, Q_u: Array, Q_ux: Array) -> tuple[Array, Array]:
-        """Return the gains K ``(N, m, n)``, or ``(m, n)``, and k ``(N, m)``; inputs at a limit have no gain."""
-        Q_uu = Q_uu if self.ridge is None else Q_uu + self.ridge
-        opposite = -_inverses(Q_uu)
-        K, k = opposite @ Q_ux, times(Q_u, opposite)
-        if self.box is None:
-            return K, k
-        low, high = self.box[0][t], self.box[1][t]
-        beyond = np.flatnonzero(((k <= low) | (k >= high)).any(axis=-1))
-        if len(beyond):
-            parts = (part if part.ndim == 3 else np.repeat(part[None], len(k), axis=0) for part in (K, Q_uu, Q_ux))
-            K, Q_uu, Q_ux = parts
-            box = low[beyond], high[beyond]
-            K[beyond], k[beyond] = _within(box, k[beyond], Q_uu[beyond], Q_u[beyond], Q_ux[beyond])
+def _solved(Q_uu: Array, Q_u: Array, Q_ux: Array, box: tuple[Array, Array] | None) -> tuple[Array, Array]:
+    """Return the gains K ``(N, m, n)`` or ``(m, n)`` and k ``(N, m)`` within a box; inputs at a limit have no gain."""
+    opposite = -_inverses(Q_uu)
+    K, k = opposite @ Q_ux, times(Q_u, opposite)
+    if box is None:
         return K, k
+    low, high = box
+    beyond = np.flatnonzero(((k <= low) | (k >= high)).any(axis=-1))
+    if len(beyond):
+        K, Q_uu, Q_ux = (part if part.ndim == 3 else np.repeat(part[None], len(k), axis=0) for part in (K, Q_uu, Q_ux))
+        limits = low[beyond], high[beyond]
+        K[beyond], k[beyond] = _within(limits, k[beyond], Q_uu[beyond], Q_u[beyond], Q_ux[beyond])
+    return K, k
 
 
 def _within(box: tuple[Array, Array], best: Array, Q_uu: Array, Q_u: Array, Q_ux: Array) -> tuple[Array, Array]:

@@ -118,7 +118,7 @@ class _Descent:
 
     def advance(self, rows: Rows) -> None:
         around, policy = self._step(rows)
-        gain = -policy.change.at(1.0)
+        gain = -(policy.slope + 0.5 * policy.curvature)
         arrived = gain <= self.settings.tolerance * (np.abs(self.J[rows]) + self.settings.tolerance)
         # A damped step is always small, so only an undamped step may mark a task as converged.
         self.converged[rows] = arrived & (self.damping[rows] == 0)
@@ -152,7 +152,6 @@ class _Descent:
         self._keep(policy, np.flatnonzero(finite), rows)
 
     def _step(self, rows: Rows) -> tuple[Expansion, InputStep]:
-        """Return the expansion at the iterates of these tasks, and the step that minimises it."""
         X, U = self.X[:, rows], self.U[:, rows]
         known = self.latest  # the derivatives of unchanged iterates are kept
         if known is None or not self.refused[rows].all() or not np.array_equal(known[0], rows):
@@ -190,7 +189,7 @@ class _Descent:
         index = np.arange(len(of)) - np.repeat(np.cumsum(counts) - counts - tried, counts)
         lengths, tasks = _STEP_LENGTHS[index], waiting[of]
         X, U, J = self._forward(rows[tasks], policy, tasks, lengths)
-        expected = lengths * policy.change.slope[tasks] + 0.5 * lengths**2 * policy.change.curvature[tasks]
+        expected = lengths * policy.slope[tasks] + 0.5 * lengths**2 * policy.curvature[tasks]
         good = np.flatnonzero(self.J[rows[tasks]] - J >= -1e-4 * expected)
         moved, first = np.unique(of[good], return_index=True)
         chosen, to = good[first], rows[waiting[moved]]
@@ -223,7 +222,6 @@ class _Descent:
         return inputs if self.limits is None else self.limits.clip(inputs)
 
     def solution(self, batch_shape: tuple[int, ...]) -> ILQRSolution:
-        """Return the iterates as a solution, batch first."""
 
         def batch_first(array: Array) -> Array:
             return np.moveaxis(array, 0, 1).reshape(*batch_shape, len(array), *array.shape[2:])

@@ -163,7 +163,6 @@ class _Problem:
         return X, U, True
 
     def _merit(self, X: Array, U: Array) -> float:
-        """Return the cost plus the weighted violation of the state limits."""
         deviations = X[1:] - self.reference
         weighed = ((self.Q @ deviations[..., None])[..., 0] * deviations).sum()
         cost = 0.5 * (weighed + ((U @ self.settings.cost.R) * U).sum())

@@ -82,11 +82,9 @@ class RecurrentPolicy(ShortRepr):
 
     @property
     def limits(self) -> Limits | None:
-        """The limits of the inputs; None if there are none."""
         return self.policy.limits
 
     def start(self, task: Task) -> tuple[Array, ...]:
-        """Return states ``(..., k)`` of the network that are 0."""
         return tuple(np.zeros((*task.batch_shape, width or 0)) for width in self.policy.network.widths[1:])
 
     def step(self, t: int, x: Array, memory: tuple[Array, ...]) -> tuple[Array, tuple[Array, ...]]:
@@ -96,5 +94,4 @@ class RecurrentPolicy(ShortRepr):
         return (u if self.limits is None else Limits.of(self.limits, u.shape[-1]).clip(u)), tuple(new)
 
     def __getitem__(self, index: int) -> RecurrentPolicy:
-        """Return the controller of one task of the batch."""
         return RecurrentPolicy(self.policy, self.task[index])

@@ -30,9 +30,6 @@ class OutputFeedback(ShortRepr):
         outputs: a function ``h(x) -> y`` of M's states, or the indices of the states that are outputs.
         process: standard deviations of what M misses in each state in one step, a number or ``(n,)``.
         measurement: standard deviations of the errors of the outputs, a number or ``(p,)``.
-
-    Raises:
-        InputError: if a standard deviation is not positive.
     """
 
     def __init__(
@@ -46,11 +43,9 @@ class OutputFeedback(ShortRepr):
 
     @property
     def batched(self) -> bool:
-        """Whether the state feedback is designed for a batch of tasks in one call."""
         return bool(getattr(self.synthesizer, "batched", False))
 
     def design(self, task: Task, model: Model) -> EstimatedFeedback:
-        """Return the controller, which has memory."""
         n, p = task.initial_state.shape[-1], self.outputs(task.initial_state).shape[-1]
         task.require_width(p)
         zero = np.zeros(n)
@@ -94,16 +89,13 @@ class EstimatedFeedback(ShortRepr):
 
     @property
     def limits(self) -> Limits | None:
-        """The limits of the inputs; None if there are none."""
         return getattr(self.feedback, "limits", None)
 
     @property
     def converged(self) -> Any:
-        """Whether the design of the state feedback converged; None if it does not tell."""
         return getattr(self.feedback, "converged", None)
 
     def start(self, task: Task) -> FilterMemory:
-        """Return the initial state of the task as the first estimate."""
         known = np.broadcast_to(self.process, (*task.batch_shape, *self.process.shape))
         of_feedback = self.feedback.start(task) if isinstance(self.feedback, ControllerWithMemory) else None
         return FilterMemory(Estimate(np.array(task.initial_state), known), of_feedback)
@@ -121,6 +113,5 @@ class EstimatedFeedback(ShortRepr):
         return u, FilterMemory(prior, of_feedback)
 
     def __getitem__(self, index: int) -> EstimatedFeedback:
-        """Return the controller of one task of the batch."""
         feedback: Any = self.feedback
         return EstimatedFeedback(feedback[index], self.model, self.outputs, self.process, self.measurement)

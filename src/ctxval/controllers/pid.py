@@ -70,17 +70,11 @@ class PID(ShortRepr):
 
 
 class PIDMemory(NamedTuple):
-    """What a PID controller remembers of earlier steps.
+    """What a PID controller remembers of earlier steps."""
 
-    Attributes:
-        integral: the integral part of each input, ``(..., m)``.
-        states: the chosen states at the last step, ``(..., k)``.
-        derivative: the filtered derivative of the chosen states, ``(..., k)``.
-    """
-
-    integral: Array
-    states: Array
-    derivative: Array
+    integral: Array  # the integral part of each input (..., m)
+    states: Array  # the chosen states at the last step (..., k)
+    derivative: Array  # the filtered derivative of the chosen states (..., k)
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,7 +93,6 @@ class PIDFeedback(ShortRepr):
 
     @property
     def limits(self) -> Limits | None:
-        """The limits of the inputs; None if there are none."""
         return self.pid.limits
 
     def start(self, task: Task) -> PIDMemory:
@@ -126,7 +119,6 @@ class PIDFeedback(ShortRepr):
         return (u if pid.limits is None else pid.limits.clip(u)), new
 
     def __getitem__(self, index: int) -> PIDFeedback:
-        """Return the controller of one task of the batch."""
         return replace(self, reference=self.reference[index])
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ctxval._util.arrays import ArrayLike, vector_norm
+from ctxval._util.arrays import ArrayLike
 from ctxval.core.plan import Plan
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.validation import Validation
@@ -52,6 +52,6 @@ def start_offset(validation: Validation, point: ArrayLike, trajectory: Trajector
     size, state = float(gap.max()), int(gap.argmax())
     if hasattr(validation.distance, "difference"):
         compared = validation.distance.difference(trajectory.states[0], start)
-        size = float(vector_norm(compared, getattr(validation.distance, "norm", 1)))
+        size = float(np.linalg.norm(compared, getattr(validation.distance, "norm", 1), axis=-1))
     name, unit = list(validation.names(len(gap), trajectory.inputs.shape[-1])[0].items())[state]
     return StartOffset(size, f"{gap[state]:.2g} {unit}".rstrip() + f" in {name}")

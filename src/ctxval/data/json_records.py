@@ -26,40 +26,25 @@ def read_json_records(path: Path) -> list[Log]:
     is missing or null in a record is NaN. Numbers beside the list, such as a gain, hold for all records. Files that end
     in ``.gz`` are decompressed.
     """
-    content = _content(path)
+    packed = read_bytes(path)
+    try:
+        if path.suffix.lower() == ".gz":
+            with gzip.open(path) as file:
+                packed = file.read(MOST_BYTES + 1)
+            if len(packed) > MOST_BYTES:
+                raise InputError(f"{path} has more than {MOST_BYTES} bytes when it is decompressed.")
+        content = json.loads(packed.decode("utf-8"))
+    except (OSError, EOFError, zlib.error, ValueError, RecursionError) as error:
+        raise InputError(f"{path} cannot be read as JSON: {error}.") from error
     records = _records(path, content)
     rows = [dict(_numbers("", record, _DEPTH)) for record in records]
     columns = {name: _column([row.get(name) for row in rows]) for name in dict.fromkeys(k for row in rows for k in row)}
     kept = {name: column for name, column in columns.items() if column is not None}
     if not kept:
         raise InputError(f"{path} has no field with numbers in its records.")
-    around = {name: value for name, value in _around(content).items() if not isinstance(value, str)}
-    constant = {name: np.full(len(records), float(value)) for name, value in around.items()}
+    around = content.items() if isinstance(content, Mapping) else ()
+    constant = {name: np.full(len(records), float(value)) for name, value in around if isinstance(value, int | float)}
     return [MemoryTable(str(path), {**constant, **kept})]
-
-
-def about_json_records(path: Path) -> dict[str, Any]:
-    """Return what the object around the records of a JSON file says of all of them, such as a mass or a gain."""
-    return _around(_content(path))
-
-
-def _around(content: Any) -> dict[str, Any]:
-    if not isinstance(content, Mapping):
-        return {}
-    return {name: value for name, value in content.items() if isinstance(value, str | int | float)}
-
-
-def _content(path: Path) -> Any:
-    content = read_bytes(path)
-    try:
-        if path.suffix.lower() == ".gz":
-            with gzip.open(path) as file:
-                content = file.read(MOST_BYTES + 1)
-            if len(content) > MOST_BYTES:
-                raise InputError(f"{path} has more than {MOST_BYTES} bytes when it is decompressed.")
-        return json.loads(content.decode("utf-8"))
-    except (OSError, EOFError, zlib.error, ValueError, RecursionError) as error:
-        raise InputError(f"{path} cannot be read as JSON: {error}.") from error
 
 
 def _records(path: Path, content: Any) -> list[Mapping[str, Any]]:
@@ -75,7 +60,6 @@ def _records(path: Path, content: Any) -> list[Mapping[str, Any]]:
 
 
 def _numbers(before: str, record: Mapping[str, Any], depth: int) -> Iterator[tuple[str, Any]]:
-    """Yield the fields of a record that may hold numbers, by their paths."""
     for name, value in record.items():
         path = f"{before}.{name}".removeprefix(".")
         if isinstance(value, Mapping):

@@ -33,9 +33,6 @@ class Recorded(ShortRepr):
             the file without its ending.
         mapping: which fields of the logs are states and inputs, and how long a step is; a table as in a file, or
             :class:`ctxval.data.LogMapping`. Without inputs, they are those that the controller gives along the records.
-
-    Raises:
-        InputError: if a log cannot be read, or has several recordings.
     """
 
     def __init__(

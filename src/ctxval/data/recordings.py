@@ -188,7 +188,6 @@ def _channels(log: Log, mapping: LogMapping, names: Mapping[str, list[str]], not
 
 
 def _without_marks(name: str, column: Array, scale: float, signal: Signal, notes: list[str]) -> None:
-    """Replace marks of missing values by NaN; note them."""
     for value in sentinels(column, scale):
         marked = column == value
         notes.append(
@@ -202,7 +201,6 @@ def _without_marks(name: str, column: Array, scale: float, signal: Signal, notes
 
 
 def _in_unit_of(log: Log, channel: Channel, first: Channel) -> Channel:
-    """Return a channel in the unit of the same channel in the first log."""
     if channel.unit == first.unit:
         return channel
     if not channel.unit or not first.unit:

@@ -146,7 +146,6 @@ def _plausible(stamps: Mapping[str, Sequence[Mapping[str, Any]]]) -> bool:
 
 
 def _resolved(content: Any, path: Sequence[str | int]) -> Any:
-    """Return a part of a message; None if there is none."""
     for step in path:
         if isinstance(step, int):
             content = content[step] if hasattr(content, "__getitem__") and step < len(content) else None
@@ -161,12 +160,10 @@ def _resolved(content: Any, path: Sequence[str | int]) -> Any:
 
 
 def _first(content: Any, *paths: Sequence[str | int]) -> Any:
-    """Return the first part of a message that exists; None if there is none."""
     return next((value for path in paths if (value := _resolved(content, path)) is not None), None)
 
 
 def _leaves(content: Any, before: str = "", depth: int = 6) -> Iterator[str]:
-    """Yield the paths of all numbers in a message."""
     if isinstance(content, bool | int | float | np.number):
         yield before
     elif depth and isinstance(content, Mapping):

@@ -10,7 +10,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from ctxval._util.arrays import Array, ArrayLike, as_finite, vector_norm
+from ctxval._util.arrays import Array, ArrayLike, as_finite
 from ctxval._util.checked import Norm
 from ctxval._util.representation import ShortRepr
 from ctxval.core.task import Task
@@ -121,7 +121,7 @@ class ErrorNorm(StateNorm, ABC):
 
     def compose(self, error: Array) -> Array:
         """Return the norms of error vectors ``(..., k)``, shape ``(...)``."""
-        return vector_norm(error, self.norm)
+        return np.asarray(np.linalg.norm(error, self.norm, axis=-1))
 
     def __call__(self, model_trajectory: Trajectory, system_trajectory: Trajectory, task: Task) -> Array:
         return self.compose(self.error(model_trajectory, system_trajectory, task))

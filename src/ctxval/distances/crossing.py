@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 
-from ctxval._util.arrays import Array, vector_norm
+from ctxval._util.arrays import Array
 from ctxval._util.checked import FiniteFloat, Norm, PositiveInt
 from ctxval._util.registry import part
 from ctxval.core.task import Task
@@ -45,10 +45,9 @@ class AtCrossing(ErrorNorm):
 
     def compose(self, error: Array) -> Array:
         gap = error.reshape(*error.shape[:-1], self.crossings, -1)
-        return np.asarray(vector_norm(gap, self.norm).max(axis=-1))
+        return np.asarray(np.linalg.norm(gap, self.norm, axis=-1).max(axis=-1))
 
     def _states(self, trajectory: Trajectory) -> Array:
-        """Return the states at the crossings, shape ``(..., crossings, n)``."""
         states = trajectory.states
         n = states.shape[-1]
         [state] = require_indices("state", [self.state], n)

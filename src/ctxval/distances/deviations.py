@@ -8,7 +8,7 @@ from typing import ClassVar, Literal
 
 import numpy as np
 
-from ctxval._util.arrays import Array, vector_norm
+from ctxval._util.arrays import Array
 from ctxval._util.checked import Norm
 from ctxval._util.registry import part
 from ctxval.core.task import Task
@@ -56,7 +56,7 @@ class AtTimes(ErrorNorm):
 
     def compose(self, error: Array) -> Array:
         gap = error.reshape(*error.shape[:-1], len(self.times), -1)
-        return np.asarray(vector_norm(gap, self.norm).max(axis=-1))
+        return np.asarray(np.linalg.norm(gap, self.norm, axis=-1).max(axis=-1))
 
 
 @part()
@@ -71,7 +71,7 @@ class MaximumDeviation(StateNorm):
 
     def __call__(self, model_trajectory: Trajectory, system_trajectory: Trajectory, task: Task) -> Array:
         gap = self.difference(system_trajectory.states, model_trajectory.states)
-        return np.asarray(vector_norm(gap, self.norm).max(axis=-1))
+        return np.asarray(np.linalg.norm(gap, self.norm, axis=-1).max(axis=-1))
 
 
 @part()
@@ -86,7 +86,7 @@ class MeanDeviation(StateNorm):
 
     def __call__(self, model_trajectory: Trajectory, system_trajectory: Trajectory, task: Task) -> Array:
         gap = self.difference(system_trajectory.states, model_trajectory.states)
-        return np.asarray(vector_norm(gap[..., 1:, :], self.norm).mean(axis=-1))
+        return np.asarray(np.linalg.norm(gap[..., 1:, :], self.norm, axis=-1).mean(axis=-1))
 
 
 @part()
@@ -117,7 +117,7 @@ class RelativeDeviation(StateNorm):
         gap = self.difference(system_trajectory.states, model_trajectory.states)
         moved = selected(np.ptp(model_trajectory.states, axis=-2), self.components)
         ranges = np.maximum(moved, np.asarray(self.least, dtype=np.float64))
-        return np.asarray(vector_norm(gap / ranges[..., None, :], self.norm).max(axis=-1))
+        return np.asarray(np.linalg.norm(gap / ranges[..., None, :], self.norm, axis=-1).max(axis=-1))
 
 
 @part()
@@ -138,7 +138,7 @@ class WholeTrajectory(StateNorm):
 
     def __call__(self, model_trajectory: Trajectory, system_trajectory: Trajectory, task: Task) -> Array:
         gap = self.difference(system_trajectory.states, model_trajectory.states)
-        whole = vector_norm(gap.reshape(*gap.shape[:-2], -1), self.norm)
+        whole = np.asarray(np.linalg.norm(gap.reshape(*gap.shape[:-2], -1), self.norm, axis=-1))
         return whole / task.horizon if self.per_step else whole
 
 
@@ -177,5 +177,5 @@ class TrackingError(StateNorm):
 
     def __call__(self, model_trajectory: Trajectory, system_trajectory: Trajectory, task: Task) -> Array:
         gap = self.difference(system_trajectory.states, task.reference)[..., 1:, :]
-        norms = vector_norm(gap, self.norm)
+        norms = np.linalg.norm(gap, self.norm, axis=-1)
         return np.asarray(norms.max(axis=-1) if self.over == "maximum" else norms.mean(axis=-1))

@@ -10,7 +10,7 @@ from scipy.spatial.distance import cdist
 from scipy.special import erfcx, log_ndtr, ndtr
 
 from ctxval._util.arrays import Array, Mask
-from ctxval._util.boxes import climb, moves_to_bounds, separated_rows
+from ctxval._util.boxes import Box, climb, polish, separated_rows
 from ctxval.gp.regression import GaussianProcess
 
 
@@ -41,7 +41,6 @@ class UpperConfidenceBound:
     beta: float = 2.0
 
     def __call__(self, X: Array) -> Array:
-        """Return the bound at ``(m, d)``, shape ``(m,)``."""
         mean, variance = self.process.predict(X)
         return np.asarray(mean + np.sqrt(self.beta * variance))
 
@@ -66,13 +65,11 @@ class LogExpectedImprovement:
     best: float
 
     def __call__(self, X: Array) -> Array:
-        """Return the logarithm at ``(m, d)``, shape ``(m,)``."""
         mean, variance = self.process.predict(X)
         sigma = np.maximum(np.sqrt(variance), _CERTAIN)
         return np.asarray(log_improvement((mean - self.best) / sigma) + np.log(sigma))
 
     def with_gradient(self, X: Array) -> tuple[Array, Array]:
-        """Return the logarithm ``(m,)`` and its gradient ``(m, d)``."""
         mean, variance, d_mean, d_variance = self.process.predict_with_gradient(X)
         sigma = np.maximum(np.sqrt(variance), _CERTAIN)
         d_sigma = np.where(np.sqrt(variance) > _CERTAIN, d_variance.T / (2 * sigma), 0.0).T
@@ -104,17 +101,11 @@ class Uncertainty:
     process: GaussianProcess
 
     def __call__(self, X: Array) -> Array:
-        """Return the variance at ``(m, d)``, shape ``(m,)``."""
         return self.process.predict(X)[1]
 
     def with_gradient(self, X: Array) -> tuple[Array, Array]:
-        """Return the variance ``(m,)`` and its gradient ``(m, d)``."""
         _, variance, _, d_variance = self.process.predict_with_gradient(X)
         return variance, d_variance
-
-
-Box = tuple[Array, Array]
-"""The lower and upper bounds ``(d,)`` of a part of the unit cube."""
 
 
 def maximise(
@@ -161,23 +152,13 @@ def maximise(
     starts = best[separated_rows(best, 0.05 * diagonal, 4)]
     climbed, _ = climb(acquisition.with_gradient, starts, low, high, iterations=20)
     if corners:
-        climbed = np.concatenate([climbed, _polish(acquisition, climbed, low, high)])
+        heights = acquisition(climbed)
+        row = [int(heights.argmax())]
+        top, _ = polish(lambda Z: acquisition(Z[0])[None], climbed[row], heights[row], (low, high), 2 * dimension)
+        climbed = np.concatenate([climbed, top])
     finalists = np.concatenate([climbed, candidates[order[:16]]])
     is_new = cdist(finalists, known, "chebyshev").min(axis=1, initial=np.inf) > 1e-6
     values = np.where(is_new & is_apart(finalists), acquisition(finalists), -np.inf)
     if not np.isfinite(values).any():
         return np.asarray(low + rng.random(dimension) * (high - low))
     return np.asarray(finalists[np.argmax(values)])
-
-
-def _polish(acquisition: Acquisition, points: Array, low: Array, high: Array) -> Array:
-    """Move one coordinate of the best point at a time to a bound, while that increases the value."""
-    values = acquisition(points)
-    point, value = points[np.argmax(values)], float(values.max())
-    for _ in range(2 * len(low)):
-        moved = moves_to_bounds(point, low, high)
-        values = acquisition(moved)
-        if values.max() <= value:
-            break
-        point, value = moved[np.argmax(values)], float(values.max())
-    return np.asarray(point[None])

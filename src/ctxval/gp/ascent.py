@@ -57,7 +57,6 @@ class Ascent:
 
     @property
     def _left(self) -> int:
-        """How many evaluations the budget still allows."""
         used = 0 if self._rough is self._exact else self._rough.budget - self._rough.left
         return self._exact.left - used
 
@@ -100,17 +99,11 @@ class Ascent:
 
 @dataclass(frozen=True)
 class Effort:
-    """What a search usually evaluates; one that goes on improving evaluates up to half as much again.
+    """What a search usually evaluates; one that goes on improving evaluates up to half as much again."""
 
-    Attributes:
-        exact: number of points at which the function itself is evaluated.
-        rough: number of points at which its approximation is evaluated.
-        batches: number of calls in which all of these are evaluated.
-    """
-
-    exact: int
-    rough: int
-    batches: int
+    exact: int  # number of points at which the function itself is evaluated
+    rough: int  # number of points at which its approximation is evaluated
+    batches: int  # number of calls in which all of these are evaluated
 
     @property
     def points(self) -> int:
@@ -136,7 +129,6 @@ def usual_effort(dimension: int, budget: int) -> Effort:
 
 
 def _best(done: Evaluations, count: int, share: float = 0.1) -> Array:
-    """Return some of the best points, each at a distance from all better ones."""
     points, values = done.found()
     finite = points[np.isfinite(values)]
     reach = share * float(np.linalg.norm(done.high - done.low))
@@ -144,11 +136,10 @@ def _best(done: Evaluations, count: int, share: float = 0.1) -> Array:
 
 
 def _pool(dimension: int, count: int) -> Array:
-    """Return points that fill the unit cube evenly and reach its faces, shape ``(count, d)``.
+    """Return points ``(count, d)`` that fill the unit cube evenly and reach its faces.
 
-    Source:
-        Roberts 2018, "The unreasonable effectiveness of quasirandom sequences": a Kronecker sequence of generalised
-        golden ratios.
+    A Kronecker sequence of generalised golden ratios (Roberts 2018, "The unreasonable effectiveness of quasirandom
+    sequences").
     """
     ratio = 2.0
     for _ in range(30):

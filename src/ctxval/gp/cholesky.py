@@ -20,13 +20,9 @@ from ctxval.errors import InputError
 
 @dataclass(frozen=True, eq=False)
 class CholeskyFactor:
-    """The factor L of a positive definite matrix ``K = L L'``; make one with :func:`factorise`.
+    """The factor L of a positive definite matrix ``K = L L'``; make one with :func:`factorise`."""
 
-    Attributes:
-        L: lower triangular, with zeros above its diagonal, shape ``(n, n)``.
-    """
-
-    L: Array
+    L: Array  # lower triangular, with zeros above its diagonal (n, n)
 
     def solve(self, right: Array) -> Array:
         """Return ``K^-1 right`` in the shape of ``right``, ``(n,)`` or ``(n, k)``."""
@@ -37,10 +33,9 @@ class CholeskyFactor:
         return np.asarray(dtrtrs(self.L, right, lower=1)[0])
 
     def whiten_many(self, right: Array) -> Array:
-        """Return ``L^-1 right`` for many columns by a product with the inverse factor, which is faster.
+        """Return ``L^-1 right`` for many columns, by a product with the inverse factor, which is faster.
 
-        Args:
-            right: shape ``(n, k)``, columns contiguous; it may be overwritten.
+        The columns of ``right`` are contiguous, and may be overwritten.
         """
         return np.asarray(dtrmm(1.0, self.inverse_factor, right, lower=1, overwrite_b=1))
 
@@ -73,12 +68,7 @@ class CholeskyFactor:
 
 
 def factorise(covariance: Array, noises: float | Iterable[float]) -> CholeskyFactor:
-    """Return the Cholesky factor of ``covariance + noise I``.
-
-    Args:
-        covariance: covariance of the noise-free observations, shape ``(n, n)``; it is not changed.
-        noises: the noise variance, or several of them, which are tried one after the other.
-    """
+    """Return the Cholesky factor of ``covariance + noise I``, shape ``(n, n)``; several noises are tried in turn."""
     tried = [noises] if isinstance(noises, float) else noises
     for noise in tried:
         noisy = np.array(covariance, order="F")

@@ -27,18 +27,11 @@ _STEPS = (0.3, 0.005)  # largest standard deviation of a mutation in the first a
 
 @dataclass(frozen=True, eq=False)
 class GlobalMaximum:
-    """What a search of a function over the unit cube has found.
+    """What a search of a function over the unit cube has found."""
 
-    Attributes:
-        points: all points that were evaluated, those of largest values first, shape ``(m, d)``.
-        values: their values, shape ``(m,)``; minus infinity if the function was not finite there.
-        elites: good points that are apart from each other, the best first, shape ``(e, d)``; none if no value is
-            finite.
-    """
-
-    points: Array
-    values: Array
-    elites: Array
+    points: Array  # all points that were evaluated, those of largest values first (m, d)
+    values: Array  # their values (m,); minus infinity if the function was not finite there
+    elites: Array  # good points that are apart from each other, the best first (e, d); none if no value is finite
 
     @property
     def evaluations(self) -> int:

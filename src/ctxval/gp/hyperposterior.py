@@ -29,13 +29,10 @@ EXACT = 1e-10
 class Warp:
     """A scale on which values are a Gaussian process.
 
-    Attributes:
-        offset: c of ``log(y + c)``; infinity for the values themselves.
-        unit: unit of the values in their likelihood, if ``offset`` is infinite; it makes that likelihood comparable
-            with that of the logarithm, which has no unit.
+    The unit of the values makes their likelihood comparable with that of the logarithm, which has no unit.
     """
 
-    offset: float = np.inf
+    offset: float = np.inf  # c of log(y + c); infinity for the values themselves
     unit: float = 1.0
 
     def forward(self, y: ArrayLike) -> Array:
@@ -99,17 +96,11 @@ class Prior:
 
 @dataclass(frozen=True, eq=False)
 class Hyperparameters(ShortRepr):
-    """One draw of the hyperparameters.
+    """One draw of the hyperparameters."""
 
-    Attributes:
-        nu: the kernel's smoothness.
-        log_scales: logarithms of the length-scales, shape ``(d,)``.
-        log_noise: logarithm of the noise variance relative to sigma^2.
-    """
-
-    nu: float
-    log_scales: Array
-    log_noise: float
+    nu: float  # the kernel's smoothness
+    log_scales: Array  # logarithms of the length-scales (d,)
+    log_noise: float  # logarithm of the noise variance relative to sigma^2
 
     def kernel(self, X: Array, Z: Array) -> Array:
         """Return the correlations ``(n, m)`` of g between points ``(n, d)`` and ``(m, d)``."""
@@ -131,26 +122,16 @@ class Hyperparameters(ShortRepr):
 
 @dataclass(frozen=True, eq=False)
 class Conditioned(ShortRepr):
-    """A Gaussian process with one draw of hyperparameters, conditioned on data.
-
-    Attributes:
-        warp: the scale of the values.
-        y: the values on that scale, shape ``(n,)``.
-        factor: Cholesky factor of the observations' correlations.
-        mean: the most likely mu.
-        mean_variance: variance of mu relative to sigma^2.
-        scale2: the most likely sigma^2, with ``n - 1`` degrees of freedom.
-        log_likelihood: log likelihood of the data with mu and sigma integrated out, up to a constant.
-    """
+    """A Gaussian process with one draw of hyperparameters, conditioned on data."""
 
     hyperparameters: Hyperparameters
     warp: Warp
-    y: Array
-    factor: CholeskyFactor
-    mean: float
-    mean_variance: float
-    scale2: float
-    log_likelihood: float
+    y: Array  # the values on the scale of the warp (n,)
+    factor: CholeskyFactor  # of the observations' correlations
+    mean: float  # the most likely mu
+    mean_variance: float  # variance of mu relative to sigma^2
+    scale2: float  # the most likely sigma^2, with n - 1 degrees of freedom
+    log_likelihood: float  # of the data with mu and sigma integrated out, up to a constant
 
 
 def condition(hyperparameters: Hyperparameters, X: Array, values: Array, warp: Warp | None = None) -> Conditioned:

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 from ctxval._util.arrays import Array, Rows
-from ctxval.errors import InputError, ShapeError
+from ctxval.errors import InputError
 from ctxval.gp.cholesky import CholeskyFactor, factorise
 from ctxval.gp.kernels import Bounds, Kernel
 
@@ -69,26 +69,16 @@ class GaussianProcess:
         """Return mean and variance ``(n,)`` of each observation given all others (Rasmussen and Williams, eq. 5.12)."""
         return self.y - self.alpha / self.factor.precisions, 1 / self.factor.precisions
 
-    def log_marginal_likelihood(self) -> float:
-        """Return log p(y | X, theta)."""
-        return _log_likelihood(self.factor, self.alpha, self.y - self.mean(self.X))
-
 
 @dataclass(frozen=True, eq=False)
 class MultiOutputProcess:
-    """Gaussian processes of zero mean for several outputs that share a covariance, conditioned on observations.
-
-    Attributes:
-        X, Y: observations, shapes ``(n, d)`` and ``(n, k)``.
-        noises: variances of the observations' noise, which are tried in this order until the covariance matrix is
-            positive definite.
-    """
+    """Gaussian processes of zero mean for several outputs that share a covariance, conditioned on observations."""
 
     kernel: Kernel
     theta: Array
-    X: Array
-    Y: Array
-    noises: Sequence[float] = (NOISE,)
+    X: Array  # (n, d)
+    Y: Array  # (n, k)
+    noises: Sequence[float] = (NOISE,)  # tried in this order until the covariance matrix is positive definite
 
     @functools.cached_property
     def factor(self) -> CholeskyFactor:
@@ -131,16 +121,9 @@ def condition(
     kernel: Kernel, theta: Array, X: Array, y: Array, *, noise: float = NOISE, mean: Mean = zero_mean
 ) -> GaussianProcess:
     """Return the process with these hyperparameters, conditioned on observations ``(n, d)``, ``(n,)``."""
-    if X.ndim != 2 or y.shape != (len(X),):
-        raise ShapeError(f"observations need X (n, d) and y (n,), got {X.shape} and {y.shape}.")
     factor = factorise(kernel(theta, X, X), noise)
     alpha = factor.solve(y - mean(X))
     return GaussianProcess(kernel, np.asarray(theta, dtype=np.float64), noise, mean, X, y, factor, alpha)
-
-
-def _log_likelihood(factor: CholeskyFactor, alpha: Array, residual: Array) -> float:
-    fit = -0.5 * residual @ alpha
-    return float(fit - factor.half_log_determinant() - 0.5 * len(alpha) * np.log(2 * np.pi))
 
 
 def log_likelihood_of_outputs(K: Array, noise: float, Y: Array) -> tuple[float, Array]:
@@ -158,13 +141,9 @@ def log_likelihood_of_outputs(K: Array, noise: float, Y: Array) -> tuple[float, 
 def log_marginal_likelihood(
     kernel: Kernel, theta: Array, noise: float, X: Array, residual: Array
 ) -> tuple[float, Array]:
-    """Return log p(residual | X, theta, noise) and its gradient with respect to (theta, log noise).
+    """Return log p(residual | X, theta, noise) and its gradient by (theta, log noise), eq. 5.9.
 
-    Args:
-        residual: the observations minus the prior mean, ``(n,)``.
-
-    Source:
-        Rasmussen and Williams 2006, eq. 5.9.
+    The residual ``(n,)`` is the observations minus the prior mean.
     """
     factor = factorise(kernel(theta, X, X), noise)
     alpha = factor.solve(residual)
@@ -172,7 +151,8 @@ def log_marginal_likelihood(
     W -= np.outer(alpha, alpha)
     W *= -0.5
     gradient = kernel.weighted_gradient(theta, X, W)
-    return _log_likelihood(factor, alpha, residual), np.append(gradient, noise * np.trace(W))
+    value = -0.5 * residual @ alpha - factor.half_log_determinant() - 0.5 * len(alpha) * np.log(2 * np.pi)
+    return float(value), np.append(gradient, noise * np.trace(W))
 
 
 def fit(

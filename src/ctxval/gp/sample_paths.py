@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ctxval._util.arrays import Array
-from ctxval._util.boxes import climb, moves_to_bounds
+from ctxval._util.boxes import climb, polish
 from ctxval.gp.hyperposterior import EXACT, Conditioned
 
 WAVES = 512
@@ -22,23 +22,15 @@ path's maximum much smaller."""
 
 @dataclass(frozen=True, eq=False)
 class Paths:
-    """Paths under one draw of hyperparameters, as functions on the unit cube.
-
-    Attributes:
-        X: the data's points ``(n, d)``.
-        frequencies: frequencies of the waves, shape ``(F, d)``.
-        amplitudes: amplitudes of cosines and sines, shape ``(2 F, s)``.
-        corrections: weights of the correlations with the data, shape ``(n, s)``.
-        means, scales: mu and sigma of each path, shapes ``(s,)``.
-    """
+    """Paths under one draw of hyperparameters, as functions on the unit cube."""
 
     conditioned: Conditioned
-    X: Array
-    frequencies: Array
-    amplitudes: Array
-    corrections: Array
-    means: Array
-    scales: Array
+    X: Array  # the data's points (n, d)
+    frequencies: Array  # of the waves (F, d)
+    amplitudes: Array  # of cosines and sines (2 F, s)
+    corrections: Array  # weights of the correlations with the data (n, s)
+    means: Array  # mu of each path (s,)
+    scales: Array  # sigma of each path (s,)
 
     def __len__(self) -> int:
         return len(self.means)
@@ -129,7 +121,9 @@ def maxima(paths: Paths, known: Array, rng: np.random.Generator) -> tuple[Array,
     heights = paths.own(points)
     best, rows = np.argmax(heights, axis=1), np.arange(len(paths))
     tops, where = heights[rows, best], points[rows, best]
-    return _polish(paths, tops, where) if d > 2 else (tops, where)
+    if d > 2:
+        where, tops = polish(paths.own, where, tops, (np.zeros(d), np.ones(d)), d, 1e-9 * paths.scales)
+    return tops, where
 
 
 def _climb(paths: Paths, starts: Array, steps: int) -> Array:
@@ -141,19 +135,3 @@ def _climb(paths: Paths, starts: Array, steps: int) -> Array:
         return values / units, gradients / units[..., None]
 
     return climb(sloped, starts, np.zeros(d), np.ones(d), iterations=steps)[0]
-
-
-def _polish(paths: Paths, tops: Array, where: Array) -> tuple[Array, Array]:
-    """Move one coordinate of each path's maximum at a time to a bound, the best move first."""
-    s, d = where.shape
-    for _ in range(d):
-        moved = moves_to_bounds(where, np.zeros(d), np.ones(d))
-        heights = paths.own(moved)
-        best = heights.argmax(axis=1)
-        rows = np.arange(s)
-        better = heights[rows, best] > tops + 1e-9 * paths.scales
-        if not better.any():
-            break
-        tops = np.where(better, heights[rows, best], tops)
-        where = np.where(better[:, None], moved[rows, best], where)
-    return tops, where

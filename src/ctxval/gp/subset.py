@@ -45,17 +45,11 @@ def pivoted_rows(kernel: Covariance, theta: Array, X: Array, count: int, least: 
 
 @dataclass(frozen=True, eq=False)
 class PivotedCholesky:
-    """A part of a positive semidefinite matrix of which each row has the largest variance given the rows before it.
+    """A part of a positive semidefinite matrix of which each row has the largest variance given the rows before it."""
 
-    Attributes:
-        rows: the rows, shape ``(k,)``.
-        L: the Cholesky factor of the matrix of these rows, shape ``(k, k)``.
-        left: the variances of all n rows given these, shape ``(n,)``.
-    """
-
-    rows: Rows
-    L: Array
-    left: Array
+    rows: Rows  # (k,)
+    L: Array  # the Cholesky factor of the matrix of these rows (k, k)
+    left: Array  # the variances of all n rows given these (n,)
 
 
 def pivoted_cholesky(
@@ -63,10 +57,8 @@ def pivoted_cholesky(
 ) -> PivotedCholesky:
     """Return the Cholesky factor of those rows of a covariance matrix that represent all of it.
 
-    Args:
-        variances: the diagonal of the matrix, shape ``(n,)``.
-        covariances: a row of the matrix -> its n entries, in an array that may be overwritten.
-        count, least: as in :func:`pivoted_rows`.
+    The matrix has the diagonal ``variances`` ``(n,)``, and ``covariances`` returns one of its rows in an array that may
+    be overwritten; count and least are as in :func:`pivoted_rows`.
     """
     left = np.array(variances)
     columns = np.empty((min(count, len(left)), len(left)))

@@ -74,7 +74,6 @@ def _scaled(mean: Mean, scale: float, X: Array) -> Array:
 
 
 def _scale(residual: Array) -> float:
-    """Return the residual's root mean square, or 1 if it vanishes."""
     size = float(np.sqrt((residual**2).mean()))
     return size if size > 1e-12 else 1.0
 
@@ -92,18 +91,11 @@ def _with_imputed(process: GaussianProcess, points: Array) -> GaussianProcess:
 
 @dataclass(frozen=True, eq=False)
 class Learned(ShortRepr):
-    """Learned hyperparameters, with which a process can be conditioned on the same values and on later ones.
+    """Learned hyperparameters, with which a process can be conditioned on the same values and on later ones."""
 
-    Attributes:
-        theta: logarithms of the hyperparameters of a Matern 3/2 kernel, a length-scale for each dimension, and a
-            linear kernel.
-        warp: the scale on which the values are a Gaussian process.
-        shift, scale: constants of the standardisation on that scale.
-    """
-
-    theta: Array
-    warp: Warp
-    shift: float
+    theta: Array  # logarithms of the hyperparameters of a Matern 3/2 kernel and a linear kernel
+    warp: Warp  # the scale on which the values are a Gaussian process
+    shift: float  # constants of the standardisation on that scale
     scale: float
 
     def standardised(self, values: Array) -> Array:

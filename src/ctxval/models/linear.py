@@ -72,7 +72,6 @@ class Linear(ShortRepr):
             raise ShapeError(f"the model has {len(self.A)} states and {self.B.shape[1]} inputs, got {got}.") from error
 
     def jacobian(self, x: Array, u: Array) -> tuple[Array, Array]:
-        """Return A and B, which are the same for all states and inputs."""
         return self.A, self.B
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -36,7 +35,6 @@ class MuJoCo(ShortRepr):
     """
 
     def __init__(self, mjcf: str | Path, *, dt: Seconds | None = None, data: Transitions | None = None) -> None:
-        self._mujoco = require_extra("mujoco", "mujoco", "models of MuJoCo")
         _, self._model = compile_mjcf(mjcf if is_mjcf_text(mjcf) else identified_in(Path(mjcf)))
         timestep = float(self._model.opt.timestep)
         ratio = 1.0 if dt is None else dt / timestep
@@ -62,20 +60,15 @@ class MuJoCo(ShortRepr):
         batch = np.broadcast_shapes(x.shape[:-1], u.shape[:-1])
         states, inputs = map(rows_of, paired(x, u))
         reached = np.full(states.shape, np.nan)
-        data = self._mujoco.MjData(model)
+        mujoco = require_extra("mujoco", "mujoco", "models of MuJoCo")
+        data = mujoco.MjData(model)
         for k in np.flatnonzero(np.isfinite(states).all(axis=1) & np.isfinite(inputs).all(axis=1)).tolist():
-            self._mujoco.mj_resetData(model, data)
+            mujoco.mj_resetData(model, data)
             data.qpos, data.qvel, data.ctrl = states[k, :nq], states[k, nq:], inputs[k]
-            self._mujoco.mj_step(model, data, self.substeps)
+            mujoco.mj_step(model, data, self.substeps)
             if not data.warning.number.any():
                 reached[k] = np.concatenate([data.qpos, data.qvel])
         return reached.reshape(*batch, -1)
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {name: value for name, value in vars(self).items() if name != "_mujoco"}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__ = {**state, "_mujoco": require_extra("mujoco", "mujoco", "models of MuJoCo")}
 
 
 def identified_in(path: Path) -> Path:

@@ -6,7 +6,6 @@ import functools
 import itertools
 import warnings
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
@@ -14,7 +13,7 @@ from ctxval._util.arrays import ArrayLike, as_finite, single_threaded
 from ctxval._util.checked import NonNegativeInt, PositiveInt, checked
 from ctxval._util.extras import require_extra
 from ctxval.core.trajectory import Transitions
-from ctxval.errors import InputError, ShapeError
+from ctxval.errors import ShapeError
 from ctxval.models.scaling import IncrementModel, IncrementScaling
 from ctxval.models.smooth_maps import SmoothMap, network
 
@@ -52,15 +51,6 @@ class FeedforwardReLU(IncrementModel):
             )
 
     @classmethod
-    def from_sklearn(
-        cls, regressor: Any, scaling: IncrementScaling, data: Transitions | None = None
-    ) -> FeedforwardReLU:
-        """Return a fitted ``sklearn.neural_network.MLPRegressor`` as a model that does not need scikit-learn."""
-        if regressor.activation != "relu" or regressor.out_activation_ != "identity":
-            raise InputError(f"the network must have ReLU units, got {regressor.activation!r}.")
-        return cls(regressor.coefs_, regressor.intercepts_, scaling, data)
-
-    @classmethod
     @checked
     def fit(
         cls,
@@ -92,7 +82,8 @@ class FeedforwardReLU(IncrementModel):
                     random_state=int(start),
                 )
                 trained.append(regressor.fit(scaling.inputs(data.x, data.u), scaling.targets(data)))
-        return cls.from_sklearn(min(trained, key=lambda regressor: regressor.loss_), scaling, data)
+        best = min(trained, key=lambda regressor: regressor.loss_)
+        return cls(best.coefs_, best.intercepts_, scaling, data)
 
     @functools.cached_property
     def _map(self) -> SmoothMap:

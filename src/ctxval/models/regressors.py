@@ -128,7 +128,6 @@ def _ridge_kernel(regressor: Any, features: int) -> Kernel | None:
 
 
 def _covariance(kernel: Any) -> Kernel | None:
-    """Return a kernel of ``sklearn.gaussian_process``; None if it is not known."""
     match _name(kernel):
         case "ConstantKernel":
             value = float(kernel.constant_value)

@@ -12,13 +12,12 @@ from ctxval.searches.cma_es import CMAES
 from ctxval.searches.gp_ucb import GPUCB
 from ctxval.searches.random import Random, SamplingDiscarding
 from ctxval.searches.repeated import Repeated
-from ctxval.searches.trust_region import TrustRegion, TrustRegionSettings
+from ctxval.searches.trust_region import TrustRegion
 
 __all__ = [
     "CMAES",
     "DEFAULT",
     "GPUCB",
-    "NAMES",
     "REGISTRY",
     "Auto",
     "BaseSearch",
@@ -32,15 +31,11 @@ __all__ = [
     "Search",
     "SequentialSearch",
     "TrustRegion",
-    "TrustRegionSettings",
     "by_name",
 ]
 
 REGISTRY: Registry[Search] = Registry("search", __name__, method="ask")
 """The searches that are found by name: those of this package, and those that installed packages add."""
-
-NAMES: dict[str, type[Any]] = {name: REGISTRY.find(name) for name in sorted((*REGISTRY.built_in, *REGISTRY.aliases))}
-"""The searches of this package, by name; ``climbs`` and ``scalar`` are older names."""
 
 DEFAULT = "auto"
 """The default search of a campaign, in Python, in experiment files and on the command line."""
@@ -53,10 +48,6 @@ def by_name(name: str, *, repeats: int = 1, **options: Any) -> Search:
         name: a name of :data:`REGISTRY`, such as ``"auto"``.
         repeats: number of evaluations of each point; more than one if the function is noisy.
         options: options of the search.
-
-    Raises:
-        UnknownNameError: if no search has this name; the message suggests the nearest name.
-        InputError: if the search does not take these options, or if its package cannot be loaded.
     """
     search = REGISTRY.make(name, **options)
     return search if repeats == 1 else Repeated(search, repeats)

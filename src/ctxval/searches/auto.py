@@ -13,7 +13,7 @@ from ctxval._util.progress import expect
 from ctxval._util.registry import part
 from ctxval.gp.ascent import usual_effort
 from ctxval.searches.base import Costs, Prediction
-from ctxval.searches.trust_region import TrustRegion
+from ctxval.searches.trust_region import POINTS, TrustRegion
 
 Thinking = Literal["balanced", "fast", "thorough"]
 
@@ -63,7 +63,7 @@ class Auto(TrustRegion):
 
     def designs(self, prediction: Prediction) -> int:
         """Return the number of points that are predicted for the next choice."""
-        most = min(prediction.budget, self._settings.points * self.dimension)
+        most = min(prediction.budget, POINTS * self.dimension)
         match self.thinking:
             case "thorough":
                 return most
@@ -76,18 +76,17 @@ class Auto(TrustRegion):
         fixed = next((number for number in noted if isinstance(number, int) and number >= 1), None)
         if fixed is not None or prediction.costs is None:
             return min(most, fixed or most)
+        # As many designs as take no longer than one evaluation, or one second. An evaluation that was not timed is
+        # supposed to take 10 s.
         costs = prediction.costs()
-        designs = self._balanced(costs, most)
+        seconds = max(1.0, 10.0 if costs.evaluation is None else costs.evaluation)
+        numbers = [max(1, round(share * most)) for share in _SHARES]
+        designs = next((number for number in numbers if self.thinking_seconds(costs, number) <= seconds), numbers[-1])
         self._fixed_now = None if costs.evaluation is None else designs
         return designs
 
     def thinking_seconds(self, costs: Costs, designs: int) -> float:
         """Return the estimated seconds of CPU time of the predictions of a choice with so many designs."""
-        return costs.thinking(usual_effort(self.dimension, designs))
-
-    def _balanced(self, costs: Costs, most: int) -> int:
-        """Return the largest number of designs that takes no longer than one evaluation, or than is always short."""
-        # An execution that was not timed is supposed to take 10 s, and one second is short in any case.
-        seconds = max(1.0, 10.0 if costs.evaluation is None else costs.evaluation)
-        numbers = [max(1, round(share * most)) for share in _SHARES]
-        return next((number for number in numbers if self.thinking_seconds(costs, number) <= seconds), numbers[-1])
+        effort = usual_effort(self.dimension, designs)
+        rough = costs.prediction if costs.rough is None else costs.rough
+        return effort.batches * costs.batch + effort.exact * costs.prediction + effort.rough * rough

@@ -13,7 +13,6 @@ from ctxval._util.arrays import Array, ArrayLike, Rows, as_floats
 from ctxval._util.checked import NonNegativeInt, PositiveInt, checked
 from ctxval._util.representation import ShortRepr, call, options
 from ctxval.errors import InputError, ShapeError
-from ctxval.gp.ascent import Effort
 from ctxval.gp.surrogate import Surrogate
 
 Note = dict[str, Any]
@@ -35,11 +34,6 @@ class Costs:
     evaluation: float | None
     rough: float | None = None
     batch: float = 0.0
-
-    def thinking(self, effort: Effort) -> float:
-        """Return the seconds of CPU time of so many predictions."""
-        rough = self.prediction if self.rough is None else self.rough
-        return effort.batches * self.batch + effort.exact * self.prediction + effort.rough * rough
 
 
 @dataclass(frozen=True, eq=False)
@@ -249,9 +243,6 @@ class SequentialSearch(BaseSearch):
         return self._last_note
 
     def remember(self, notes: Sequence[Note | None]) -> None:
-        self._require_reset()
-        if len(notes) != len(self._points):
-            raise ShapeError(f"there must be one note for each of {len(self._points)} points, got {len(notes)}.")
         self._notes = list(notes)
 
     def _append(self, point: Array, value: float, note: Note | None) -> None:
@@ -270,7 +261,6 @@ class SequentialSearch(BaseSearch):
 
     @property
     def dimension(self) -> int:
-        """The dimension d of the unit cube."""
         return self._dimension
 
     @property
@@ -302,5 +292,4 @@ def best_first(points: Array, values: Array) -> Array:
 
 
 def _key(point: Array) -> bytes:
-    """Return a key that is the same for equal points."""
     return (point + 0.0).tobytes()  # minus zero is zero

@@ -17,10 +17,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ctxval._util.arrays import Array, single_threaded
+from ctxval._util.boxes import Box
 from ctxval._util.checked import NonNegativeFloat, PositiveInt
 from ctxval._util.registry import part
-from ctxval.gp.acquisition import Acquisition, Box, LogExpectedImprovement, UpperConfidenceBound, maximise
-from ctxval.gp.regression import GaussianProcess
+from ctxval.gp.acquisition import Acquisition, LogExpectedImprovement, UpperConfidenceBound, maximise
 from ctxval.gp.subset import kept_rows
 from ctxval.gp.surrogate import Learned, learn
 from ctxval.searches.base import Note, SequentialSearch, best_first
@@ -36,28 +36,20 @@ _ENGINE = "scalar"
 
 @dataclass(frozen=True, eq=False)
 class _Branch:
-    """A restriction of the search to half of the cube.
-
-    Attributes:
-        coordinate: the axis that is halved.
-        upper: whether it is the upper half.
-        best: the largest value found in this half since the branch began; minus infinity at first.
-        misses: number of successive executions in the branch without improvement.
-    """
+    """A restriction of the search to the upper or lower half of the cube along one coordinate."""
 
     coordinate: int
     upper: bool
-    best: float = -np.inf
-    misses: int = 0
+    best: float = -np.inf  # the largest value in this half since the branch began
+    misses: int = 0  # number of successive executions in the branch without improvement
 
     def box(self, dimension: int) -> Box:
-        """Return the bounds of this half."""
         low, high = np.zeros(dimension), np.ones(dimension)
         (low if self.upper else high)[self.coordinate] = 0.5
         return low, high
 
 
-@part("bayesian-optimisation", aliases=("scalar",))
+@part("bayesian-optimisation")
 class BayesianOptimisation(SequentialSearch):
     """Bayesian optimisation from values alone: expected improvement and upper confidence bounds, with branches.
 
@@ -98,8 +90,18 @@ class BayesianOptimisation(SequentialSearch):
         rows = kept_rows(points, values, 1000)
         process = learned.condition(points[rows], values[rows])
         branch = None if len(values) % _EVERYWHERE == 0 else _branch(points[known], values[known])
-        believed = process.y[int(known[rows].sum()) :].max(initial=-np.inf)
-        acquisition = self._acquisition(learned, process, values, branch, float(believed))
+        if branch is not None and not np.isfinite(branch.best):
+            # Be bold, far from the maximum that was left: near it, the branch would only lead back to it.
+            acquisition: Acquisition = UpperConfidenceBound(process, 100.0)
+        elif len(values) % _BOUND == _BOUND - 1:
+            acquisition = UpperConfidenceBound(process, self.beta)
+        elif branch is not None:
+            acquisition = LogExpectedImprovement(process, _worthwhile(learned, values, branch.best))
+        else:
+            # Predicted values of pending points count, so that the points of one batch do not all improve on one value.
+            believed = float(process.y[int(known[rows].sum()) :].max(initial=-np.inf))
+            best = _worthwhile(learned, values, float(np.nanmax(values)))
+            acquisition = LogExpectedImprovement(process, max(best, believed))
         box = None if branch is None else branch.box(self.dimension)
         known_first, away = best_first(points, values), points[~known]
         point = maximise(acquisition, self.dimension, known_first, rng, box=box, corners=True, away=away)
@@ -109,20 +111,6 @@ class BayesianOptimisation(SequentialSearch):
             "branch": None if branch is None else [branch.coordinate, branch.upper],
             "logarithm": bool(np.isfinite(learned.warp.offset)),
         }
-
-    def _acquisition(
-        self, learned: Learned, process: GaussianProcess, values: Array, branch: _Branch | None, believed: float
-    ) -> Acquisition:
-        if branch is not None and not np.isfinite(branch.best):
-            # Be bold, far from the maximum that was left: near it, the branch would only lead back to it.
-            return UpperConfidenceBound(process, 100.0)
-        if len(values) % _BOUND == _BOUND - 1:
-            return UpperConfidenceBound(process, self.beta)
-        if branch is not None:
-            return LogExpectedImprovement(process, _worthwhile(learned, values, branch.best))
-        # Predicted values of pending points count, so that the points of one batch do not all improve on one value.
-        best = _worthwhile(learned, values, float(np.nanmax(values)))
-        return LogExpectedImprovement(process, max(best, believed))
 
     def _learned(self, points: Array, values: Array) -> Learned:
         """Return hyperparameters learned from the first values; a fixed schedule says how many of them are used.

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ctxval._util.arrays import Array, single_threaded
 from ctxval._util.checked import PositiveFloat, PositiveInt
+from ctxval._util.extras import require_extra
 from ctxval._util.registry import part
 from ctxval.errors import InputError
 from ctxval.searches.base import SequentialSearch
 
 if TYPE_CHECKING:
     from cmaes import CMA
+
+_library = partial(require_extra, "cmaes", "searches", "CMA-ES searches")
 
 
 @part("cma-es")
@@ -33,7 +37,7 @@ class CMAES(SequentialSearch):
     def __init__(self, sigma: PositiveFloat = 0.3, population: PositiveInt | None = None) -> None:
         if population is not None and population < 4:
             raise InputError(f"CMA-ES needs a population of at least 4, got {population!r}.")
-        _cma_class()
+        _library()
         self.sigma = sigma
         self.population = population
 
@@ -56,8 +60,13 @@ class CMAES(SequentialSearch):
         if not np.array_equal(values[: len(self._learned)], self._learned, equal_nan=True):
             self._begin()  # a late value belongs to a generation that was learned without it
         while (last := (first := len(self._learned)) + self._distribution.population_size) <= len(points):
-            _learn(self._distribution, points[first:last], values[first:last])
-            if self._distribution.should_stop() or (np.ptp(points[first:last], axis=0) < 1e-4).all():
+            generation, results = points[first:last], values[first:last]
+            known = np.isfinite(results)
+            if known.any():  # failures rank last, and a generation of failures alone is left out
+                losses = np.where(known, -results, -results[known].min())
+                order = np.argsort(-results, kind="stable")  # NaN last
+                self._distribution.tell([(generation[i], float(losses[i])) for i in order])
+            if self._distribution.should_stop() or (np.ptp(generation, axis=0) < 1e-4).all():
                 # Trial k draws from [seed, k]; the third number of the seed separates the restart from it.
                 rng = np.random.default_rng(np.random.SeedSequence([self._seed, last, 1]))
                 population = 2 * self._distribution.population_size
@@ -66,23 +75,4 @@ class CMAES(SequentialSearch):
 
     def _started(self, mean: Array, population: int | None) -> CMA:
         bounds = np.tile([0.0, 1.0], (self.dimension, 1))
-        return _cma_class()(mean=mean, sigma=self.sigma, bounds=bounds, population_size=population)
-
-
-def _learn(distribution: CMA, points: Array, values: Array) -> None:
-    """Tell one generation to CMA-ES; failures rank last, and a generation of failures alone is left out."""
-    known = np.isfinite(values)
-    if not known.any():
-        return
-    losses = np.where(known, -values, -values[known].min())
-    order = np.argsort(-values, kind="stable")  # NaN last
-    distribution.tell([(points[i], float(losses[i])) for i in order])
-
-
-def _cma_class() -> type[CMA]:
-    try:
-        import cmaes  # here, and not above: it is an extra
-    except ImportError as error:
-        raise InputError('cmaes is not installed: pip install "ctxval[searches]".') from error
-    found: type[CMA] = cmaes.CMA
-    return found
+        return _library().CMA(mean=mean, sigma=self.sigma, bounds=bounds, population_size=population)

@@ -54,7 +54,6 @@ class Repeated(SequentialSearch):
         return point
 
     def _tell(self, points: Array, groups: Sequence[Rows]) -> None:
-        """Tell the inner search the mean of the known values at each point."""
         values, known = self.values, np.isfinite(self.values)
         known_rows = [rows[known[rows]] for rows in groups]
         means = [values[rows].mean() if len(rows) else np.nan for rows in known_rows]

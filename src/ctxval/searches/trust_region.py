@@ -15,16 +15,15 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.distance import cdist
 
 from ctxval._util.arrays import Array, Mask, single_threaded
+from ctxval._util.boxes import Box
 from ctxval._util.checked import NonNegativeFloat, PositiveInt
 from ctxval._util.registry import part
-from ctxval.gp.acquisition import Box
 from ctxval.gp.ascent import Ascent
 from ctxval.gp.subset import kept_rows
 from ctxval.gp.surrogate import fit_surrogate
@@ -35,47 +34,10 @@ _ENGINE = "climb"
 """The name of this search in notes. Existing stores contain it, so it differs from the name of the class."""
 
 
-@dataclass(frozen=True)
-class TrustRegionSettings:
-    """Settings of :class:`TrustRegion` that its studies vary (``benchmarks/study_ablations.py``).
-
-    Attributes:
-        compare_with_surrogate: whether a prediction is used only if leave-one-out errors show that it is good.
-        restrict: whether there are trust regions; if not, the whole cube is searched each time.
-        accurate: largest relative error of a prediction that counts as right.
-        points: largest number of points that are predicted for one suggestion, for each dimension.
-        first_radius: half the width of a new region.
-        least_radius: half the width below which a region is left.
-        improvement: least predicted improvement worth an execution, as a share of the largest value.
-        patience: factor of the optimism in the test whether a region may still lead to a value larger than all others.
-        boldness: factor by which the optimism grows with each new region that has found nothing larger.
-        compared_from: number of known values from which on the prediction must be better than the surrogate.
-        compared_on: largest number of known values, the latest ones, on which the two are compared.
-        good_enough: mean error of the logarithm up to which a prediction needs no comparison.
-        hedge: whether a prediction that may mislead alternates with the surrogate.
-        far_off: relative error of the last two predictions from which on the search hedges if the doubt exceeds 1.
-        fruitless: number of executions that found nothing larger, from which on it hedges in any case.
-        distinct: least distance of a suggestion from each known point, in at least one coordinate.
-        apart: least distance of a suggestion from pending and failed points, as a share of the cube's diagonal.
-    """
-
-    compare_with_surrogate: bool = True
-    restrict: bool = True
-    accurate: float = 0.1
-    points: int = 400
-    first_radius: float = 0.4
-    least_radius: float = 0.02
-    improvement: float = 1e-3
-    patience: float = 10.0
-    boldness: float = 4.0
-    compared_from: int = 6
-    compared_on: int = 24
-    good_enough: float = 0.1
-    hedge: bool = True
-    far_off: float = 0.5
-    fruitless: int = 6
-    distinct: float = 1e-6
-    apart: float = 0.05
+POINTS = 400  # largest number of points that are predicted for one suggestion, for each dimension
+_IMPROVEMENT = 1e-3  # least predicted improvement worth an execution, as a share of the largest value
+_COMPARED_FROM = 6  # number of known values from which on the prediction must be better than the surrogate
+_COMPARED_ON = 24  # largest number of known values, the latest ones, on which the two are compared
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,7 +49,6 @@ class _Candidate:
     doubt: float
 
     def optimistic(self, optimism: float) -> float:
-        """Return the optimistic value with this kappa."""
         return self.expected * (1 + optimism * self.doubt)
 
 
@@ -110,32 +71,22 @@ class _OptimisticValue:
         return np.asarray(expected * (1 + self.optimism * doubt))
 
     def at(self, point: Array) -> _Candidate:
-        """Return a point ``(d,)`` with what is predicted there."""
         expected, doubt = self.prediction.expected(point[None])
         return _Candidate(point, float(expected[0]), float(doubt[0]))
 
 
 @dataclass(frozen=True, eq=False)
 class _Region:
-    """The state of a trust region, computed from notes and values.
-
-    Attributes:
-        number: the number of the region, from 0.
-        radius: half its width; 1 for the whole cube.
-        best, point: its largest value and the point with this value; minus infinity and None before there is one.
-        misses: number of successive executions without improvement.
-        stale: number of successive regions that have not improved the largest value of all.
-    """
+    """The state of a trust region, computed from notes and values."""
 
     number: int = 0
-    radius: float = 1.0
-    best: float = -np.inf
+    radius: float = 1.0  # half its width; 1 for the whole cube
+    best: float = -np.inf  # its largest value, at the point
     point: Array | None = None
-    misses: int = 0
-    stale: int = 0
+    misses: int = 0  # number of successive executions without improvement
+    stale: int = 0  # number of successive regions that have not improved the largest value of all
 
     def box(self, dimension: int) -> Box:
-        """Return the bounds of the region within the unit cube."""
         centre = np.full(dimension, 0.5) if self.point is None else self.point
         return np.clip(centre - self.radius, 0, 1), np.clip(centre + self.radius, 0, 1)
 
@@ -150,7 +101,7 @@ class _History:
     others: Array
 
 
-@part("trust-region", aliases=("climbs",))
+@part("trust-region")
 class TrustRegion(SequentialSearch):
     """Trust-region search with restarts on a prediction of the values; Bayesian optimisation if no prediction is good.
 
@@ -161,18 +112,15 @@ class TrustRegion(SequentialSearch):
 
     initial = 1
 
-    def __init__(
-        self, optimism: NonNegativeFloat = 2.0, misses: PositiveInt = 3, *, settings: TrustRegionSettings | None = None
-    ) -> None:
+    # What is set otherwise to study the parts of the search (benchmarks/study_ablations.py).
+    compare_with_surrogate = True  # whether a prediction is used only if leave-one-out errors show that it is good
+    restrict = True  # whether there are trust regions; if not, the whole cube is searched each time
+    boldness = 4.0  # factor by which the optimism grows with each new region that has found nothing larger
+    hedge = True  # whether a prediction that may mislead alternates with the surrogate
+
+    def __init__(self, optimism: NonNegativeFloat = 2.0, misses: PositiveInt = 3) -> None:
         self.optimism = optimism
         self.misses = misses
-        self._settings = TrustRegionSettings() if settings is None else settings
-
-    def describe(self) -> dict[str, Any]:
-        """Return the options that identify this search in a store, and the settings if they are not the defaults."""
-        options = {name: value for name, value in vars(self).items() if not name.startswith("_")}
-        usual = self._settings == TrustRegionSettings()
-        return options if usual else {**options, "settings": asdict(self._settings)}
 
     def reset(self, dimension: int, seed: int) -> None:
         super().reset(dimension, seed)
@@ -190,10 +138,17 @@ class TrustRegion(SequentialSearch):
         while prediction is not None:
             with single_threaded():
                 doubtful = self._why_not(prediction, surrogate_error)
-                point = self._promising(prediction, rng) if doubtful is None else None
-            if point is not None:
+                found, region = self._promising(prediction, rng) if doubtful is None else (None, _Region())
+            if found is not None:
+                self._last_note = {
+                    "engine": _ENGINE,
+                    "climb": region.number,
+                    "radius": region.radius,
+                    "expected": found.expected,
+                    "doubt": found.doubt,
+                }
                 why_hedge = self._why_hedge()
-                return point if why_hedge is None else self._without_prediction(rng, why_hedge)
+                return found.point if why_hedge is None else self._without_prediction(rng, why_hedge)
             why = doubtful or "nothing is predicted anywhere"
             prediction = None if prediction.otherwise is None else prediction.otherwise()
         return self._without_prediction(rng, why)
@@ -206,19 +161,18 @@ class TrustRegion(SequentialSearch):
     @property
     def predicted_besides(self) -> int:
         """The number of known points that are predicted for a choice, besides those of the budget."""
-        known, settings = int(np.isfinite(self.values).sum()), self._settings
-        return min(known, settings.compared_on) if known >= settings.compared_from else 0
+        known = int(np.isfinite(self.values).sum())
+        return min(known, _COMPARED_ON) if known >= _COMPARED_FROM else 0
 
     # How good the prediction is
 
     def _why_not(self, prediction: Prediction, surrogate_error: Callable[[], float]) -> str | None:
-        """Return why the prediction is not used; None if it is."""
         values = self.values[np.isfinite(self.values)]
-        if not self._settings.compare_with_surrogate or len(values) < self._settings.compared_from:
+        if not self.compare_with_surrogate or len(values) < _COMPARED_FROM:
             return None
-        rows = np.arange(len(values))[-self._settings.compared_on :]
+        rows = np.arange(len(values))[-_COMPARED_ON:]
         error = _log_error(prediction.left_out(rows), values[rows])
-        if error <= self._settings.good_enough or error <= surrogate_error():
+        if error <= 0.1 or error <= surrogate_error():  # a small error needs no comparison
             return None
         return (
             f"leaving one out, the prediction errs by {error:.2g} where the surrogate errs by {surrogate_error():.2g}"
@@ -231,7 +185,7 @@ class TrustRegion(SequentialSearch):
         kept = kept_rows(points, values, 150, long=150)  # they end with the latest values, which are compared
         surrogate = fit_surrogate(points[kept], values[kept])
         left_out = surrogate.shift + surrogate.scale * surrogate.process.left_out()[0]
-        latest = slice(-min(len(values), self._settings.compared_on), None)
+        latest = slice(-min(len(values), _COMPARED_ON), None)
         return _log_error(left_out[latest], values[latest])
 
     def _why_hedge(self) -> str | None:
@@ -239,23 +193,21 @@ class TrustRegion(SequentialSearch):
         rows = [
             row for row in np.flatnonzero(np.isfinite(self.values)) if (self.notes[row] or {}).get("engine") == _ENGINE
         ]
-        if not rows or not self._settings.hedge or (self.notes[-1] or {}).get("engine") != _ENGINE:
+        if not rows or not self.hedge or (self.notes[-1] or {}).get("engine") != _ENGINE:
             return None
         last = [(self.values[row], (self.notes[row] or {})["expected"]) for row in rows[-2:]]
         error = min(abs(value - expected) / max(value, expected, 1e-300) for value, expected in last)
-        if len(last) == 2 and (self._last_note or {})["doubt"] > 1 and error > self._settings.far_off:
+        if len(last) == 2 and (self._last_note or {})["doubt"] > 1 and error > 0.5:
             return f"the last two predictions erred by {100 * error:.0f} % or more and the next one is in doubt"
         values = self.values[np.isfinite(self.values)]
-        gains = values[1:] > (1 + self._settings.improvement) * np.maximum.accumulate(values)[:-1]
+        gains = values[1:] > (1 + _IMPROVEMENT) * np.maximum.accumulate(values)[:-1]
         fruitless = len(gains) - int(np.flatnonzero(gains).max(initial=-1)) - 1
-        if fruitless >= self._settings.fruitless:
-            return f"the last {fruitless} executions found nothing larger"
-        return None
+        return f"the last {fruitless} executions found nothing larger" if fruitless >= 6 else None
 
     # Where to execute next
 
-    def _promising(self, prediction: Prediction, rng: np.random.Generator) -> Array | None:
-        """Return the next point of the last region or of a new one; None if no point can be predicted.
+    def _promising(self, prediction: Prediction, rng: np.random.Generator) -> tuple[_Candidate | None, _Region]:
+        """Return the next point of the last region or of a new one, None if no point can be predicted, and the region.
 
         The point that follows from the known values alone comes first. If it is being evaluated already, the next one
         is chosen as if all pending points had the expected values.
@@ -264,41 +216,38 @@ class TrustRegion(SequentialSearch):
         whole = _History(points, values, notes, points[~np.isfinite(values)])
         pending = prediction.pending
         if pending is None:
-            return self._noted(*self._next(prediction, whole, rng))
+            return self._next(prediction, whole, rng)
         waiting = np.isnan(values) & (points[:, None] == pending.points).all(axis=2).any(axis=1)
         ended = [note for note, waits in zip(notes, waiting, strict=True) if not waits]
         known = _History(points[~waiting], values[~waiting], tuple(ended), points[np.isnan(values) & ~waiting])
         found, region = self._next(prediction, known, rng)
         if found is None or self._is_new(found.point[None], whole)[0]:
-            return self._noted(found, region)
+            return found, region
         expected = values.copy()
         expected[waiting] = prediction.expected(points[waiting])[0]
         as_if = pending.prediction()
         after = replace(prediction, expected=as_if.expected, rough=as_if.rough)
-        return self._noted(*self._next(after, replace(whole, values=expected), rng))
+        return self._next(after, replace(whole, values=expected), rng)
 
     def _next(
         self, prediction: Prediction, history: _History, rng: np.random.Generator
     ) -> tuple[_Candidate | None, _Region]:
         """Return the next candidate after a history, None if no point can be predicted, and its region."""
-        settings, value = self._settings, _OptimisticValue(prediction, self.optimism)
-        if not settings.restrict:
+        value = _OptimisticValue(prediction, self.optimism)
+        if not self.restrict:
             return self._best(value, _Region(), history, rng), _Region()
         region = self._state(history)
-        if region.misses < self.misses and region.radius >= settings.least_radius:
+        if region.misses < self.misses and region.radius >= 0.02:
             found = self._best(value, region, history, rng)
-            if found is not None and self._is_worth(found, region.best, float(np.nanmax(history.values, initial=0.0))):
-                return found, region
+            if found is not None:
+                # It may exceed the region's best value and, with ten times the optimism, the largest value of all.
+                least, largest = 1 + _IMPROVEMENT, float(np.nanmax(history.values, initial=0.0))
+                patient = found.optimistic(10.0 * self.optimism)
+                if found.optimistic(self.optimism) > region.best * least and patient > largest * least:
+                    return found, region
         # The optimism grows with every region that finds nothing larger, so the search explores more.
-        bold = replace(value, optimism=self.optimism * settings.boldness ** (1 + region.stale))
-        new = _Region(region.number + 1, settings.first_radius)
-        return self._best(bold, _Region(), history, rng), new
-
-    def _is_worth(self, found: _Candidate, best: float, largest: float) -> bool:
-        """Return whether a value may exceed a region's best value and, with more optimism, the largest of all."""
-        optimism, least = self.optimism, 1 + self._settings.improvement
-        patient = self._settings.patience * optimism
-        return found.optimistic(optimism) > best * least and found.optimistic(patient) > largest * least
+        bold = replace(value, optimism=self.optimism * self.boldness ** (1 + region.stale))
+        return self._best(bold, _Region(), history, rng), _Region(region.number + 1, radius=0.4)
 
     def _best(
         self, value: _OptimisticValue, region: _Region, history: _History, rng: np.random.Generator
@@ -312,7 +261,7 @@ class TrustRegion(SequentialSearch):
             order = np.argsort(-np.nan_to_num(promised, nan=-np.inf), kind="stable")
             points, promised = points[order], promised[order]
         else:
-            budget = min(value.prediction.budget, self._settings.points * self.dimension)
+            budget = min(value.prediction.budget, POINTS * self.dimension)
             ascent = Ascent(value, *region.box(self.dimension), budget, value.rough)
             points, promised = ascent.run(best_first(history.points, history.values)[:8], rng)
         points = points[self._is_new(points, history) & np.isfinite(promised)]
@@ -320,28 +269,13 @@ class TrustRegion(SequentialSearch):
         best = next(filter(steady, points), points[0]) if len(points) else None
         return None if best is None else value.at(best)
 
-    def _noted(self, found: _Candidate | None, region: _Region) -> Array | None:
-        """Return the next point of a region, and record the prediction for it in the note; None if there is none."""
-        if found is None:
-            return None
-        self._last_note = {
-            "engine": _ENGINE,
-            "climb": region.number,
-            "radius": region.radius,
-            "expected": found.expected,
-            "doubt": found.doubt,
-        }
-        return found.point
-
     def _is_new(self, points: Array, history: _History) -> Mask:
-        """Return which of some points ``(m, d)`` are far enough from all known, pending and failed ones."""
-        known, reach = np.isfinite(history.values), self._settings.apart * np.sqrt(self.dimension)
+        known, reach = np.isfinite(history.values), 0.05 * np.sqrt(self.dimension)
         gaps = cdist(points, history.points[known], "chebyshev").min(axis=1, initial=np.inf)
         others = cdist(points, history.others).min(axis=1, initial=np.inf)
-        return np.asarray((gaps > self._settings.distinct) & (others > reach))
+        return np.asarray((gaps > 1e-6) & (others > reach))
 
     def _state(self, history: _History) -> _Region:
-        """Return the state of the last region after a history."""
         region, largest = _Region(), -np.inf
         for point, value, note in zip(history.points, history.values.tolist(), history.notes, strict=True):
             if note is not None and note.get("engine") == _ENGINE:
@@ -350,22 +284,20 @@ class TrustRegion(SequentialSearch):
                 region = self._after(region, point, value, note)
             elif value > region.best:
                 region = replace(region, best=value, point=point)
-            if value > largest * (1 + self._settings.improvement) or largest == -np.inf:
+            if value > largest * (1 + _IMPROVEMENT) or largest == -np.inf:
                 region = replace(region, stale=0)
             largest = max(largest, value) if np.isfinite(value) else largest
         return region
 
     def _after(self, region: _Region, point: Array, value: float, note: Note) -> _Region:
-        """Return a region after one of its executions."""
         if not np.isfinite(value):
             return replace(region, misses=region.misses + 1)
-        right = abs(value - note["expected"]) <= self._settings.accurate * max(value, note["expected"])
-        if value > region.best * (1 + self._settings.improvement) or region.point is None:
-            first = region.point is None
-            grown = region.radius if first else min(1.0, 2 * region.radius)
+        if value > region.best * (1 + _IMPROVEMENT) or region.point is None:
+            grown = region.radius if region.point is None else min(1.0, 2 * region.radius)
             return replace(region, best=value, point=point, misses=0, radius=grown)
         if value > region.best:
             region = replace(region, best=value, point=point)
+        right = abs(value - note["expected"]) <= 0.1 * max(value, note["expected"])
         return replace(region, misses=region.misses + 1, radius=region.radius if right else region.radius / 2)
 
 

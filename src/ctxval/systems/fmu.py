@@ -6,8 +6,10 @@ import contextlib
 import hashlib
 import json
 import os
+import shutil
 import subprocess
 import sys
+import tempfile
 import weakref
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -21,7 +23,6 @@ from ctxval._util.extras import require_extra
 from ctxval._util.files import require_regular_file
 from ctxval._util.registry import part
 from ctxval._util.representation import ShortRepr
-from ctxval._util.temporary import TemporaryFolder
 from ctxval.core.controller import Controller
 from ctxval.core.task import Task
 from ctxval.core.trajectory import COMPLETE, Trajectory
@@ -84,7 +85,7 @@ class FMU(ShortRepr):
         start = [self.start[name] for name in self.states]
         _references(known, start)
         self._setup = {
-            "folder": str(self._unpacked.path),
+            "folder": self._unpacked,
             "name": self.path.name,
             "states": _references(known, self.states),
             "inputs": _references(known, self.inputs),
@@ -203,15 +204,14 @@ class _Process:
                 pipe.close()
 
 
-def _clean(idle: dict[int, list[_Process]], unpacked: TemporaryFolder, owner: int) -> None:
-    """End the idle processes of this process, and remove the unpacked files if this process unpacked them."""
+def _clean(idle: dict[int, list[_Process]], unpacked: str, owner: int) -> None:
     for process in idle.pop(os.getpid(), []):
         process.end()
-    if os.getpid() == owner:
-        unpacked.remove()
+    if os.getpid() == owner:  # not in a fork of the process that unpacked the file
+        shutil.rmtree(unpacked, ignore_errors=True)
 
 
-def _unpacked(path: Path) -> tuple[Any, TemporaryFolder]:
+def _unpacked(path: Path) -> tuple[Any, str]:
     fmpy = require_extra("fmpy", "fmu", "FMUs")
     try:
         require_regular_file(path)
@@ -223,11 +223,11 @@ def _unpacked(path: Path) -> tuple[Any, TemporaryFolder]:
             f"{path} must be an FMU for co-simulation, FMI 2 or 3, got FMI {description.fmiVersion}"
             f"{'' if description.coSimulation else ' without co-simulation'}."
         )
-    folder = TemporaryFolder()
+    folder = tempfile.mkdtemp(prefix="ctxval-")
     try:
-        fmpy.extract(str(path), str(folder.path))
+        fmpy.extract(str(path), folder)
     except Exception as error:
-        folder.remove()
+        shutil.rmtree(folder, ignore_errors=True)
         raise InputError(f"{path} cannot be unpacked: {error}") from error
     return description, folder
 

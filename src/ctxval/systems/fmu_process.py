@@ -17,11 +17,7 @@ from typing import IO, Any
 
 
 class Refused(Exception):  # noqa: N818
-    """The FMU refused a request; ``input_is_wrong`` tells whether the user's input is the cause."""
-
-    def __init__(self, sentence: str, *, input_is_wrong: bool = False) -> None:
-        super().__init__(sentence)
-        self.input_is_wrong = input_is_wrong
+    """The FMU refused a request; its arguments are a sentence, and whether the user's input is the cause."""
 
 
 @contextlib.contextmanager
@@ -30,7 +26,7 @@ def refused(sentence: str, *, input_is_wrong: bool = False) -> Iterator[None]:
     try:
         yield
     except Exception as error:
-        raise Refused(f"{sentence}: {error}", input_is_wrong=input_is_wrong) from error
+        raise Refused(f"{sentence}: {error}", input_is_wrong) from error
 
 
 class Unit:
@@ -120,7 +116,7 @@ def serve(requests: IO[str], answers: IO[str]) -> None:
         try:
             answer: dict[str, Any] = {"value": acts[act](*arguments)}
         except Refused as error:
-            answer = {"refused": str(error), "input": error.input_is_wrong}
+            answer = dict(zip(("refused", "input"), error.args, strict=True))
         answers.write(json.dumps(answer) + "\n")
         answers.flush()
 

@@ -32,9 +32,6 @@ class Imperfect(ShortRepr):
         delay: steps by which inputs act late; it need not be an integer. Before the first one, the input is 0.
         lag: time constant of the actuators in steps; 0 if they follow at once.
         seed: with a seed, noise is a function of it, of the task and of how often this object has executed.
-
-    Raises:
-        InputError: if a number is negative.
     """
 
     batched = True

@@ -13,9 +13,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 from ctxval._util.checked import TimeLimit
+from ctxval._util.files import temporary_folder
 from ctxval._util.registry import part
 from ctxval._util.representation import ShortRepr
-from ctxval._util.temporary import temporary_folder
 from ctxval.core.controller import Controller
 from ctxval.core.exchange import write_controller, write_task
 from ctxval.core.labels import require_names

@@ -11,7 +11,6 @@ import selectors
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import IO
@@ -67,13 +66,9 @@ def run_supervised(
 
 
 def _readable(stdout: IO[bytes], timeout: float) -> bool:
-    deadline = time.monotonic() + timeout
     with selectors.DefaultSelector() as selector:
         selector.register(stdout, selectors.EVENT_READ)
-        while (left := deadline - time.monotonic()) > 0:
-            if selector.select(min(left, 3600.0)):  # the operating system does not take a timeout of years
-                return True
-    return False
+        return bool(selector.select(timeout if timeout < 1e6 else None))  # the system does not take years
 
 
 def _end(supervisor: subprocess.Popen[bytes], child: int) -> None:

@@ -55,7 +55,6 @@ def main() -> None:
 
 
 def _spawn(command: list[str], stdout: int, stderr: int) -> int:
-    """Start the command in its own process group; return the id of its process."""
     files: list[tuple[Any, ...]] = [(os.POSIX_SPAWN_OPEN, 0, os.devnull, os.O_RDONLY, 0)]
     files += [(os.POSIX_SPAWN_DUP2, stdout, 1), (os.POSIX_SPAWN_DUP2, stderr, 2)]
     files += [(os.POSIX_SPAWN_CLOSE, stdout), (os.POSIX_SPAWN_CLOSE, stderr)]
@@ -107,7 +106,6 @@ def _end(child: int, statuses: dict[int, int]) -> None:
 
 
 def _descendants(ancestor: int) -> set[int]:
-    """Return the descendants of a process."""
     children: dict[int, list[int]] = {}
     for name in filter(str.isdigit, os.listdir("/proc")):
         try:

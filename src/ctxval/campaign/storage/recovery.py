@@ -15,8 +15,7 @@ from typing import Any, get_args
 from urllib.parse import quote
 
 from ctxval._util.describe import describe
-from ctxval._util.files import MADE_BY, write_text, written_whole
-from ctxval._util.temporary import temporary_folder
+from ctxval._util.files import MADE_BY, temporary_folder, write_text, written_whole
 from ctxval._util.texts import guarded, shortened, visible
 from ctxval.campaign.storage import schema
 from ctxval.campaign.storage.rows import COLUMNS, checksum_of, read_json, read_trajectory, read_trial
