@@ -418,7 +418,7 @@ EXAMPLES: dict[str, Callable[[], object]] = {
     "studies.replay.ReplayReport": lambda: replayed(),
     "studies.replay.ResidualShare": lambda: replayed().residuals[0],
     "studies.replay.StepError": lambda: replayed().errors[0],
-    "studies.replay.Suggestion": lambda: replay.Suggestion("delay", 0.04, 0.5, 1.0, "the inputs act later"),
+    "studies.replay.Suggestion": lambda: replay.Suggestion("delay", 0.04, 0.5, "the inputs act later"),
     "testing.FaultyRig": lambda: testing.FaultyRig(systems.Simulated(LINEAR), {3: "raise"}),
 }
 

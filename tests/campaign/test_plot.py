@@ -27,13 +27,14 @@ from ctxval.errors import InputError
 
 @pytest.fixture(scope="module")
 def campaign() -> Campaign:
-    return Campaign(make_validation(), search=searches.GPUCB(), seed=1).run(9)
+    labels = Labels(("angle [rad]", "rate"), ("torque [N m]",), "rad")
+    return Campaign(make_validation().with_labels(labels), search=searches.GPUCB(), seed=1).run(9)
 
 
 def test_the_surrogate_shows_every_sample_the_truth_and_the_maximum(campaign: Campaign) -> None:
     grid = campaign.validation.space.grid(101)
     curve = plot.Curve(grid[:, 0], campaign.validation.distances(grid))
-    axes = plot.surrogate(campaign, truth=curve, units="rad").axes[0]
+    axes = plot.surrogate(campaign, truth=curve).axes[0]
     lines = {line.get_label(): line for line in axes.lines}
     assert {"GP mean", "true distance", "initial samples", "acquired samples", "worst task executed"} <= set(lines)
     assert len(lines["initial samples"].get_xdata()) == 5
@@ -46,7 +47,7 @@ def test_the_surrogate_shows_every_sample_the_truth_and_the_maximum(campaign: Ca
 
 
 def test_the_trajectories_are_those_of_the_worst_task(campaign: Campaign) -> None:
-    figure = plot.worst_trajectories(campaign, states=("angle [rad]",), inputs=("torque [N m]",))
+    figure = plot.worst_trajectories(campaign)
     assert campaign.worst is not None
     model, system = campaign.trajectories(campaign.worst)
     assert model is not None
@@ -54,7 +55,7 @@ def test_the_trajectories_are_those_of_the_worst_task(campaign: Campaign) -> Non
     drawn = {line.get_label(): line.get_ydata() for line in figure.axes[0].lines}
     np.testing.assert_array_equal(drawn["system S"], system.states[:, 0])
     np.testing.assert_array_equal(drawn["model M"], model.states[:, 0])
-    assert [axes.get_ylabel() for axes in figure.axes] == ["angle [rad]", "state 1", "torque [N m]"]
+    assert [axes.get_ylabel() for axes in figure.axes] == ["angle [rad]", "rate", "torque [N m]"]
     assert figure.axes[-1].get_xlabel() == "time [s]"
 
 
@@ -95,7 +96,7 @@ def ax() -> Axes:
 
 
 def test_one_slice_of_the_surrogate_is_drawn_into_given_axes(campaign: Campaign, ax: Axes) -> None:
-    assert plot.surrogate_slice(campaign, units="rad", ax=ax) is ax
+    assert plot.surrogate_slice(campaign, ax=ax) is ax
     assert ax.get_xlabel() == "goal [rad]"
     assert ax.get_ylabel() == "distance [rad]"
     whole = plot.surrogate(campaign).axes[0]
@@ -107,7 +108,7 @@ def test_one_slice_of_the_surrogate_is_drawn_into_given_axes(campaign: Campaign,
 
 def test_the_convergence_shows_each_distance_the_largest_so_far_and_what_failed(ax: Axes) -> None:
     campaign = Campaign(make_plane(), seed=1).run(7, explore=True)
-    assert plot.convergence(campaign, units="m", ax=ax) is ax
+    assert plot.convergence(campaign, ax=ax) is ax
     lines = {line.get_label(): line for line in ax.lines}
     so_far = lines["largest so far"].get_ydata()
     assert (np.diff(so_far) >= 0).all()
@@ -116,11 +117,11 @@ def test_the_convergence_shows_each_distance_the_largest_so_far_and_what_failed(
     assert list(lines["no distance is known"].get_xdata()) == [2]
     drawn = [*lines["initial samples"].get_xdata(), *lines["acquired samples"].get_xdata()]
     assert drawn == [trial.number for trial in campaign.completed]
-    assert ax.get_ylabel() == "distance [m]"
+    assert ax.get_ylabel() == "distance"
 
 
 def test_a_campaign_draws_its_surrogate_or_its_convergence(campaign: Campaign, ax: Axes) -> None:
-    assert campaign.plot(ax=ax, units="rad") is ax
+    assert campaign.plot(ax=ax) is ax
     assert ax.get_xlabel() == "goal [rad]"
     other = Figure().add_subplot()
     assert Campaign(make_plane(), seed=1).run(2).plot(ax=other) is other

@@ -2,8 +2,8 @@
 
 A function that draws one plot has the argument ``ax`` and returns the matplotlib axes. By default, these are new axes
 of ``matplotlib.pyplot``, so that notebooks and ``pyplot.show()`` show them. A function that draws several panels
-returns a figure. Names and units are those of the validation, unless the arguments state others. A campaign must have
-at least one distance, and two for a surrogate.
+returns a figure. Names and units are those of the validation. A campaign must have at least one distance, and two for
+a surrogate.
 """
 
 from __future__ import annotations
@@ -46,22 +46,18 @@ class Curve(ShortRepr):
     values: Array
 
 
-def overview(
-    campaign: Campaign, *, units: str = "", threshold: Limit = None, bound: Limit = None, ax: Axes | None = None
-) -> Axes:
+def overview(campaign: Campaign, *, threshold: Limit = None, bound: Limit = None, ax: Axes | None = None) -> Axes:
     """Draw the most informative single plot of a campaign.
 
     It is the surrogate if there is one task parameter and two distances are known, and :func:`convergence` otherwise.
     """
     space = campaign.validation.space
     if space.dimension == 1 and space.members is None and len(campaign.completed) >= 2:
-        return surrogate_slice(campaign, units=units, threshold=threshold, bound=bound, ax=ax)
-    return convergence(campaign, units=units, threshold=threshold, bound=bound, ax=ax)
+        return surrogate_slice(campaign, threshold=threshold, bound=bound, ax=ax)
+    return convergence(campaign, threshold=threshold, bound=bound, ax=ax)
 
 
-def convergence(
-    campaign: Campaign, *, units: str = "", threshold: Limit = None, bound: Limit = None, ax: Axes | None = None
-) -> Axes:
+def convergence(campaign: Campaign, *, threshold: Limit = None, bound: Limit = None, ax: Axes | None = None) -> Axes:
     """Draw the distance of each trial and the largest distance so far, and mark the trials without a distance."""
     from matplotlib.ticker import MaxNLocator
 
@@ -79,7 +75,7 @@ def convergence(
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes.set_xlim(-0.3, max(last, 1) + 0.3)
     axes.set_xlabel("trial")
-    return _finished(axes, campaign, units, threshold, bound)
+    return _finished(axes, campaign, threshold, bound)
 
 
 def surrogate_slice(
@@ -87,7 +83,6 @@ def surrogate_slice(
     axis: int = 0,
     *,
     truth: Curve | None = None,
-    units: str = "",
     threshold: Limit = None,
     bound: Limit = None,
     ax: Axes | None = None,
@@ -103,11 +98,11 @@ def surrogate_slice(
         raise InputError(f"axis must be from 0 to {space.dimension - 1}, one of {', '.join(space.names)}, got {axis}.")
     axes = _axes(ax)
     _draw_slice(axes, campaign, campaign.surrogate(), axis, truth)
-    return _finished(axes, campaign, units, threshold, bound)
+    return _finished(axes, campaign, threshold, bound)
 
 
 def surrogate(
-    campaign: Campaign, *, truth: Curve | None = None, units: str = "", threshold: Limit = None, bound: Limit = None
+    campaign: Campaign, *, truth: Curve | None = None, threshold: Limit = None, bound: Limit = None
 ) -> Figure:
     """Draw the Gaussian process over the task space with its 95 % band, the samples and the maximum.
 
@@ -122,9 +117,9 @@ def surrogate(
     for axis in range(space.dimension):
         axes = figure.add_subplot(rows, columns, axis + 1)
         _draw_slice(axes, campaign, fitted, axis, truth)
-        _draw_limits(axes, threshold, bound)
-        if axis % columns == 0:
-            axes.set_ylabel(_distance_label(campaign, units))
+        _draw_limits(axes, campaign, threshold, bound)
+        if axis % columns:
+            axes.set_ylabel("")
     figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=3, fontsize=8)
     return figure
 
@@ -137,9 +132,8 @@ def _box(campaign: Campaign) -> TaskSpace:
     return space
 
 
-def _finished(axes: Axes, campaign: Campaign, units: str, threshold: Limit, bound: Limit) -> Axes:
-    _draw_limits(axes, threshold, bound)
-    axes.set_ylabel(_distance_label(campaign, units))
+def _finished(axes: Axes, campaign: Campaign, threshold: Limit, bound: Limit) -> Axes:
+    _draw_limits(axes, campaign, threshold, bound)
     axes.legend(loc="best", fontsize=8, framealpha=0.9)
     return axes
 
@@ -165,8 +159,10 @@ def _draw_slice(axes: Axes, campaign: Campaign, fitted: Surrogate, axis: int, tr
     axes.set_xlabel(space.labels[axis])
 
 
-def _draw_limits(axes: Axes, threshold: Limit, bound: Limit) -> None:
-    """Draw the threshold and the bound as horizontal lines, which differ in style and not only in colour."""
+def _draw_limits(axes: Axes, campaign: Campaign, threshold: Limit, bound: Limit) -> None:
+    """Label the axis of the distance, with horizontal lines at the threshold and the bound, which differ in style."""
+    units = campaign.validation.labels.units
+    axes.set_ylabel(f"distance [{units}]" if units else "distance")
     if threshold is not None:
         axes.axhline(threshold, color=_ORANGE, linestyle="-.", linewidth=1.4, label=f"threshold {threshold:.4g}")
     if bound is not None:
@@ -187,8 +183,8 @@ def _draw_samples(axes: Axes, campaign: Campaign, place: Callable[[Trial], float
             axes.plot(x, y, "o", markersize=5, markerfacecolor=face, markeredgecolor=_BLACK, label=label)
 
 
-def worst_trajectories(campaign: Campaign, *, states: Sequence[str] = (), inputs: Sequence[str] = ()) -> Figure:
-    """Draw the trajectories of M and of S for the worst executed task, with these axis labels."""
+def worst_trajectories(campaign: Campaign) -> Figure:
+    """Draw the trajectories of M and of S for the worst executed task."""
     worst = _worst(campaign)
     model, system = campaign.trajectories(worst)
     if model is None or system is None:
@@ -196,8 +192,7 @@ def worst_trajectories(campaign: Campaign, *, states: Sequence[str] = (), inputs
     validation = campaign.validation
     space = validation.space
     reference = validation.task(space.parameters(space.from_unit(worst.unit_point))).reference
-    names = map(labels_of, validation.names(model.states.shape[-1], model.inputs.shape[-1]))
-    states, inputs = (given or known for given, known in zip((states, inputs), names, strict=True))
+    states, inputs = map(labels_of, validation.names(model.states.shape[-1], model.inputs.shape[-1]))
     figure = trajectories(model, system, reference=reference, states=states, inputs=inputs)
     distance = f"{_known(worst):.4g} {validation.labels.units}".rstrip()
     items = worst.parameters.items()
@@ -219,11 +214,9 @@ def trajectories(
 
     The reference of the states, ``(H + 1, n)``, is drawn for a state if it is not zero everywhere.
     """
-    n, m = model.states.shape[-1], model.inputs.shape[-1]
-    names = [
-        *(states[i] if i < len(states) else f"state {i}" for i in range(n)),
-        *(inputs[i] if i < len(inputs) else f"input {i}" for i in range(m)),
-    ]
+    states = states or [f"state {i}" for i in range(model.states.shape[-1])]
+    inputs = inputs or [f"input {i}" for i in range(model.inputs.shape[-1])]
+    names = [*states, *inputs]
     figure = _figure(6.4, 1.0 + 1.7 * len(names))
     for row, name in enumerate(names):
         axes = figure.add_subplot(len(names), 1, row + 1, sharex=figure.axes[0] if row else None)
@@ -292,11 +285,6 @@ def _axes(ax: Axes | None) -> Axes:
     from matplotlib import pyplot
 
     return pyplot.subplots(layout="constrained")[1]
-
-
-def _distance_label(campaign: Campaign, units: str) -> str:
-    known = units or campaign.validation.labels.units
-    return f"distance [{known}]" if known else "distance"
 
 
 def _worst(campaign: Campaign) -> Trial:

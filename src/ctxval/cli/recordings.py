@@ -115,7 +115,6 @@ def replay(
     html: Path | None = None,
     force: bool = False,
 ) -> Any:
-    """``ctxval replay``."""
     require_outputs({"--html .html": html}, [*logs, model, experiment, reading.mapping], force=force)
     settings = None if experiment is None else read_settings(experiment, {})
     loaded = None if settings is None else settings.load()
@@ -207,7 +206,6 @@ def fit_models(
     force: bool = False,
     seed: int = 0,
 ) -> Any:
-    """``ctxval fit``."""
     kinds: Any = kind.split(",") if kind else (["parameters"] if function.step is not None else list(KINDS[:3]))
     if (function.step is None) != (not function.parameter):
         raise InputError("--step and --parameter must be given together.")
@@ -295,7 +293,6 @@ def collect(
     seed: int = 0,
     option: list[str] | None = None,
 ) -> Any:
-    """``ctxval collect``."""
     settings = read_settings(target, {"options": named_values(option), "seed": seed})
     experiment = settings.load()
     size = parsed(amplitude)

@@ -72,7 +72,6 @@ def run(
     live: bool = False,
     option: list[str] | None = None,
 ) -> Any:
-    """``ctxval run``."""
     stated: dict[str, Any] = {
         "budget": budget,
         "search": search,

@@ -12,25 +12,16 @@ import numpy as np
 from ctxval._util.files import write_text
 from ctxval.cli.base import command, out, print_columns
 from ctxval.cli.options import require_outputs
-from ctxval.cli.recordings import Logs, print_breaks
+from ctxval.cli.recordings import Logs, error_cells, print_breaks
 from ctxval.data import Field, LogMapping
 from ctxval.models import write_model
 from ctxval.report.replay_page import write_replay_page
 from ctxval.studies.survey import Survey, survey
 
-FILES = ("mapping.toml", "model.npz", "experiment.toml", "report.html")
-
 
 @command()
-def start(
-    logs: list[Path],
-    reading: Logs,
-    out_: Path = Path("start"),
-    force: bool = False,
-    seed: int = 0,
-) -> Any:
-    """``ctxval start``."""
-    files = {name: out_ / name for name in FILES}
+def start(logs: list[Path], reading: Logs, out_: Path = Path("start"), force: bool = False, seed: int = 0) -> Any:
+    files = {name: out_ / name for name in ("mapping.toml", "model.npz", "experiment.toml", "report.html")}
     require_outputs({f"--out {name}": path for name, path in files.items()}, [*logs, reading.mapping], force=force)
     stated = reading.stated()
     found = survey(logs, stated, dt=reading.dt, seed=seed)
@@ -38,16 +29,16 @@ def start(
     write_text(files["mapping.toml"], mapping_text(found.mapping, found.recordings.dt))
     write_model(files["model.npz"], found.best.model)
     write_replay_page(found.replay, files["report.html"], name=f"the {found.best.kind} model")
-    written = ["mapping.toml", "model.npz", "report.html"]
     if found.recordings.inputs:
         write_text(files["experiment.toml"], experiment_text(found))
-        written.insert(2, "experiment.toml")
+    else:
+        del files["experiment.toml"]
     out.say("")
-    out.say(f"{', '.join(written)} in {out_}")
-    where = shlex.quote(str(out_ / "experiment.toml"))
+    out.say(f"{', '.join(files)} in {out_}")
     if found.recordings.inputs:
+        where = shlex.quote(str(files["experiment.toml"]))
         out.say(f"next: edit {where}, and then ctxval check {where}")
-    return {**found.to_json(), "files": [str(out_ / name) for name in written]}
+    return {**found.to_json(), "files": [str(path) for path in files.values()]}
 
 
 def _print(found: Survey) -> None:
@@ -71,17 +62,7 @@ def _print(found: Survey) -> None:
     for guess in found.guesses:
         out.say(("guessed: ", "yellow"), guess, wrap=True)
     print_breaks(recordings)
-    errors = [
-        (
-            model.kind,
-            each.state,
-            str(each.steps),
-            f"{each.rms:.3g} {each.unit}".rstrip(),
-            f"{100 * each.relative:.3g} %",
-        )
-        for model in found.fit.fitted
-        for each in model.errors
-    ]
+    errors = [(model.kind, *error_cells(each)) for model in found.fit.fitted for each in model.errors]
     print_columns(["model", "state", "steps", "rms error", "of the change"], errors, "error on others", left=2)
     out.say("")
     for sentence in found.replay.insights:

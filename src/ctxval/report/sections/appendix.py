@@ -17,7 +17,7 @@ from ctxval.report.context import ReportContext
 from ctxval.report.distance_model import distance_of
 from ctxval.report.findings import WORDS
 from ctxval.report.markup import UNCUT, joined, number, paragraph, quantity, table, text
-from ctxval.report.sections.repeat import command_of, digest
+from ctxval.report.sections.repeat import command_of, identity
 
 _NASA, _V10, _V20 = "NASA-STD-7009B", "ASME V&V 10", "ASME V&V 20"
 
@@ -80,7 +80,7 @@ def _evidence(context: ReportContext) -> Iterator[Entry]:
         f"{_NASA}, {_V10}",
         f"{context.executions} executions of the system in {len(context.trials)} trials ({listed or 'none'}), of which "
         f"{len(context.completed)} gave a distance and {len(context.recordings)} a recorded trajectory. Digest of the "
-        f"description of the system: {_part_digest(context, 'system')}.",
+        f"description of the system: {identity(context).get('digest of the system', 'not known')}.",
     )
     error, executed = "No distance is known.", "Nothing was executed."
     if context.completed:
@@ -135,7 +135,7 @@ def _limits(context: ReportContext) -> Iterator[Entry]:
         "Provenance",
         _NASA,
         f"Store {context.store.name}; ctxval {VERSION}; command: {command_of(context) or 'none'}; digest of the "
-        f"description of the model: {_part_digest(context, 'model')}.",
+        f"description of the model: {identity(context).get('digest of the model', 'not known')}.",
     )
     conclusion = str(context.verdict or "No verdict, because no threshold was stated.")
     yield Entry("Conclusion", f"{_NASA}, {_V10}", conclusion)
@@ -146,7 +146,3 @@ def _box(context: ReportContext, low: Array, high: Array) -> str:
         return f"a suite of {len(context.suite)} tasks, {enumerated(context.suite.task_names, 40)}"
     ends = zip(context.space.labels, low.tolist(), high.tolist(), strict=True)
     return "; ".join(f"{label} from {number(first)} to {number(last)}" for label, first, last in ends)
-
-
-def _part_digest(context: ReportContext, part: str) -> str:
-    return digest(context.parts[part]) if part in context.parts else "not known"

@@ -24,8 +24,6 @@ _SHAPES = {
     **{"good": "\u25cf", "note": "\u25c6", "attention": "\u25b2", "bad": "\u25a0", "unknown": "\u25cb"},
 }
 
-_TESTS = 22  # number of tests that is advised if an error would be costly
-
 
 def verdict(context: ReportContext) -> Markup:
     """Return the first screen: the verdict, its sentence, the picture, the next step and the numbers."""
@@ -60,12 +58,13 @@ def _next(context: ReportContext) -> tuple[str, str]:
             "or the tasks change."
         )
         tests = {} if verdict.certificate is None else verdict.certificate.details.get("tests", {})
-        drawn = tests.get("drawn", _TESTS)
-        budget = max(context.budget or 0, context.executions + _TESTS - drawn)
-        command = command_of(context, budget, "--tests", str(_TESTS), "--store", path)
-        if not command or drawn >= _TESTS:
+        most = 22  # tests are advised if an error would be costly
+        drawn = tests.get("drawn", most)
+        budget = max(context.budget or 0, context.executions + most - drawn)
+        command = command_of(context, budget, "--tests", str(most), "--store", path)
+        if not command or drawn >= most:
             return advice, ""
-        return f"{advice} If an error would be costly, test the predictions at {_TESTS} drawn tasks:", command
+        return f"{advice} If an error would be costly, test the predictions at {most} drawn tasks:", command
     if verdict.answer == "falsified":
         largest = quantity(distance_of(context.worst_first[0]), context.labels.units)
         advice = (
@@ -88,10 +87,6 @@ def _next(context: ReportContext) -> tuple[str, str]:
     return f"Execute more tasks: {advice}.", shlex.join(["ctxval", "ask", path]) if by_hand else command
 
 
-def _bound(context: ReportContext, certificate: Certificate) -> str:
-    return f"{with_error(certificate.upper_bound, certificate.error)} {context.labels.units}".rstrip()
-
-
 def _facts(context: ReportContext) -> Markup:
     verdict, certificate, units = context.verdict, context.certificate, context.labels.units
     rows: list[tuple[str, object]] = []
@@ -101,7 +96,8 @@ def _facts(context: ReportContext) -> Markup:
         rows.append(("Largest executed", at))
     if certificate is not None:
         how = "withdrawn" if certificate.doubt is not None else f"{percent(certificate.confidence)} confidence"
-        rows.append(("Bound on all tasks", f"{_bound(context, certificate)} ({certificate.kind}, {how})"))
+        bound = f"{with_error(certificate.upper_bound, certificate.error)} {units}".rstrip()
+        rows.append(("Bound on all tasks", f"{bound} ({certificate.kind}, {how})"))
         if certificate.volume:
             rows.append(("Tasks left out", f"{at_most(100 * certificate.volume, 3)} %"))
     if verdict is not None:
