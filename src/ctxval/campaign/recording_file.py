@@ -62,7 +62,12 @@ class RecordingFile:
         """Return the recording."""
         path = self.path
         if is_log(path) or (self.mapping is not None and self.npz is not True and path.is_file()):
-            logged = self._logged()
+            dt = float(self.times[1] - self.times[0])
+            recordings = read_recordings([path], self.mapping, states=self.states, inputs=self.inputs, dt=dt)
+            if len(recordings.runs) > 1 or recordings.breaks:
+                why = f"; it was split: {recordings.breaks[0]}" if recordings.breaks else ""
+                raise InputError(f"{path} must be one recording without gaps, and has {len(recordings.runs)}{why}.")
+            logged = recordings.runs[0].trajectory
             return logged.resampled(self.times) if self.resample else logged
         require_file(path)
         if path.suffix == ".npz" if self.npz is None else self.npz:
@@ -75,15 +80,6 @@ class RecordingFile:
             raise InputError(f"{path} must be one recording, got a batch of shape {recording.states.shape}.")
         self._require_finite(recording)
         return recording.resampled(self.times) if self.resample else recording
-
-    def _logged(self) -> Trajectory:
-        """Return the only recording in a log, at the time step of the task."""
-        dt = float(self.times[1] - self.times[0])
-        recordings = read_recordings([self.path], self.mapping, states=self.states, inputs=self.inputs, dt=dt)
-        if len(recordings.runs) > 1 or recordings.breaks:
-            why = f"; it was split: {recordings.breaks[0]}" if recordings.breaks else ""
-            raise InputError(f"{self.path} must be one recording without gaps, and has {len(recordings.runs)}{why}.")
-        return recordings.runs[0].trajectory
 
     def _require_finite(self, recording: Trajectory) -> None:
         """Refuse a complete recording with a number that is missing, infinite or a mark; the message says where."""
@@ -122,16 +118,14 @@ class RecordingFile:
         if status != REFUSED:
             raise InputError(f"{self.path} cannot be read within {seconds} s and {MOST_MEMORY} bytes of memory.")
         sentence = content.decode(errors="replace")
-        raise InputError(self._withheld(sentence) if self.uploaded else sentence)
-
-    def _withheld(self, sentence: str) -> str:
-        """Return where an uploaded file is wrong and what would be right, without anything that is in the file."""
-        place = re.search(r", line \d{1,9}", sentence)
-        needed = ", ".join(labels_of({"t": "s", **self.states, **self.inputs}))
-        return (
-            f"{self.path}{'' if place is None else place[0]}: it is not a recording of this trial. The columns or "
-            f"fields {needed} are needed, with a finite number for each time from 0 to {self.times[-1]:g} s."
-        )
+        if self.uploaded:  # the place of the mistake, and what would be right, without anything that is in the file
+            place = re.search(r", line \d{1,9}", sentence)
+            needed = ", ".join(labels_of({"t": "s", **self.states, **self.inputs}))
+            sentence = (
+                f"{self.path}{'' if place is None else place[0]}: it is not a recording of this trial. The columns or "
+                f"fields {needed} are needed, with a finite number for each time from 0 to {self.times[-1]:g} s."
+            )
+        raise InputError(sentence)
 
 
 def require_file(path: Path) -> None:

@@ -64,7 +64,11 @@ class Logs:
     ) -> Recordings:
         """Return the recordings in files and folders, with the names and units of the experiment if they fit."""
         mapping = self.stated() or (None if settings is None else settings.log_mapping)
-        states, inputs = ({}, {}) if experiment is None else _names(experiment)
+        states, inputs = dict[str, str](), dict[str, str]()
+        if experiment is not None:
+            system = experiment.validation.system
+            known = {kind: getattr(experiment, kind) or names_of(system, kind) for kind in ("states", "inputs")}
+            states, inputs = experiment.names(*map(len, known.values())) if known["states"] else ({}, {})
         recordings = read_recordings(logs, mapping, states=states, inputs=inputs, **self.changes)
         same = (len(states), len(inputs)) == (len(recordings.states), len(recordings.inputs))
         if not same or states.keys() & inputs.keys():
@@ -321,13 +325,6 @@ def collect(
     out.say(f"{len(recorded)} executions recorded in {out_}, {known} were there before, {len(failed)} failed.")
     report = {"recorded": recorded, "known": known, "failed": failed, "folder": str(out_)}
     return (report, CANNOT_GO_ON) if failed and not recorded and not known else report
-
-
-def _names(experiment: Experiment) -> tuple[dict[str, str], dict[str, str]]:
-    """Return the names and units of the states and inputs of an experiment, as far as they are known."""
-    system = experiment.validation.system
-    states, inputs = experiment.states or names_of(system, "states"), experiment.inputs or names_of(system, "inputs")
-    return experiment.names(len(states), len(inputs)) if states else ({}, {})
 
 
 def _fields(given: Sequence[str]) -> dict[str, Field]:

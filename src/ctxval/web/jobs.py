@@ -90,16 +90,15 @@ class ServedCampaign:
     def read(self) -> Snapshot:
         """Read the trials in the store, with what people must know of the open tasks before they execute them."""
         self.campaign.refresh()
+        validation, tasks = self.campaign.validation, dict[int, dict[str, Any]]()
+        for trial in (trial for trial in self.campaign.trials if trial.state == "open"):
+            task = validation.task_at(validation.space.parameters(validation.space.point(trial.parameters)))
+            start = np.atleast_1d(validation.recorded_task(task).initial_state).tolist()
+            labels = labels_of(self.experiment.names(len(start), 0)[0])
+            starts = list(zip(labels, start, strict=True))
+            tasks[trial.number] = {"start": starts, "horizon": task.horizon, "dt": task.dt}
         # The trials were read after this process's last change, so their counts are those of the signature.
-        tasks = {trial.number: self._task(trial) for trial in self.campaign.trials if trial.state == "open"}
         return self.snapshot(tasks, self.campaign.store.signature()[2])
-
-    def _task(self, trial: Trial) -> dict[str, Any]:
-        validation = self.campaign.validation
-        task = validation.task_at(validation.space.parameters(validation.space.point(trial.parameters)))
-        start = np.atleast_1d(validation.recorded_task(task).initial_state).tolist()
-        states, _ = self.experiment.names(len(start), 0)
-        return {"start": list(zip(labels_of(states), start, strict=True)), "horizon": task.horizon, "dt": task.dt}
 
 
 OpenCampaign = Callable[[], ServedCampaign]

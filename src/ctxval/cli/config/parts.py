@@ -237,24 +237,23 @@ def with_distribution(
         return space.sampled(argument(tables["sampler"], folder))
     for name in tables:
         space.columns(name)  # which refuses names that are not in the space
-    stated = {name: table for name, table in tables.items() if table.get("type") != "uniform"}
-    if not stated:
-        return space
-    return space.distributed(**{name: _distribution(name, table, folder) for name, table in stated.items()})
-
-
-def _distribution(name: str, table: Mapping[str, Any], folder: Path | None) -> Any:
-    if set(table) == {"ref"}:
-        return argument(table, folder)
-    given = dict(table)
-    kind = given.pop("type", None)
-    if kind != "normal":
-        raise UnknownNameError.among(f"distribution of {name}", str(kind), ("normal", "uniform"))
-    for key in given.keys() - {"mean", "deviation"}:
-        raise UnknownNameError.among(f"argument of the distribution of {name}", key, ("mean", "deviation"))
-    if len(given) < 2:
-        raise InputError(f"the normal distribution of {name} needs a mean and a deviation, got {given!r}.")
-    return Normal(**given)
+    stated: dict[str, Any] = {}
+    for name, table in tables.items():
+        if set(table) == {"ref"}:
+            stated[name] = argument(table, folder)
+            continue
+        given = dict(table)
+        kind = given.pop("type", None)
+        if kind == "uniform":
+            continue
+        if kind != "normal":
+            raise UnknownNameError.among(f"distribution of {name}", str(kind), ("normal", "uniform"))
+        for key in given.keys() - {"mean", "deviation"}:
+            raise UnknownNameError.among(f"argument of the distribution of {name}", key, ("mean", "deviation"))
+        if len(given) < 2:
+            raise InputError(f"the normal distribution of {name} needs a mean and a deviation, got {given!r}.")
+        stated[name] = Normal(**given)
+    return space.distributed(**stated) if stated else space
 
 
 def named_experiment(text: str, seed: int, options: dict[str, Any], folder: Path | None = None) -> Experiment:

@@ -7,7 +7,6 @@ import shlex
 from markupsafe import Markup
 
 from ctxval._util.representation import counted
-from ctxval.certificates import Certificate
 from ctxval.certificates.bounds import as_text, at_most, with_error
 from ctxval.report import markup
 from ctxval.report.context import ReportContext
@@ -133,27 +132,20 @@ def _remarks(context: ReportContext) -> list[Markup]:
 
 def basis(context: ReportContext) -> Markup:
     """Return what the verdict rests on: the assumptions, the diagnostics and what was not tested."""
-    rests_on = None if context.verdict is None else context.verdict.rests_on
-    return joined(
-        [
-            *([] if context.certificate is None else _assumptions(context.certificate)),
-            *([] if rests_on is None else [paragraph(text(rests_on, UNCUT))]),
-            heading("Diagnostics"),
-            lights(context.diagnostics),
-            heading("What was not tested"),
-            bullets(context.not_tested),
+    parts, certificate = list[Markup](), context.certificate
+    if certificate is not None:
+        rows = ((name.replace("_", " "), as_text(value)) for name, value in certificate.numbers.items())
+        stated = certificate.statement if certificate.doubt is None else f"It is withdrawn: {certificate.doubt}."
+        parts += [
+            heading(f"What the certificate {certificate.kind} assumes"),
+            paragraph(stated),
+            bullets(text(f"{markup.sentence(words)}.", UNCUT) for words in certificate.assumptions),
+            markup.details("Numbers of the certificate", table("Numbers of the certificate", ("Name", "Value"), rows)),
         ]
-    )
-
-
-def _assumptions(certificate: Certificate) -> list[Markup]:
-    rows = ((name.replace("_", " "), as_text(value)) for name, value in certificate.numbers.items())
-    return [
-        heading(f"What the certificate {certificate.kind} assumes"),
-        paragraph(certificate.statement if certificate.doubt is None else f"It is withdrawn: {certificate.doubt}."),
-        bullets(text(f"{markup.sentence(words)}.", UNCUT) for words in certificate.assumptions),
-        markup.details("Numbers of the certificate", table("Numbers of the certificate", ("Name", "Value"), rows)),
-    ]
+    if context.verdict is not None and context.verdict.rests_on is not None:
+        parts.append(paragraph(text(context.verdict.rests_on, UNCUT)))
+    parts += [heading("Diagnostics"), lights(context.diagnostics)]
+    return joined([*parts, heading("What was not tested"), bullets(context.not_tested)])
 
 
 def lights(findings: list[Finding]) -> Markup:

@@ -17,7 +17,7 @@ from ctxval._util.representation import ShortRepr
 from ctxval.core.model import Model
 from ctxval.core.trajectory import Transitions
 from ctxval.learning import PosteriorSettings, learn_posterior
-from ctxval.studies.replay.accuracy import RecordedSteps, Windows, stepped
+from ctxval.studies.replay.accuracy import RecordedSteps, Windows, squared, stepped
 
 
 @dataclass(frozen=True)
@@ -142,13 +142,14 @@ def _delay(model: Model, recorded: RecordedSteps) -> Suggestion | None:
     if not recorded.recordings.inputs or not len(where):
         return None
     x, reached, groups = where.states(), where.states(1), where.groups
+    sizes = np.sqrt(((reached - x) ** 2).mean(axis=0))
 
     def errors(of: Callable[[Array], Array], shift: float) -> Array:
         """Return the squared errors of states that depend on the mean input of each step, if inputs act so late."""
         whole = math.floor(shift)
         u, part = where.inputs(-whole), shift - whole
         u = u + part * (where.inputs(-whole - 1) - u) if part else u
-        return _squared(of(u), reached - x)
+        return squared(of(u), sizes)
 
     def chosen(of: Callable[[Array], Array]) -> tuple[dict[float, Array], tuple[float, float] | None]:
         """Return the errors for whole steps, and for tenths around the best of them, and what they choose."""
@@ -194,7 +195,7 @@ def _time_step(model: Model, recorded: RecordedSteps) -> Suggestion | None:
         held = np.mean([where.inputs(k) for k in range(steps)], axis=0)
         for _ in range(of_model):
             x = stepped(model, x, held)
-        return _squared(x - where.states(steps), where.states(steps) - start)
+        return squared(x - where.states(steps), np.sqrt(((where.states(steps) - start) ** 2).mean(axis=0)))
 
     known: dict[float, Array] = {1.0: errors(1, 1)}
     for k in multiples:
@@ -209,14 +210,6 @@ def _time_step(model: Model, recorded: RecordedSteps) -> Suggestion | None:
         f"instead of {recorded.recordings.dt:g} s: check the time step of the model, or give dt = {dt:g}"
     )
     return Suggestion("time step", dt, ratio, sentence)
-
-
-def _squared(errors: Array, changes: Array) -> Array:
-    """Return the mean over the states of squared errors relative to their changes, ``(N,)``; large if not finite."""
-    sizes = np.sqrt((changes**2).mean(axis=0))
-    sizes[sizes == 0] = np.inf
-    with np.errstate(all="ignore"):
-        return np.asarray(np.nan_to_num(((errors / sizes) ** 2).mean(axis=1), nan=1e30, posinf=1e30).clip(max=1e30))
 
 
 def _affine_errors(x: Array, u: Array, reached: Array, groups: Rows) -> Array:

@@ -19,7 +19,7 @@ from ctxval._util.representation import ShortRepr, counted
 from ctxval.core.model import Model
 from ctxval.core.trajectory import Trajectory
 from ctxval.data.recordings import Recording, Recordings
-from ctxval.studies.replay.accuracy import stepped
+from ctxval.studies.replay.accuracy import squared, stepped
 
 EXPLAINS = 0.5  # least share of the error with which a fault is named as its cause
 
@@ -62,7 +62,7 @@ def faults(model: Model, recordings: Recordings, used: Sequence[int]) -> tuple[F
     whole = [run.trajectory for run in runs]
     changes = np.concatenate([np.diff(run.states, axis=0) for run in whole])
     sizes = np.maximum(np.sqrt((changes**2).mean(axis=0)), 1e-300)
-    errors = [_squared(stepped(model, run.states[:-1], run.inputs) - run.states[1:], sizes) for run in whole]
+    errors = [squared(stepped(model, run.states[:-1], run.inputs) - run.states[1:], sizes) for run in whole]
     total = max(float(sum(error.sum() for error in errors)), 1e-300)
     found = []
     for number, (name, unit) in enumerate(recordings.states.items()):
@@ -83,12 +83,6 @@ def faults(model: Model, recordings: Recordings, used: Sequence[int]) -> tuple[F
     by_run = dict(zip(used, (float(error.sum()) / total for error in errors), strict=True))
     found += _files(recordings.runs, by_run)
     return tuple(sorted(found, key=lambda fault: -fault.share))
-
-
-def _squared(errors: Array, sizes: Array) -> Array:
-    """Return the mean over the states of squared errors in units of their typical changes, ``(H,)``."""
-    with np.errstate(all="ignore"):
-        return np.asarray(np.nan_to_num(((errors / sizes) ** 2).mean(axis=1), nan=1e12, posinf=1e12).clip(max=1e12))
 
 
 def _sentence(kind: str, state: str, steps: int, dt: float, where: str, share: float) -> str:
