@@ -42,7 +42,6 @@ from ctxval import (
     fitting,
     learning,
     models,
-    plot,
     refinement,
     replay,
     report,
@@ -425,7 +424,6 @@ INSIDE: dict[str, Callable[[], object]] = {
     "a bound policy": lambda: controllers.Policy(policy).design(TASK, LINEAR),
     "a change of a store": lambda: Change("accepted", "same code", {"differences": ["model"], "trials": 3}),
     "hyperparameters": lambda: certificates.draw_maxima(sample(), draws=12, paths=4).conditioned[0],
-    "a curve": lambda: plot.Curve(np.linspace(0, 1, 100), np.linspace(0, 1, 100)),
     "an ONNX network": lambda: models.Onnx(network()).network,
     "the weights of LQR": lambda: controllers.LQR([1, 1], [1]).cost,
 }

@@ -31,15 +31,12 @@ def campaign() -> Campaign:
     return Campaign(make_validation().with_labels(labels), search=searches.GPUCB(), seed=1).run(9)
 
 
-def test_the_surrogate_shows_every_sample_the_truth_and_the_maximum(campaign: Campaign) -> None:
-    grid = campaign.validation.space.grid(101)
-    curve = plot.Curve(grid[:, 0], campaign.validation.distances(grid))
-    axes = plot.surrogate(campaign, truth=curve).axes[0]
+def test_the_surrogate_shows_every_sample_and_the_maximum(campaign: Campaign, ax: Axes) -> None:
+    axes = plot.surrogate_slice(campaign, ax=ax)
     lines = {line.get_label(): line for line in axes.lines}
-    assert {"GP mean", "true distance", "initial samples", "acquired samples", "worst task executed"} <= set(lines)
+    assert {"GP mean", "initial samples", "acquired samples", "worst task executed"} <= set(lines)
     assert len(lines["initial samples"].get_xdata()) == 5
     assert len(lines["acquired samples"].get_xdata()) == 4
-    np.testing.assert_array_equal(lines["true distance"].get_ydata(), curve.values)
     assert campaign.worst is not None
     assert lines["worst task executed"].get_ydata()[0] == campaign.worst.distance
     assert axes.get_xlabel() == "goal [rad]"
@@ -59,22 +56,21 @@ def test_the_trajectories_are_those_of_the_worst_task(campaign: Campaign) -> Non
     assert figure.axes[-1].get_xlabel() == "time [s]"
 
 
-def test_more_dimensions_are_shown_as_slices() -> None:
-    figure = plot.surrogate(Campaign(make_plane()).run(8, explore=True))
-    assert [axes.get_xlabel() for axes in figure.axes] == ["x [m]", "y [m]"]
+def test_of_more_dimensions_one_is_shown(ax: Axes) -> None:
+    assert plot.surrogate_slice(Campaign(make_plane()).run(8, explore=True), 1, ax=ax).get_xlabel() == "y [m]"
 
 
 @pytest.mark.parametrize("ending", ["png", "svg"])
 def test_pictures_are_written(campaign: Campaign, tmp_path: Path, ending: str) -> None:
-    path = plot.save(plot.surrogate(campaign), tmp_path / f"a.{ending}")
+    path = plot.save(plot.worst_trajectories(campaign), tmp_path / f"a.{ending}")
     assert path.stat().st_size > 5000
 
 
 def test_a_picture_that_cannot_be_written_or_drawn_is_an_input_error(campaign: Campaign, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="cannot be written"):
-        plot.save(plot.surrogate(campaign), tmp_path / "none" / "a.png")
+        plot.save(plot.worst_trajectories(campaign), tmp_path / "none" / "a.png")
     with pytest.raises(InputError, match="cannot be written"):
-        plot.save(plot.surrogate(campaign), tmp_path / "a.nonsense")
+        plot.save(plot.worst_trajectories(campaign), tmp_path / "a.nonsense")
     with pytest.raises(InputError, match="nothing to draw"):
         plot.worst_trajectories(Campaign(make_validation()))
 
@@ -99,9 +95,6 @@ def test_one_slice_of_the_surrogate_is_drawn_into_given_axes(campaign: Campaign,
     assert plot.surrogate_slice(campaign, ax=ax) is ax
     assert ax.get_xlabel() == "goal [rad]"
     assert ax.get_ylabel() == "distance [rad]"
-    whole = plot.surrogate(campaign).axes[0]
-    means = [next(line for line in axes.lines if line.get_label() == "GP mean").get_ydata() for axes in (ax, whole)]
-    np.testing.assert_array_equal(*means)
     with pytest.raises(InputError, match="axis must be from 0 to 0, one of goal, got 1"):
         plot.surrogate_slice(campaign, 1, ax=ax)
 
@@ -160,16 +153,3 @@ def test_labels_are_those_of_the_validation() -> None:
     assert [axes.get_ylabel() for axes in figure.axes] == ["angle [rad]", "rate [rad/s]", "torque [N m]"]
     axes = plot.convergence(named, ax=Figure().add_subplot())
     assert axes.get_ylabel() == "distance [rad]"
-
-
-def test_one_signal_is_drawn_into_given_axes(campaign: Campaign, ax: Axes) -> None:
-    assert campaign.worst is not None
-    model, system = campaign.trajectories(campaign.worst)
-    assert model is not None
-    assert system is not None
-    assert plot.signal(model, system, 2, label="torque [N m]", ax=ax) is ax
-    drawn = {line.get_label(): line.get_ydata() for line in ax.lines}
-    np.testing.assert_array_equal(drawn["system S"], system.inputs[:, 0])
-    assert ax.get_ylabel() == "torque [N m]"
-    with pytest.raises(InputError, match="component must be from 0 to 2, the 2 states and 1 inputs, got 3"):
-        plot.signal(model, system, 3, ax=ax)
