@@ -8,7 +8,6 @@ import re
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -16,9 +15,7 @@ from ctxval._util.arrays import Array
 from ctxval._util.columns import sentinels
 from ctxval._util.confinement import MOST_MEMORY
 from ctxval._util.temporary import temporary_folder
-from ctxval.core.experiment import Experiment
 from ctxval.core.labels import labels_of
-from ctxval.core.plan import Plan
 from ctxval.core.trajectory import COMPLETE, Trajectory
 from ctxval.data import LogMapping, is_log, read_recordings
 from ctxval.errors import ExecutionError, InputError
@@ -52,11 +49,6 @@ class RecordingFile:
     resample: bool = False
     mapping: LogMapping | None = None
     uploaded: bool = False
-
-    @property
-    def foreign(self) -> bool:
-        """Whether libraries in C read the file, or a stranger may have made it."""
-        return self.uploaded or is_log(self.path)
 
     def read(self) -> Trajectory:
         """Return the recording."""
@@ -136,10 +128,3 @@ def require_file(path: Path) -> None:
         raise InputError(f"{path} cannot be read: {error.strerror}.") from error
     if not is_file:
         raise InputError(f"{path} cannot be read: it is a folder." if is_folder else f"there is no file {path}.")
-
-
-def read_recording(path: Path, experiment: Experiment, plan: Plan, **options: Any) -> Trajectory:
-    """Read a recorded trajectory; a log in a format of another program is read in a confined process."""
-    names = experiment.names(plan.model_trajectory.states.shape[-1], plan.model_trajectory.inputs.shape[-1])
-    file = RecordingFile(path, *names, plan.task.times, **options)
-    return file.read_confined() if file.foreign else file.read()

@@ -123,8 +123,14 @@ def worst_open_loop(
         np.put_along_axis(chosen, largest, np.sign(np.take_along_axis(flat, largest, axis=-1)), axis=-1)
         return chosen.reshape(gap.shape) * counts
 
+    # Random sequences at the bound, with few to many switches.
+    sequences = []
+    for r in range(restarts):
+        rng = np.random.default_rng(np.random.SeedSequence([seed, r]))
+        switches = rng.random((task.horizon, 1)) < rng.uniform() ** 3
+        sequences.append(1.0 - 2.0 * ((rng.integers(2, size=1) + switches.cumsum(axis=0)) % 2))
     with single_threaded():
-        U = _first_inputs(pair, restarts, seed)
+        U = np.array(sequences) * bound
         U = _ascend(pair, U, lambda gap, rows: first[rows], _by_gradient)
         U = _ascend(pair, U, norm, _by_gradient)
         U = _ascend(pair, U, norm, _by_trial)
@@ -193,17 +199,6 @@ def _directions(order: float, counts: Array, restarts: int) -> Array:
         else:
             directions[r] = [1 - 2 * (r >> j & 1) for j in range(n)]
     return directions * counts
-
-
-def _first_inputs(pair: _Pair, restarts: int, seed: int) -> Array:
-    """Return random sequences at the bound, with few to many switches, shape ``(R, H, 1)``."""
-    sequences = []
-    for r in range(restarts):
-        rng = np.random.default_rng(np.random.SeedSequence([seed, r]))
-        switches = rng.random((pair.task.horizon, 1)) < rng.uniform() ** 3
-        start = rng.integers(2, size=1)
-        sequences.append(1.0 - 2.0 * ((start + switches.cumsum(axis=0)) % 2))
-    return np.array(sequences) * pair.bound
 
 
 def _ascend(

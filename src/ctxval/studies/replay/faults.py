@@ -16,6 +16,7 @@ import numpy as np
 
 from ctxval._util.arrays import Array, Mask
 from ctxval._util.representation import ShortRepr, counted
+from ctxval.core.labels import labels_of
 from ctxval.core.model import Model
 from ctxval.core.trajectory import Trajectory
 from ctxval.data.recordings import Recording, Recordings
@@ -77,24 +78,20 @@ def faults(model: Model, recordings: Recordings, used: Sequence[int]) -> tuple[F
                 share = sum(float(error[mask].sum()) for error, mask in zip(errors, marked, strict=True)) / total
                 first = next(k for k, mask in enumerate(marked) if mask.any())
                 at = runs[first].start + recordings.dt * int(np.argmax(marked[first]))
-                where = f"{runs[first].source}, {at:.4g} s"
-                sentence = _sentence(kind, f"{name} [{unit}]" if unit else name, count, recordings.dt, where, share)
+                where, (state,) = f"{runs[first].source}, {at:.4g} s", labels_of({name: unit})
+                what = {
+                    "turn": f"{state} jumps by a whole turn in {counted(count, 'step')} (first at {where}): state "
+                    "angle = true for its field in the mapping",
+                    "frozen": f"{state} keeps exactly one value for {count * recordings.dt:.3g} s while other states "
+                    f"move (first at {where}): a frozen sensor; leave this part out",
+                    "spike": f"{state} has values far from those before and after them, around "
+                    f"{counted(count, 'step')} (first at {where}): leave them out, or mark them as missing",
+                }[kind]
+                sentence = f"{what}; {100 * share:.0f} % of the squared one-step error lies there"
                 found.append(Fault(kind, name, runs[first].source, count, share, sentence))  # type: ignore[arg-type]
     by_run = dict(zip(used, (float(error.sum()) / total for error in errors), strict=True))
     found += _files(recordings.runs, by_run)
     return tuple(sorted(found, key=lambda fault: -fault.share))
-
-
-def _sentence(kind: str, state: str, steps: int, dt: float, where: str, share: float) -> str:
-    what = {
-        "turn": f"{state} jumps by a whole turn in {counted(steps, 'step')} (first at {where}): state angle = true for "
-        "its field in the mapping",
-        "frozen": f"{state} keeps exactly one value for {steps * dt:.3g} s while other states move (first at {where}): "
-        "a frozen sensor; leave this part out",
-        "spike": f"{state} has values far from those before and after them, around {counted(steps, 'step')} (first at "
-        f"{where}): leave them out, or mark them as missing",
-    }[kind]
-    return f"{what}; {100 * share:.0f} % of the squared one-step error lies there"
 
 
 def _turns(columns: Sequence[Array]) -> list[Mask]:
