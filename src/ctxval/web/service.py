@@ -74,18 +74,18 @@ class CampaignService(PageState):
 
     async def tell(self, number: int, result: ToldResult, submission: str) -> Trial:
         """Record the result of an open trial, or replace an earlier result, once for each submitted form."""
+
+        def record() -> None:
+            try:
+                tell_result(self.served.campaign, self.served.experiment, number, result)
+            except DistanceError:
+                if self.served.campaign.trials[number].state != "unmeasured":
+                    raise
+
         async with self._telling:
             if not submission or self._submitted.get(submission) != number:
-
-                def told() -> None:
-                    try:
-                        tell_result(self.served.campaign, self.served.experiment, number, result)
-                    except DistanceError:
-                        if self.served.campaign.trials[number].state != "unmeasured":
-                            raise
-
                 try:
-                    await self._in_thread(told)
+                    await self._in_thread(record)
                 finally:
                     await self._look()
                 self._submitted[submission] = number
