@@ -16,7 +16,7 @@ import numpy as np
 
 from ctxval._util.arrays import Array
 from ctxval._util.files import MADE_BY, written_whole
-from ctxval._util.representation import number
+from ctxval._util.representation import task_text
 from ctxval.core.labels import labels_of
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import Trial
@@ -135,10 +135,7 @@ def worst_trajectories(campaign: Campaign) -> Figure:
     states, inputs = map(labels_of, validation.names(model.states.shape[-1], model.inputs.shape[-1]))
     figure = trajectories(model, system, reference=reference, states=states, inputs=inputs)
     distance = f"{_known(worst):.4g} {validation.labels.units}".rstrip()
-    items = worst.parameters.items()
-    texts = {k: f"[{', '.join(f'{x:.3g}' for x in v)}]" if isinstance(v, list) else number(v) for k, v in items}
-    task = ", ".join(f"{name} = {value}" for name, value in texts.items())
-    figure.suptitle(f"worst task executed: {task} (distance {distance})", fontsize=10)
+    figure.suptitle(f"worst task executed: {task_text(worst.parameters)} (distance {distance})", fontsize=10)
     return figure
 
 
