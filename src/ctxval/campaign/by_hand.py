@@ -124,13 +124,13 @@ def _table(path: Path, space: TaskSpace, reading: Mapping[str, Any]) -> list[Kno
         if len(given["trajectory"]) >= 255 or not file.resolve().is_relative_to(path.parent.resolve()):
             got = shortened(given["trajectory"], 60)
             raise InputError(f"{where}: trajectory must be a file in the folder of the table, got {got!r}.")
-        told = ToldResult(
+        result = ToldResult(
             file if given["trajectory"] else None,
             table.number(line, "distance", given["distance"]) if given["distance"] else None,
             given["failed"] or None,
             **reading,
         )
-        runs.append(KnownRun(where, parameters, told))
+        runs.append(KnownRun(where, parameters, result))
     if not runs:
         raise InputError(f"{path} has no run below its header.")
     return runs

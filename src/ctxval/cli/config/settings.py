@@ -101,8 +101,8 @@ class CertificateTable(BaseModel):
         # For another kind than the planned one, only those settings of the file hold that are not about one kind.
         common = {"stochastic", "resolution", "volume", "tests", "quantile"}
         planned = self.model_dump(include=None if planned_kind else common)
-        own = {**(self.model_extra or {}), **given} if planned_kind else given
-        merged = {**planned, **require_types(f"certificate {chosen.name!r}", chosen, own)}
+        further = {**(self.model_extra or {}), **given} if planned_kind else given
+        merged = {**planned, **require_types(f"certificate {chosen.name!r}", chosen, further)}
         return CertificateOptions(chosen.of(merged), confidence, merged["volume"])
 
 

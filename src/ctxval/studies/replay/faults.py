@@ -65,7 +65,7 @@ def faults(model: Model, recordings: Recordings, used: Sequence[int]) -> tuple[F
     sizes = np.maximum(np.sqrt((changes**2).mean(axis=0)), 1e-300)
     errors = [squared(stepped(model, run.states[:-1], run.inputs) - run.states[1:], sizes) for run in whole]
     total = max(float(sum(error.sum() for error in errors)), 1e-300)
-    found = []
+    results = []
     for number, (name, unit) in enumerate(recordings.states.items()):
         columns = [run.states[:, number] for run in whole]
         for kind, marked in (
@@ -88,10 +88,10 @@ def faults(model: Model, recordings: Recordings, used: Sequence[int]) -> tuple[F
                     f"{counted(count, 'step')} (first at {where}): leave them out, or mark them as missing",
                 }[kind]
                 sentence = f"{what}; {100 * share:.0f} % of the squared one-step error lies there"
-                found.append(Fault(kind, name, runs[first].source, count, share, sentence))  # type: ignore[arg-type]
+                results.append(Fault(kind, name, runs[first].source, count, share, sentence))  # type: ignore[arg-type]
     by_run = dict(zip(used, (float(error.sum()) / total for error in errors), strict=True))
-    found += _files(recordings.runs, by_run)
-    return tuple(sorted(found, key=lambda fault: -fault.share))
+    results += _files(recordings.runs, by_run)
+    return tuple(sorted(results, key=lambda fault: -fault.share))
 
 
 def _turns(columns: Sequence[Array]) -> list[Mask]:
