@@ -131,7 +131,7 @@ def test_the_glossary_explains_what_replay_and_fit_say() -> None:
     report = replay(Linear([[1, 0.05], [0, 1]], [[0], [0.05]]), recordings)
     task = PredictedTask({}, 0.5, 0.4, 0.6, 0.9)
     tasks = PredictedTasks((task,), 0.5, 0.6, (task,), 64, 0.0, 0.1, 0)
-    suggestion, gap = Suggestion("delay", 0.1, 0.5, 1.0, "later"), Break("a.csv", 0.5, 0.1, "x0", "has no value")
+    suggestion, gap = Suggestion("delay", 0.1, 0.5, "later"), Break("a.csv", 0.5, 0.1, "x0", "has no value")
     report = replace(report, tasks=tasks, suggestions=(suggestion,), data=replace(report.data, breaks=(gap,)))
     learned = fit(recordings, ["linear"])
     parameter = FittedParameter("mass", 1.0, 0.9, 1.1)

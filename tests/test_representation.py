@@ -42,7 +42,6 @@ from ctxval import (
     fitting,
     learning,
     models,
-    plot,
     refinement,
     replay,
     report,
@@ -400,9 +399,6 @@ EXAMPLES: dict[str, Callable[[], object]] = {
     "data.Table": lambda: data.Table("run.csv", ("t", "x"), lambda names: dict.fromkeys(names, np.arange(9.0))),
     "studies.fitting.Excitation": lambda: fitting.Excitation(make_validation(), "chirp", 0.5, 5.0),
     "studies.fitting.Excited": lambda: fitting.Excited(policy, np.ones((9, 1)), controllers.Limits([-1.0], [1.0])),
-    "studies.fitting.ExcitedWithMemory": lambda: fitting.ExcitedWithMemory(
-        PID.design(TASK, LINEAR), np.ones((9, 1)), controllers.Limits([-1.0], [1.0])
-    ),
     "studies.fitting.FailedFit": lambda: fitting.FailedFit("linear", "too few steps"),
     "studies.fitting.FitReport": fitted,
     "studies.fitting.FittedModel": lambda: fitted().fitted[0],
@@ -417,7 +413,7 @@ EXAMPLES: dict[str, Callable[[], object]] = {
     "studies.replay.ReplayReport": lambda: replayed(),
     "studies.replay.ResidualShare": lambda: replayed().residuals[0],
     "studies.replay.StepError": lambda: replayed().errors[0],
-    "studies.replay.Suggestion": lambda: replay.Suggestion("delay", 0.04, 0.5, 1.0, "the inputs act later"),
+    "studies.replay.Suggestion": lambda: replay.Suggestion("delay", 0.04, 0.5, "the inputs act later"),
     "testing.FaultyRig": lambda: testing.FaultyRig(systems.Simulated(LINEAR), {3: "raise"}),
 }
 
@@ -427,7 +423,6 @@ INSIDE: dict[str, Callable[[], object]] = {
     "a bound policy": lambda: controllers.Policy(policy).design(TASK, LINEAR),
     "a change of a store": lambda: Change("accepted", "same code", {"differences": ["model"], "trials": 3}),
     "hyperparameters": lambda: certificates.draw_maxima(sample(), draws=12, paths=4).conditioned[0],
-    "a curve": lambda: plot.Curve(np.linspace(0, 1, 100), np.linspace(0, 1, 100)),
     "an ONNX network": lambda: models.Onnx(network()).network,
     "the weights of LQR": lambda: controllers.LQR([1, 1], [1]).cost,
 }

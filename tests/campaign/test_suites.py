@@ -163,4 +163,4 @@ def test_pictures_of_suites_have_no_curve_between_tasks() -> None:
     assert plot.overview(campaign).get_xlabel() == "trial"
     assert "go to" in plot.worst_trajectories(campaign).get_suptitle()
     with pytest.raises(InputError, match=r"no curve of the distance between its tasks; plot\.convergence"):
-        plot.surrogate(campaign)
+        plot.surrogate_slice(campaign)

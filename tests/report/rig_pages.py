@@ -71,12 +71,12 @@ def hostile_store(path: Path) -> Store:
         named = {HOSTILE: float(point[0]), "plain": 0.5}
         note = {"prediction": {"quantiles": HOSTILE}}
         trial = Trial(number, "acquisition", "open", point, named, because=HOSTILE, note=note)
-        store.open_trial(trial, model)
+        store.add([(trial, model, None)])
         states = np.full((4, 2), 1e200 if number == 0 else float(number))
         ended = replace(trial, state="completed", executed=True, distance=value)
         store.close_trial(ended, Trajectory(np.arange(4.0), states, np.zeros((3, 1))))
     last = Trial(4, "manual", "open", np.array([0.9, 0.5]), {HOSTILE: 0.9, "plain": 0.5})
-    store.open_trial(last, model)
+    store.add([(last, model, None)])
     store.close_trial(replace(last, state="failed", executed=True, failure=HOSTILE), None)
     store.keep_settings({"experiment": HOSTILE, "search": {"name": HOSTILE}, "options": {HOSTILE: HOSTILE}, "seed": 0})
     return store

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
@@ -234,7 +234,7 @@ def test_every_finding_is_one_text_with_a_light_and_json(swing: ReportContext, f
     for context in (swing, flat):
         for found in context.diagnostics + context.insights:
             assert found.light in ("good", "note", "attention", "bad", "unknown")
-            assert found.to_json()["name"] == found.name
+            assert asdict(found)["name"] == found.name
             assert "could not be computed" not in found.text
             assert "nan" not in found.text.lower().split()
 

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from ctxval._util.arrays import Array
-from ctxval._util.texts import plain, shortened, visible
+from ctxval._util.texts import plain, quoted, shortened, visible
 
 LONGEST, LINES = 600, 5  # characters and lines of one object
 LINE, _CALL = 150, 240  # characters of one line of several, and of an object in a single line
@@ -127,6 +127,17 @@ def number(value: Any) -> str:
         return "0" if text == "-0" else text
     except (TypeError, ValueError):
         return cut(str(value), _VALUE)
+
+
+def task_text(parameters: Mapping[str, Any]) -> str:
+    """Return the parameters of a task in one line."""
+
+    def of(value: Any) -> str:
+        if isinstance(value, list):
+            return f"[{', '.join(map(of, value))}]"
+        return quoted(value) if isinstance(value, str) else number(value)
+
+    return ", ".join(f"{name} = {of(value)}" for name, value in parameters.items())
 
 
 def array(values: Array) -> Shown:

@@ -41,7 +41,15 @@ def write_files(folder: Path, experiment: Experiment, opened: OpenTrial) -> list
         folder.parent.mkdir(parents=True, exist_ok=True)
         fresh = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
         try:
-            names = _written(fresh, experiment, opened)
+            plan, promised = opened.plan, opened.plan.model_trajectory
+            states, inputs = experiment.names(promised.states.shape[-1], promised.inputs.shape[-1])
+            write_task(fresh / "task.json", experiment.validation.recorded_task(plan.task), states=states)
+            promised.to_csv(fresh / "model.csv", states=list(states), inputs=list(inputs))
+            names = ["task.json", "model.csv"]
+            if isinstance(plan.controller, AffineFeedback):
+                for name in ("controller.json", "controller.npz"):
+                    write_controller(fresh / name, plan.controller, dt=plan.task.dt, states=states, inputs=inputs)
+                names = list(TRIAL_FILES)
             fresh.chmod(0o755)
             folder.mkdir(exist_ok=True)
             for name in names:
@@ -54,19 +62,6 @@ def write_files(folder: Path, experiment: Experiment, opened: OpenTrial) -> list
             f"`ctxval ask STORE --trial {opened.number} --out FOLDER` writes them to another folder."
         ) from error
     return names
-
-
-def _written(folder: Path, experiment: Experiment, opened: OpenTrial) -> list[str]:
-    plan, promised = opened.plan, opened.plan.model_trajectory
-    states, inputs = experiment.names(promised.states.shape[-1], promised.inputs.shape[-1])
-    write_task(folder / "task.json", experiment.validation.recorded_task(plan.task), states=states)
-    promised.to_csv(folder / "model.csv", states=list(states), inputs=list(inputs))
-    if not isinstance(plan.controller, AffineFeedback):
-        return ["task.json", "model.csv"]
-    files = ["controller.json", "controller.npz"]
-    for name in files:
-        write_controller(folder / name, plan.controller, dt=plan.task.dt, states=states, inputs=inputs)
-    return ["task.json", *files, "model.csv"]
 
 
 class KnownRun(NamedTuple):
@@ -124,24 +119,21 @@ def _table(path: Path, space: TaskSpace, reading: Mapping[str, Any]) -> list[Kno
         given = {name: unguarded(row.get(name, "").strip()) for name in _RESULTS}
         if sum(bool(text) for text in given.values()) != 1:
             raise InputError(f"{where}: exactly one of {', '.join(_RESULTS)} must be filled in.")
-        told = ToldResult(
-            _beside(path, given["trajectory"], where) if given["trajectory"] else None,
+        file = path.parent / given["trajectory"]
+        # One outside of the table's folder is refused before it is opened.
+        if len(given["trajectory"]) >= 255 or not file.resolve().is_relative_to(path.parent.resolve()):
+            got = shortened(given["trajectory"], 60)
+            raise InputError(f"{where}: trajectory must be a file in the folder of the table, got {got!r}.")
+        result = ToldResult(
+            file if given["trajectory"] else None,
             table.number(line, "distance", given["distance"]) if given["distance"] else None,
             given["failed"] or None,
             **reading,
         )
-        runs.append(KnownRun(where, parameters, told))
+        runs.append(KnownRun(where, parameters, result))
     if not runs:
         raise InputError(f"{path} has no run below its header.")
     return runs
-
-
-def _beside(table: Path, name: str, where: str) -> Path:
-    """Return a file that a table names; one outside of the table's folder is refused before it is opened."""
-    folder = table.parent
-    if len(name) >= 255 or not (folder / name).resolve().is_relative_to(folder.resolve()):
-        raise InputError(f"{where}: trajectory must be a file in the folder of the table, got {shortened(name, 60)!r}.")
-    return folder / name
 
 
 _NUMBER = re.compile(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)(.*)", re.DOTALL)

@@ -550,15 +550,12 @@ class Campaign:
         """
         return display.to_dataframe(self.trials, self.validation.space)
 
-    def plot(
-        self, *, units: str = "", threshold: float | None = None, bound: float | None = None, ax: Axes | None = None
-    ) -> Axes:
+    def plot(self, *, threshold: float | None = None, bound: float | None = None, ax: Axes | None = None) -> Axes:
         """Draw the surrogate over one task parameter, or else the distances in their order; return the axes.
 
-        By default, the units are those of the validation, and the axes new ones of ``matplotlib.pyplot``. The threshold
-        and a bound on d* are drawn as lines.
+        By default, the axes are new ones of ``matplotlib.pyplot``. The threshold and a bound on d* are drawn as lines.
         """
-        return overview(self, units=units, threshold=threshold, bound=bound, ax=ax)
+        return overview(self, threshold=threshold, bound=bound, ax=ax)
 
     def _distances(self) -> tuple[Array, Array]:
         """Return the points of the unit cube with a distance ``(n, d)``, and the distances ``(n,)``."""

@@ -13,7 +13,6 @@ from ctxval._util.describe import describe, differences
 from ctxval._util.progress import advance, stage
 from ctxval._util.texts import text_of
 from ctxval.campaign.storage.store import Store
-from ctxval.core.distance import Distance
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import REDEFINED, TOLD_ALONE, Change, Trial
 from ctxval.core.validation import Validation
@@ -37,7 +36,7 @@ def search_of(store: Store) -> Search:
         return by_name(DEFAULT)
     search = _ready_made(described)
     # A user's search may have the same name, and options that are not numbers cannot be restored.
-    if search is None or _plain(search) != described:
+    if search is None or described_plainly(search) != described:
         kind = described.get("type", "unknown") if isinstance(described, dict) else described
         raise StoreMismatchError(
             f"{store.name} was made with the search {kind!r}, which cannot be made from its description in the store: "
@@ -58,31 +57,25 @@ def _ready_made(described: Any) -> Search | None:
             return None if repeated is None else Repeated(repeated, described.get("times", 0))
         if kind is None:
             return None
-        default = _plain(kind())
+        default = described_plainly(kind())
         options = {name: value for name, value in described.items() if value != default.get(name)}
-        if not all(_is_numeric(value) or isinstance(default.get(name), str) for name, value in options.items()):
-            return None
+        for name, value in options.items():
+            items = value if isinstance(value, list) else [value]
+            if not (isinstance(default.get(name), str) or all(isinstance(item, int | float | None) for item in items)):
+                return None
         search: Search = kind(**{name: tuple(v) if isinstance(v, list) else v for name, v in options.items()})
     except (TypeError, InputError):
         return None
     return search
 
 
-def _is_numeric(value: Any) -> bool:
-    return all(isinstance(item, int | float | None) for item in (value if isinstance(value, list) else [value]))
-
-
-def _plain(value: Any) -> Any:
+def described_plainly(value: Any) -> Any:
     """Return the description of an object in the form that a store returns."""
     return json.loads(json.dumps(describe(value)))
 
 
-def with_distance(description: dict[str, Any], distance: Distance) -> dict[str, Any]:
-    """Return a description with another distance and all other parts unchanged."""
-    return _of_distance(description, _plain(distance))
-
-
-def _of_distance(description: dict[str, Any], distance: Any) -> dict[str, Any]:
+def with_distance(description: dict[str, Any], distance: Any) -> dict[str, Any]:
+    """Return a description with the description of another distance."""
     return {**description, "validation": {**description["validation"], "distance": distance}}
 
 
@@ -105,7 +98,8 @@ def identify(
         raise _mismatch(store, asked[0], "use another store")
     loop = _changed_loop(store, validation, trials)
     if loop is not None:
-        raise _mismatch(store, next((sentence for _, sentence in differing), loop), _LOOP_CHANGED)
+        advice = "the model, the task or the controller design has changed since the executions: use another store"
+        raise _mismatch(store, next((sentence for _, sentence in differing), loop), advice)
     others = [sentence for path, sentence in differing if not path.startswith("validation.distance")]
     if others and accept is None:
         raise _mismatch(store, others[0], _OTHER_CHANGED)
@@ -121,11 +115,10 @@ def identify(
     if others or accept is not None:
         change = Change("accepted", str(accept), {"differences": others, "trials": len(trials)})
         if remeasuring:  # the stored values are still those of the earlier distance
-            description = _of_distance(description, stored["validation"]["distance"])
+            description = with_distance(description, stored["validation"]["distance"])
         store.describe_anew(description, change)
 
 
-_LOOP_CHANGED = "the model, the task or the controller design has changed since the executions: use another store"
 _OTHER_CHANGED = (
     "the closed loops on the model have not changed. If the difference does not matter, or if it is a repair of the "
     'system, give the reason: --accept-change "REASON" (accept_change= in Python); otherwise use another store'
@@ -151,29 +144,25 @@ def _samples(trials: Sequence[Trial]) -> list[Trial]:
 def _changed_loop(store: Store, validation: Validation, trials: Sequence[Trial]) -> str | None:
     """Return a sentence about a stored closed loop on the model that has changed; None if none has."""
     for trial in _samples(trials):
-        stored = store.trajectory(trial.number, "model")
+        stored, point = store.trajectory(trial.number, "model"), validation.space.point
         if stored is None:
             continue
         what = f"the closed loop on the model for the task of trial {trial.number}"
         try:
-            now = _loop(validation, trial)
+            now = validation.plan(point(trial.parameters)).model_trajectory
             gap = _gap(stored, now)
             # Results that differ from one call to the next, such as those of a random planner, cannot be compared.
-            if gap > 1e-4 and _gap(now, _loop(validation, trial)) <= 1e-4:
+            if gap > 1e-4 and _gap(now, validation.plan(point(trial.parameters)).model_trajectory) <= 1e-4:
                 if np.isinf(gap):
-                    return f"{what} had {_size(stored)} and has now {_size(now)}"
+                    before, after = (
+                        f"{loop.horizon} steps of {loop.states.shape[-1]} states and {loop.inputs.shape[-1]} inputs"
+                        for loop in (stored, now)
+                    )
+                    return f"{what} had {before} and has now {after}"
                 return f"{what} differs from the stored one by {100 * min(gap, 1e6):.2g} % of its range"
         except CtxvalError as error:
             return f"{what} cannot be computed any more ({error})"
     return None
-
-
-def _size(loop: Trajectory) -> str:
-    return f"{loop.horizon} steps of {loop.states.shape[-1]} states and {loop.inputs.shape[-1]} inputs"
-
-
-def _loop(validation: Validation, trial: Trial) -> Trajectory:
-    return validation.plan(validation.space.point(trial.parameters)).model_trajectory
 
 
 def _gap(before: Trajectory, after: Trajectory) -> float:
@@ -206,7 +195,7 @@ def _changed_distance(store: Store, validation: Validation, trials: Sequence[Tri
     return None
 
 
-def _equal(before: float, after: float) -> bool:
+def _equal(before: Any, after: Any) -> bool:
     return bool(np.isclose(after, before, rtol=1e-6, atol=1e-12))
 
 
@@ -216,34 +205,25 @@ def _equal(before: float, after: float) -> bool:
 def remeasure(store: Store, validation: Validation, description: dict[str, Any]) -> list[Trial]:
     """Recompute the distance of every stored execution; return the trials that changed."""
     with store.sole_writer():
-        # Another process may record a result meanwhile; the distances are then computed again.
-        while (changed := _remeasured(store, validation, description)) is None:
-            pass
-    return changed
-
-
-def _remeasured(store: Store, validation: Validation, description: dict[str, Any]) -> list[Trial] | None:
-    """Store the recomputed distances; return the trials that changed, or None if the store has changed meanwhile."""
-    with store.snapshot():
-        seen, before, stored = store.signature(), store.trials(), store.description()
-    redefined = any(path.startswith("validation.distance") for path, _ in differences(stored, description))
-    with stage("measuring again", len(before), "trials"):
-        after = [_measured_again(store, validation, trial) for trial in before]
-    pairs = [(old.distance, new.distance) for old, new in zip(before, after, strict=True)]
-    known = [(old, new) for old, new in pairs if old is not None and new is not None]
-    redefined |= any(not _equal(old, new) for old, new in known)
-    if redefined:
-        # A distance without trajectories was told in another definition.
-        alone = [t.distance is not None and store.trajectory(t.number, "system") is None for t in after]
-        unknown: dict[str, Any] = {"state": "unmeasured", "distance": None, "failure": TOLD_ALONE}
-        after = [replace(t, **unknown) if told else t for t, told in zip(after, alone, strict=True)]
-    changed = [(old, new) for old, new in zip(before, after, strict=True) if _measured(old) != _measured(new)]
-    trials = [new for _, new in changed]
-    if not changed and not redefined:
-        return trials
-    outcomes = {str(old.number): _measured(old) for old, _ in changed}
-    change = Change("remeasured", REDEFINED if redefined else "asked for", {"before": outcomes})
-    return trials if store.remeasure(trials, description, change, seen) else None
+        while True:
+            with store.snapshot():
+                seen, before, stored = store.signature(), store.trials(), store.description()
+            redefined = any(path.startswith("validation.distance") for path, _ in differences(stored, description))
+            with stage("measuring again", len(before), "trials"):
+                after = [_measured_again(store, validation, trial) for trial in before]
+            known = [(old.distance, new.distance) for old, new in zip(before, after, strict=True)]
+            redefined |= any(not _equal(*pair) for pair in known if None not in pair)
+            if redefined:
+                # A distance without trajectories was told in another definition.
+                alone = [t.distance is not None and store.trajectory(t.number, "system") is None for t in after]
+                unknown: dict[str, Any] = {"state": "unmeasured", "distance": None, "failure": TOLD_ALONE}
+                after = [replace(t, **unknown) if told else t for t, told in zip(after, alone, strict=True)]
+            changed = [(old, new) for old, new in zip(before, after, strict=True) if _measured(old) != _measured(new)]
+            trials, outcomes = [new for _, new in changed], {str(old.number): _measured(old) for old, _ in changed}
+            change = Change("remeasured", REDEFINED if redefined else "asked for", {"before": outcomes})
+            # Another process may have recorded a result meanwhile; the distances are then computed again.
+            if not (changed or redefined) or store.remeasure(trials, description, change, seen):
+                return trials
 
 
 def _measured(trial: Trial) -> dict[str, Any]:

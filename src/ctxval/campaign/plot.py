@@ -2,14 +2,13 @@
 
 A function that draws one plot has the argument ``ax`` and returns the matplotlib axes. By default, these are new axes
 of ``matplotlib.pyplot``, so that notebooks and ``pyplot.show()`` show them. A function that draws several panels
-returns a figure. Names and units are those of the validation, unless the arguments state others. A campaign must have
-at least one distance, and two for a surrogate.
+returns a figure. Names and units are those of the validation. A campaign must have at least one distance, and two for
+a surrogate.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,13 +16,11 @@ import numpy as np
 
 from ctxval._util.arrays import Array
 from ctxval._util.files import MADE_BY, written_whole
-from ctxval._util.representation import ShortRepr, number
+from ctxval._util.representation import task_text
 from ctxval.core.labels import labels_of
-from ctxval.core.space import TaskSpace
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import Trial
 from ctxval.errors import InputError
-from ctxval.gp.surrogate import Surrogate
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -38,30 +35,18 @@ Limit = float | None
 """A threshold tau, or a bound on d*, which is drawn as a line; None if there is none."""
 
 
-@dataclass(frozen=True, eq=False)
-class Curve(ShortRepr):
-    """A known distance over a one-dimensional task space: points ``(N,)`` in its units and values ``(N,)``."""
-
-    points: Array
-    values: Array
-
-
-def overview(
-    campaign: Campaign, *, units: str = "", threshold: Limit = None, bound: Limit = None, ax: Axes | None = None
-) -> Axes:
+def overview(campaign: Campaign, *, threshold: Limit = None, bound: Limit = None, ax: Axes | None = None) -> Axes:
     """Draw the most informative single plot of a campaign.
 
     It is the surrogate if there is one task parameter and two distances are known, and :func:`convergence` otherwise.
     """
     space = campaign.validation.space
     if space.dimension == 1 and space.members is None and len(campaign.completed) >= 2:
-        return surrogate_slice(campaign, units=units, threshold=threshold, bound=bound, ax=ax)
-    return convergence(campaign, units=units, threshold=threshold, bound=bound, ax=ax)
+        return surrogate_slice(campaign, threshold=threshold, bound=bound, ax=ax)
+    return convergence(campaign, threshold=threshold, bound=bound, ax=ax)
 
 
-def convergence(
-    campaign: Campaign, *, units: str = "", threshold: Limit = None, bound: Limit = None, ax: Axes | None = None
-) -> Axes:
+def convergence(campaign: Campaign, *, threshold: Limit = None, bound: Limit = None, ax: Axes | None = None) -> Axes:
     """Draw the distance of each trial and the largest distance so far, and mark the trials without a distance."""
     from matplotlib.ticker import MaxNLocator
 
@@ -79,98 +64,49 @@ def convergence(
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes.set_xlim(-0.3, max(last, 1) + 0.3)
     axes.set_xlabel("trial")
-    return _finished(axes, campaign, units, threshold, bound)
+    return _finished(axes, campaign, threshold, bound)
 
 
 def surrogate_slice(
-    campaign: Campaign,
-    axis: int = 0,
-    *,
-    truth: Curve | None = None,
-    units: str = "",
-    threshold: Limit = None,
-    bound: Limit = None,
-    ax: Axes | None = None,
+    campaign: Campaign, axis: int = 0, *, threshold: Limit = None, bound: Limit = None, ax: Axes | None = None
 ) -> Axes:
     """Draw the Gaussian process along one task parameter, through the worst executed task, with its 95 % band.
 
     Args:
         axis: index of the scalar task parameter, from 0.
-        truth: the true distance, which is drawn if the task space has one dimension.
     """
-    space = _box(campaign)
-    if not 0 <= axis < space.dimension:
-        raise InputError(f"axis must be from 0 to {space.dimension - 1}, one of {', '.join(space.names)}, got {axis}.")
-    axes = _axes(ax)
-    _draw_slice(axes, campaign, campaign.surrogate(), axis, truth)
-    return _finished(axes, campaign, units, threshold, bound)
-
-
-def surrogate(
-    campaign: Campaign, *, truth: Curve | None = None, units: str = "", threshold: Limit = None, bound: Limit = None
-) -> Figure:
-    """Draw the Gaussian process over the task space with its 95 % band, the samples and the maximum.
-
-    For one task parameter, the figure shows the complete function and the true distance, if that is given. For several,
-    it shows a slice along each axis through the worst task. This is the converged Gaussian process in the paper's
-    figures.
-    """
-    space, fitted = _box(campaign), campaign.surrogate()
-    columns = min(space.dimension, 4)
-    rows = int(np.ceil(space.dimension / columns))
-    figure = _figure(max(6.4, 3.2 * columns), max(4.0, 2.6 * rows))
-    for axis in range(space.dimension):
-        axes = figure.add_subplot(rows, columns, axis + 1)
-        _draw_slice(axes, campaign, fitted, axis, truth)
-        _draw_limits(axes, threshold, bound)
-        if axis % columns == 0:
-            axes.set_ylabel(_distance_label(campaign, units))
-    figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=3, fontsize=8)
-    return figure
-
-
-def _box(campaign: Campaign) -> TaskSpace:
-    """Return the task space; refuse a suite, which has no tasks between its own."""
     space = campaign.validation.space
     if space.members is not None:
         raise InputError("a suite has no curve of the distance between its tasks; plot.convergence shows them.")
-    return space
-
-
-def _finished(axes: Axes, campaign: Campaign, units: str, threshold: Limit, bound: Limit) -> Axes:
-    _draw_limits(axes, threshold, bound)
-    axes.set_ylabel(_distance_label(campaign, units))
-    axes.legend(loc="best", fontsize=8, framealpha=0.9)
-    return axes
-
-
-def _draw_slice(axes: Axes, campaign: Campaign, fitted: Surrogate, axis: int, truth: Curve | None) -> None:
-    worst, space = _worst(campaign), campaign.validation.space
+    if not 0 <= axis < space.dimension:
+        raise InputError(f"axis must be from 0 to {space.dimension - 1}, one of {', '.join(space.names)}, got {axis}.")
+    axes, worst = _axes(ax), _worst(campaign)
     unit = np.tile(worst.unit_point, (401, 1))
     unit[:, axis] = np.linspace(0, 1, len(unit))
     x = space.from_unit(unit)[:, axis]
-    mean, deviation = fitted.predict(unit)
+    mean, deviation = campaign.surrogate().predict(unit)
     # A distance is never below 0, but the Gaussian process does not know it.
     low, high = (np.maximum(mean + sign * 1.96 * deviation, 0.0) for sign in (-1, 1))
     axes.fill_between(x, low, high, color=_GREY, alpha=0.6, linewidth=0, label="95 % band of the GP")
     axes.plot(x, np.maximum(mean, 0.0), color=_BLUE, linewidth=1.8, label="GP mean")
     if space.dimension == 1:
         _draw_samples(axes, campaign, lambda trial: space.from_unit(trial.unit_point)[axis])
-    at = space.from_unit(worst.unit_point)[axis]
-    axes.plot(
-        [at], [_known(worst)], "*", color=_ORANGE, markeredgecolor=_BLACK, markersize=14, label="worst task executed"
-    )
-    if truth is not None and space.dimension == 1:
-        axes.plot(truth.points, truth.values, color=_ORANGE, linestyle="--", linewidth=1.6, label="true distance")
+    at, label = space.from_unit(worst.unit_point)[axis], "worst task executed"
+    axes.plot([at], [_known(worst)], "*", color=_ORANGE, markeredgecolor=_BLACK, markersize=14, label=label)
     axes.set_xlabel(space.labels[axis])
+    return _finished(axes, campaign, threshold, bound)
 
 
-def _draw_limits(axes: Axes, threshold: Limit, bound: Limit) -> None:
-    """Draw the threshold and the bound as horizontal lines, which differ in style and not only in colour."""
+def _finished(axes: Axes, campaign: Campaign, threshold: Limit, bound: Limit) -> Axes:
+    """Label the axis of the distance, and draw the threshold and the bound as lines, which also differ in style."""
+    units = campaign.validation.labels.units
+    axes.set_ylabel(f"distance [{units}]" if units else "distance")
     if threshold is not None:
         axes.axhline(threshold, color=_ORANGE, linestyle="-.", linewidth=1.4, label=f"threshold {threshold:.4g}")
     if bound is not None:
         axes.axhline(bound, color=_BLACK, linestyle=":", linewidth=1.6, label="bound on d*")
+    axes.legend(loc="best", fontsize=8, framealpha=0.9)
+    return axes
 
 
 def _draw_samples(axes: Axes, campaign: Campaign, place: Callable[[Trial], float]) -> None:
@@ -187,8 +123,8 @@ def _draw_samples(axes: Axes, campaign: Campaign, place: Callable[[Trial], float
             axes.plot(x, y, "o", markersize=5, markerfacecolor=face, markeredgecolor=_BLACK, label=label)
 
 
-def worst_trajectories(campaign: Campaign, *, states: Sequence[str] = (), inputs: Sequence[str] = ()) -> Figure:
-    """Draw the trajectories of M and of S for the worst executed task, with these axis labels."""
+def worst_trajectories(campaign: Campaign) -> Figure:
+    """Draw the trajectories of M and of S for the worst executed task."""
     worst = _worst(campaign)
     model, system = campaign.trajectories(worst)
     if model is None or system is None:
@@ -196,14 +132,10 @@ def worst_trajectories(campaign: Campaign, *, states: Sequence[str] = (), inputs
     validation = campaign.validation
     space = validation.space
     reference = validation.task(space.parameters(space.from_unit(worst.unit_point))).reference
-    names = map(labels_of, validation.names(model.states.shape[-1], model.inputs.shape[-1]))
-    states, inputs = (given or known for given, known in zip((states, inputs), names, strict=True))
+    states, inputs = map(labels_of, validation.names(model.states.shape[-1], model.inputs.shape[-1]))
     figure = trajectories(model, system, reference=reference, states=states, inputs=inputs)
     distance = f"{_known(worst):.4g} {validation.labels.units}".rstrip()
-    items = worst.parameters.items()
-    texts = {k: f"[{', '.join(f'{x:.3g}' for x in v)}]" if isinstance(v, list) else number(v) for k, v in items}
-    task = ", ".join(f"{name} = {value}" for name, value in texts.items())
-    figure.suptitle(f"worst task executed: {task} (distance {distance})", fontsize=10)
+    figure.suptitle(f"worst task executed: {task_text(worst.parameters)} (distance {distance})", fontsize=10)
     return figure
 
 
@@ -219,53 +151,25 @@ def trajectories(
 
     The reference of the states, ``(H + 1, n)``, is drawn for a state if it is not zero everywhere.
     """
-    n, m = model.states.shape[-1], model.inputs.shape[-1]
-    names = [
-        *(states[i] if i < len(states) else f"state {i}" for i in range(n)),
-        *(inputs[i] if i < len(inputs) else f"input {i}" for i in range(m)),
-    ]
-    figure = _figure(6.4, 1.0 + 1.7 * len(names))
+    from matplotlib.figure import Figure  # imported here: loading it takes longer than a short campaign
+
+    states = states or [f"state {i}" for i in range(model.states.shape[-1])]
+    inputs = inputs or [f"input {i}" for i in range(model.inputs.shape[-1])]
+    names = [*states, *inputs]
+    figure = Figure(figsize=(6.4, 1.0 + 1.7 * len(names)), layout="constrained")
+    styles = (system, _ORANGE, "-", 1.8, "system S"), (model, _BLUE, "--", 1.6, "model M")
     for row, name in enumerate(names):
         axes = figure.add_subplot(len(names), 1, row + 1, sharex=figure.axes[0] if row else None)
-        signal(model, system, row, label=name, reference=reference, ax=axes)
-        axes.set_xlabel("")
+        if reference is not None and row < len(states) and reference[:, row].any():
+            axes.plot(model.times, reference[:, row], color=_BLACK, linestyle=":", linewidth=1.2, label="reference")
+        for run, color, style, width, label in styles:
+            values = run.states[:, row] if row < len(states) else run.inputs[:, row - len(states)]
+            axes.plot(run.times[: len(values)], values, style, color=color, linewidth=width, label=label)
+        axes.set_ylabel(name)
+        axes.grid(alpha=0.25)
     figure.axes[-1].set_xlabel("time [s]")
     figure.axes[0].legend(loc="best", fontsize=8, framealpha=0.9)
     return figure
-
-
-def signal(
-    model: Trajectory,
-    system: Trajectory,
-    component: int,
-    *,
-    label: str = "",
-    reference: Array | None = None,
-    ax: Axes | None = None,
-) -> Axes:
-    """Draw one state or input of two trajectories of one task over time.
-
-    Args:
-        component: index of the state from 0; the inputs follow the n states.
-        label: label of the vertical axis, with the unit.
-        reference: the reference of the states, ``(H + 1, n)``; it is drawn for a state if it is not zero everywhere.
-    """
-    n, m = model.states.shape[-1], model.inputs.shape[-1]
-    if not 0 <= component < n + m:
-        raise InputError(f"component must be from 0 to {n + m - 1}, the {n} states and {m} inputs, got {component}.")
-    axes = _axes(ax)
-    if reference is not None and component < n and reference[:, component].any():
-        axes.plot(model.times, reference[:, component], color=_BLACK, linestyle=":", linewidth=1.2, label="reference")
-    for run, color, style, width, name in (
-        (system, _ORANGE, "-", 1.8, "system S"),
-        (model, _BLUE, "--", 1.6, "model M"),
-    ):
-        values = run.states[:, component] if component < n else run.inputs[:, component - n]
-        axes.plot(run.times[: len(values)], values, style, color=color, linewidth=width, label=name)
-    axes.set_xlabel("time [s]")
-    axes.set_ylabel(label)
-    axes.grid(alpha=0.25)
-    return axes
 
 
 def save(figure: Figure, path: str | Path) -> Path:
@@ -279,12 +183,6 @@ def save(figure: Figure, path: str | Path) -> Path:
     return Path(path)
 
 
-def _figure(width: float, height: float) -> Figure:
-    from matplotlib.figure import Figure  # imported here: loading it takes longer than a short campaign
-
-    return Figure(figsize=(width, height), layout="constrained")
-
-
 def _axes(ax: Axes | None) -> Axes:
     """Return the given axes, or new ones of pyplot."""
     if ax is not None:
@@ -292,11 +190,6 @@ def _axes(ax: Axes | None) -> Axes:
     from matplotlib import pyplot
 
     return pyplot.subplots(layout="constrained")[1]
-
-
-def _distance_label(campaign: Campaign, units: str) -> str:
-    known = units or campaign.validation.labels.units
-    return f"distance [{known}]" if known else "distance"
 
 
 def _worst(campaign: Campaign) -> Trial:

@@ -8,7 +8,6 @@ import re
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -16,9 +15,7 @@ from ctxval._util.arrays import Array
 from ctxval._util.columns import sentinels
 from ctxval._util.confinement import MOST_MEMORY
 from ctxval._util.files import temporary_folder
-from ctxval.core.experiment import Experiment
 from ctxval.core.labels import labels_of
-from ctxval.core.plan import Plan
 from ctxval.core.trajectory import COMPLETE, Trajectory
 from ctxval.data import LogMapping, is_log, read_recordings
 from ctxval.errors import ExecutionError, InputError
@@ -53,16 +50,16 @@ class RecordingFile:
     mapping: LogMapping | None = None
     uploaded: bool = False
 
-    @property
-    def foreign(self) -> bool:
-        """Whether libraries in C read the file, or a stranger may have made it."""
-        return self.uploaded or is_log(self.path)
-
     def read(self) -> Trajectory:
         """Return the recording."""
         path = self.path
         if is_log(path) or (self.mapping is not None and self.npz is not True and path.is_file()):
-            logged = self._logged()
+            dt = float(self.times[1] - self.times[0])
+            recordings = read_recordings([path], self.mapping, states=self.states, inputs=self.inputs, dt=dt)
+            if len(recordings.runs) > 1 or recordings.breaks:
+                why = f"; it was split: {recordings.breaks[0]}" if recordings.breaks else ""
+                raise InputError(f"{path} must be one recording without gaps, and has {len(recordings.runs)}{why}.")
+            logged = recordings.runs[0].trajectory
             return logged.resampled(self.times) if self.resample else logged
         require_file(path)
         if path.suffix == ".npz" if self.npz is None else self.npz:
@@ -75,15 +72,6 @@ class RecordingFile:
             raise InputError(f"{path} must be one recording, got a batch of shape {recording.states.shape}.")
         self._require_finite(recording)
         return recording.resampled(self.times) if self.resample else recording
-
-    def _logged(self) -> Trajectory:
-        """Return the only recording in a log, at the time step of the task."""
-        dt = float(self.times[1] - self.times[0])
-        recordings = read_recordings([self.path], self.mapping, states=self.states, inputs=self.inputs, dt=dt)
-        if len(recordings.runs) > 1 or recordings.breaks:
-            why = f"; it was split: {recordings.breaks[0]}" if recordings.breaks else ""
-            raise InputError(f"{self.path} must be one recording without gaps, and has {len(recordings.runs)}{why}.")
-        return recordings.runs[0].trajectory
 
     def _require_finite(self, recording: Trajectory) -> None:
         """Refuse a complete recording with a number that is missing, infinite or a mark; the message says where."""
@@ -122,16 +110,14 @@ class RecordingFile:
         if status != REFUSED:
             raise InputError(f"{self.path} cannot be read within {seconds} s and {MOST_MEMORY} bytes of memory.")
         sentence = content.decode(errors="replace")
-        raise InputError(self._withheld(sentence) if self.uploaded else sentence)
-
-    def _withheld(self, sentence: str) -> str:
-        """Return where an uploaded file is wrong and what would be right, without anything that is in the file."""
-        place = re.search(r", line \d{1,9}", sentence)
-        needed = ", ".join(labels_of({"t": "s", **self.states, **self.inputs}))
-        return (
-            f"{self.path}{'' if place is None else place[0]}: it is not a recording of this trial. The columns or "
-            f"fields {needed} are needed, with a finite number for each time from 0 to {self.times[-1]:g} s."
-        )
+        if self.uploaded:  # the place of the mistake, and what would be right, without anything that is in the file
+            place = re.search(r", line \d{1,9}", sentence)
+            needed = ", ".join(labels_of({"t": "s", **self.states, **self.inputs}))
+            sentence = (
+                f"{self.path}{'' if place is None else place[0]}: it is not a recording of this trial. The columns or "
+                f"fields {needed} are needed, with a finite number for each time from 0 to {self.times[-1]:g} s."
+            )
+        raise InputError(sentence)
 
 
 def require_file(path: Path) -> None:
@@ -142,10 +128,3 @@ def require_file(path: Path) -> None:
         raise InputError(f"{path} cannot be read: {error.strerror}.") from error
     if not is_file:
         raise InputError(f"{path} cannot be read: it is a folder." if is_folder else f"there is no file {path}.")
-
-
-def read_recording(path: Path, experiment: Experiment, plan: Plan, **options: Any) -> Trajectory:
-    """Read a recorded trajectory; a log in a format of another program is read in a confined process."""
-    names = experiment.names(plan.model_trajectory.states.shape[-1], plan.model_trajectory.inputs.shape[-1])
-    file = RecordingFile(path, *names, plan.task.times, **options)
-    return file.read_confined() if file.foreign else file.read()

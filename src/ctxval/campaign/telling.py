@@ -9,13 +9,13 @@ from typing import Any
 
 from ctxval.campaign.campaign import Campaign
 from ctxval.campaign.choices import OpenTrial
-from ctxval.campaign.recording_file import read_recording
+from ctxval.campaign.recording_file import RecordingFile
 from ctxval.core.experiment import Experiment
 from ctxval.core.plan import Plan
 from ctxval.core.preflight import StartOffset
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import Trial
-from ctxval.data import LogMapping
+from ctxval.data import LogMapping, is_log
 from ctxval.errors import InputError
 
 
@@ -49,8 +49,11 @@ class ToldResult:
         """Return the recording; None if there is none."""
         if self.recording is None:
             return None
-        how = {"npz": self.npz, "resample": self.resample, "mapping": self.mapping, "uploaded": self.uploaded}
-        return read_recording(self.recording, experiment, plan, **how)
+        names = experiment.names(plan.model_trajectory.states.shape[-1], plan.model_trajectory.inputs.shape[-1])
+        times, npz, resample = plan.task.times, self.npz, self.resample
+        file = RecordingFile(self.recording, *names, times, npz, resample, self.mapping, self.uploaded)
+        # Where libraries in C read the file, or a stranger may have made it.
+        return file.read_confined() if self.uploaded or is_log(self.recording) else file.read()
 
 
 def tell_result(campaign: Campaign, experiment: Experiment, trial: OpenTrial | int, told: ToldResult) -> Trial:

@@ -17,7 +17,7 @@ from ctxval.campaign.choices import Choice, Execution, OpenTrial
 from ctxval.campaign.dynamics import CampaignDynamics
 from ctxval.campaign.goals_of_model import GoalsOfModel
 from ctxval.campaign.history import history_of
-from ctxval.campaign.identity import identify, remeasure, with_distance
+from ctxval.campaign.identity import described_plainly, identify, remeasure, with_distance
 from ctxval.campaign.proposals import IndependentDraws, Proposals, remaining_tasks
 from ctxval.campaign.storage.disks import error_with_fallback
 from ctxval.campaign.storage.store import Store
@@ -152,7 +152,7 @@ class TrialRecorder:
         validation, description = self.validation, self.description
         if distance is not None:
             validation = validation.with_distance(distance)
-            description = with_distance(description, validation.distance)
+            description = with_distance(description, described_plainly(validation.distance))
         changed = remeasure(self.store, validation, description)
         self._redefine(validation, description)
         return changed

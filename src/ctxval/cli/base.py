@@ -38,9 +38,6 @@ FALSIFIED, BAD_INPUT, CANNOT_GO_ON, INTERRUPTED, CUT_OFF = 1, 2, 3, 130, 141
 RUN = "run"
 """Key under which a store keeps the verdict of its last run and the report that was written."""
 
-LEADING_KINDS = ("auto", "posterior", "audit")
-"""The kinds of certificates that most people need."""
-
 ERROR = ("error: ", "bold red")
 
 out, notes, err = Screen(), Screen(stderr=True), Screen(stderr=True)
@@ -93,12 +90,11 @@ def command(name: str | None = None, /, *, with_json: bool = True, **words: Any)
 def _described(parameter: inspect.Parameter, command: str, words: Mapping[str, Any]) -> inspect.Parameter:
     """Return a parameter of a command as typer takes it, with its text; words replace those in braces."""
     text = {**TEXTS["options"], **TEXTS.get(command, {})}[parameter.name]
-    words = {
-        **words,
-        "target": "CASE|FILE.toml|module:attr",
-        "searches": ", ".join(sorted(SEARCHES.built_in)),
-        "certificates": ", ".join(kind for kind in KINDS.built_in if kind not in LEADING_KINDS),
-    }
+    # The text itself names the kinds that most people need.
+    kinds = (kind for kind in KINDS.built_in if kind not in ("auto", "posterior", "audit"))
+    searches = ", ".join(sorted(SEARCHES.built_in))
+    target = "CASE|FILE.toml|module:attr"
+    words = {**words, "target": target, "searches": searches, "certificates": ", ".join(kinds)}
     known: dict[str, Any] = {
         key: value.format(**words) if isinstance(value, str) else value
         for key, value in ({"help": text} if isinstance(text, str) else text).items()

@@ -47,7 +47,6 @@ class Asked:
 
 @command("certify")
 def certify_store(store: Path, asked: Asked, allowed: Allowed, audit: int | None = None) -> Any:
-    """``ctxval certify``."""
     opened, kind = Store.existing(store), asked.kind
     if kind is None:
         kind = "audit" if audit is not None else planned_settings(opened).certificate.kind
@@ -104,7 +103,6 @@ def write_report(
     markdown: Path | None = None,
     force: bool = False,
 ) -> Any:
-    """``ctxval report``."""
     opened = Store.existing(store)
     target = page_path(store) if page is None else page
     outputs = {"--out .html": target, "--junit .xml": junit, "--markdown .md": markdown}

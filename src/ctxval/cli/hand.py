@@ -49,7 +49,6 @@ def ask(
     force: bool = False,
     option: list[str] | None = None,
 ) -> Any:
-    """``ctxval ask``."""
     stated = sum((bool(parameters), draw, again is not None, trial is not None, explore))
     if stated > 1:
         raise InputError("--set, --draw, --again, --trial and --explore cannot be combined.")
@@ -133,7 +132,6 @@ def tell(
     start_tolerance: float | None = None,
     replace: str | None = None,
 ) -> Any:
-    """``ctxval tell``."""
     stated = {"--trajectory": trajectory, "--npz": npz, "--distance": distance, "--failed": failed}
     if sum(value is not None for value in stated.values()) != 1:
         raise InputError(f"exactly one of {', '.join(stated)} must be given.")
@@ -159,7 +157,6 @@ def import_runs(
     resample: bool = False,
     start_tolerance: float | None = None,
 ) -> Any:
-    """``ctxval import``."""
     require("start tolerance", NonNegativeFloat | None, start_tolerance)
     opened = open_store(store, allowed)
     campaign, experiment, mapping = opened.campaign, opened.experiment, opened.settings.log_mapping
@@ -210,7 +207,6 @@ def serve(
     threshold: float | None = None,
     budget: int | None = None,
 ) -> Any:
-    """``ctxval serve``."""
     web = web_server()
     settings = trusted_settings(Store.existing(store), experiment=allowed.experiment, trust=allowed.trust)
 

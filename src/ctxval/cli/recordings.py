@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, get_args
 
+from ctxval._util.representation import task_text
 from ctxval._util.texts import shortened
 from ctxval.cli.base import CANNOT_GO_ON, FALSIFIED, command, err, notes, out, print_columns
-from ctxval.cli.config.check import task_text
 from ctxval.cli.config.parts import part
 from ctxval.cli.config.references import reference, require_function
 from ctxval.cli.config.settings import Settings, read_settings
@@ -64,7 +64,11 @@ class Logs:
     ) -> Recordings:
         """Return the recordings in files and folders, with the names and units of the experiment if they fit."""
         mapping = self.stated() or (None if settings is None else settings.log_mapping)
-        states, inputs = ({}, {}) if experiment is None else _names(experiment)
+        states, inputs = dict[str, str](), dict[str, str]()
+        if experiment is not None:
+            system = experiment.validation.system
+            known = {kind: getattr(experiment, kind) or names_of(system, kind) for kind in ("states", "inputs")}
+            states, inputs = experiment.names(*map(len, known.values())) if known["states"] else ({}, {})
         recordings = read_recordings(logs, mapping, states=states, inputs=inputs, **self.changes)
         same = (len(states), len(inputs)) == (len(recordings.states), len(recordings.inputs))
         if not same or states.keys() & inputs.keys():
@@ -115,7 +119,6 @@ def replay(
     html: Path | None = None,
     force: bool = False,
 ) -> Any:
-    """``ctxval replay``."""
     require_outputs({"--html .html": html}, [*logs, model, experiment, reading.mapping], force=force)
     settings = None if experiment is None else read_settings(experiment, {})
     loaded = None if settings is None else settings.load()
@@ -207,7 +210,6 @@ def fit_models(
     force: bool = False,
     seed: int = 0,
 ) -> Any:
-    """``ctxval fit``."""
     kinds: Any = kind.split(",") if kind else (["parameters"] if function.step is not None else list(KINDS[:3]))
     if (function.step is None) != (not function.parameter):
         raise InputError("--step and --parameter must be given together.")
@@ -295,7 +297,6 @@ def collect(
     seed: int = 0,
     option: list[str] | None = None,
 ) -> Any:
-    """``ctxval collect``."""
     settings = read_settings(target, {"options": named_values(option), "seed": seed})
     experiment = settings.load()
     size = parsed(amplitude)
@@ -324,13 +325,6 @@ def collect(
     out.say(f"{len(recorded)} executions recorded in {out_}, {known} were there before, {len(failed)} failed.")
     report = {"recorded": recorded, "known": known, "failed": failed, "folder": str(out_)}
     return (report, CANNOT_GO_ON) if failed and not recorded and not known else report
-
-
-def _names(experiment: Experiment) -> tuple[dict[str, str], dict[str, str]]:
-    """Return the names and units of the states and inputs of an experiment, as far as they are known."""
-    system = experiment.validation.system
-    states, inputs = experiment.states or names_of(system, "states"), experiment.inputs or names_of(system, "inputs")
-    return experiment.names(len(states), len(inputs)) if states else ({}, {})
 
 
 def _fields(given: Sequence[str]) -> dict[str, Field]:

@@ -72,18 +72,10 @@ def run(
     live: bool = False,
     option: list[str] | None = None,
 ) -> Any:
-    """``ctxval run``."""
-    stated: dict[str, Any] = {
-        "budget": budget,
-        "search": search,
-        "threshold": threshold,
-        "confidence": confidence,
-        "seed": seed,
-    }
-    stated |= {"explore": explore, "within": within, "store": store, "options": named_values(option)}
-    settings = read_settings(target, stated)
+    stated: dict[str, Any] = {"budget": budget, "search": search, "threshold": threshold, "confidence": confidence}
+    stated |= {"seed": seed, "explore": explore, "within": within, "store": store, "options": named_values(option)}
     certified = {"stochastic": stochastic, "resolution": resolution, "tests": tests, "quantile": quantile}
-    settings = settings.certified_as(certified)
+    settings = read_settings(target, stated).certified_as(certified)
     experiment = settings.load()
     certificate = settings.certificate_options
     if truth and experiment.truth is None:

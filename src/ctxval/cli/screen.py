@@ -11,9 +11,6 @@ from rich.text import Text
 
 from ctxval._util.texts import shortened, visible
 
-_INDENT = "\n  "
-"""Before further lines of a text, so that they cannot be mistaken for other lines of the output."""
-
 
 class Screen(Console):
     """A console that prints texts literally.
@@ -38,7 +35,8 @@ class Screen(Console):
 
 def line(text: str) -> str:
     """Return a text to print: shortened, with control characters escaped, and its further lines indented."""
-    return visible(shortened(text).replace("\r\n", "\n")).replace("\n", _INDENT)
+    # An indented line cannot be mistaken for another line of the output.
+    return visible(shortened(text).replace("\r\n", "\n")).replace("\n", "\n  ")
 
 
 def print_anything() -> None:

@@ -25,7 +25,6 @@ from ctxval.studies import aspect1 as model_alone
 
 @command()
 def init(file: Path = Path("experiment.toml")) -> Any:
-    """``ctxval init``."""
     if file.suffix != ".toml":
         raise InputError(f"an experiment file ends in .toml, got {str(file)!r}.")
     module = "".join(c if c.isascii() and c.isalnum() else "_" for c in file.stem) + "_system"
@@ -53,7 +52,6 @@ def check(
     threshold: float | None = None,
     option: list[str] | None = None,
 ) -> Any:
-    """``ctxval check``."""
     if not aspect1 and (tasks is not None or threshold is not None):
         raise InputError(f"{'--tasks' if tasks is not None else '--threshold'} needs --aspect1.")
     settings = read_settings(target, {"options": named_values(option)})
@@ -87,7 +85,6 @@ def check(
 
 @command()
 def cases(name: str | None = None) -> Any:
-    """``ctxval cases``."""
     listed: dict[str, tuple[str, dict[str, Any]]] = {}
     for each in list(known_cases.REGISTRY) if name is None else [name]:
         try:
@@ -111,7 +108,6 @@ def cases(name: str | None = None) -> Any:
 def reproduce(
     name: str, quick: bool = False, out_: Path = Path("reproduction"), results: Path | None = None, workers: int = 2
 ) -> None:
-    """``ctxval reproduce``."""
     from ctxval import reproduce as paper  # imported here: the other commands do not need it
 
     with Progress(TextColumn("runs"), *Progress.get_default_columns(), console=err) as progress:

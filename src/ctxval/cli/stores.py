@@ -18,7 +18,6 @@ from ctxval.errors import StoreAccessError
 
 @command()
 def status(store: Path) -> Any:
-    """``ctxval status``."""
     opened = Store.existing(store)
     with opened.snapshot():
         description, trials, changes = opened.description(), opened.trials(), opened.history()
@@ -57,7 +56,6 @@ def status(store: Path) -> Any:
 
 @command("export")
 def export_store(store: Path, out_: Path | None = None, force: bool = False) -> Any:
-    """``ctxval export``."""
     content = recover(store)
     if content.damaged and not content.trials and not content.trajectories:
         raise StoreAccessError(f"nothing can be read from {store}: it is not a store, or it is damaged completely.")
@@ -75,7 +73,6 @@ def export_store(store: Path, out_: Path | None = None, force: bool = False) -> 
 
 @command()
 def remeasure(store: Path, allowed: Allowed) -> Any:
-    """``ctxval remeasure``."""
     before = {trial.number: trial.distance for trial in Store.existing(store).trials()}
     campaign = open_store(store, allowed, remeasure=True).campaign
     trials = campaign.trials

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,6 @@ from ctxval.cli.config.settings import Settings, read_settings
 from ctxval.cli.config.stored_settings import budget_of, limit_of, open_target
 from ctxval.cli.options import Allowed, named_values, require_outputs
 from ctxval.cli.recordings import StepFunction, print_parameters, require_model_file
-from ctxval.core.experiment import Experiment
 from ctxval.core.validation import Validation
 from ctxval.errors import InputError
 from ctxval.studies.comparison import compare as run_comparison
@@ -47,10 +46,9 @@ def compare(
     force: bool = False,
     option: list[str] | None = None,
 ) -> Any:
-    """``ctxval compare``."""
     picture = None if out_ is None else out_.with_suffix(".png")
     require_outputs({"--out .md": out_, "its picture": picture}, candidates, force=force)
-    campaigns = _candidates(_named(candidates), stores, seed, named_values(option))
+    campaigns = _candidates(candidates, stores, seed, named_values(option))
     comparison = run_comparison(
         campaigns,
         question=question,  # type: ignore[arg-type]  # it refuses other words
@@ -75,30 +73,24 @@ def compare(
     return {**comparison.to_dict(), "stores": paths, "failures": failures, "files": files}
 
 
-def _named(texts: Sequence[str]) -> dict[str, str]:
-    """Return the candidates by name: the name that is given, or else the text without folder and suffix."""
-    targets: dict[str, str] = {}
+def _candidates(texts: Sequence[str], folder: Path, seed: int, options: dict[str, Any]) -> dict[str, Campaign]:
+    """Return the campaigns of the candidates. A refused comparison leaves no store that a later one would find.
+
+    The name of a candidate is the one that is given, or else the text without folder and suffix.
+    """
+    settings: dict[str, Settings] = {}
     for text in texts:
         before, equals, after = text.partition("=")
-        given = bool(equals) and before.isidentifier()
-        target = after if given else text
-        name = before if given else os.path.basename(target).removesuffix(".toml")
-        if name in targets:
+        named = bool(equals) and before.isidentifier()
+        target = after if named else text
+        name = before if named else os.path.basename(target).removesuffix(".toml")
+        if name in settings:
             raise InputError(f"two candidates are called {name}: give one another name, as in NAME={target}.")
-        targets[name] = target
-    return targets
-
-
-def _candidates(targets: Mapping[str, str], folder: Path, seed: int, options: dict[str, Any]) -> dict[str, Campaign]:
-    """Return the campaigns of the candidates. A refused comparison leaves no store that a later one would find."""
-    settings = {}
-    for name, target in targets.items():
         case, colon, rest = target.partition(":")
+        given: dict[str, Any] = {"seed": seed, "options": options}
         if colon and "=" in rest:  # a case with options of its own, such as arm:model=gp
-            given = {"seed": seed, "options": {**options, **named_values(rest.split(","))}}
-            settings[name] = read_settings(case, given)
-        else:
-            settings[name] = read_settings(target, {"seed": seed, "options": options})
+            target, given["options"] = case, {**options, **named_values(rest.split(","))}
+        settings[name] = read_settings(target, given)
     loaded = {name: each.load() for name, each in settings.items()}
     require_comparable({name: experiment.validation for name, experiment in loaded.items()})
     return {name: each.campaign(loaded[name], folder / f"{store_name(name)}.sqlite") for name, each in settings.items()}
@@ -141,7 +133,6 @@ def refine_model(
     timeout: float | None = None,
     option: list[str] | None = None,
 ) -> Any:
-    """``ctxval refine``."""
     chosen = _method(method, fit, function)
     require_model_file(out_, [target, allowed.experiment], force=force)
     opened = open_target(target, {"seed": seed, "options": named_values(option) or None}, allowed)
@@ -155,13 +146,25 @@ def refine_model(
         require_file_of(out_, chosen.name, chosen.makes, opened.campaign.validation.model, function.step)
     if budget is None:
         budget = opened.campaign.executions + budget_of(opened.experiment, settings)
+
+    def open_round(
+        validation: Validation, store: Path | None, model_file: Path | None, certificate: CertificateOptions
+    ) -> Campaign:
+        """Return the campaign of a round, whose store names the experiment and the file of the model."""
+        if model_file is None or store is None:  # the model cannot be read again, so other commands cannot load it
+            search, name = settings.search.build(settings.folder), opened.experiment.name
+            return Campaign(validation, search=search, store=store, seed=settings.seed, name=name)
+        known = {"refined": model_file.resolve(), "confidence": certificate.confidence}
+        experiment = replace(opened.experiment, validation=validation, truth=None)
+        return settings.model_copy(update=known).campaign(experiment, store)
+
     refinement = refine(
         opened.campaign,
         limit,
         budget,
         method=chosen,
         certificate=settings.certificate_options,
-        open_round=_Rounds(settings, opened.experiment),
+        open_round=open_round,
         workers=workers,
         timeout=timeout,
     )
@@ -185,25 +188,6 @@ def _method(name: str, fit: str | None, function: StepFunction) -> Method:
     if name != "parameters":
         return method_of(name)
     return ParameterFit(function.bounds, function.load(), function.vectorized)
-
-
-@dataclass(frozen=True, eq=False)
-class _Rounds:
-    """Makes the campaigns of rounds, whose stores name the experiment and the file of the model."""
-
-    settings: Settings
-    experiment: Experiment
-
-    def __call__(
-        self, validation: Validation, store: Path | None, model_file: Path | None, certificate: CertificateOptions
-    ) -> Campaign:
-        settings, name = self.settings, self.experiment.name
-        if model_file is None or store is None:  # the model cannot be read again, so other commands cannot load it
-            search = settings.search.build(settings.folder)
-            return Campaign(validation, search=search, store=store, seed=settings.seed, name=name)
-        known = {"refined": model_file.resolve(), "confidence": certificate.confidence}
-        experiment = replace(self.experiment, validation=validation, truth=None)
-        return settings.model_copy(update=known).campaign(experiment, store)
 
 
 def _print_refinement(refinement: Refinement) -> None:

@@ -12,49 +12,39 @@ import numpy as np
 from ctxval._util.files import write_text
 from ctxval.cli.base import command, out, print_columns
 from ctxval.cli.options import require_outputs
-from ctxval.cli.recordings import Logs, print_breaks
+from ctxval.cli.recordings import Logs, error_cells, print_breaks
 from ctxval.data import Field, LogMapping
 from ctxval.models import write_model
 from ctxval.report.replay_page import write_replay_page
 from ctxval.studies.survey import Survey, survey
 
-FILES = ("mapping.toml", "model.npz", "experiment.toml", "report.html")
-
 
 @command()
-def start(
-    logs: list[Path],
-    reading: Logs,
-    out_: Path = Path("start"),
-    force: bool = False,
-    seed: int = 0,
-) -> Any:
-    """``ctxval start``."""
-    files = {name: out_ / name for name in FILES}
+def start(logs: list[Path], reading: Logs, out_: Path = Path("start"), force: bool = False, seed: int = 0) -> Any:
+    files = {name: out_ / name for name in ("mapping.toml", "model.npz", "experiment.toml", "report.html")}
     require_outputs({f"--out {name}": path for name, path in files.items()}, [*logs, reading.mapping], force=force)
     stated = reading.stated()
-    found = survey(logs, stated, dt=reading.dt, seed=seed)
-    _print(found)
-    write_text(files["mapping.toml"], mapping_text(found.mapping, found.recordings.dt))
-    write_model(files["model.npz"], found.best.model)
-    write_replay_page(found.replay, files["report.html"], name=f"the {found.best.kind} model")
-    written = ["mapping.toml", "model.npz", "report.html"]
-    if found.recordings.inputs:
-        write_text(files["experiment.toml"], experiment_text(found))
-        written.insert(2, "experiment.toml")
+    result = survey(logs, stated, dt=reading.dt, seed=seed)
+    _print(result)
+    write_text(files["mapping.toml"], mapping_text(result.mapping, result.recordings.dt))
+    write_model(files["model.npz"], result.best.model)
+    write_replay_page(result.replay, files["report.html"], name=f"the {result.best.kind} model")
+    if result.recordings.inputs:
+        write_text(files["experiment.toml"], experiment_text(result))
+    else:
+        del files["experiment.toml"]
     out.say("")
-    out.say(f"{', '.join(written)} in {out_}")
-    where = shlex.quote(str(out_ / "experiment.toml"))
-    if found.recordings.inputs:
+    out.say(f"{', '.join(files)} in {out_}")
+    if result.recordings.inputs:
+        where = shlex.quote(str(files["experiment.toml"]))
         out.say(f"next: edit {where}, and then ctxval check {where}")
-    return {**found.to_json(), "files": [str(out_ / name) for name in written]}
+    return {**result.to_json(), "files": [str(path) for path in files.values()]}
 
 
-def _print(found: Survey) -> None:
-    recordings = found.recordings
-    out.say(
-        f"{len(found.sources)} logs, {len(recordings.runs)} recordings, {recordings.steps} steps of {recordings.dt:g} s"
-    )
+def _print(result: Survey) -> None:
+    recordings = result.recordings
+    steps = f"{recordings.steps} steps of {recordings.dt:g} s"
+    out.say(f"{len(result.sources)} logs, {len(recordings.runs)} recordings, {steps}")
     rows = [
         (
             field.path,
@@ -63,30 +53,20 @@ def _print(found: Survey) -> None:
             f"{field.low:.4g} to {f'{field.high:.4g} {field.unit}'.rstrip()}" if field.records else "-",
             field.remark,
         )
-        for field in found.fields[:24]
+        for field in result.fields[:24]
     ]
     print_columns(["field", "taken as", "every", "values", "remark"], rows, "fields of the logs", left=2)
-    if len(found.fields) > 24:
-        out.say(f"and {len(found.fields) - 24} other fields; --json lists them.")
-    for guess in found.guesses:
+    if len(result.fields) > 24:
+        out.say(f"and {len(result.fields) - 24} other fields; --json lists them.")
+    for guess in result.guesses:
         out.say(("guessed: ", "yellow"), guess, wrap=True)
     print_breaks(recordings)
-    errors = [
-        (
-            model.kind,
-            each.state,
-            str(each.steps),
-            f"{each.rms:.3g} {each.unit}".rstrip(),
-            f"{100 * each.relative:.3g} %",
-        )
-        for model in found.fit.fitted
-        for each in model.errors
-    ]
+    errors = [(model.kind, *error_cells(each)) for model in result.fit.fitted for each in model.errors]
     print_columns(["model", "state", "steps", "rms error", "of the change"], errors, "error on others", left=2)
     out.say("")
-    for sentence in found.replay.insights:
+    for sentence in result.replay.insights:
         out.say(("- ", "bold"), sentence, wrap=True)
-    out.say((f"{found.statement[:1].upper()}{found.statement[1:]}.", "bold"), wrap=True)
+    out.say((f"{result.statement[:1].upper()}{result.statement[1:]}.", "bold"), wrap=True)
 
 
 def mapping_text(mapping: LogMapping, dt: float) -> str:
@@ -112,15 +92,15 @@ def _field(field: Field) -> str:
     return f"{{ {', '.join(f'{name} = {json.dumps(value)}' for name, value in changed.items())} }}"
 
 
-def experiment_text(found: Survey) -> str:
+def experiment_text(result: Survey) -> str:
     """Return an experiment file to edit: goals within the recorded range of the first state, and LQR on the model."""
-    recordings = found.recordings
+    recordings = result.recordings
     states, inputs = list(recordings.states), list(recordings.inputs)
     x = np.concatenate([run.trajectory.states for run in recordings.runs])
     u = np.concatenate([run.trajectory.inputs for run in recordings.runs])
     low, high = np.quantile(x[:, 0], [0.05, 0.95])
     start = np.median([run.trajectory.states[0] for run in recordings.runs], axis=0)
-    horizon = min(max(found.reach[1], 10), 200)
+    horizon = min(max(result.reach[1], 10), 200)
 
     def numbers(values: Any) -> str:
         return json.dumps([float(f"{value:.3g}") for value in values])

@@ -11,12 +11,12 @@ from typing import Any, NamedTuple
 from ctxval._util.checked import NonNegativeFloat, require
 from ctxval._util.csv_table import CsvTable
 from ctxval._util.progress import advance, stage
+from ctxval._util.representation import task_text
 from ctxval.campaign.by_hand import parameters_from, read_runs
 from ctxval.campaign.choices import Execution
 from ctxval.campaign.watching import FALSE_ALARMS, Watch
 from ctxval.certificates.expiry import WatchState
 from ctxval.cli.base import FALSIFIED, command, notes, out
-from ctxval.cli.config.check import task_text
 from ctxval.cli.config.stored_settings import Opened, limit_of, open_store
 from ctxval.cli.options import Allowed
 from ctxval.cli.recordings import Logs

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
-from typing import TYPE_CHECKING, Any, Literal
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -34,10 +34,7 @@ Light = Literal["good", "note", "attention", "bad", "unknown"]
 not known."""
 
 # The word of each light stands beside its colour.
-WORDS: dict[Light, str] = {
-    **{"good": "good", "note": "note", "attention": "attention"},
-    **{"bad": "problem", "unknown": "not known"},
-}
+WORDS: dict[Light, str] = {light: light for light in get_args(Light)} | {"bad": "problem", "unknown": "not known"}
 
 
 @dataclass(frozen=True)
@@ -55,10 +52,6 @@ class Finding(ShortRepr):
     light: Light
     text: str
     numbers: dict[str, Any] = field(default_factory=dict)
-
-    def to_json(self) -> dict[str, Any]:
-        """Return all attributes, ready for JSON."""
-        return asdict(self)
 
 
 Answer = tuple[Light, str, dict[str, Any]]
@@ -109,12 +102,10 @@ def executions(context: ReportContext) -> Answer | None:
 def certificate_stands(context: ReportContext) -> Answer | None:
     """Whether the certificate is refused or withdrawn."""
     verdict, certificate = context.verdict, context.certificate
-    if verdict is None or verdict.answer == "falsified":
+    if verdict is None or verdict.answer == "falsified" or (certificate is not None and certificate.doubt is None):
         return None
     if certificate is None:
         return "bad", f"Refused: {verdict.reason}", {}
-    if certificate.doubt is None:
-        return None
     bound = certificate.upper_bound if np.isfinite(certificate.upper_bound) else None
     numbers = {"kind": certificate.kind, "upper_bound": bound, "confidence": certificate.confidence}
     return "bad", f"Withdrawn: {certificate.doubt}.", numbers

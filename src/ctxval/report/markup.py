@@ -116,18 +116,13 @@ def table(
     head = element("tr", *(element("th", header, scope="col") for header in headers))
     body = [row if isinstance(row, Markup) else _row(*row) for row in rows]
     inside = element("caption", caption), element("thead", head), element("tbody", *body)
-    return scrolling(
-        element("table", *inside, class_=class_, id=id_), label or shortened(visible(caption), 120), scroll
-    )
+    whole, label = element("table", *inside, class_=class_, id=id_), label or shortened(visible(caption), 120)
+    # What scrolls by itself must be reached by the keyboard.
+    return element("div", whole, class_=scroll, tabindex="0", role="region", aria_label=label)
 
 
 def _row(first: object, *others: object) -> Markup:
     return element("tr", element("th", cell(first), scope="row"), *(element("td", cell(value)) for value in others))
-
-
-def scrolling(content: object, label: str, class_: str = "scroll") -> Markup:
-    """Return a wide element that scrolls by itself, so that it can be reached by the keyboard."""
-    return element("div", content, class_=class_, tabindex="0", role="region", aria_label=label)
 
 
 def cell(value: object) -> Markup:

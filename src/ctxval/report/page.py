@@ -63,9 +63,7 @@ def framed(
         element("style", Markup(style)),
     )
     with np.errstate(all="ignore"):  # a store may have any numbers
-        shown = [
-            _section(number, name, render, folded=folded) for number, (name, render) in enumerate(sections, start=1)
-        ]
+        shown = [_section(place, *titled, folded=folded) for place, titled in enumerate(sections, start=1)]
     body = element(
         "body",
         element("header", element("h1", heading), paragraph(text(subtitle, 600), class_="note")),

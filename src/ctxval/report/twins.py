@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import asdict
 from typing import Any
 from xml.etree import ElementTree
 
@@ -31,8 +32,8 @@ def to_json(context: ReportContext) -> dict[str, Any]:
             "failed": [trial.number for trial in context.failed],
             "certificate": None if certificate is None else certificate.to_json(),
             "missing": context.missing or None,
-            "diagnostics": [finding.to_json() for finding in context.diagnostics],
-            "insights": [finding.to_json() for finding in context.insights],
+            "diagnostics": [asdict(finding) for finding in context.diagnostics],
+            "insights": [asdict(finding) for finding in context.insights],
             "not_tested": context.not_tested,
             "worst": [
                 {
@@ -86,30 +87,24 @@ def junit(context: ReportContext) -> str:
     return f'<?xml version="1.0" encoding="utf-8"?>\n<!-- {MADE_BY} -->\n{content}\n'
 
 
-def _cell(value: float | str) -> str:
-    return markdown_text(value) if isinstance(value, str) else number(value)
-
-
 def markdown(context: ReportContext) -> str:
     """Return the report without its charts as Markdown; texts of the store cannot become markup."""
     units, verdict = context.labels.units, context.verdict
     answer = "No verdict: no threshold was given." if verdict is None else f"{verdict}"
     trials = context.worst_tasks()
-    rows = [
-        f"| {trial.number} | {markdown_text(quantity(distance_of(trial), units))} | {' | '.join(map(_cell, task))} |"
-        for trial, task in zip(trials, context.tasks_of(trials), strict=True)
-    ]
+    rows = []
+    for trial, task in zip(trials, context.tasks_of(trials), strict=True):
+        values = (value if isinstance(value, str) else number(value) for value in task)
+        cells = (str(trial.number), quantity(distance_of(trial), units), *values)
+        rows.append(f"| {' | '.join(map(markdown_text, cells))} |")
     entries = [
         f"- **{markdown_text(entry.term)}** ({entry.standard}): {markdown_text(entry.content, UNCUT)}"
         for entry in appendix(context)
     ]
 
     def items(findings: list[Finding]) -> list[str]:
-        listed = [
-            f"- {WORDS[finding.light]}: **{markdown_text(finding.name)}.** {markdown_text(finding.text)}"
-            for finding in findings
-        ]
-        return listed or ["Nothing is unusual."]
+        texts = ((WORDS[each.light], markdown_text(each.name), markdown_text(each.text)) for each in findings)
+        return [f"- {light}: **{name}.** {text}" for light, name, text in texts] or ["Nothing is unusual."]
 
     head = f"| trial | distance | {' | '.join(map(markdown_text, context.task_labels))} |"
     parts = {

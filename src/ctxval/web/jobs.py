@@ -7,7 +7,7 @@ import tempfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -25,9 +25,6 @@ from ctxval.core.experiment import Experiment
 from ctxval.core.labels import labels_of
 from ctxval.core.trial import Trial
 from ctxval.errors import InputError
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 Files = dict[str, bytes]
 """The files of a trial by name."""
@@ -93,16 +90,15 @@ class ServedCampaign:
     def read(self) -> Snapshot:
         """Read the trials in the store, with what people must know of the open tasks before they execute them."""
         self.campaign.refresh()
+        validation, tasks = self.campaign.validation, dict[int, dict[str, Any]]()
+        for trial in (trial for trial in self.campaign.trials if trial.state == "open"):
+            task = validation.task_at(validation.space.parameters(validation.space.point(trial.parameters)))
+            start = np.atleast_1d(validation.recorded_task(task).initial_state).tolist()
+            labels = labels_of(self.experiment.names(len(start), 0)[0])
+            starts = list(zip(labels, start, strict=True))
+            tasks[trial.number] = {"start": starts, "horizon": task.horizon, "dt": task.dt}
         # The trials were read after this process's last change, so their counts are those of the signature.
-        tasks = {trial.number: self._task(trial) for trial in self.campaign.trials if trial.state == "open"}
         return self.snapshot(tasks, self.campaign.store.signature()[2])
-
-    def _task(self, trial: Trial) -> dict[str, Any]:
-        validation = self.campaign.validation
-        task = validation.task_at(validation.space.parameters(validation.space.point(trial.parameters)))
-        start = np.atleast_1d(validation.recorded_task(task).initial_state).tolist()
-        states, _ = self.experiment.names(len(start), 0)
-        return {"start": list(zip(labels_of(states), start, strict=True)), "horizon": task.horizon, "dt": task.dt}
 
 
 OpenCampaign = Callable[[], ServedCampaign]
@@ -195,32 +191,24 @@ def draw(served: ServedCampaign) -> Pictures:
 def pictures_of(served: ServedCampaign) -> Pictures:
     """Return the pictures of the trials that the campaign knows."""
     import matplotlib
+    from matplotlib.figure import Figure
+
+    def distance() -> Figure:
+        figure = Figure(figsize=(6.4, 4.2), layout="constrained")
+        overview(served.campaign, threshold=served.threshold, ax=figure.add_subplot())
+        return figure
+
+    def worst() -> Figure:
+        return worst_trajectories(served.campaign)
 
     pictures: Pictures = {}
-    for name, figure in (("distance", _distance_picture), ("worst", _worst_picture)) if served.campaign.worst else ():
+    for name, figure in (("distance", distance), ("worst", worst)) if served.campaign.worst else ():
         # Names of parameters may contain a $, which is not mathematics; a stated id makes equal pictures equal files.
         try:
             with matplotlib.rc_context({"text.parse_math": False, "svg.hashsalt": "ctxval"}):
                 content = io.BytesIO()
-                figure(served).savefig(content, format="svg", metadata={"Date": None})
+                figure().savefig(content, format="svg", metadata={"Date": None})
             pictures[name] = content.getvalue()
         except Exception as error:  # a picture must not hide the verdict
             pictures[name] = reason_of(error)
     return pictures
-
-
-def _distance_picture(served: ServedCampaign) -> Figure:
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(6.4, 4.2), layout="constrained")
-    overview(served.campaign, units=served.experiment.units, threshold=served.threshold, ax=figure.add_subplot())
-    return figure
-
-
-def _worst_picture(served: ServedCampaign) -> Figure:
-    worst: Any = served.campaign.worst
-    model, _ = served.campaign.trajectories(worst)
-    if model is None:
-        raise InputError(f"the trajectories of trial {worst.number} are not in the store.")
-    states, inputs = served.experiment.names(model.states.shape[-1], model.inputs.shape[-1])
-    return worst_trajectories(served.campaign, states=labels_of(states), inputs=labels_of(inputs))

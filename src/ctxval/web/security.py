@@ -25,14 +25,10 @@ from ctxval.errors import InputError
 MOST_UPLOAD = 64 * 2**20
 """Largest size of a recording in bytes."""
 
-POLICY = (
-    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; connect-src 'self'; form-action 'self'; "
-    "base-uri 'none'; frame-ancestors 'none'"
-)
-"""The Content-Security-Policy: nothing from elsewhere, and no script or style inside the page."""
-
 HEADERS = {
-    "Content-Security-Policy": POLICY,
+    # Nothing from elsewhere, and no script or style inside the page.
+    "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; "
+    "connect-src 'self'; form-action 'self'; base-uri 'none'; frame-ancestors 'none'",
     "X-Content-Type-Options": "nosniff",
     "X-Frame-Options": "DENY",
     # With no-referrer, a browser sends forms with the origin "null".

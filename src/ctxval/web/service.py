@@ -14,7 +14,7 @@ from ctxval.core.trial import Trial
 from ctxval.errors import CampaignError, CtxvalError, DistanceError, InputError
 from ctxval.web import jobs
 from ctxval.web.background import BackgroundProcess
-from ctxval.web.jobs import Files, OpenCampaign, ServedCampaign, TaskRequest
+from ctxval.web.jobs import Files, OpenCampaign, TaskRequest
 from ctxval.web.state import PageState, Work
 
 Result = TypeVar("Result")
@@ -74,10 +74,18 @@ class CampaignService(PageState):
 
     async def tell(self, number: int, result: ToldResult, submission: str) -> Trial:
         """Record the result of an open trial, or replace an earlier result, once for each submitted form."""
+
+        def record() -> None:
+            try:
+                tell_result(self.served.campaign, self.served.experiment, number, result)
+            except DistanceError:
+                if self.served.campaign.trials[number].state != "unmeasured":
+                    raise
+
         async with self._telling:
             if not submission or self._submitted.get(submission) != number:
                 try:
-                    await self._in_thread(lambda: _told(self.served, number, result))
+                    await self._in_thread(record)
                 finally:
                     await self._look()
                 self._submitted[submission] = number
@@ -184,14 +192,3 @@ class CampaignService(PageState):
             else:
                 self.update(judged=ended, verdict=verdict, judgement_error=None)
         self.update(judging=None)
-
-
-def _told(served: ServedCampaign, number: int, result: ToldResult) -> Trial:
-    """Check and store the result of an open trial; return the trial, which may be unmeasured."""
-    try:
-        return tell_result(served.campaign, served.experiment, number, result)
-    except DistanceError:
-        trial = served.campaign.trials[number]
-        if trial.state != "unmeasured":
-            raise
-        return trial

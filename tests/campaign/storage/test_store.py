@@ -23,7 +23,7 @@ def trial(number: int = 0) -> Trial:
 
 def test_a_trial_comes_back_bit_for_bit(tmp_path: Path) -> None:
     store = Store(tmp_path / "a.sqlite")
-    store.open_trial(trial(), TRAJECTORY)
+    store.add([(trial(), TRAJECTORY, None)])
     ended = replace(trial(), state="completed", executed=True, distance=0.1 + 0.2, seconds=1.5)
     store.close_trial(ended, TRAJECTORY)
     store.close()
@@ -41,8 +41,8 @@ def test_a_trial_comes_back_bit_for_bit(tmp_path: Path) -> None:
 def test_a_note_comes_back_bit_for_bit_and_none_as_none(tmp_path: Path) -> None:
     store = Store(tmp_path / "a.sqlite")
     note = {"engine": "climb", "climb": 2, "expected": 0.1 + 0.2, "radius": 1.0, "why": None}
-    store.open_trial(replace(trial(), note=note), TRAJECTORY)
-    store.open_trial(trial(1), TRAJECTORY)
+    store.add([(replace(trial(), note=note), TRAJECTORY, None)])
+    store.add([(trial(1), TRAJECTORY, None)])
     store.add([(replace(trial(2), state="failed", failure="x", note=note), None, None)])
     store.close()
     assert [t.note for t in Store(tmp_path / "a.sqlite").trials()] == [note, None, note]
@@ -50,7 +50,7 @@ def test_a_note_comes_back_bit_for_bit_and_none_as_none(tmp_path: Path) -> None:
 
 def test_trajectories_come_back_bit_for_bit_and_absent_ones_as_none() -> None:
     store = Store()
-    store.open_trial(trial(), TRAJECTORY)
+    store.add([(trial(), TRAJECTORY, None)])
     back = store.trajectory(0, "model")
     assert back is not None
     np.testing.assert_array_equal(back.states, TRAJECTORY.states)
@@ -59,7 +59,7 @@ def test_trajectories_come_back_bit_for_bit_and_absent_ones_as_none() -> None:
 
 def test_an_ended_trial_cannot_end_again() -> None:
     store = Store()
-    store.open_trial(trial(), TRAJECTORY)
+    store.add([(trial(), TRAJECTORY, None)])
     store.close_trial(replace(trial(), state="failed", failure="x"), None)
     with pytest.raises(InputError, match="nothing more can be told"):
         store.close_trial(replace(trial(), state="completed", distance=1.0), TRAJECTORY)
@@ -68,9 +68,9 @@ def test_an_ended_trial_cannot_end_again() -> None:
 
 def test_two_writers_of_one_trial_collide_with_a_clear_error(tmp_path: Path) -> None:
     first, second = Store(tmp_path / "a.sqlite"), Store(tmp_path / "a.sqlite")
-    first.open_trial(trial(), TRAJECTORY)
+    first.add([(trial(), TRAJECTORY, None)])
     with pytest.raises(StoreAccessError, match="written by another process"):
-        second.open_trial(trial(), TRAJECTORY)
+        second.add([(trial(), TRAJECTORY, None)])
     assert len(second.trials()) == 1
 
 
@@ -129,12 +129,12 @@ def test_an_impossible_path_is_an_access_error(tmp_path: Path) -> None:
 
 def test_a_full_disk_loses_nothing_that_was_stored(tmp_path: Path) -> None:
     store = Store(tmp_path / "a.sqlite")
-    store.open_trial(trial(), TRAJECTORY)
+    store.add([(trial(), TRAJECTORY, None)])
     pages = store._database.execute("PRAGMA page_count").fetchone()[0]
     store._database.execute(f"PRAGMA max_page_count = {pages}")
     big = Trajectory(np.arange(5001.0), np.random.default_rng(1).normal(size=(5001, 4)), np.zeros((5000, 1)))
     with pytest.raises(StoreAccessError, match="full"):
-        store.open_trial(trial(1), big)
+        store.add([(trial(1), big, None)])
     store.close()
     assert [t.number for t in Store(tmp_path / "a.sqlite").trials()] == [0]
 
@@ -172,7 +172,7 @@ def test_settings_do_not_change_which_experiment_it_is() -> None:
 
 def test_what_was_computed_is_kept_until_the_content_changes(tmp_path: Path) -> None:
     store = Store(tmp_path / "a.sqlite")
-    store.open_trial(trial(), TRAJECTORY)
+    store.add([(trial(), TRAJECTORY, None)])
     digest = store.digest()
     store.keep_computed("verdict", {"bound": np.inf}, digest)
     assert Store(tmp_path / "a.sqlite").computed("verdict") == {"bound": np.inf}

@@ -84,7 +84,7 @@ def test_what_another_process_stores_is_seen(tmp_path: Path, monkeypatch: pytest
     store, other = Store(tmp_path / "a.sqlite"), Store(tmp_path / "a.sqlite")
     add(store, 0, trajectory(0))
     opened = Trial(1, "manual", "open", np.array([0.2]), {"a": 0.2})
-    store.open_trial(opened, trajectory(0))
+    store.add([(opened, trajectory(0), None)])
     reads = reads_of(store, monkeypatch)
     assert list(store.trajectories([0, 1], "system")) == [0]
     other.close_trial(replace(opened, state="completed", executed=True, distance=1.0), trajectory(1))

@@ -118,9 +118,21 @@ def _read(connection: sqlite3.Connection, tables: dict[str, set[str]], size: int
             continue
         for row in _rows(connection, table, names, size, recovered):
             if table == "trials":
-                _take_trial(row, recovered)
+                if (trial := read_trial(row[:-1], row[-1])) is not None:
+                    recovered.trials.setdefault(trial.number, trial)
+                else:
+                    fits = checksum_of(row[:-1]) == row[-1]
+                    why = "it holds what no trial can" if fits else "its checksum does not fit"
+                    recovered.note(f"trial {row[0]}: {why}")
             elif table == "trajectories":
-                _take_trajectory(row, recovered)
+                number, side, npz, checksum = row
+                name = f"the {side}'s trajectory of trial {number}"
+                if side not in get_args(Side) or not isinstance(number, int):
+                    recovered.note(f"{name}: there is no such thing")
+                elif trajectory := read_trajectory(number, side, npz, checksum):
+                    recovered.trajectories.setdefault((number, side), trajectory)
+                else:
+                    recovered.note(f"{name}: its checksum does not fit")
             else:
                 try:
                     content = read_json(row[-1], finite=False)
@@ -153,27 +165,6 @@ def _rows(
     for reason, places in unreadable.items():
         which = f"{len(places)} rows from {places[0]} to {places[-1]}" if len(places) > 1 else f"row {places[0]}"
         recovered.note(f"the table {table}, {which}: {reason}")
-
-
-def _take_trial(row: tuple[Any, ...], recovered: Recovered) -> None:
-    number, checksum = row[0], row[-1]
-    trial = read_trial(row[:-1], checksum)
-    if trial is None:
-        fits = checksum_of(row[:-1]) == checksum
-        recovered.note(f"trial {number}: {'it holds what no trial can' if fits else 'its checksum does not fit'}")
-    else:
-        recovered.trials.setdefault(trial.number, trial)
-
-
-def _take_trajectory(row: tuple[Any, ...], recovered: Recovered) -> None:
-    number, side, npz, checksum = row
-    name = f"the {side}'s trajectory of trial {number}"
-    if side not in get_args(Side) or not isinstance(number, int):
-        recovered.note(f"{name}: there is no such thing")
-    elif trajectory := read_trajectory(number, side, npz, checksum):
-        recovered.trajectories.setdefault((number, side), trajectory)
-    else:
-        recovered.note(f"{name}: its checksum does not fit")
 
 
 def export(recovered: Recovered, folder: Path) -> list[Path]:

@@ -48,7 +48,7 @@ def read_trial(row: tuple[Any, ...], checksum: Any) -> Trial | None:
     except InputError:
         return None
     valid = (
-        _count(number) and _count(attempts) and executed in (0, 1),
+        all(isinstance(count, int) and 0 <= count < 2**53 for count in (number, attempts)) and executed in (0, 1),
         state in get_args(State) and origin in get_args(Origin),
         _numbers(unit_point) and all(0 <= value <= 1 for value in unit_point),
         isinstance(parameters, dict)
@@ -64,10 +64,6 @@ def read_trial(row: tuple[Any, ...], checksum: Any) -> Trial | None:
     where = np.array(unit_point, dtype=np.float64)
     known = Trial(number, origin, state, where, parameters, attempts, bool(executed), note=notes, because=because)
     return replace(known, distance=distance, failure=failure, seconds=seconds)
-
-
-def _count(value: Any) -> bool:
-    return isinstance(value, int) and 0 <= value < 2**53
 
 
 def _number(value: Any) -> bool:
@@ -87,10 +83,14 @@ def follows(trial: Trial, earlier: list[Trial]) -> bool:
 
 def read_json(text: Any, *, finite: bool = True) -> Any:
     """Return the value of a JSON text."""
+
+    def refuse(constant: str) -> NoReturn:
+        raise InputError(f"{constant} is not a number of JSON.")
+
     if not isinstance(text, str):
         raise InputError(f"JSON must be text, got {type(text).__name__}.")
     try:
-        value = json.loads(text, parse_constant=_refuse_constant if finite else None)
+        value = json.loads(text, parse_constant=refuse if finite else None)
     except (ValueError, RecursionError, MemoryError) as error:
         raise InputError(f"the text is not JSON: {error}.") from error
     if not _shallow(value, 50):
@@ -103,10 +103,6 @@ def _shallow(value: Any, levels: int) -> bool:
         return True
     items = value.values() if isinstance(value, dict) else value
     return levels > 0 and all(_shallow(item, levels - 1) for item in items)
-
-
-def _refuse_constant(name: str) -> NoReturn:
-    raise InputError(f"{name} is not a number of JSON.")
 
 
 MOST_CHARACTERS = 2**24  # largest number of characters of a key, and of the JSON text of a value

@@ -6,7 +6,6 @@ the file. A store has only plain tables, so a file with anything else is refused
 
 from __future__ import annotations
 
-import functools
 import itertools
 import os
 import re
@@ -101,11 +100,10 @@ def require_files(path: Path) -> None:
     require_file(path)
     real = os.path.realpath(path)
     for ending in _BESIDE:
-        beside = Path(real + ending)
-        mode = _mode(beside, follow=False)
-        if mode is not None and (reason := why_not_regular(mode)):
-            what = reason.removeprefix("it ")
-            raise StoreAccessError(f"{path} cannot be read as a store: {beside} {what}; move it away.")
+        with suppress(FileNotFoundError, NotADirectoryError):
+            if reason := why_not_regular(os.lstat(real + ending).st_mode):
+                what = f"{real}{ending} {reason.removeprefix('it ')}"
+                raise StoreAccessError(f"{path} cannot be read as a store: {what}; move it away.")
     end = b""
     with suppress(OSError), Path(f"{real}-journal").open("rb") as file:
         file.seek(-8, os.SEEK_END)
@@ -119,20 +117,15 @@ def require_files(path: Path) -> None:
 
 def require_file(path: Path) -> None:
     """Check that a path is a regular file or does not exist."""
+    reason = ""
     try:
-        mode = _mode(path)
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise StoreAccessError(f"{path} cannot be read as a store: {reason}.") from error
-    if mode is not None and (reason := why_not_regular(mode)):
-        raise StoreAccessError(f"{path} cannot be read as a store: {reason}.")
-
-
-def _mode(path: Path, *, follow: bool = True) -> int | None:
-    try:
-        return os.stat(path, follow_symlinks=follow).st_mode
+        reason = why_not_regular(os.stat(path).st_mode)
     except (FileNotFoundError, NotADirectoryError):
-        return None
+        pass
+    except (OSError, ValueError) as error:
+        reason = str(getattr(error, "strerror", None) or error)
+    if reason:
+        raise StoreAccessError(f"{path} cannot be read as a store: {reason}.")
 
 
 def beside(path: Path) -> list[Path]:
@@ -174,13 +167,11 @@ def plain_tables(connection: sqlite3.Connection, names: Iterable[str]) -> dict[s
 
 def difference(connection: sqlite3.Connection, script: str) -> str | None:
     """Return how the tables of a file differ from those that a script makes. Returns None if they agree."""
-    expected, present = _expected(script), {}
-    for place, (kind, name, table, definition) in enumerate(connection.execute(_MASTER)):
-        if place == 100:
-            return "it has more than 100 tables"
-        if (kind, name) not in expected:
-            return f"it has {'an' if str(kind)[:1] in 'aeiou' else 'a'} {kind} {name!r}"
-        present[kind, name] = (table, _bare(definition))
+    with closing(sqlite3.connect(":memory:", isolation_level=None)) as made:
+        made.executescript(script)
+        expected, present = _tables(made), _tables(connection)
+    for kind, name in (key for key in present if key not in expected):
+        return f"it has {'an' if str(kind)[:1] in 'aeiou' else 'a'} {kind} {name!r}"
     for key, what in expected.items():
         if present.get(key) != what:
             return f"its {key[0]} {key[1]!r} is {'missing' if key not in present else 'another one'}"
@@ -190,14 +181,7 @@ def difference(connection: sqlite3.Connection, script: str) -> str | None:
 _MASTER = "SELECT type, name, tbl_name, sql FROM sqlite_master"
 
 
-@functools.cache
-def _expected(script: str) -> dict[tuple[str, str], tuple[str, str]]:
-    with closing(sqlite3.connect(":memory:", isolation_level=None)) as connection:
-        connection.executescript(script)
-        rows = connection.execute(_MASTER).fetchall()
-    return {(kind, name): (table, _bare(definition)) for kind, name, table, definition in rows}
-
-
-def _bare(definition: object) -> str:
-    """Return a definition without spaces and quotes, which versions of SQLite write differently."""
-    return re.sub(r'[\s"`\[\]]', "", str(definition)).lower()
+def _tables(connection: sqlite3.Connection) -> dict[tuple[str, str], tuple[str, str]]:
+    """Return the definitions without spaces and quotes, which versions of SQLite write differently."""
+    rows = itertools.islice(connection.execute(_MASTER), 100)
+    return {(k, name): (table, re.sub(r'[\s"`\[\]]', "", str(made)).lower()) for k, name, table, made in rows}

@@ -67,10 +67,9 @@ class Store:
         self._database.close()
 
     def sole_writer(self, wait: float = 0.0) -> AbstractContextManager[None]:
-        """Prevent other processes from running this store. The lock is released when the process ends, however it ends.
+        """Prevent other processes from running this store; wait so many seconds for one that is running it.
 
-        If another process is running the store, wait so many seconds for its end, and then raise a
-        :class:`StoreAccessError`.
+        The lock is released when the process ends, however it ends.
         """
         return self._database.sole_writer(wait)
 
@@ -127,18 +126,13 @@ class Store:
     def state_threshold(self, threshold: float) -> None:
         """Record a threshold with the number of distances that are known; if it is recorded already, nothing changes.
 
-        A store that keeps no thresholds, because it was made before they were kept, stays as it is: nobody knows which
-        ones were stated.
+        A store without thresholds is one that no campaign has described, and stays as it is.
         """
-
-        def is_new(stated: tuple[StatedThreshold, ...] | None) -> bool:
-            return stated is not None and all(each.threshold != threshold for each in stated)
-
-        if not is_new(self.thresholds()):
+        if any(each.threshold == threshold for each in self.thresholds() or ()):
             return
         with self._database.transaction():
-            stated = self.thresholds() or ()
-            if is_new(stated):
+            stated = self.thresholds()
+            if stated is not None and all(each.threshold != threshold for each in stated):
                 known = self._database.execute("SELECT count(*) FROM trials WHERE state = 'completed'").fetchone()[0]
                 self._write_thresholds((*stated, StatedThreshold(float(threshold), int(known), now())))
 
@@ -215,10 +209,6 @@ class Store:
 
     # Trials
 
-    def open_trial(self, trial: Trial, model_trajectory: Trajectory, *, changes: int | None = None) -> None:
-        """Store a new trial with its model trajectory, before its execution starts."""
-        self.add([(trial, model_trajectory, None)], changes=changes)
-
     def add(
         self, new: Iterable[tuple[Trial, Trajectory | None, Trajectory | None]], *, changes: int | None = None
     ) -> None:
@@ -239,15 +229,13 @@ class Store:
         """Record one more attempt, which the trial counts, before the execution starts."""
         with self._database.transaction():
             self._require_unchanged(changes)
-            if not self._update(trial, "AND state = 'open'"):
-                raise self._not_open(trial.number)
+            self._update_open(trial, "AND state = 'open'")
 
     def close_trial(self, trial: Trial, system_trajectory: Trajectory | None, *, changes: int | None = None) -> None:
         """Store the result of an open trial; of two results for one trial, the first is stored."""
         with self._database.transaction():
             self._require_unchanged(changes)
-            if not self._update(trial, f"AND state = 'open' AND attempts = {trial.attempts:d}", closed_at=now()):
-                raise self._not_open(trial.number)
+            self._update_open(trial, f"AND state = 'open' AND attempts = {trial.attempts:d}", closed_at=now())
             self._trajectories.write(trial.number, "system", system_trajectory)
 
     def replace_result(
@@ -272,10 +260,13 @@ class Store:
         assignments = f"{' = ?, '.join(columns)} = ?, checksum = ?, closed_at = coalesce(?, closed_at)"
         return self._database.execute(f"UPDATE trials SET {assignments} WHERE number = ? {where}", values).rowcount == 1
 
-    def _not_open(self, number: int) -> InputError:
-        row = self._database.execute("SELECT state FROM trials WHERE number = ?", (number,)).fetchone()
+    def _update_open(self, trial: Trial, where: str, closed_at: str | None = None) -> None:
+        """Store what an execution changes in a trial that is open, and refuse another one."""
+        if self._update(trial, where, closed_at):
+            return
+        row = self._database.execute("SELECT state FROM trials WHERE number = ?", (trial.number,)).fetchone()
         state = "not open" if row is None else "being executed by another process" if row[0] == "open" else row[0]
-        return InputError(f"trial {number} is {state}, so nothing more can be told of it.")
+        raise InputError(f"trial {trial.number} is {state}, so nothing more can be told of it.")
 
     def trials(self) -> list[Trial]:
         """Return all trials in their order. Raises a :class:`ForeignStoreError` if one is damaged."""

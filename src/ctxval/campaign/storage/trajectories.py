@@ -31,7 +31,15 @@ class StoredTrajectories:
         if side == "model":
             rows = ((number, self._read(number, side)) for number in numbers)
             return {number: row[1] for number, row in rows if row is not None}
-        self._forget_changed()
+        with self._database.snapshot():
+            version = self._database.execute("PRAGMA data_version").fetchone()[0]
+            if version != self._version:  # another connection may have changed the file
+                statement = "SELECT trial, checksum FROM trajectories WHERE side = 'system'"
+                stored = dict(self._database.execute(statement)) if self._kept else {}
+                self._version = version
+                self._missing.clear()
+                for number in [n for n, (checksum, _) in self._kept.items() if stored.get(n) != checksum]:
+                    self._left += _size(self._kept.pop(number)[1])
         of_system = ((number, self._of_system(number)) for number in numbers)
         return {number: trajectory for number, trajectory in of_system if trajectory is not None}
 
@@ -68,19 +76,6 @@ class StoredTrajectories:
             self._left -= size
             self._kept[number] = row
         return trajectory
-
-    def _forget_changed(self) -> None:
-        """Forget what another connection may have changed in the file."""
-        with self._database.snapshot():
-            version = self._database.execute("PRAGMA data_version").fetchone()[0]
-            if version == self._version:
-                return
-            statement = "SELECT trial, checksum FROM trajectories WHERE side = 'system'"
-            stored = dict(self._database.execute(statement)) if self._kept else {}
-        self._version = version
-        self._missing.clear()
-        for number in [number for number, (checksum, _) in self._kept.items() if stored.get(number) != checksum]:
-            self._left += _size(self._kept.pop(number)[1])
 
     def _read(self, number: int, side: Side) -> tuple[int, Trajectory] | None:
         where = "FROM trajectories {} WHERE trial = ? AND side = ?"

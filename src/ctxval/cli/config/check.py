@@ -10,7 +10,8 @@ import numpy as np
 
 from ctxval._util.arrays import Array
 from ctxval._util.progress import stage
-from ctxval._util.texts import quoted, reason_of
+from ctxval._util.representation import task_text
+from ctxval._util.texts import reason_of
 from ctxval.campaign.costs import ThinkingCosts
 from ctxval.certificates.bounds import of_tasks
 from ctxval.core.controller import converged_of
@@ -139,17 +140,6 @@ def _convergence(failed: Sequence[dict[str, Any]], designs: int) -> Findings:
     else:
         examples = "; ".join(map(task_text, failed[:3]))
         yield "noted", f"{len(failed)} of {designs} designs did not converge, such as {examples}"
-
-
-def task_text(parameters: dict[str, Any]) -> str:
-    """Return the parameters of a task as a text."""
-
-    def number(value: Any) -> str:
-        if isinstance(value, str):
-            return quoted(value)
-        return f"[{', '.join(map(number, value))}]" if isinstance(value, list) else f"{value:.4g}"
-
-    return ", ".join(f"{name} = {number(value)}" for name, value in parameters.items())
 
 
 def _names(experiment: Experiment, counts: Mapping[str, int]) -> Findings:

@@ -68,21 +68,21 @@ def part(kind: str, given: str | Mapping[str, Any], folder: Path | None = None) 
     return registry.require_made(name, _built(kind, what, build, arguments, folder))
 
 
-def _referenced(registry: Registry[Any], what: str, found: Any, arguments: dict[str, Any], folder: Path | None) -> Any:
+def _referenced(registry: Registry[Any], what: str, named: Any, arguments: dict[str, Any], folder: Path | None) -> Any:
     """Return the part that a reference names, or that the named class or function makes.
 
     The class or function is checked before it is called.
     """
     # A model or a distance may be a function itself, rather than a function that makes one.
     count = {"model": 2, "distance": 3}.get(registry.kind)
-    makes = inspect.isfunction(found) and (bool(arguments) or count is None or not accepts(found, count))
-    if isinstance(found, type) or (makes and not arguments and not accepts(found, 0)):
-        require_part(registry, what, found)  # raises an error with the reason
-    if isinstance(found, type) or makes:
-        found = _built(registry.kind, what, found, arguments, folder)
+    makes = inspect.isfunction(named) and (bool(arguments) or count is None or not accepts(named, count))
+    if isinstance(named, type) or (makes and not arguments and not accepts(named, 0)):
+        require_part(registry, what, named)  # raises an error with the reason
+    if isinstance(named, type) or makes:
+        named = _built(registry.kind, what, named, arguments, folder)
     elif arguments:
         raise InputError(f"{what} is an object already, so it takes no arguments, got {', '.join(arguments)}.")
-    return require_part(registry, what, found)
+    return require_part(registry, what, named)
 
 
 def _built(kind: str, what: str, build: Any, arguments: dict[str, Any], folder: Path | None) -> Any:
@@ -96,12 +96,12 @@ def argument(value: Any, folder: Path | None = None) -> Any:
     """Return an argument unchanged, or the object that ``{ref = "module:attr"}`` names."""
     if isinstance(value, Mapping):
         if set(value) == {"ref"}:
-            found = reference(str(value["ref"]), folder)
-            if inspect.ismodule(found) or (inspect.isroutine(found) and not inspect.isfunction(found)):
+            named = reference(str(value["ref"]), folder)
+            if inspect.ismodule(named) or (inspect.isroutine(named) and not inspect.isfunction(named)):
                 raise InputError(
-                    f"{value['ref']} must be an object, a class or a function written in Python, got {found!r}."
+                    f"{value['ref']} must be an object, a class or a function written in Python, got {named!r}."
                 )
-            return found
+            return named
         return {key: argument(item, folder) for key, item in value.items()}
     return value
 
@@ -237,24 +237,23 @@ def with_distribution(
         return space.sampled(argument(tables["sampler"], folder))
     for name in tables:
         space.columns(name)  # which refuses names that are not in the space
-    stated = {name: table for name, table in tables.items() if table.get("type") != "uniform"}
-    if not stated:
-        return space
-    return space.distributed(**{name: _distribution(name, table, folder) for name, table in stated.items()})
-
-
-def _distribution(name: str, table: Mapping[str, Any], folder: Path | None) -> Any:
-    if set(table) == {"ref"}:
-        return argument(table, folder)
-    given = dict(table)
-    kind = given.pop("type", None)
-    if kind != "normal":
-        raise UnknownNameError.among(f"distribution of {name}", str(kind), ("normal", "uniform"))
-    for key in given.keys() - {"mean", "deviation"}:
-        raise UnknownNameError.among(f"argument of the distribution of {name}", key, ("mean", "deviation"))
-    if len(given) < 2:
-        raise InputError(f"the normal distribution of {name} needs a mean and a deviation, got {given!r}.")
-    return Normal(**given)
+    stated: dict[str, Any] = {}
+    for name, table in tables.items():
+        if set(table) == {"ref"}:
+            stated[name] = argument(table, folder)
+            continue
+        given = dict(table)
+        kind = given.pop("type", None)
+        if kind == "uniform":
+            continue
+        if kind != "normal":
+            raise UnknownNameError.among(f"distribution of {name}", str(kind), ("normal", "uniform"))
+        for key in given.keys() - {"mean", "deviation"}:
+            raise UnknownNameError.among(f"argument of the distribution of {name}", key, ("mean", "deviation"))
+        if len(given) < 2:
+            raise InputError(f"the normal distribution of {name} needs a mean and a deviation, got {given!r}.")
+        stated[name] = Normal(**given)
+    return space.distributed(**stated) if stated else space
 
 
 def named_experiment(text: str, seed: int, options: dict[str, Any], folder: Path | None = None) -> Experiment:

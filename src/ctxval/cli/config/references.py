@@ -66,12 +66,12 @@ def _here() -> str:
 def _require_place(text: str, module: str, home: str) -> None:
     """Check that a top-level module is found, and that no other module of this name is already loaded."""
     importlib.invalidate_caches()
-    found = _found(module)
-    own = found is not None and os.path.dirname(found) in (home, os.path.join(home, module))
-    if module in sys.stdlib_module_names and not own:
+    place = _place_of(module)
+    beside = place is not None and os.path.dirname(place) in (home, os.path.join(home, module))
+    if module in sys.stdlib_module_names and not beside:
         raise InputError(f"{text} is in Python's standard library, which contains no part of an experiment.")
     loaded = sys.modules.get(module)
-    if loaded is None and found is None:
+    if loaded is None and place is None:
         raise InputError(
             f"{text} cannot be loaded: no module named {module!r} is in {home} or installed. The modules of an "
             "experiment file must be in the folder of the file, and those of the command line in the current one."
@@ -80,8 +80,8 @@ def _require_place(text: str, module: str, home: str) -> None:
         "{} cannot be loaded: a module named {!r} is already in use, {}, and {}. Rename one, or use another process."
     )
     used = _place(getattr(loaded, "__file__", None), getattr(loaded, "__path__", None))
-    if used not in (None, found):
-        other = f"none of this name is in {home} or installed" if found is None else f"the reference means {found}"
+    if used not in (None, place):
+        other = f"none of this name is in {home} or installed" if place is None else f"the reference means {place}"
         raise InputError(clash.format(text, module, used, other))
     # No loaded module of another experiment's folder may have the name of any module in this folder.
     others = _added - {home}
@@ -93,7 +93,7 @@ def _require_place(text: str, module: str, home: str) -> None:
             raise InputError(clash.format(text, name, used, f"there is one in {home} too"))
 
 
-def _found(module: str) -> str | None:
+def _place_of(module: str) -> str | None:
     """Return the file or folder that would be imported; None if there is none, as for built-in modules."""
     for finder in sys.meta_path:
         spec = finder.find_spec(module, None)
@@ -110,56 +110,56 @@ def _place(file: str | None, folders: Any) -> str | None:
 # Checks of the object that a reference names
 
 
-def require_part(registry: Registry[Any], what: str, found: Any) -> Any:
+def require_part(registry: Registry[Any], what: str, value: Any) -> Any:
     """Return an object or a class if it can be a part of the kind.
 
     It must have the method of the kind; a model or a distance may also be a function.
     """
     kind, method = registry.kind, str(registry.method)
-    if isinstance(found, type):
-        has = has_method(found, method)
+    if isinstance(value, type):
+        has = has_method(value, method)
     elif kind == "distance":
-        has = is_function(found) and accepts(found, 3)
+        has = is_function(value) and accepts(value, 3)
     else:
-        has = callable(getattr(found, method, None)) or (kind == "model" and is_function(found) and accepts(found, 2))
+        has = callable(getattr(value, method, None)) or (kind == "model" and is_function(value) and accepts(value, 2))
     if not has:
         if kind == "distance":
             wanted = "a function (model_trajectory, system_trajectory, task) -> d written in Python"
-            raise InputError(f"{what} must be {wanted}, got {_named(found)}.")
-        raise InputError(f"{what} must be a {kind}, got {_named(found)}, which has no {method}.")
-    return found
+            raise InputError(f"{what} must be {wanted}, got {_named(value)}.")
+        raise InputError(f"{what} must be a {kind}, got {_named(value)}, which has no {method}.")
+    return value
 
 
-def require_function(what: str, found: Any, form: str) -> Any:
+def require_function(what: str, value: Any, form: str) -> Any:
     """Return a function if it takes the arguments of a form such as ``(x, u) -> x_next``; it is not called here."""
     count = form.partition("->")[0].count(",") + 1
-    if not is_function(found):
-        raise InputError(f"{what} must be a function {form} written in Python, got {_named(found)}.")
-    if not accepts(found, count):
-        raise InputError(f"{what} must be a function {form}; it takes {inspect.signature(found)}.")
-    return found
+    if not is_function(value):
+        raise InputError(f"{what} must be a function {form} written in Python, got {_named(value)}.")
+    if not accepts(value, count):
+        raise InputError(f"{what} must be a function {form}; it takes {inspect.signature(value)}.")
+    return value
 
 
-def is_function(found: Any) -> bool:
+def is_function(value: Any) -> bool:
     """Return whether an object is a function written in Python, or has a ``__call__`` that is one.
 
     Builtin functions and methods of other libraries' objects do not count: no user wrote them for an experiment.
     """
-    if isinstance(found, functools.partial):
-        return is_function(found.func)
-    if inspect.isfunction(_unwrapped(found)):
+    if isinstance(value, functools.partial):
+        return is_function(value.func)
+    if inspect.isfunction(_unwrapped(value)):
         return True
-    if isinstance(found, type):
+    if isinstance(value, type):
         return False
-    return any(inspect.isfunction(_unwrapped(vars(base).get("__call__"))) for base in type(found).__mro__)
+    return any(inspect.isfunction(_unwrapped(vars(base).get("__call__"))) for base in type(value).__mro__)
 
 
-def _unwrapped(found: Any) -> Any:
+def _unwrapped(value: Any) -> Any:
     """Return the function inside decorators, such as those of compilers."""
     try:
-        return inspect.unwrap(found)
+        return inspect.unwrap(value)
     except (ValueError, AttributeError):
-        return found
+        return value
 
 
 def accepts(function: Any, count: int, /, **named: Any) -> bool:
@@ -173,9 +173,9 @@ def accepts(function: Any, count: int, /, **named: Any) -> bool:
     return True
 
 
-def _named(found: Any) -> str:
-    if isinstance(found, type):
-        return f"the class {found.__module__}.{found.__qualname__}"
-    if inspect.isroutine(found):
-        return f"the {'function' if inspect.isfunction(found) else 'builtin or method'} {found.__name__}"
-    return f"an object of the class {type(found).__module__}.{type(found).__qualname__}"
+def _named(value: Any) -> str:
+    if isinstance(value, type):
+        return f"the class {value.__module__}.{value.__qualname__}"
+    if inspect.isroutine(value):
+        return f"the {'function' if inspect.isfunction(value) else 'builtin or method'} {value.__name__}"
+    return f"an object of the class {type(value).__module__}.{type(value).__qualname__}"

@@ -36,7 +36,6 @@ from ctxval.cli.config.references import reference, require_function
 from ctxval.cli.config.signatures import code_named, signed
 from ctxval.core.experiment import Experiment
 from ctxval.core.labels import Labels, labels_of
-from ctxval.core.outputs import OutputsLike
 from ctxval.core.quantiles import QUANTILE
 from ctxval.core.space import TaskSpace
 from ctxval.core.task_suite import TaskSuite
@@ -51,9 +50,6 @@ from ctxval.studies.aspect1 import TASKS
 
 Part = str | dict[str, Any]
 """``module:attr``, or a table with a type and its arguments."""
-
-
-_COMMON = {"stochastic", "resolution", "volume", "tests", "quantile"}
 
 
 class CertificateTable(BaseModel):
@@ -103,9 +99,10 @@ class CertificateTable(BaseModel):
         planned_kind = kind is None or kind == self.kind
         require_use(chosen.name, given)
         # For another kind than the planned one, only those settings of the file hold that are not about one kind.
-        planned = self.model_dump(include=None if planned_kind else _COMMON)
-        own = {**(self.model_extra or {}), **given} if planned_kind else given
-        merged = {**planned, **require_types(f"certificate {chosen.name!r}", chosen, own)}
+        common = {"stochastic", "resolution", "volume", "tests", "quantile"}
+        planned = self.model_dump(include=None if planned_kind else common)
+        further = {**(self.model_extra or {}), **given} if planned_kind else given
+        merged = {**planned, **require_types(f"certificate {chosen.name!r}", chosen, further)}
         return CertificateOptions(chosen.of(merged), confidence, merged["volume"])
 
 
@@ -133,7 +130,7 @@ class Aspect1Table(BaseModel):
 
     model_config = ConfigDict(extra="forbid")
 
-    distance: str | dict[str, Any] | None = None
+    distance: Part | None = None
     threshold: float | None = Field(default=None, gt=0, allow_inf_nan=False, strict=True)
     tasks: int = Field(default=TASKS, ge=2)
 
@@ -235,6 +232,9 @@ class Settings(BaseModel):
         else:
             space = TaskSpace(**{name: tuple(bounds) for name, bounds in (self.space or {}).items()})
         system = part("system", self.system or {}, self.folder)
+        outputs: Any = self.outputs
+        if isinstance(self.outputs, str):
+            outputs = require_function("outputs", reference(self.outputs, self.folder), "x -> y")
         validation = Validation(
             space=space,
             task=task_function(self.task or {}, space, system, self.folder),
@@ -243,26 +243,14 @@ class Settings(BaseModel):
             synthesizer=part("synthesizer", self.synthesizer or {}, self.folder),
             distance=part("distance", self.distance or "FinalState", self.folder),
             labels=Labels(labels_of(self.states), labels_of(self.inputs), self.units or ""),
-            outputs=self._outputs,
+            outputs=outputs,
         )
         if isinstance(validation.task, TaskTable):
             validation.require_goal(validation.task(space.parameters(space.low)))
         return Experiment(self.name or "experiment", validation)
 
-    @property
-    def _outputs(self) -> OutputsLike | None:
-        if isinstance(self.outputs, str):
-            function: OutputsLike = require_function("outputs", reference(self.outputs, self.folder), "x -> y")
-            return function
-        return self.outputs
-
     def campaign(
-        self,
-        experiment: Experiment,
-        store: Store | Path,
-        *,
-        accept_change: str | None = None,
-        remeasure: bool = False,
+        self, experiment: Experiment, store: Store | Path, *, accept_change: str | None = None, remeasure: bool = False
     ) -> Campaign:
         """Return a campaign, and write these settings into its store, signed by this user.
 

@@ -123,8 +123,14 @@ def worst_open_loop(
         np.put_along_axis(chosen, largest, np.sign(np.take_along_axis(flat, largest, axis=-1)), axis=-1)
         return chosen.reshape(gap.shape) * counts
 
+    # Random sequences at the bound, with few to many switches.
+    sequences = []
+    for r in range(restarts):
+        rng = np.random.default_rng(np.random.SeedSequence([seed, r]))
+        switches = rng.random((task.horizon, 1)) < rng.uniform() ** 3
+        sequences.append(1.0 - 2.0 * ((rng.integers(2, size=1) + switches.cumsum(axis=0)) % 2))
     with single_threaded():
-        U = _first_inputs(pair, restarts, seed)
+        U = np.array(sequences) * bound
         U = _ascend(pair, U, lambda gap, rows: first[rows], _by_gradient)
         U = _ascend(pair, U, norm, _by_gradient)
         U = _ascend(pair, U, norm, _by_trial)
@@ -195,17 +201,6 @@ def _directions(order: float, counts: Array, restarts: int) -> Array:
     return directions * counts
 
 
-def _first_inputs(pair: _Pair, restarts: int, seed: int) -> Array:
-    """Return random sequences at the bound, with few to many switches, shape ``(R, H, 1)``."""
-    sequences = []
-    for r in range(restarts):
-        rng = np.random.default_rng(np.random.SeedSequence([seed, r]))
-        switches = rng.random((pair.task.horizon, 1)) < rng.uniform() ** 3
-        start = rng.integers(2, size=1)
-        sequences.append(1.0 - 2.0 * ((start + switches.cumsum(axis=0)) % 2))
-    return np.array(sequences) * pair.bound
-
-
 def _ascend(
     pair: _Pair, U: Array, slope: Slope, proposal: Callable[[_Pair, Array, Slope, Rows], tuple[Array, Array]]
 ) -> Array:
@@ -218,26 +213,21 @@ def _ascend(
     for _ in range(200):
         if not len(rows):
             break
-        candidates = _moves(U[rows], *proposal(pair, U[rows], slope, rows))
+        targets, gains = proposal(pair, U[rows], slope, rows)
+        # The 1, 2, 4, ... entries with the largest gains move all the way, or all entries move a part of the way.
+        size = U[0].size
+        order = np.argsort(-gains.reshape(len(rows), -1), axis=1, kind="stable")
+        rank = np.argsort(order, axis=1).reshape(targets.shape)
+        counts = [*(2**j for j in range(size.bit_length()) if 2**j < size), size]
+        whole = [np.where(rank < count, targets, U[rows]) for count in counts]
+        parts = [U[rows] + share * (targets - U[rows]) for share in 0.5 ** np.arange(1, 7)]
+        candidates = np.stack([*whole, *parts])
         reached = pair.values(candidates, slope, rows)
         best, columns = reached.argmax(axis=0), np.arange(len(rows))
         improved = reached[best, columns] > values[rows] + 1e-10 * np.abs(values[rows])
         best, columns, rows = best[improved], columns[improved], rows[improved]
         U[rows], values[rows] = candidates[best, columns], reached[best, columns]
     return U
-
-
-def _moves(U: Array, targets: Array, gains: Array) -> Array:
-    """Return moves of the inputs towards the targets, shape ``(K, N, H, 1)``.
-
-    Either the 1, 2, 4, ... entries with the largest gains move all the way, or all entries move a part of the way.
-    """
-    size = U[0].size
-    order = np.argsort(-gains.reshape(len(U), -1), axis=1, kind="stable")
-    rank = np.argsort(order, axis=1).reshape(U.shape)
-    counts = [*(2**j for j in range(size.bit_length()) if 2**j < size), size]
-    whole = [np.where(rank < count, targets, U) for count in counts]
-    return np.stack([*whole, *(U + share * (targets - U) for share in 0.5 ** np.arange(1, 7))])
 
 
 def _by_gradient(pair: _Pair, U: Array, slope: Slope, rows: Rows) -> tuple[Array, Array]:

@@ -124,7 +124,6 @@ def distances_of(result: Result) -> Array:
 
 
 def _truth(job: Job) -> Result:
-    """Return the largest distance that the case's own method finds."""
     find = job.experiment().truth
     assert find is not None  # each case of the paper has one
     truth = find()

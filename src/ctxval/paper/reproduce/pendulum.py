@@ -187,10 +187,7 @@ class Techniques(Study):
     name = "techniques"
     title = "Pendulum: three techniques"
     case = "pendulum"
-    axes = (
-        "executions of S",
-        "error of the estimated d* [%], median and quartiles\n(below 0.001 % drawn at 0.001 %)",
-    )
+    axes = ("executions of S", "error of the estimated d* [%], median and quartiles\n(below 0.001 % drawn at 0.001 %)")
     legend = 3
 
     def jobs(self, scale: Scale) -> list[Job]:

@@ -17,7 +17,7 @@ from ctxval.report.context import ReportContext
 from ctxval.report.distance_model import distance_of
 from ctxval.report.findings import WORDS
 from ctxval.report.markup import UNCUT, joined, number, paragraph, quantity, table, text
-from ctxval.report.sections.repeat import command_of, digest
+from ctxval.report.sections.repeat import command_of, identity
 
 _NASA, _V10, _V20 = "NASA-STD-7009B", "ASME V&V 10", "ASME V&V 20"
 
@@ -41,13 +41,9 @@ def for_the_file(context: ReportContext) -> Markup:
     return joined([paragraph(meaning), table("Appendix for the file", headers, rows, class_="facts")])
 
 
-def appendix(context: ReportContext) -> list[Entry]:
-    """Return the entries of the appendix."""
-    return [*_purpose(context), *_evidence(context), *_limits(context)]
-
-
-def _purpose(context: ReportContext) -> Iterator[Entry]:
-    space, units = context.space, context.labels.units
+def appendix(context: ReportContext) -> Iterator[Entry]:
+    """Yield the entries of the appendix: the purpose, the evidence, and its limits."""
+    space, units, certificate, digests = context.space, context.labels.units, context.certificate, identity(context)
     synthesizer = None if context.validation is None else type(context.validation.synthesizer).__name__
     design = "" if synthesizer is None else f", with the synthesizer {synthesizer}"
     yield Entry(
@@ -65,14 +61,11 @@ def _purpose(context: ReportContext) -> Iterator[Entry]:
         "The context-specific distance d(p) between the trajectories of model and system under the same controller "
         f"({kind}{f', in {units}' if units else ''}); the quantity of interest is its largest value d* over all tasks.",
     )
-    criterion, certificate = "None was stated.", context.certificate
+    criterion = "None was stated."
     if context.verdict is not None:
         confidence = "" if certificate is None else f", with confidence {number(certificate.confidence)}"
         criterion = f"d* is at most {quantity(context.verdict.threshold, units)}{confidence}."
     yield Entry("Acceptance criterion (accuracy requirement)", f"{_NASA}, {_V10}", criterion)
-
-
-def _evidence(context: ReportContext) -> Iterator[Entry]:
     origins = Counter(trial.origin for trial in context.trials)
     listed = ", ".join(f"{count} {origin}" for origin, count in sorted(origins.items()))
     yield Entry(
@@ -80,11 +73,11 @@ def _evidence(context: ReportContext) -> Iterator[Entry]:
         f"{_NASA}, {_V10}",
         f"{context.executions} executions of the system in {len(context.trials)} trials ({listed or 'none'}), of which "
         f"{len(context.completed)} gave a distance and {len(context.recordings)} a recorded trajectory. Digest of the "
-        f"description of the system: {_part_digest(context, 'system')}.",
+        f"description of the system: {digests.get('digest of the system', 'not known')}.",
     )
     error, executed = "No distance is known.", "Nothing was executed."
     if context.completed:
-        units, worst = context.labels.units, context.worst_first[0]
+        worst = context.worst_first[0]
         error = (
             f"Largest distance {quantity(distance_of(worst), units)} (trial {worst.number}), median "
             f"{quantity(float(np.median(context.distances)), units)}, smallest "
@@ -98,10 +91,6 @@ def _evidence(context: ReportContext) -> Iterator[Entry]:
         executed = f"Executed: {ranges}. Nothing is said about tasks outside the intended use."
     yield Entry("Comparison error E = S \u2212 D (here: M \u2212 S)", _V20, error)
     yield Entry("Domain of validation, and what lies outside it", f"{_NASA}, {_V10}, {_V20}", executed)
-
-
-def _limits(context: ReportContext) -> Iterator[Entry]:
-    certificate, model = context.certificate, context.distance_model
     uncertainty = "No certificate was computed, so no uncertainty is stated for tasks that were not executed."
     assumptions, robustness = "None beyond the recorded executions", "Not known: fewer than two distances."
     if certificate is not None:
@@ -114,7 +103,7 @@ def _limits(context: ReportContext) -> Iterator[Entry]:
             f"not part of it.{withdrawn}"
         )
         assumptions = "; ".join(certificate.assumptions)
-    if model is not None and context.suite is None:
+    if (model := context.distance_model) is not None and context.suite is None:
         shares = ((context.space.labels[j], number(float(model.sensitivity[j]), 2)) for j in model.influence[:5])
         listed = "; ".join(f"{label} {share}" for label, share in shares)
         robustness = f"Total Sobol indices of the predicted distance, the largest first: {listed}."
@@ -135,7 +124,7 @@ def _limits(context: ReportContext) -> Iterator[Entry]:
         "Provenance",
         _NASA,
         f"Store {context.store.name}; ctxval {VERSION}; command: {command_of(context) or 'none'}; digest of the "
-        f"description of the model: {_part_digest(context, 'model')}.",
+        f"description of the model: {digests.get('digest of the model', 'not known')}.",
     )
     conclusion = str(context.verdict or "No verdict, because no threshold was stated.")
     yield Entry("Conclusion", f"{_NASA}, {_V10}", conclusion)
@@ -146,7 +135,3 @@ def _box(context: ReportContext, low: Array, high: Array) -> str:
         return f"a suite of {len(context.suite)} tasks, {enumerated(context.suite.task_names, 40)}"
     ends = zip(context.space.labels, low.tolist(), high.tolist(), strict=True)
     return "; ".join(f"{label} from {number(first)} to {number(last)}" for label, first, last in ends)
-
-
-def _part_digest(context: ReportContext, part: str) -> str:
-    return digest(context.parts[part]) if part in context.parts else "not known"

@@ -33,7 +33,13 @@ def distances(context: ReportContext) -> Markup:
     if context.space.dimension == 1 or context.suite is not None:
         parts = [element("div", predicted, class_="charts")]
     else:
-        second = element("div", _sensitivity(context, model), predicted, class_="charts")
+        caption = (
+            "Sensitivity of the distance: the share of each parameter in the variance of the predicted distance, alone "
+            "and together with others (total Sobol index)"
+        )
+        shares = ((context.space.labels[j], float(model.sensitivity[j])) for j in model.influence)
+        rows = ((label, percent(share), bar(share)) for label, share in shares)
+        second = element("div", table(caption, ("Parameter", "Share", "Bar"), rows), predicted, class_="charts")
         note = "Lines, bands and maps are pictures of what the trials suggest, and no certificate."
         parts = [paragraph(note), *_over_space(context, model), second]
     return joined([*parts, *_region(context)])
@@ -93,7 +99,13 @@ def _slice(context: ReportContext, axis: int, *, small: bool = False) -> Chart |
     title = f"Distance over {space.labels[axis]}" + (
         "" if space.dimension == 1 else ", through the worst executed task"
     )
-    chart = Chart(title, _parameter_axis(context, axis), _distance_axis(context, band), **(SMALL if small else {}))
+    limits = [limit for limit in (context.threshold, context.bound) if limit is not None]
+    # A threshold far above all distances would flatten the curve, so it may lie outside.
+    top = 3 * max(float(context.distances.max()), float(np.nanmax(band.median)))
+    shown = [value for value in limits if value <= top or top == 0]
+    high = np.minimum(band.high, max(top, *shown, 1e-300))
+    y = Axis.over(context.distance_label, context.distances, high, shown, zero=True)
+    chart = Chart(title, _parameter_axis(context, axis), y, **(SMALL if small else {}))
     if band.low is band.high:
         chart.line(x, band.median, "mean", "predicted by the learned dynamics")
     else:
@@ -108,15 +120,6 @@ def _slice(context: ReportContext, axis: int, *, small: bool = False) -> Chart |
 def _parameter_axis(context: ReportContext, axis: int) -> Axis:
     space = context.space
     return Axis(space.labels[axis], float(space.low[axis]), float(space.high[axis]))
-
-
-def _distance_axis(context: ReportContext, band: Band) -> Axis:
-    limits = [limit for limit in (context.threshold, context.bound) if limit is not None]
-    # A threshold far above all distances would flatten the curve, so it may lie outside.
-    top = 3 * max(float(context.distances.max()), float(np.nanmax(band.median)))
-    shown = [value for value in limits if value <= top or top == 0]
-    high = np.minimum(band.high, max(top, *shown, 1e-300))
-    return Axis.over(context.distance_label, context.distances, high, shown, zero=True)
 
 
 def _add_trials(chart: Chart, context: ReportContext, x: int, y: int | None = None) -> None:
@@ -163,17 +166,6 @@ def _map(context: ReportContext, title: str, values: Array, label: str) -> Marku
     _add_trials(chart, context, 0, 1)
     _add_marks(chart, context, [context.worst_first[0]], (0, 1), "worst", "worst executed task")
     return chart.render(colour_scale(0.0, top, label))
-
-
-def _sensitivity(context: ReportContext, model: DistanceModel) -> Markup:
-    """Return the shares of the parameters in the variance of the predicted distance, the largest first."""
-    shares = {context.space.labels[j]: float(model.sensitivity[j]) for j in model.influence}
-    caption = (
-        "Sensitivity of the distance: the share of each parameter in the variance of the predicted distance, alone and "
-        "together with others (total Sobol index)"
-    )
-    rows = ((label, percent(share), bar(share)) for label, share in shares.items())
-    return table(caption, ("Parameter", "Share", "Bar"), rows)
 
 
 def _predicted(context: ReportContext, model: DistanceModel) -> Chart:

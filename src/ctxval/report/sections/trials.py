@@ -32,10 +32,16 @@ def trials(context: ReportContext) -> Markup:
     # Data for the page's script: the element is no script itself, and its content cannot end it.
     plain = json.dumps(lines.data, allow_nan=False, separators=(",", ":"))
     escaped = Markup(plain.translate({ord(character): f"\\u{ord(character):04x}" for character in "<>&"}))
+    # Those with the largest distances, and those without a distance.
+    shown = [*context.worst_first, *(trial for trial in context.trials if trial.distance is None)][:_ROWS]
+    headers = ("trial", "distance", "state", "origin", *context.task_labels, "time [s]", "attempts", "remarks")
+    tasks = zip(shown, context.tasks_of(shown), strict=True)
+    rows = [_row(trial, task, trial.number in lines.kept) for trial, task in tasks]
+    caption = f"Trials, the largest distance first{'' if len(shown) == len(context.trials) else f' ({_ROWS} of them)'}"
     return joined(
         [
             *_left_out(context, lines),
-            _table(context, lines),
+            table(caption, headers, rows, "sortable", id_="trials", label="Table of trials", scroll="scroll tall"),
             element("div", id="trial", aria_live="polite", class_="needs-script"),
             element("script", escaped, type="application/json", id="trial-data"),
             *_worst(context),
@@ -57,16 +63,6 @@ def _left_out(context: ReportContext, lines: RecordedLines) -> list[Markup]:
     elif context.replays:
         notes.append("The corrected model in each trial is learned from the other trials.")
     return [paragraph(" ".join(notes))] if notes else []
-
-
-def _table(context: ReportContext, lines: RecordedLines) -> Markup:
-    # Those with the largest distances, and those without a distance.
-    shown = [*context.worst_first, *(trial for trial in context.trials if trial.distance is None)][:_ROWS]
-    headers = ("trial", "distance", "state", "origin", *context.task_labels, "time [s]", "attempts", "remarks")
-    tasks = context.tasks_of(shown)
-    rows = [_row(trial, task, trial.number in lines.kept) for trial, task in zip(shown, tasks, strict=True)]
-    caption = f"Trials, the largest distance first{'' if len(shown) == len(context.trials) else f' ({_ROWS} of them)'}"
-    return table(caption, headers, rows, "sortable", id_="trials", label="Table of trials", scroll="scroll tall")
 
 
 def _row(trial: Trial, task: list[float | str], recorded: bool) -> Markup:

@@ -7,7 +7,6 @@ import shlex
 from markupsafe import Markup
 
 from ctxval._util.representation import counted
-from ctxval.certificates import Certificate
 from ctxval.certificates.bounds import as_text, at_most, with_error
 from ctxval.report import markup
 from ctxval.report.context import ReportContext
@@ -23,8 +22,6 @@ _SHAPES = {
     **{"validated": "\u2714", "falsified": "\u2718", "undecided": "?", "no verdict": "\u2013"},
     **{"good": "\u25cf", "note": "\u25c6", "attention": "\u25b2", "bad": "\u25a0", "unknown": "\u25cb"},
 }
-
-_TESTS = 22  # number of tests that is advised if an error would be costly
 
 
 def verdict(context: ReportContext) -> Markup:
@@ -60,12 +57,13 @@ def _next(context: ReportContext) -> tuple[str, str]:
             "or the tasks change."
         )
         tests = {} if verdict.certificate is None else verdict.certificate.details.get("tests", {})
-        drawn = tests.get("drawn", _TESTS)
-        budget = max(context.budget or 0, context.executions + _TESTS - drawn)
-        command = command_of(context, budget, "--tests", str(_TESTS), "--store", path)
-        if not command or drawn >= _TESTS:
+        most = 22  # tests are advised if an error would be costly
+        drawn = tests.get("drawn", most)
+        budget = max(context.budget or 0, context.executions + most - drawn)
+        command = command_of(context, budget, "--tests", str(most), "--store", path)
+        if not command or drawn >= most:
             return advice, ""
-        return f"{advice} If an error would be costly, test the predictions at {_TESTS} drawn tasks:", command
+        return f"{advice} If an error would be costly, test the predictions at {most} drawn tasks:", command
     if verdict.answer == "falsified":
         largest = quantity(distance_of(context.worst_first[0]), context.labels.units)
         advice = (
@@ -88,10 +86,6 @@ def _next(context: ReportContext) -> tuple[str, str]:
     return f"Execute more tasks: {advice}.", shlex.join(["ctxval", "ask", path]) if by_hand else command
 
 
-def _bound(context: ReportContext, certificate: Certificate) -> str:
-    return f"{with_error(certificate.upper_bound, certificate.error)} {context.labels.units}".rstrip()
-
-
 def _facts(context: ReportContext) -> Markup:
     verdict, certificate, units = context.verdict, context.certificate, context.labels.units
     rows: list[tuple[str, object]] = []
@@ -101,7 +95,8 @@ def _facts(context: ReportContext) -> Markup:
         rows.append(("Largest executed", at))
     if certificate is not None:
         how = "withdrawn" if certificate.doubt is not None else f"{percent(certificate.confidence)} confidence"
-        rows.append(("Bound on all tasks", f"{_bound(context, certificate)} ({certificate.kind}, {how})"))
+        bound = f"{with_error(certificate.upper_bound, certificate.error)} {units}".rstrip()
+        rows.append(("Bound on all tasks", f"{bound} ({certificate.kind}, {how})"))
         if certificate.volume:
             rows.append(("Tasks left out", f"{at_most(100 * certificate.volume, 3)} %"))
     if verdict is not None:
@@ -137,27 +132,20 @@ def _remarks(context: ReportContext) -> list[Markup]:
 
 def basis(context: ReportContext) -> Markup:
     """Return what the verdict rests on: the assumptions, the diagnostics and what was not tested."""
-    rests_on = None if context.verdict is None else context.verdict.rests_on
-    return joined(
-        [
-            *([] if context.certificate is None else _assumptions(context.certificate)),
-            *([] if rests_on is None else [paragraph(text(rests_on, UNCUT))]),
-            heading("Diagnostics"),
-            lights(context.diagnostics),
-            heading("What was not tested"),
-            bullets(context.not_tested),
+    parts, certificate = list[Markup](), context.certificate
+    if certificate is not None:
+        rows = ((name.replace("_", " "), as_text(value)) for name, value in certificate.numbers.items())
+        stated = certificate.statement if certificate.doubt is None else f"It is withdrawn: {certificate.doubt}."
+        parts += [
+            heading(f"What the certificate {certificate.kind} assumes"),
+            paragraph(stated),
+            bullets(text(f"{markup.sentence(words)}.", UNCUT) for words in certificate.assumptions),
+            markup.details("Numbers of the certificate", table("Numbers of the certificate", ("Name", "Value"), rows)),
         ]
-    )
-
-
-def _assumptions(certificate: Certificate) -> list[Markup]:
-    rows = ((name.replace("_", " "), as_text(value)) for name, value in certificate.numbers.items())
-    return [
-        heading(f"What the certificate {certificate.kind} assumes"),
-        paragraph(certificate.statement if certificate.doubt is None else f"It is withdrawn: {certificate.doubt}."),
-        bullets(text(f"{markup.sentence(words)}.", UNCUT) for words in certificate.assumptions),
-        markup.details("Numbers of the certificate", table("Numbers of the certificate", ("Name", "Value"), rows)),
-    ]
+    if context.verdict is not None and context.verdict.rests_on is not None:
+        parts.append(paragraph(text(context.verdict.rests_on, UNCUT)))
+    parts += [heading("Diagnostics"), lights(context.diagnostics)]
+    return joined([*parts, heading("What was not tested"), bullets(context.not_tested)])
 
 
 def lights(findings: list[Finding]) -> Markup:

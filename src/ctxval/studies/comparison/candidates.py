@@ -103,7 +103,6 @@ class Candidate:
     name: str
     campaign: Campaign
     seed: int
-    _trajectories: dict[int, Trajectory] = field(default_factory=dict, init=False)
     _last: tuple[tuple[int, ...], Prediction | None] | None = field(default=None, init=False)
 
     def __post_init__(self) -> None:
@@ -132,13 +131,8 @@ class Candidate:
         return [trial for trial in self.trials if trial.executed and is_shared(trial) == shared]
 
     def trajectories(self) -> list[tuple[Trial, Trajectory]]:
-        """Return the completed trials with a recorded trajectory; each trajectory is read once."""
-        completed = [trial for trial in self.trials if trial.state == "completed"]
-        if unread := [trial for trial in completed if trial.number not in self._trajectories]:
-            read = executed_trials(self.campaign.store, unread)
-            self._trajectories.update((trial.number, trajectory) for trial, trajectory in read)
-        known = self._trajectories
-        return [(trial, known[trial.number]) for trial in completed if trial.number in known]
+        """Return the completed trials with a recorded trajectory; the store keeps what it has read."""
+        return executed_trials(self.campaign.store, self.trials)
 
     def highest(self, executed: Executed) -> tuple[float, Array] | None:
         """Return the largest predicted distance and its task ``(d,)``; None if nothing can be predicted."""

@@ -200,7 +200,13 @@ class MeanQuestion:
         usual = sum(drawn[last][1].shared is None for drawn in draws if last in drawn) or len(active)
         if len(waiting) == len(active) and left < min(len(active), usual):
             return False
-        candidate, point = waiting[0], self._point(draw)
+        candidate = waiting[0]
+        # The draw depends on all models, so that a model that is learned again with the draws is not judged by them; a
+        # number identifies the random stream, which is none of those of trials.
+        models = [candidate.recorder.draws.of_model() for candidate in self.candidates]
+        rng = np.random.default_rng([self.seed, draw, 0x6472, *models])
+        space = candidate.campaign.validation.space
+        point = np.asarray(space.rounded(space.unit_draws(1, rng)[0]))
         note = self.executions.predicted(candidate, TrialNote(self.executions.steps, "mean", draw), point)
         self.executions.execute(candidate, Choice(point, "iid"), note, predicts=False)
         return True
@@ -220,17 +226,6 @@ class MeanQuestion:
             reason = self._lost(a, b) or undecided
         interval = mean.estimate, mean.low, mean.high, mean.tasks, mean.variance_left
         return PairResult("mean", a.name, b.name, smaller, reason, *interval)
-
-    def _point(self, draw: int) -> Array:
-        """Return an independent draw from the distribution of tasks, a point of the unit cube ``(d,)``.
-
-        It depends on all models, so that a model that is learned again with the draws is not judged by them.
-        """
-        models = [candidate.recorder.draws.of_model() for candidate in self.candidates]
-        # The number identifies a random stream, which is none of those of trials.
-        rng = np.random.default_rng([self.seed, draw, 0x6472, *models])
-        space = self.candidates[0].campaign.validation.space
-        return np.asarray(space.rounded(space.unit_draws(1, rng)[0]))
 
     def _difference(self, a: Candidate, b: Candidate) -> MeanDifference:
         """Return the difference by the draws that both have, up to the first one without a usable distance."""

@@ -9,7 +9,7 @@ import numpy as np
 
 from ctxval._util.arrays import Array, ArrayLike, as_finite
 from ctxval._util.representation import ShortRepr
-from ctxval.core.controller import Controller, ControllerWithMemory, Feedback, Limits
+from ctxval.core.controller import Controller, ControllerWithMemory, Limits
 from ctxval.core.plan import Plan
 from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory
@@ -52,35 +52,25 @@ def _signal(kind: SignalKind, horizon: int, rng: np.random.Generator) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Excited(ShortRepr):
-    """A controller without memory, with a signal ``(H, m)`` added to its inputs, within limits."""
+    """A controller with a signal ``(H, m)`` added to its inputs, within limits.
 
-    controller: Feedback
-    signal: Array
-    limits: Limits
-
-    def __call__(self, t: int, x: Array) -> Array:
-        """Return the input at step t, shape ``(..., m)``."""
-        return self.limits.clip(np.asarray(self.controller(t, x)) + self.signal[t])
-
-
-@dataclass(frozen=True, eq=False)
-class ExcitedWithMemory(ShortRepr):
-    """A controller with memory, with a signal ``(H, m)`` added to its inputs, within limits.
-
-    The memory is that of the controller, which does not know of the signal.
+    The memory is that of the controller, which does not know of the signal; None if it has none.
     """
 
-    controller: ControllerWithMemory
+    controller: Controller
     signal: Array
     limits: Limits
 
     def start(self, task: Task) -> Any:
         """Return the memory of the controller before its first step."""
-        return self.controller.start(task)
+        return self.controller.start(task) if isinstance(self.controller, ControllerWithMemory) else None
 
     def step(self, t: int, x: Array, memory: Any) -> tuple[Array, Any]:
         """Return the input at step t, shape ``(..., m)``, and the new memory."""
-        u, memory = self.controller.step(t, x, memory)
+        if isinstance(self.controller, ControllerWithMemory):
+            u, memory = self.controller.step(t, x, memory)
+        else:
+            u = self.controller(t, x)
         return self.limits.clip(np.asarray(u) + self.signal[t]), memory
 
 
@@ -124,10 +114,5 @@ class Excitation(ShortRepr):
         """Execute S once and return its trajectory."""
         plan = self.plan(number)
         signal = excitation(self.kind, plan.task.horizon, self.amplitude, np.random.default_rng([self.seed, number, 1]))
-        designed, limits = plan.controller, self.limits
-        excited: Controller = (
-            ExcitedWithMemory(designed, signal, limits)
-            if isinstance(designed, ControllerWithMemory)
-            else Excited(designed, signal, limits)
-        )
+        excited = Excited(plan.controller, signal, self.limits)
         return self.validation.execute(Plan(plan.parameters, plan.task, excited, plan.model_trajectory))

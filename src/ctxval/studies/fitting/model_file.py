@@ -5,6 +5,7 @@ An ONNX file has double precision, for robots and other programs; it needs onnx 
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +31,9 @@ BESIDE = (".data.npz", ".residual.json", ".residual.txt")
 """The suffixes of the files that may be written beside a model."""
 
 
+_NO_REFERENCE = "the parameters of a function can only be written with the reference module:attr to it (--step)."
+
+
 def require_suffix(path: Path) -> None:
     """Check that the name of the file of a model ends as one that can be written."""
     if path.suffix not in SUFFIXES:
@@ -47,8 +51,8 @@ def require_file_of(path: Path, method: str, makes: type[Model] | None, model: M
             f"the model of the method {method!r} cannot be written to a file that ends in {path.suffix}: give one that "
             f"ends in {' or '.join(suitable)}."
         )
-    if issubclass(makes, Parametric):
-        _require_reference(step)
+    if issubclass(makes, Parametric) and step is None:
+        raise InputError(_NO_REFERENCE)
     if path.suffix == ".onnx":
         _require_onnx(before_refinement(model) if issubclass(makes, Corrected) else None)
 
@@ -59,13 +63,15 @@ def write_model_file(path: Path, model: Model, step: str | None = None) -> list[
     if not isinstance(model, SUFFIXES[path.suffix]):
         raise InputError(f"the model {model!r} cannot be written to a file that ends in {path.suffix}.")
     if isinstance(model, Parametric):
+        if step is None:
+            raise InputError(_NO_REFERENCE)
         values = ", ".join(f"{name} = {value!r}" for name, value in model.theta.items())
         dt = model.dt or getattr(model.data, "dt", None)
         lines = [
             f"# {MADE_BY}",
             "[model]",
             'type = "Parametric"',
-            f'step = {{ ref = "{_require_reference(step)}" }}',
+            f'step = {{ ref = "{step}" }}',
             f"theta = {{ {values} }}",
             *([] if dt is None else [f"dt = {dt!r}"]),
             *(["vectorized = true"] if model.vectorized else []),
@@ -83,24 +89,15 @@ def write_model_file(path: Path, model: Model, step: str | None = None) -> list[
     return [str(path), str(beside)]
 
 
-def _require_reference(step: str | None) -> str:
-    """Return the reference ``module:attr`` to the user's function, without which its parameters cannot be written."""
-    if step is None:
-        raise InputError(
-            "the parameters of a function can only be written with the reference module:attr to it (--step)."
-        )
-    return step
-
-
 def write_onnx(path: str | Path, model: Model) -> None:
     """Write a model as an ONNX file with one input ``(x, u)`` and the output ``x_next``."""
     onnx = _require_onnx(model)
-    graph = _Graph(onnx)
-    _, n, m = _next_state(_Value(graph, "z"), model)
-    graph.nodes[-1].output[0] = "x_next"
+    nodes, tensors = list[Any](), list[Any]()
+    _, n, m = _next_state(_Value("z", onnx, nodes, tensors), model)
+    nodes[-1].output[0] = "x_next"
     value, kind = onnx.helper.make_tensor_value_info, onnx.TensorProto.DOUBLE
     ends = [value("z", kind, ["N", n + m])], [value("x_next", kind, ["N", n])]
-    made = onnx.helper.make_graph(graph.nodes, "step", *ends, graph.tensors)
+    made = onnx.helper.make_graph(nodes, "step", *ends, tensors)
     # Versions that onnxruntime has read since 2022.
     opset = [onnx.helper.make_opsetid("", 17)]
     content = onnx.helper.make_model(made, opset_imports=opset, ir_version=8, producer_name=MADE_BY)
@@ -168,32 +165,26 @@ def _squared_distance(z: _Value, centres: Array, scales: Array, factor: float) -
     return (mixed + squares).node("Relu")
 
 
-class _Graph:
-    """The nodes and constants of a graph."""
-
-    def __init__(self, onnx: Any) -> None:
-        self.onnx = onnx
-        self.nodes: list[Any] = []
-        self.tensors: list[Any] = []
-
-
+@dataclass(frozen=True, eq=False)
 class _Value:
-    """A value in a graph, with the operations that add a node to it."""
+    """A value in a graph, with the operations that add a node to it; all values share the nodes and the constants."""
 
-    def __init__(self, graph: _Graph, name: str) -> None:
-        self.graph, self.name = graph, name
+    name: str
+    onnx: Any
+    nodes: list[Any]
+    tensors: list[Any]
 
     def node(self, kind: str, *others: _Value | Array) -> _Value:
         """Return the result of an operation on this value and others; constants are broadcast."""
-        nodes, tensors, onnx = self.graph.nodes, self.graph.tensors, self.graph.onnx
         names = [self.name]
         for other in others:
             if not isinstance(other, _Value):
-                constant = onnx.numpy_helper.from_array(np.asarray(other, dtype=np.float64), f"constant_{len(tensors)}")
-                tensors.append(constant)
-            names.append(other.name if isinstance(other, _Value) else tensors[-1].name)
-        nodes.append(onnx.helper.make_node(kind, names, [f"value_{len(nodes)}"]))
-        return _Value(self.graph, f"value_{len(nodes) - 1}")
+                array, name = np.asarray(other, dtype=np.float64), f"constant_{len(self.tensors)}"
+                self.tensors.append(self.onnx.numpy_helper.from_array(array, name))
+            names.append(other.name if isinstance(other, _Value) else self.tensors[-1].name)
+        result = f"value_{len(self.nodes)}"
+        self.nodes.append(self.onnx.helper.make_node(kind, names, [result]))
+        return replace(self, name=result)
 
     def affine(self, weight: Array, bias: Array) -> _Value:
         return self.node("Gemm", weight, bias)

@@ -156,6 +156,16 @@ def stepped(model: Model, x: Array, u: Array) -> Array:
     return x_next
 
 
+def squared(errors: Array, sizes: Array) -> Array:
+    """Return the mean over the states of squared errors in units of sizes, ``(N,)``; large if it is not finite.
+
+    A state of the size 0, which never changes, does not count.
+    """
+    with np.errstate(all="ignore"):
+        squares = ((errors / np.where(sizes > 0, sizes, np.inf)) ** 2).mean(axis=1)
+        return np.asarray(np.nan_to_num(squares, nan=1e12, posinf=1e12).clip(max=1e12))
+
+
 def root_mean_square(values: Array) -> Array:
     """Return the root mean square over the first axis, without rows whose squares are not finite; NaN if none is."""
     with np.errstate(over="ignore"):

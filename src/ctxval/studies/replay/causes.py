@@ -17,7 +17,7 @@ from ctxval._util.representation import ShortRepr
 from ctxval.core.model import Model
 from ctxval.core.trajectory import Transitions
 from ctxval.learning import PosteriorSettings, learn_posterior
-from ctxval.studies.replay.accuracy import RecordedSteps, Windows, stepped
+from ctxval.studies.replay.accuracy import RecordedSteps, Windows, squared, stepped
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,6 @@ class ResidualShare(ShortRepr):
             at least 0.
         history: share of the rest that the previous state, input and residual explain; at least 0. If it is large, the
             system has a state that is not recorded, or a delay.
-        correlation: correlation of the rest with itself one step earlier.
         rest: root mean square of what state and input do not explain.
     """
 
@@ -42,7 +41,6 @@ class ResidualShare(ShortRepr):
     linear: float
     explained: float
     history: float
-    correlation: float
     rest: float
 
 
@@ -71,24 +69,16 @@ def residual_shares(model: Model, recorded: RecordedSteps, seed: int) -> tuple[R
     better = (affine**2).mean(axis=0) < (rest**2).mean(axis=0)
     rest[:, better] = affine[:, better]
     history = left_by(lambda held: _affine(past, rest, held), rest)
-    follows: Mask = (np.diff(where.runs) == 0) & (np.diff(where.places) == 1)
 
     def share(errors: Array, size: float) -> float:
         """Return which share of a mean square is explained if these errors are left."""
         return max(0.0, 1.0 - float((errors**2).mean()) / size) if size > 0 else 0.0
 
-    def correlation(values: Array) -> float:
-        """Return the correlation of values with those one step earlier; 0 if no steps follow each other."""
-        first, second = values[:-1][follows], values[1:][follows]
-        if len(first) < 3 or first.std() == 0 or second.std() == 0:
-            return 0.0
-        return float(np.corrcoef(first, second)[0, 1])
-
     sizes, left = (residuals**2).mean(axis=0).tolist(), (rest**2).mean(axis=0).tolist()
     return tuple(
         ResidualShare(
             *(name, unit, math.sqrt(sizes[i]), share(affine[:, i], sizes[i]), share(rest[:, i], sizes[i])),
-            *(share(history[:, i], left[i]), correlation(rest[:, i]), math.sqrt(left[i])),
+            *(share(history[:, i], left[i]), math.sqrt(left[i])),
         )
         for i, (name, unit) in enumerate(recorded.recordings.states.items())
     )
@@ -127,14 +117,12 @@ class Suggestion(ShortRepr):
         kind: ``delay`` or ``time step``.
         value: the delay in seconds, or the time step of the model in seconds.
         ratio: the held-out one-step error with the change, divided by that without it.
-        agreeing: share of the recordings in which the error falls.
         sentence: what it means.
     """
 
     kind: Literal["delay", "time step"]
     value: float
     ratio: float
-    agreeing: float
     sentence: str
 
 
@@ -154,15 +142,16 @@ def _delay(model: Model, recorded: RecordedSteps) -> Suggestion | None:
     if not recorded.recordings.inputs or not len(where):
         return None
     x, reached, groups = where.states(), where.states(1), where.groups
+    sizes = np.sqrt(((reached - x) ** 2).mean(axis=0))
 
     def errors(of: Callable[[Array], Array], shift: float) -> Array:
         """Return the squared errors of states that depend on the mean input of each step, if inputs act so late."""
         whole = math.floor(shift)
         u, part = where.inputs(-whole), shift - whole
         u = u + part * (where.inputs(-whole - 1) - u) if part else u
-        return _squared(of(u), reached - x)
+        return squared(of(u), sizes)
 
-    def chosen(of: Callable[[Array], Array]) -> tuple[dict[float, Array], tuple[float, float, float] | None]:
+    def chosen(of: Callable[[Array], Array]) -> tuple[dict[float, Array], tuple[float, float] | None]:
         """Return the errors for whole steps, and for tenths around the best of them, and what they choose."""
         known = {float(shift): errors(of, shift) for shift in range(first, last + 1)}
         best = min(known, key=lambda shift: known[shift].mean())
@@ -177,7 +166,7 @@ def _delay(model: Model, recorded: RecordedSteps) -> Suggestion | None:
         # A model that predicts better than these affine models was not learned with inputs of another time.
         if change is None or by_model[0].mean() <= fitted[change[0]].mean():
             return None
-    shift, ratio, agreeing = change
+    shift, ratio = change
     delay = shift * recorded.recordings.dt
     when = (
         f"if the inputs act {abs(delay):.3g} s ({abs(shift):g} steps) {'after' if shift > 0 else 'before'} the time at "
@@ -190,7 +179,7 @@ def _delay(model: Model, recorded: RecordedSteps) -> Suggestion | None:
         else f"an affine model that is fitted to the recordings has {100 * ratio:.0f} % of the error {when}; the model "
         "was perhaps learned with inputs of another time"
     )
-    return Suggestion("delay", delay, ratio, agreeing, sentence)
+    return Suggestion("delay", delay, ratio, sentence)
 
 
 def _time_step(model: Model, recorded: RecordedSteps) -> Suggestion | None:
@@ -206,7 +195,7 @@ def _time_step(model: Model, recorded: RecordedSteps) -> Suggestion | None:
         held = np.mean([where.inputs(k) for k in range(steps)], axis=0)
         for _ in range(of_model):
             x = stepped(model, x, held)
-        return _squared(x - where.states(steps), where.states(steps) - start)
+        return squared(x - where.states(steps), np.sqrt(((where.states(steps) - start) ** 2).mean(axis=0)))
 
     known: dict[float, Array] = {1.0: errors(1, 1)}
     for k in multiples:
@@ -214,21 +203,13 @@ def _time_step(model: Model, recorded: RecordedSteps) -> Suggestion | None:
     change = _chosen(known, where.groups, 1.0, 0.7, 0.0)
     if change is None:
         return None
-    factor, ratio, agreeing = change
+    factor, ratio = change
     dt = factor * recorded.recordings.dt
     sentence = (
         f"the error relative to the motion falls to {100 * ratio:.0f} % if one step of the model takes {dt:g} s "
         f"instead of {recorded.recordings.dt:g} s: check the time step of the model, or give dt = {dt:g}"
     )
-    return Suggestion("time step", dt, ratio, agreeing, sentence)
-
-
-def _squared(errors: Array, changes: Array) -> Array:
-    """Return the mean over the states of squared errors relative to their changes, ``(N,)``; large if not finite."""
-    sizes = np.sqrt((changes**2).mean(axis=0))
-    sizes[sizes == 0] = np.inf
-    with np.errstate(all="ignore"):
-        return np.asarray(np.nan_to_num(((errors / sizes) ** 2).mean(axis=1), nan=1e30, posinf=1e30).clip(max=1e30))
+    return Suggestion("time step", dt, ratio, sentence)
 
 
 def _affine_errors(x: Array, u: Array, reached: Array, groups: Rows) -> Array:
@@ -246,8 +227,8 @@ def _affine_errors(x: Array, u: Array, reached: Array, groups: Rows) -> Array:
 
 def _chosen(
     errors: Mapping[float, Array], groups: Rows, usual: float, clear: float, alike: float
-) -> tuple[float, float, float] | None:
-    """Return the value that two halves of the recordings choose alike, its held-out ratio and the agreeing share.
+) -> tuple[float, float] | None:
+    """Return the value that two halves of the recordings choose alike, and its held-out ratio.
 
     Returns None unless the error clearly falls, in most recordings.
 
@@ -269,7 +250,7 @@ def _chosen(
     if abs(picked[0] - picked[1]) > alike or usual in picked or base.mean() < 1e-9**2:
         return None
     row = int(np.argmin(table.sum(axis=1)))
-    ratio, agreeing = float(np.sqrt(table[row].sum() / base.sum())), float((table[row] < base).mean())
-    if ratio > clear or agreeing < 0.8:  # in most recordings
+    ratio = float(np.sqrt(table[row].sum() / base.sum()))
+    if ratio > clear or (table[row] < base).mean() < 0.8:  # in most recordings
         return None
-    return values[row], ratio, agreeing
+    return values[row], ratio

@@ -16,10 +16,11 @@ import numpy as np
 
 from ctxval._util.arrays import Array, Mask
 from ctxval._util.representation import ShortRepr, counted
+from ctxval.core.labels import labels_of
 from ctxval.core.model import Model
 from ctxval.core.trajectory import Trajectory
 from ctxval.data.recordings import Recording, Recordings
-from ctxval.studies.replay.accuracy import stepped
+from ctxval.studies.replay.accuracy import squared, stepped
 
 EXPLAINS = 0.5  # least share of the error with which a fault is named as its cause
 
@@ -62,9 +63,9 @@ def faults(model: Model, recordings: Recordings, used: Sequence[int]) -> tuple[F
     whole = [run.trajectory for run in runs]
     changes = np.concatenate([np.diff(run.states, axis=0) for run in whole])
     sizes = np.maximum(np.sqrt((changes**2).mean(axis=0)), 1e-300)
-    errors = [_squared(stepped(model, run.states[:-1], run.inputs) - run.states[1:], sizes) for run in whole]
+    errors = [squared(stepped(model, run.states[:-1], run.inputs) - run.states[1:], sizes) for run in whole]
     total = max(float(sum(error.sum() for error in errors)), 1e-300)
-    found = []
+    results = []
     for number, (name, unit) in enumerate(recordings.states.items()):
         columns = [run.states[:, number] for run in whole]
         for kind, marked in (
@@ -77,30 +78,20 @@ def faults(model: Model, recordings: Recordings, used: Sequence[int]) -> tuple[F
                 share = sum(float(error[mask].sum()) for error, mask in zip(errors, marked, strict=True)) / total
                 first = next(k for k, mask in enumerate(marked) if mask.any())
                 at = runs[first].start + recordings.dt * int(np.argmax(marked[first]))
-                where = f"{runs[first].source}, {at:.4g} s"
-                sentence = _sentence(kind, f"{name} [{unit}]" if unit else name, count, recordings.dt, where, share)
-                found.append(Fault(kind, name, runs[first].source, count, share, sentence))  # type: ignore[arg-type]
+                where, (state,) = f"{runs[first].source}, {at:.4g} s", labels_of({name: unit})
+                what = {
+                    "turn": f"{state} jumps by a whole turn in {counted(count, 'step')} (first at {where}): state "
+                    "angle = true for its field in the mapping",
+                    "frozen": f"{state} keeps exactly one value for {count * recordings.dt:.3g} s while other states "
+                    f"move (first at {where}): a frozen sensor; leave this part out",
+                    "spike": f"{state} has values far from those before and after them, around "
+                    f"{counted(count, 'step')} (first at {where}): leave them out, or mark them as missing",
+                }[kind]
+                sentence = f"{what}; {100 * share:.0f} % of the squared one-step error lies there"
+                results.append(Fault(kind, name, runs[first].source, count, share, sentence))  # type: ignore[arg-type]
     by_run = dict(zip(used, (float(error.sum()) / total for error in errors), strict=True))
-    found += _files(recordings.runs, by_run)
-    return tuple(sorted(found, key=lambda fault: -fault.share))
-
-
-def _squared(errors: Array, sizes: Array) -> Array:
-    """Return the mean over the states of squared errors in units of their typical changes, ``(H,)``."""
-    with np.errstate(all="ignore"):
-        return np.asarray(np.nan_to_num(((errors / sizes) ** 2).mean(axis=1), nan=1e12, posinf=1e12).clip(max=1e12))
-
-
-def _sentence(kind: str, state: str, steps: int, dt: float, where: str, share: float) -> str:
-    what = {
-        "turn": f"{state} jumps by a whole turn in {counted(steps, 'step')} (first at {where}): state angle = true for "
-        "its field in the mapping",
-        "frozen": f"{state} keeps exactly one value for {steps * dt:.3g} s while other states move (first at {where}): "
-        "a frozen sensor; leave this part out",
-        "spike": f"{state} has values far from those before and after them, around {counted(steps, 'step')} (first at "
-        f"{where}): leave them out, or mark them as missing",
-    }[kind]
-    return f"{what}; {100 * share:.0f} % of the squared one-step error lies there"
+    results += _files(recordings.runs, by_run)
+    return tuple(sorted(results, key=lambda fault: -fault.share))
 
 
 def _turns(columns: Sequence[Array]) -> list[Mask]:

@@ -10,7 +10,7 @@ import numpy as np
 
 from ctxval._util.arrays import single_threaded
 from ctxval._util.columns import unit_advice
-from ctxval._util.representation import ShortRepr, counted
+from ctxval._util.representation import ShortRepr, counted, task_text
 from ctxval.core.model import Model, require_time_step
 from ctxval.core.trajectory import Transitions
 from ctxval.core.validation import Validation
@@ -255,11 +255,9 @@ def _insights_of_tasks(names: Sequence[str], tasks: PredictedTasks | None) -> It
     if tasks is None or not tasks.worst:
         return
     worst = tasks.worst[0]
-    values = {k: f"{value:.4g}" if isinstance(value, float) else value for k, value in worst.parameters.items()}
-    task = ", ".join(f"{name} = {value}" for name, value in values.items())
     yield (
-        f"of all tasks, {task} has the largest predicted distance, {worst.median:.3g} (between {worst.low:.3g} and "
-        f"{worst.high:.3g}); no execution has tested it"
+        f"of all tasks, {task_text(worst.parameters)} has the largest predicted distance, {worst.median:.3g} (between "
+        f"{worst.low:.3g} and {worst.high:.3g}); no execution has tested it"
     )
     if tasks.beyond > 0.05:
         yield (
