@@ -41,7 +41,6 @@ from ctxval.learning.structures import NOISY, ChosenStructure, predicted_by_hist
 from ctxval.learning.vector import ErrorVectors, Executed, predict_composed
 from ctxval.learning.worst_case import WorstCaseSearch, WorstCaseSettings
 from ctxval.models.corrected import before_refinement
-from ctxval.models.scaling import standard_deviations
 from ctxval.searches import Prediction
 
 _TRIED = 32  # tasks of the pool among which those with the largest distances show what noise does
@@ -207,8 +206,7 @@ class DynamicsStudy(ShortRepr):
         if self.given.outputs is None or self._loops is None:
             return None
         states = self._loops.states[..., : self._loops.states.shape[-1] - added_states(self.given)]
-        changes = np.diff(states, axis=-2).reshape(-1, states.shape[-1])
-        return StateEstimates(self.given, self.given.outputs, standard_deviations(changes[np.isfinite(changes).all(1)]))
+        return StateEstimates(self.given, self.given.outputs, states)
 
     def recorded(self, trajectory: Trajectory) -> Trajectory:
         """Return a trajectory as the system records it, without physical parameters and with outputs for states."""

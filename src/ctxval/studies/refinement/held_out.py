@@ -110,6 +110,13 @@ class HeldOut(ShortRepr):
         return np.asarray((self.errors**2).mean(axis=0) < (self.before**2).mean(axis=0))
 
     @property
+    def left(self) -> float:
+        """The share of the first model's error that is left, of the states that are better corrected; at most 1."""
+        sizes = np.maximum(self.rms_before, 1e-7 * self.changes.std(axis=0))
+        shares = np.minimum(self.rms, self.rms_before) / np.maximum(sizes, 1e-300)
+        return float(np.sqrt((shares[self.rms_before >= sizes] ** 2).mean())) if len(self.errors) else 1.0
+
+    @property
     def rms(self) -> Array:
         """The root mean square of each state's error, shape ``(n,)``."""
         return np.asarray(np.sqrt((self.errors**2).mean(axis=0)))
