@@ -1,8 +1,8 @@
 """A real servo: what campaigns on its 16 recorded closed loops find, for each published friction model.
 
 ``python benchmarks/study_servo.py`` runs what is not stored yet. Each campaign sees one recording at a time; the
-others judge it. Comparisons of the models see one at a time too. docs/servo.md is written from the results by
-``servo_page.py``.
+others judge it. Comparisons of the models see one at a time too. Refinements learn from half of the recordings, and
+the other half judges them. docs/servo.md is written from the results by ``servo_page.py``.
 """
 
 from __future__ import annotations
@@ -18,9 +18,11 @@ from typing import Any
 import numpy as np
 
 from calibrate import RESULTS, all_of
-from ctxval import Campaign, Task, Trajectory, Validation, compare
+from ctxval import Campaign, Task, TaskSuite, Trajectory, Validation, compare, refine, searches
 from ctxval._util.arrays import Array, single_threaded
 from ctxval._util.json_lines import JsonLines
+from ctxval.certificates import CertificateOptions, WholeSuite
+from ctxval.core.model import Model
 
 SERVO = Path(__file__).parents[1] / "examples" / "servo"
 sys.path.insert(0, str(SERVO))
@@ -33,9 +35,11 @@ MODELS = tuple(servo.PUBLISHED)
 FITTED = tuple(f"{friction} {pair}" for friction in ("m1", "m4") for pair in PAIRS)
 COMPARED = (*MODELS, f"m4 {PAIRS[0]}")
 SHARES, SEEDS, COMPARISONS = (1.1, 0.9), 10, 3
+REFINED, OF_EIGHT = ("m1", "m4"), 0.9  # the threshold of a refinement, as a share of the largest of the eight distances
 
 STORED = JsonLines(RESULTS / "servo.jsonl", ("model", "share", "seed"))
 DISTANCES = JsonLines(RESULTS / "servo_distances.jsonl", ("model",))
+REFINED_STORED = JsonLines(RESULTS / "servo_refined.jsonl", ("model", "half"))
 COMPARED_STORED = JsonLines(RESULTS / "servo_comparisons.jsonl", ("seed",))
 
 Run = tuple[str, float, int]
@@ -102,6 +106,50 @@ def comparison(seed: int) -> dict[str, Any]:
     return {"seed": seed, "executions": found.executions, "pairs": pairs, "seconds": seconds}
 
 
+def half(number: int) -> TaskSuite:
+    """Return eight of the 16 tasks, with each reference at two gains and each gain with two references."""
+    suite = validation("m1").space
+    assert isinstance(suite, TaskSuite)
+    places = [(i, j) for j in range(len(servo.GAINS)) for i in range(len(servo.PATHS)) if (i + j) % 2 == number]
+    names = [f"{servo.PATHS[i]}-{servo.GAINS[j]}" for i, j in places]
+    return TaskSuite({name: suite[name] for name in names})
+
+
+def refined(run: tuple[str, int]) -> dict[str, Any]:
+    """Return the distances of half of the recordings from a model that was refined with the other half."""
+    (model, number), started = run, time.process_time()
+    given, learned_from, others = validation(model), half(number), half(1 - number)
+    with single_threaded():
+        campaign = Campaign(given.with_space(learned_from), search=searches.by_name("random"), seed=number).run(8)
+        assert campaign.worst is not None
+        threshold = OF_EIGHT * (campaign.worst.distance or 0.0)
+        # Its only execution is one of the other half, so the model of the first round has learned from eight.
+        found = refine(
+            campaign,
+            threshold,
+            9,
+            certificate=CertificateOptions(WholeSuite()),
+            open_round=lambda made, *_: Campaign(made.with_space(others), search=searches.by_name("random"), seed=0),
+        )
+
+    def distances(suite: TaskSuite, of: Model) -> dict[str, float]:
+        values = given.with_space(suite).with_model(of).distances(suite.from_unit(suite.members))
+        return dict(zip(suite.task_names, values.tolist(), strict=True))
+
+    after = found.rounds[1].model if len(found.rounds) > 1 else None
+    return {
+        "model": model,
+        "half": number,
+        "threshold": threshold,
+        "ended": found.ended,
+        "before": distances(others, given.model),
+        "after": None if after is None else distances(others, after),
+        "learned_from": None if after is None else distances(learned_from, after),
+        "one_step_error": {name: list(errors) for name, errors in found.accuracy.items()},
+        "seconds": round(time.process_time() - started, 1),
+    }
+
+
 def main() -> None:
     """Run what is missing."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -115,6 +163,9 @@ def main() -> None:
     for result in all_of(decide, [run for run in runs if run not in STORED], options.workers):
         STORED.append(result)
         print(*(result[key] for key in ("model", "share", "seed", "answer")), len(result["tasks"]), result["seconds"])
+    for run in [(model, number) for model in REFINED for number in (0, 1)]:
+        if run not in REFINED_STORED:
+            REFINED_STORED.append(refined(run))
     missing = [seed for seed in range(min(options.seeds, COMPARISONS)) if (seed,) not in COMPARED_STORED]
     for result in all_of(comparison, missing, options.workers):
         COMPARED_STORED.append(result)
