@@ -146,6 +146,11 @@ def require_file(path: Path) -> None:
 
 def read_recording(path: Path, experiment: Experiment, plan: Plan, **options: Any) -> Trajectory:
     """Read a recorded trajectory; a log in a format of another program is read in a confined process."""
+    if (mapping := options.get("mapping")) is not None and mapping.observer is not None:
+        raise InputError(
+            "the mapping of recordings names an observer, which is for replay, fit and start: the result of a trial "
+            "has the recorded states, or outputs, of the experiment."
+        )
     names = experiment.names(plan.model_trajectory.states.shape[-1], plan.model_trajectory.inputs.shape[-1])
     file = RecordingFile(path, *names, plan.task.times, **options)
     return file.read_confined() if file.foreign else file.read()
