@@ -18,7 +18,6 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from study_servo import (
-    COMPARED,
     COMPARED_STORED,
     DISTANCES,
     FITTED,
@@ -26,6 +25,7 @@ from study_servo import (
     PAIRS,
     REFINED_STORED,
     SHARES,
+    SHOWN,
     STORED,
     servo,
     validation,
@@ -95,7 +95,9 @@ d*, one execution decides.
 ## Which model is better
 
 `ctxval.compare` asks which model has the smaller d*. The firmware's inputs follow from the recorded angle alone, so
-one run counts for all models. {comparisons}
+one run counts for all models.
+
+{comparisons}
 
 ## Refined with eight runs
 
@@ -179,11 +181,9 @@ def _models(largest: dict[str, float]) -> str:
 
 
 def _runs() -> str:
-    head = ["run", *(_short(model) for model in COMPARED)]
-    known = {model: DISTANCES[model,]["distances"] for model in COMPARED}
-    rows = [
-        [name, *(" / ".join(f"{value:.3f}" for value in known[model][name]) for model in COMPARED)] for name in NAMES
-    ]
+    head = ["run", *(_short(model) for model in SHOWN)]
+    known = {model: DISTANCES[model,]["distances"] for model in SHOWN}
+    rows = [[name, *(" / ".join(f"{value:.3f}" for value in known[model][name]) for model in SHOWN)] for name in NAMES]
     return _table(head, rows)
 
 
@@ -240,17 +240,19 @@ def _errors(line: dict[str, Any]) -> list[float]:
 
 
 def _comparisons() -> str:
-    lines = list(COMPARED_STORED.values())
-    if not lines:
+    if not COMPARED_STORED:
         return "No comparison is stored."
-    head = ["pair", "smaller d*", "decided after"]
+    head = ["models", "smaller d*", "runs", "why"]
     rows = []
-    for k, (first, second, *_) in enumerate(lines[0]["pairs"]):
-        pairs = [line["pairs"][k] for line in lines]
-        smaller = dict.fromkeys("not decided" if pair[2] is None else _short(pair[2]) for pair in pairs)
-        counts = [pair[3] for pair in pairs if pair[2] is not None]
-        rows.append([f"{_short(first)}, {_short(second)}", ", ".join(smaller), f"{_spread(counts)} runs"])
-    return f"{len(lines)} comparisons of four models were run:\n\n{_table(head, rows)}"
+    for line in COMPARED_STORED.values():
+        first, second = line["models"].split(" / ")
+        smaller = line["smaller"]
+        if smaller is not None:  # the page must not show a false decision without saying so
+            largest = {one: max(pair[0] for pair in DISTANCES[one,]["distances"].values()) for one in (first, second)}
+            assert largest[smaller] == min(largest.values())
+        reason = line["reason"].replace(second, _short(second)).split("; decided after")[0]
+        rows.append([f"{_short(first)}; {_short(second)}", _short(smaller or "-"), str(line["executions"]), reason])
+    return f"{_table(head, rows)}"
 
 
 def _refined() -> str:

@@ -63,7 +63,13 @@ class DynamicsStudy(ShortRepr):
         quantile: the share of the executions of a task that a distance is about, if the system is noisy.
     """
 
-    def __init__(self, validation: Validation, seed: int = 0, quantile: float = QUANTILE) -> None:
+    def __init__(
+        self,
+        validation: Validation,
+        seed: int = 0,
+        quantile: float = QUANTILE,
+        estimates: StateEstimates | None = None,
+    ) -> None:
         self.given, self.seed, self.quantile = validation, seed, quantile
         self.validation = with_parameters_as_states(with_states_of_model(validation))
         self.planner = LoopPlanner(self.validation)
@@ -73,6 +79,7 @@ class DynamicsStudy(ShortRepr):
         self._found: dict[bytes, str | None] = {}
         self._others: dict[str, DynamicsStudy] = {}
         self._parts: tuple[str, bytes] | None = None
+        self._known_estimates = estimates
 
     def anew(self, quantile: float | None = None) -> DynamicsStudy:
         """Return a study of the same experiment that has learned nothing yet, with a quantile if it is given."""
@@ -203,8 +210,8 @@ class DynamicsStudy(ShortRepr):
 
     @functools.cached_property
     def _estimates(self) -> StateEstimates | None:
-        if self.given.outputs is None or self._loops is None:
-            return None
+        if self.given.outputs is None or self._loops is None or self._known_estimates is not None:
+            return self._known_estimates
         states = self._loops.states[..., : self._loops.states.shape[-1] - added_states(self.given)]
         return StateEstimates(self.given, self.given.outputs, states)
 
@@ -328,7 +335,8 @@ class DynamicsStudy(ShortRepr):
         """Return the study with another task parameter as a state; it is kept."""
         if name not in self._others:
             given = self.given.with_physical([*self.given.physical, name])
-            self._others[name] = DynamicsStudy(given, self.seed, self.quantile)
+            # The states of M along executions are the same.
+            self._others[name] = DynamicsStudy(given, self.seed, self.quantile, self._estimates)
         return self._others[name]
 
     def _most_telling(self, executed: Executed) -> tuple[str | None, float, float]:

@@ -409,7 +409,11 @@ def _sensitivities(
             nonlocal psi
 
             def step(x: Array) -> Array:
-                return np.asarray(history.model.step(x, u) + residual(np.concatenate([x, z[:, n:]], axis=1)))
+                rest = np.broadcast_to(z[:, n:], (*x.shape[:-1], z.shape[1] - n))
+                moved = np.concatenate([x, rest], axis=-1).reshape(-1, z.shape[1])
+                inputs = np.broadcast_to(u, (*x.shape[:-1], u.shape[1])).reshape(-1, u.shape[1])
+                after = history.model.step(moved[:, :n], inputs) + residual(moved)
+                return np.asarray(after.reshape(x.shape))
 
             G = jacobian(step, memory.estimate, steps) @ psi
             own = G.reshape(len(z), n, F, n)
