@@ -1,14 +1,13 @@
 """A real servo: what campaigns on its 16 recorded closed loops find, for each published friction model.
 
 ``python benchmarks/study_servo.py`` runs what is not stored yet. Each campaign sees one recording at a time; the
-others judge it. Comparisons of the models see one at a time too. docs/servo.md is written from the results by
-``servo_page.py``.
+others judge it. Comparisons of the models see one at a time too. Refinements learn from half of the recordings, and
+the other half judges them. docs/servo.md is written from the results by ``servo_page.py``.
 """
 
 from __future__ import annotations
 
 import argparse
-import re
 import sys
 import time
 from functools import cache
@@ -18,9 +17,11 @@ from typing import Any
 import numpy as np
 
 from calibrate import RESULTS, all_of
-from ctxval import Campaign, Task, Trajectory, Validation, compare
+from ctxval import Campaign, Task, TaskSuite, Trajectory, Validation, compare, refine, searches
 from ctxval._util.arrays import Array, single_threaded
 from ctxval._util.json_lines import JsonLines
+from ctxval.certificates import CertificateOptions, WholeSuite
+from ctxval.core.model import Model
 
 SERVO = Path(__file__).parents[1] / "examples" / "servo"
 sys.path.insert(0, str(SERVO))
@@ -31,12 +32,15 @@ PAIRS = ("sin_sin-200,lift_and_drop-800", "up_and_down-400,sin_time_square-800",
 
 MODELS = tuple(servo.PUBLISHED)
 FITTED = tuple(f"{friction} {pair}" for friction in ("m1", "m4") for pair in PAIRS)
-COMPARED = (*MODELS, f"m4 {PAIRS[0]}")
-SHARES, SEEDS, COMPARISONS = (1.1, 0.9), 10, 3
+SHOWN = (*MODELS, f"m4 {PAIRS[0]}")
+COMPARED = (("m4", f"m4 {PAIRS[0]}"), ("m1", "m4"))
+SHARES, SEEDS, COMPARISONS = (1.1, 0.9), 10, 1
+REFINED, OF_EIGHT = ("m1", "m4"), 0.9  # the threshold of a refinement, as a share of the largest of the eight distances
 
 STORED = JsonLines(RESULTS / "servo.jsonl", ("model", "share", "seed"))
 DISTANCES = JsonLines(RESULTS / "servo_distances.jsonl", ("model",))
-COMPARED_STORED = JsonLines(RESULTS / "servo_comparisons.jsonl", ("seed",))
+REFINED_STORED = JsonLines(RESULTS / "servo_refined.jsonl", ("model", "half"))
+COMPARED_STORED = JsonLines(RESULTS / "servo_comparisons.jsonl", ("models", "seed"))
 
 Run = tuple[str, float, int]
 
@@ -89,17 +93,64 @@ def of_model(model: str) -> dict[str, Any]:
     return {"model": model, "distances": {name: [float(largest), float(rms)] for name, largest, rms in named}}
 
 
-def comparison(seed: int) -> dict[str, Any]:
-    """Return what a comparison of the models by d* decides, and after how many executions."""
-    started, counts = time.process_time(), list[int]()
+def comparison(run: tuple[str, int]) -> dict[str, Any]:
+    """Return what a comparison of two models by d* decides, and after how many executions."""
+    (models, seed), started = run, time.process_time()
     with single_threaded():
-        found = compare({model: validation(model) for model in COMPARED}, question="worst", budget=16, seed=seed)
-    for pair in found.pairs:
-        after = re.search(r"decided after (\d+) executions", pair.reason)
-        counts.append(0 if after is None else int(after[1]))
-    pairs = [[pair.first, pair.second, pair.smaller, count] for pair, count in zip(found.pairs, counts, strict=True)]
-    seconds = round(time.process_time() - started, 1)
-    return {"seed": seed, "executions": found.executions, "pairs": pairs, "seconds": seconds}
+        found = compare({one: validation(one) for one in models.split(" / ")}, question="worst", budget=16, seed=seed)
+    (pair,) = found.pairs
+    return {
+        "models": models,
+        "seed": seed,
+        "executions": found.executions,
+        "smaller": pair.smaller,
+        "reason": pair.reason,
+        "seconds": round(time.process_time() - started, 1),
+    }
+
+
+def half(number: int) -> TaskSuite:
+    """Return eight of the 16 tasks, with each reference at two gains and each gain with two references."""
+    suite = validation("m1").space
+    assert isinstance(suite, TaskSuite)
+    places = [(i, j) for j in range(len(servo.GAINS)) for i in range(len(servo.PATHS)) if (i + j) % 2 == number]
+    names = [f"{servo.PATHS[i]}-{servo.GAINS[j]}" for i, j in places]
+    return TaskSuite({name: suite[name] for name in names})
+
+
+def refined(run: tuple[str, int]) -> dict[str, Any]:
+    """Return the distances of half of the recordings from a model that was refined with the other half."""
+    (model, number), started = run, time.process_time()
+    given, learned_from, others = validation(model), half(number), half(1 - number)
+    with single_threaded():
+        campaign = Campaign(given.with_space(learned_from), search=searches.by_name("random"), seed=number).run(8)
+        assert campaign.worst is not None
+        threshold = OF_EIGHT * (campaign.worst.distance or 0.0)
+        # Its only execution is one of the other half, so the model of the first round has learned from eight.
+        found = refine(
+            campaign,
+            threshold,
+            9,
+            certificate=CertificateOptions(WholeSuite()),
+            open_round=lambda made, *_: Campaign(made.with_space(others), search=searches.by_name("random"), seed=0),
+        )
+
+    def distances(suite: TaskSuite, of: Model) -> dict[str, float]:
+        values = given.with_space(suite).with_model(of).distances(suite.from_unit(suite.members))
+        return dict(zip(suite.task_names, values.tolist(), strict=True))
+
+    after = found.rounds[1].model if len(found.rounds) > 1 else None
+    return {
+        "model": model,
+        "half": number,
+        "threshold": threshold,
+        "ended": found.ended,
+        "before": distances(others, given.model),
+        "after": None if after is None else distances(others, after),
+        "learned_from": None if after is None else distances(learned_from, after),
+        "one_step_error": {name: list(errors) for name, errors in found.accuracy.items()},
+        "seconds": round(time.process_time() - started, 1),
+    }
 
 
 def main() -> None:
@@ -115,8 +166,11 @@ def main() -> None:
     for result in all_of(decide, [run for run in runs if run not in STORED], options.workers):
         STORED.append(result)
         print(*(result[key] for key in ("model", "share", "seed", "answer")), len(result["tasks"]), result["seconds"])
-    missing = [seed for seed in range(min(options.seeds, COMPARISONS)) if (seed,) not in COMPARED_STORED]
-    for result in all_of(comparison, missing, options.workers):
+    for run in [(model, number) for model in REFINED for number in (0, 1)]:
+        if run not in REFINED_STORED:
+            REFINED_STORED.append(refined(run))
+    asked = [(" / ".join(pair), seed) for pair in COMPARED for seed in range(min(options.seeds, COMPARISONS))]
+    for result in all_of(comparison, [run for run in asked if run not in COMPARED_STORED], options.workers):
         COMPARED_STORED.append(result)
 
 

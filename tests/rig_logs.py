@@ -190,6 +190,74 @@ def write_mat(path: Path, one: Trajectory, *, version: str) -> None:
         savemat(path, dict(content))
 
 
+def write_control_desk(
+    path: Path, one: Trajectory, *, version: str = "7.3", name: str = "rec1", alone: bool = False
+) -> None:
+    """Write the run as ControlDesk does: states on one raster, and the command on another one, which is twice as fast.
+
+    With ``alone``, the position is the only signal, so X and Y are no arrays of structures.
+    """
+    half = one.times[1] / 2
+    fine = one.times[0] + half * np.arange(2 * one.horizon)
+    root = "Model Root/Plant/"
+    axes = [
+        {"Name": "", "Type": "float", "Data": one.times[None], "Unit": "s", "Raster": "Periodic Task 1"},
+        {"Name": "", "Type": "float", "Data": fine[None], "Unit": "s", "Raster": "Periodic Task 2"},
+    ]
+    columns = [
+        (f"{root}position", one.states[:, 0], "m", 1, "Periodic Task 1"),
+        (f'"{root}speed"'.replace("/", '"/"'), one.states[:, 1], "m/s", 1, "Periodic Task 1"),
+        ("Model Root/Controller/force{SubArray1}", np.repeat(one.inputs[:, 0], 2), "N", 2, "Periodic Task 2"),
+    ]
+    signals = [
+        {"Name": label, "Type": "float", "Data": data[None], "Unit": unit, "XIndex": index, "Raster": raster}
+        for label, data, unit, index, raster in columns
+    ]
+    content = {"X": axes[:1] if alone else axes, "Y": signals[:1] if alone else signals}
+    if version == "7.3":
+        _write_structures(path, name, content)
+        return
+    from scipy.io import savemat
+
+    arrays: dict[str, Any] = {"Description": {"General": "a cart"}, "RTProgram": "cart.sdf", "Info": "ControlDesk"}
+    for key, rows in content.items():
+        arrays[key] = np.zeros((1, len(rows)), dtype=[(field, object) for field in rows[0]])
+        for k, row in enumerate(rows):
+            arrays[key][0, k] = tuple(row.values())
+    savemat(path, {name: arrays})
+
+
+def _write_structures(path: Path, name: str, content: Mapping[str, list[dict[str, Any]]]) -> None:
+    """Write a structure of arrays of structures as MATLAB does: references, and texts of 16-bit characters."""
+    import h5py
+
+    def put(group: Any, key: str, value: Any) -> Any:
+        empty = isinstance(value, str) and not value
+        if isinstance(value, str):
+            data = np.array([1, 0], dtype=np.uint64) if empty else np.frombuffer(value.encode("utf-16-le"), np.uint16)
+            made = group.create_dataset(key, data=data if empty else data[:, None])
+        else:
+            made = group.create_dataset(key, data=np.atleast_2d(np.asarray(value, dtype=np.float64)).T)
+        made.attrs["MATLAB_class"] = np.bytes_("char" if isinstance(value, str) else "double")
+        if empty:
+            made.attrs["MATLAB_empty"] = np.uint8(1)
+        return made
+
+    with h5py.File(path, "w", userblock_size=512) as file:
+        top, refs = file.create_group(name), file.create_group("#refs#")
+        put(top, "RTProgram", "cart.sdf")
+        put(top.create_group("Info"), "Text", "ControlDesk")
+        for key, rows in content.items():
+            group = top.create_group(key)
+            for field in rows[0]:
+                if len(rows) == 1:
+                    put(group, field, rows[0][field])
+                    continue
+                cells = group.create_dataset(field, (len(rows), 1), h5py.ref_dtype)
+                for k, row in enumerate(rows):
+                    cells[k, 0] = put(refs, f"{key}{field}{k}", row[field]).ref
+
+
 def write_parquet(path: Path, one: Trajectory) -> None:
     """Write the run as a Parquet file with a column for each state."""
     import pyarrow as pa

@@ -143,7 +143,7 @@ def test_the_glossary_explains_what_replay_and_fit_say() -> None:
 
 
 def test_the_glossary_explains_what_refine_says() -> None:
-    held = HeldOut(*(np.ones((60, 3)), *[np.full((60, 2), 0.1)] * 3))
+    held = HeldOut(*(np.ones((60, 3)), *[np.full((60, 2), 0.1)] * 5))
     residual = measure_residual(held, {"x": "m", "v": "m/s"}, {"u": "N"})
     found = replace(
         refine(Campaign(make_validation()).run(1), 1e-9, 1),

@@ -247,7 +247,7 @@ CORRECTION = models.Correction(
     *(np.zeros(3), np.ones(3), np.zeros((4, 3)), np.ones(3), np.ones((4, 2)), np.zeros((4, 2))),
     *(-np.ones(3), np.ones(3), np.ones(3), np.ones(2)),
 )
-HELD_OUT = refinement.HeldOut(*(np.ones((60, 3)), *[np.full((60, 2), 0.1)] * 3))
+HELD_OUT = refinement.HeldOut(*(np.ones((60, 3)), *[np.full((60, 2), 0.1)] * 5))
 RESIDUAL = refinement.measure_residual(HELD_OUT, {"x": "m", "v": "m/s"}, {"u": "N"})
 
 

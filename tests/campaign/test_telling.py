@@ -15,6 +15,7 @@ from conftest import make_validation
 from ctxval import Campaign, Experiment, Store, Trajectory, Validation, searches
 from ctxval.campaign.telling import ToldResult, parameters_of_trial, result_sentence, tell_result
 from ctxval.core.trial import Trial
+from ctxval.data import LogMapping
 from ctxval.errors import InputError
 
 
@@ -142,3 +143,10 @@ def test_the_trajectories_are_read_together_for_the_largest_offset_of_a_start(mo
     monkeypatch.setattr(campaign.store, "trajectories", counted)
     assert campaign.provenance.start == max(known)
     assert reads == [[0, 1, 2, 3]]
+
+
+def test_a_result_is_not_estimated_by_an_observer(campaign: Campaign, tmp_path: Path) -> None:
+    mapping = LogMapping({"x": "x"}, observer=lambda y, u, dt: y)
+    trial, made = campaign.ask(), Experiment("pendulum", campaign.validation)
+    with pytest.raises(InputError, match="names an observer, which is for replay, fit and start"):
+        tell_result(campaign, made, trial.number, ToldResult(tmp_path / "run.csv", mapping=mapping))

@@ -14,6 +14,13 @@ from rig_logs import run, write_mat, write_parquet
 
 pytestmark = pytest.mark.slow
 
+OBSERVER = """
+import numpy as np
+
+def estimate(y, u, dt):
+    return 2 * np.hstack([y, np.gradient(y, dt, axis=0)])
+"""
+
 
 @pytest.fixture
 def logs(tmp_path: Path) -> Path:
@@ -76,3 +83,23 @@ def test_what_cannot_be_read_is_said_in_one_sentence(tmp_path: Path) -> None:
         assert refused.exit_code == 2
         assert message in " ".join(refused.stderr.split())
     assert not list((tmp_path / "start").glob("*"))
+
+
+def test_an_observer_is_loaded_from_the_folder_of_its_mapping(logs: Path, tmp_path: Path) -> None:
+    (tmp_path / "apart").mkdir()
+    (tmp_path / "apart" / "an_observer.py").write_text(OBSERVER)
+    mapping = tmp_path / "apart" / "mapping.toml"
+    observer = '[observer]\nfunction = "an_observer:estimate"\nstates = { twice = "m", rate = "m/s" }\n'
+    mapping.write_text(f'[states]\nposition = "position"\n[inputs]\nforce = "force"\n{observer}')
+    call = calling()
+    found = report(call("fit", str(logs), "--mapping", str(mapping), "--json"))
+    assert "the states are estimated by an_observer:estimate from position" in str(found)
+    out = tmp_path / "apart" / "start"
+    started = report(call("start", str(logs), "--mapping", str(mapping), "--out", str(out), "--json"))
+    assert started["states"] == {"twice": "m", "rate": "m/s"}
+    written = LogMapping.from_toml(out / "mapping.toml")
+    assert written.observer == LogMapping.from_toml(mapping).observer
+    mapping.write_text(mapping.read_text().replace(":estimate", ":missing"))
+    refused = call("fit", str(logs), "--mapping", str(mapping))
+    assert refused.exit_code == 2
+    assert "an_observer:missing cannot be loaded" in " ".join(refused.output.split())

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ctxval.data import LogMapping, MemoryTable, Recordings, recordings_of
+from ctxval.data import LogMapping, MemoryTable, Observer, Recordings, recordings_of
 from ctxval.errors import InputError
 from ctxval.studies.fitting import fit
 
@@ -86,3 +86,51 @@ def test_recordings_that_are_too_short_are_left_out_and_said() -> None:
 def test_what_cannot_be_derived_is_refused(mapping: dict[str, Any], message: str) -> None:
     with pytest.raises(InputError, match=message):
         read({"y": T, "u": T}, **mapping)
+
+
+# Observers
+
+
+def settling(y: np.ndarray, u: np.ndarray, dt: float) -> np.ndarray:
+    """Return the record and its backward difference, which the first record has not."""
+    rate = np.vstack([[np.nan], np.diff(y, axis=0) / dt])
+    return np.hstack([y, rate])
+
+
+def observed(observer: Any, **mapping: Any) -> Recordings:
+    log = MemoryTable("run", {"t": T, "y": 2 * T, "u": np.cos(T)})
+    return recordings_of([log], LogMapping({"y": "y"}, {"u": "u"}, observer=observer, **mapping))
+
+
+def test_an_observer_estimates_states() -> None:
+    recordings = observed(Observer(settling, {"angle": "rad", "rate": "rad/s"}))
+    (run,) = recordings.runs
+    assert recordings.states == {"angle": "rad", "rate": "rad/s"}
+    assert run.start == pytest.approx(0.1)
+    assert np.allclose(run.trajectory.states, np.stack([2 * T[1:], np.full(39, 2.0)], axis=-1))
+    assert np.allclose(run.trajectory.inputs[:, 0], np.cos(T[1:-1]))
+    assert recordings.notes[-1] == "the states are estimated by settling from y"
+    assert list(observed(settling).states) == ["x0", "x1"]
+    assert list(observed(lambda y, u, dt: 2 * y).states) == ["y"]
+    assert list(observed(settling, lags=1).states)[:3] == ["x0", "x1", "x0 a step before"]
+
+
+@pytest.mark.parametrize(
+    ("observer", "message"),
+    [
+        (lambda y, u, dt: y[1:], r"must return states of shape \(40, n\), got \(39, 1\)"),
+        (lambda y, u, dt: 1 / 0, "failed on run: ZeroDivisionError"),
+        (lambda y, u, dt: np.where(y > 1, np.nan, y), r"must return finite states; row 6 of run has \[nan\]"),
+        (lambda y, u, dt: np.full_like(y, np.nan), "returns no two finite states in a row"),
+        (Observer(settling, {"a": "", "b": "", "c": ""}), r"settling must return 3 states \(a, b, c\), got 2"),
+        (Observer(None, reference="a:b"), "the observer a:b is not loaded: replay, fit and start do it"),
+    ],
+)
+def test_an_observer_that_cannot_be_used_is_refused(observer: Any, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        observed(observer)
+
+
+def test_an_observer_is_a_function() -> None:
+    with pytest.raises(InputError, match=r"an observer must be a function \(y, u, dt\) -> x, got 3"):
+        observed(3)

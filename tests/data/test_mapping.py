@@ -53,6 +53,10 @@ def test_a_mapping_in_toml_is_that_in_python(tmp_path: Path) -> None:
     ("change", "message"),
     [
         ({"states": {}}, "a mapping of a log needs at least one state"),
+        ({"observer": 3}, "an observer must name a function module:attr, got 3"),
+        ({"observer": {"functon": "a:b"}}, "an observer must name a function module:attr"),
+        ({"observer": {"function": "a:b", "state": {}}}, "no entry of the observer is called 'state'"),
+        ({"observer": {"function": "a:b", "states": {"x": 3}}}, "states must be"),
         ({"dt": 0}, "dt must be a positive number of seconds, got 0"),
         ({"dt": True}, "dt must be a positive number of seconds, got True"),
         ({"longest_gap": -1}, "longest_gap must be a positive number"),

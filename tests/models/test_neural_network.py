@@ -159,3 +159,9 @@ def test_a_column_that_never_varies_is_no_trouble() -> None:
     network = models.FeedforwardReLU.fit(still, (4,), restarts=1, iterations=20)
     assert np.isfinite(network.step(still.x, still.u)).all()
     np.testing.assert_array_equal(network.scaling.scale_out[2], 1.0)
+
+
+def test_one_state_is_learned_without_a_warning() -> None:
+    x = np.linspace(-1, 1, 40)[:, None]
+    network = models.FeedforwardReLU.fit(Transitions(x, 0 * x, 0.5 * x), (4,), restarts=2, iterations=100)
+    assert network.step(x, 0 * x) == pytest.approx(0.5 * x, abs=0.01)

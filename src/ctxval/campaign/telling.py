@@ -49,6 +49,11 @@ class ToldResult:
         """Return the recording; None if there is none."""
         if self.recording is None:
             return None
+        if self.mapping is not None and self.mapping.observer is not None:
+            raise InputError(
+                "the mapping of recordings names an observer, which is for replay, fit and start: the result of a "
+                "trial has the recorded states, or outputs, of the experiment."
+            )
         names = experiment.names(plan.model_trajectory.states.shape[-1], plan.model_trajectory.inputs.shape[-1])
         times, npz, resample = plan.task.times, self.npz, self.resample
         file = RecordingFile(self.recording, *names, times, npz, resample, self.mapping, self.uploaded)

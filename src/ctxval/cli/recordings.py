@@ -17,7 +17,7 @@ from ctxval.cli.options import named_values, parsed, require_outputs
 from ctxval.core.experiment import Experiment
 from ctxval.core.labels import labels_of, names_of
 from ctxval.core.model import Model, as_model
-from ctxval.data import Field, LogMapping, Recordings, read_recordings
+from ctxval.data import Field, LogMapping, Observer, Recordings, read_recordings
 from ctxval.errors import ExecutionError, InputError
 from ctxval.models import REGISTRY, read_model
 from ctxval.models.mujoco import is_sysid_result
@@ -51,7 +51,10 @@ class Logs:
             if not self.state:
                 raise InputError("--input needs --state: name the fields of all states too.")
             return replace(LogMapping(_fields(self.state), _fields(self.input_ or ())), **self.changes)
-        return None if self.mapping is None else replace(LogMapping.from_toml(self.mapping), **self.changes)
+        if self.mapping is None:
+            return None
+        mapping = replace(LogMapping.from_toml(self.mapping), **self.changes)
+        return _with_observer(mapping, self.mapping.parent)
 
     @property
     def changes(self) -> dict[str, Any]:
@@ -63,7 +66,9 @@ class Logs:
         self, logs: Sequence[Path], settings: Settings | None = None, experiment: Experiment | None = None
     ) -> Recordings:
         """Return the recordings in files and folders, with the names and units of the experiment if they fit."""
-        mapping = self.stated() or (None if settings is None else settings.log_mapping)
+        mapping = self.stated()
+        if mapping is None and settings is not None and settings.log_mapping is not None:
+            mapping = _with_observer(settings.log_mapping, settings.folder)
         states, inputs = dict[str, str](), dict[str, str]()
         if experiment is not None:
             system = experiment.validation.system
@@ -81,6 +86,16 @@ class Logs:
         if any(unit not in ("", known) for unit, known in units):
             return recordings
         return replace(recordings, states=states, inputs=inputs)
+
+
+def _with_observer(mapping: LogMapping, folder: Path | None) -> LogMapping:
+    """Return a mapping that the user has named, with the function of its observer, which is imported."""
+    observer = mapping.observer
+    if not isinstance(observer, Observer) or observer.function is not None:
+        return mapping
+    what = f"the observer {observer.reference}"
+    function = require_function(what, reference(observer.reference, folder), "(y, u, dt) -> x")
+    return replace(mapping, observer=replace(observer, function=function))
 
 
 @dataclass(frozen=True)

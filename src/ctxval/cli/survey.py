@@ -13,7 +13,7 @@ from ctxval._util.files import write_text
 from ctxval.cli.base import command, out, print_columns
 from ctxval.cli.options import require_outputs
 from ctxval.cli.recordings import Logs, error_cells, print_breaks
-from ctxval.data import Field, LogMapping
+from ctxval.data import Field, LogMapping, Observer
 from ctxval.models import write_model
 from ctxval.report.replay_page import write_replay_page
 from ctxval.studies.survey import Survey, survey
@@ -81,6 +81,9 @@ def mapping_text(mapping: LogMapping, dt: float) -> str:
             f"[{kind}]",
             *(f"{json.dumps(name)} = {_field(at)}" for name, at in getattr(mapping, kind).items()),
         ]
+    if isinstance(mapping.observer, Observer):
+        named = ", ".join(f"{json.dumps(name)} = {json.dumps(unit)}" for name, unit in mapping.observer.states.items())
+        lines += ["", "[observer]", f"function = {json.dumps(mapping.observer.reference)}", f"states = {{ {named} }}"]
     return "\n".join(lines) + "\n"
 
 

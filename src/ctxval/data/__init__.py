@@ -1,7 +1,7 @@
 """Recordings of a system: readers of logs, and their mapping to states and inputs at equal steps."""
 
 from ctxval.data.log import Clock, Log, MemoryTable, Signal, Table
-from ctxval.data.mapping import Field, LogMapping
+from ctxval.data.mapping import Field, LogMapping, Observer
 from ctxval.data.readers import READERS, is_log, read_logs
 from ctxval.data.recorded import Recorded
 from ctxval.data.recordings import Recording, Recordings, component_names, read_recordings, recordings_of
@@ -18,6 +18,7 @@ __all__ = [
     "LogMapping",
     "MemoryTable",
     "Message",
+    "Observer",
     "Recorded",
     "Recording",
     "Recordings",

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ctxval._util.arrays import Array
+from ctxval._util.arrays import Array, Mask
+from ctxval._util.texts import enumerated, reason_of
 from ctxval.core.trajectory import Trajectory
-from ctxval.data.mapping import LogMapping
+from ctxval.data.mapping import LogMapping, Observer
 from ctxval.data.sampling import Break
 from ctxval.errors import InputError
 
@@ -19,8 +20,11 @@ if TYPE_CHECKING:
 
 
 def with_derived(recordings: Recordings, mapping: LogMapping) -> Recordings:
-    """Return recordings with the derivatives and the earlier records that a mapping asks for, as further states."""
-    return _with_lags(_with_derivatives(recordings, mapping), mapping.lags)
+    """Return recordings with derivatives, with the states of an observer, and with those of earlier steps."""
+    whole = _with_derivatives(recordings, mapping)
+    if isinstance(mapping.observer, Observer):
+        whole = _with_observer(whole, mapping.observer)
+    return _with_lags(whole, mapping.lags)
 
 
 def _with_derivatives(recordings: Recordings, mapping: LogMapping) -> Recordings:
@@ -67,6 +71,56 @@ def _components(name: str, known: Sequence[str]) -> list[str]:
     if name in known:
         return [name]
     return [label for label in known if label.startswith(name) and label[len(name) :].isdecimal()]
+
+
+def _with_observer(recordings: Recordings, observer: Observer) -> Recordings:
+    """Return recordings with the states that a user's function estimates from them."""
+    name = observer.reference or getattr(observer.function, "__name__", "")
+    if observer.function is None:
+        raise InputError(
+            f"the observer {name} is not loaded: replay, fit and start do it; in Python, give the mapping the function."
+        )
+    runs: list[Recording] = []
+    breaks, widths = list(recordings.breaks), set[int]()
+    for run in recordings.runs:
+        x, old = _estimated(observer.function, name, run, recordings.dt), run.trajectory
+        widths.add(x.shape[1])
+        finite: Mask = np.asarray(np.isfinite(x).all(axis=1))
+        first = int(finite.argmax()) if finite.any() else len(x)
+        if not finite[first:].all():
+            row = first + int(finite[first:].argmin())
+            raise InputError(f"the observer {name} must return finite states; row {row} of {run.source} has {x[row]}.")
+        if len(x) - first < 2:
+            length, reason = old.horizon * recordings.dt, f"is too short for {name}"
+            breaks.append(Break(run.source, run.start, length, "a part", reason))
+            continue
+        later = Trajectory(old.times[: len(x) - first], x[first:], old.inputs[first:])
+        runs.append(replace(run, start=run.start + first * recordings.dt, trajectory=later))
+    if not runs:
+        raise InputError(f"the observer {name} returns no two finite states in a row.")
+    n = min(widths)
+    states = dict(observer.states)
+    if not states:
+        states = recordings.states if n == len(recordings.states) else {f"x{k}": "" for k in range(n)}
+    if widths != {len(states)}:
+        raise InputError(
+            f"the observer {name} must return {len(states)} states ({enumerated(states, 6)}), got {max(widths)}."
+        )
+    note = f"the states are estimated by {name} from {enumerated(recordings.states, 6)}"
+    notes = (*recordings.notes, note)
+    return replace(recordings, runs=tuple(runs), breaks=tuple(breaks), states=states, notes=notes)
+
+
+def _estimated(function: Callable[[Array, Array, float], Array], name: str, run: Recording, dt: float) -> Array:
+    """Return the states ``(H + 1, n)`` that a user's function returns for a recording."""
+    y, u = run.trajectory.states, run.trajectory.inputs
+    try:
+        x = np.asarray(function(y.copy(), u.copy(), dt), dtype=np.float64)
+    except Exception as error:  # the user's function
+        raise InputError(f"the observer {name} failed on {run.source}: {reason_of(error)}.") from error
+    if x.ndim != 2 or len(x) != len(y) or not x.shape[1]:
+        raise InputError(f"the observer {name} must return states of shape ({len(y)}, n), got {x.shape}.")
+    return x
 
 
 def _with_lags(recordings: Recordings, lags: int) -> Recordings:

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import re
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, Literal
 
+from ctxval._util.arrays import Array
 from ctxval._util.checked import FiniteFloat, NonNegativeInt, Seconds, checked, require
 from ctxval._util.columns import column_of
 from ctxval._util.files import read_bytes
@@ -79,6 +80,38 @@ class Field:
 
 
 @dataclass(frozen=True)
+class Observer(ShortRepr):
+    """A function of the user's own that estimates states from the records of one recording.
+
+    Attributes:
+        function: ``(y, u, dt) -> x``, from the recorded states ``(H + 1, p)``, the inputs ``(H, m)`` and the time step
+            in seconds to states ``(H + 1, n)``. The first states may be NaN, while it settles; they are left out. None
+            until it is loaded.
+        states: the names of the n states with their units; empty for those of the records, or else x0, x1, ...
+        reference: ``module:attr`` of the function, which the command line loads from the folder of the mapping's file.
+    """
+
+    function: Callable[[Array, Array, float], Array] | None
+    states: Mapping[str, str] = field(default_factory=dict)
+    reference: str = ""
+
+    def __post_init__(self) -> None:
+        if self.function is not None and not callable(self.function):
+            raise InputError(f"an observer must be a function (y, u, dt) -> x, got {self.function!r}.")
+        require("states", Mapping[str, str], self.states)
+
+    @staticmethod
+    def from_table(described: Any) -> Observer:
+        """Return the observer that a mapping describes: ``module:attr``, or a table of ``function`` and ``states``."""
+        table: Any = {"function": described} if isinstance(described, str) else described
+        if not isinstance(table, Mapping) or not isinstance(table.get("function"), str):
+            raise InputError(f"an observer must name a function module:attr, got {described!r}.")
+        if unknown := [key for key in table if key not in ("function", "states")]:
+            raise UnknownNameError.among("entry of the observer", unknown[0], ["function", "states"])
+        return Observer(None, table.get("states", {}), table["function"])
+
+
+@dataclass(frozen=True)
 class LogMapping(ShortRepr):
     """How recordings become states and inputs at equal steps.
 
@@ -93,6 +126,8 @@ class LogMapping(ShortRepr):
         lags: the number of earlier steps whose states and inputs are further states, if the records at one step do not
             determine the next ones.
         valid: which rows count, such as ``status == 0``: a field, ``==`` or ``!=``, and a number; None for all rows.
+        observer: a function that estimates the states from the recorded ones, or an :class:`Observer`; None if they are
+            the states.
     """
 
     states: Mapping[str, Field]
@@ -105,8 +140,11 @@ class LogMapping(ShortRepr):
     longest_gap: float | None = None
     lags: int = 0
     valid: str | None = None
+    observer: Observer | Callable[[Array, Array, float], Array] | None = None
 
     def __post_init__(self) -> None:
+        if self.observer is not None and not isinstance(self.observer, Observer):
+            object.__setattr__(self, "observer", Observer(self.observer))
         for name in ("states", "inputs"):
             fields = {key: _field(key, item) for key, item in dict(getattr(self, name)).items()}
             object.__setattr__(self, name, fields)
@@ -166,7 +204,8 @@ class LogMapping(ShortRepr):
             parts[kind] = {name: _field(name, item) for name, item in named.items()}
         if "states" not in table:
             raise InputError("the mapping of recordings needs states.")
-        return LogMapping(**{**table, **parts})
+        observer = {"observer": Observer.from_table(table["observer"])} if "observer" in table else {}
+        return LogMapping(**{**table, **parts, **observer})
 
     @staticmethod
     def from_toml(path: str | Path) -> LogMapping:

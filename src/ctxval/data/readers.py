@@ -1,14 +1,11 @@
 """The reader of each kind of log, by the suffix of a file or the content of a folder; nothing in a log is ever run.
 
-MATLAB files of version 7.3 (HDF5) need h5py, and Parquet files and LeRobot data sets (versions 2 and 3) need pyarrow:
-the extra ``logs``.
+Parquet files and LeRobot data sets (versions 2 and 3) need pyarrow: the extra ``logs``.
 """
 
 from __future__ import annotations
 
-import math
-import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,11 +14,12 @@ import numpy as np
 from ctxval._util.arrays import Array
 from ctxval._util.csv_table import CsvTable
 from ctxval._util.extras import require_extra
-from ctxval._util.files import MOST_BYTES, open_regular, read_bytes, read_json, require_regular_file
+from ctxval._util.files import MOST_BYTES, read_bytes, read_json, require_regular_file
 from ctxval._util.npz import Archive
 from ctxval._util.texts import quoted, reason_of
 from ctxval.data.json_records import read_json_records
 from ctxval.data.log import Log, MemoryTable, Table, reading
+from ctxval.data.matlab import read_mat
 from ctxval.data.messages import BagLog, McapLog
 from ctxval.errors import InputError
 
@@ -62,118 +60,6 @@ def read_npz(path: Path) -> list[Log]:
         MemoryTable(f"{path}, trajectory {k}", {"times": times, "states": x, "inputs": u})
         for k, (x, u) in enumerate(zip(states, inputs, strict=True))
     ]
-
-
-# MATLAB
-
-
-def read_mat(path: Path) -> list[Log]:
-    """Return the log in a MATLAB file: its numeric arrays; ``name.part`` is a field of a structure.
-
-    References, which cells and arrays of structures consist of, are never followed.
-    """
-    with reading(path, "a MATLAB file"):
-        with open_regular(path) as file:
-            is_hdf5 = any(file.seek(start) == start and file.read(8) == b"\x89HDF\r\n\x1a\n" for start in (0, 512))
-        columns = _version_7_3(path) if is_hdf5 else _version_5(path)
-    if not columns:
-        raise InputError(f"{path} has no numeric array.")
-    return [MemoryTable(str(path), columns)]
-
-
-def _version_5(path: Path) -> dict[str, Array]:
-    from scipy.io import loadmat, whosmat  # imported here: loading it takes longer than a command
-
-    _require_size(sum(8 * math.prod(shape) for _, shape, _ in whosmat(str(path))))
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of objects of MATLAB's classes, which are not data
-        return dict(_numeric("", loadmat(str(path), simplify_cells=True), 6))
-
-
-def _numeric(before: str, content: Mapping[str, Any], depth: int) -> Iterator[tuple[str, Array]]:
-    """Yield the numeric arrays in nested structures, by their paths."""
-    for name, value in content.items():
-        path = f"{before}.{name}".removeprefix(".")
-        if str(name).startswith("__"):
-            continue  # what the reader says of the file
-        if isinstance(value, Mapping):
-            if depth:
-                yield from _numeric(path, value, depth - 1)
-            continue
-        array = np.asarray(value) if isinstance(value, np.ndarray | int | float) else np.array("")
-        if array.dtype.kind in "biuf" and array.ndim <= 2 and array.size:
-            yield path, array.astype(np.float64)
-
-
-def _version_7_3(path: Path) -> dict[str, Array]:
-    """Return the numeric arrays of an HDF5 file, after everything in it is checked.
-
-    HDF5 lets a file name others: by links, as the storage of a data set, and as the source of a virtual one. A
-    stranger's file would name any file of the user. MATLAB writes none of these.
-    """
-    h5py = require_extra("h5py", "logs", "MATLAB files of version 7.3")
-    numeric, size = dict[str, Any](), 0
-    with h5py.File(path, "r") as file:
-        for count, (name, identifier) in enumerate(_hdf5_objects(h5py, file.id)):
-            if count >= 10_000:
-                raise InputError("it has more than 10000 variables and fields")
-            if isinstance(identifier, h5py.h5d.DatasetID) and (least := _hdf5_size(h5py, name, identifier)):
-                size += least
-                _require_size(size)
-                numeric[name] = identifier
-        arrays = {name: np.asarray(h5py.Dataset(item)[()], dtype=np.float64) for name, item in numeric.items()}
-    return {name: np.squeeze(array).T for name, array in arrays.items()}  # MATLAB counts the first index fastest
-
-
-def _hdf5_objects(h5py: Any, group: Any, before: str = "", depth: int = 6) -> Iterator[tuple[str, Any]]:
-    """Yield all data sets and groups in a group by their paths; no link to another place is followed."""
-    for name in group:
-        text = name.decode(errors="replace")
-        if group.links.get_info(name).type != h5py.h5l.TYPE_HARD:
-            raise InputError(f"{quoted(text)} is a link, which could lead to any file")
-        path, identifier = f"{before}.{text}".removeprefix("."), h5py.h5o.open(group, name)
-        yield path, identifier
-        is_group = isinstance(identifier, h5py.h5g.GroupID)
-        if is_group and depth and not h5py.h5a.exists(identifier, b"MATLAB_sparse"):
-            yield from _hdf5_objects(h5py, identifier, path, depth - 1)
-
-
-def _hdf5_size(h5py: Any, path: str, identifier: Any) -> int:
-    """Return how many bytes of numbers a data set declares; 0 if it is no array of numbers. Nothing of it is read."""
-    h5d, h5t, h5z = h5py.h5d, h5py.h5t, h5py.h5z
-    plan = identifier.get_create_plist()
-    if plan.get_layout() == h5d.VIRTUAL or plan.get_external_count():
-        raise InputError(f"the values of {quoted(path)} are in another file")
-    shape = identifier.shape  # only now: the shape of a virtual data set may depend on other files
-    if identifier.get_type().get_class() not in (h5t.INTEGER, h5t.FLOAT, h5t.ENUM) or math.prod(shape) == 0:
-        return 0
-    if h5py.h5a.exists(identifier, b"MATLAB_empty") or _is_text(h5py, identifier):
-        return 0
-    if sum(extent > 1 for extent in shape) > 2:
-        return 0
-    # The filters that MATLAB uses; others may be code in a library that a path in the environment names.
-    usual = {h5z.FILTER_DEFLATE, h5z.FILTER_SHUFFLE, h5z.FILTER_FLETCHER32}
-    if not usual.issuperset(plan.get_filter(i)[0] for i in range(plan.get_nfilters())):
-        raise InputError(f"{quoted(path)} is compressed in a way that MATLAB does not use")
-    chunk = math.prod(plan.get_chunk()) if plan.get_layout() == h5d.CHUNKED else 0
-    return int(8 * max(math.prod(shape), chunk))
-
-
-def _is_text(h5py: Any, identifier: Any) -> bool:
-    if not h5py.h5a.exists(identifier, b"MATLAB_class"):
-        return False
-    attribute = h5py.h5a.open(identifier, b"MATLAB_class")
-    kind = attribute.get_type()
-    if kind.get_class() != h5py.h5t.STRING or kind.is_variable_str() or attribute.shape not in ((), (1,)):
-        raise InputError("its classes must be texts")
-    value = np.zeros(attribute.shape, dtype=attribute.dtype)
-    attribute.read(value)
-    return bool(value.item() == b"char")
-
-
-def _require_size(size: int) -> None:
-    if size > MOST_BYTES:
-        raise InputError(f"its arrays have {size} bytes, and at most {MOST_BYTES} are read")
 
 
 # Parquet

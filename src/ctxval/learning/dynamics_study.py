@@ -69,12 +69,11 @@ class DynamicsStudy(ShortRepr):
         validation: Validation,
         seed: int = 0,
         quantile: float = QUANTILE,
-        actuator: Actuator | None = None,
-        inputs: int = 0,
+        extended: ExtendedValidation | None = None,
     ) -> None:
-        self.given, self.seed, self.quantile, self.actuator = validation, seed, quantile, actuator
-        self.extended = ExtendedValidation(validation, actuator, inputs)
-        self.validation = self.extended.validation
+        self.given, self.seed, self.quantile = validation, seed, quantile
+        self.extended = ExtendedValidation(validation) if extended is None else extended
+        self.actuator, self.validation = self.extended.actuator, self.extended.validation
         self.planner = LoopPlanner(self.validation)
         self._errors = ErrorVectors(self.planner if validation.outputs is None else LoopPlanner(validation))
         self._covariances = Latest[bytes, LearnedCovariances | None](8)
@@ -334,7 +333,7 @@ class DynamicsStudy(ShortRepr):
         """Return the study with another task parameter as a state; it is kept."""
         if name not in self._others:
             given = self.given.with_physical([*self.given.physical, name])
-            self._others[name] = DynamicsStudy(given, self.seed, self.quantile, self.actuator, self.extended.inputs)
+            self._others[name] = DynamicsStudy(given, self.seed, self.quantile, self.extended.of(given))
         return self._others[name]
 
     def _found_actuator(self, executed: Executed) -> Actuator | None:
@@ -365,7 +364,9 @@ class DynamicsStudy(ShortRepr):
     def _with_actuator(self, actuator: Actuator, inputs: int) -> DynamicsStudy:
         """Return the study of inputs that act late; it is kept."""
         if self._actuated is None or self._actuated.actuator != actuator:
-            self._actuated = DynamicsStudy(self.given, self.seed, self.quantile, actuator, inputs)
+            self._actuated = DynamicsStudy(
+                self.given, self.seed, self.quantile, ExtendedValidation(self.given, actuator, inputs)
+            )
         return self._actuated
 
     def _most_telling(self, executed: Executed) -> tuple[str | None, float, float]:

@@ -17,7 +17,6 @@ from ctxval.learning.physical import added_states, with_parameters, with_paramet
 from ctxval.learning.recorded import closed_loops_on_model
 from ctxval.learning.state_estimates import StateEstimates, with_states_of_model
 from ctxval.learning.vector import Executed
-from ctxval.models.scaling import standard_deviations
 
 
 class ExtendedValidation:
@@ -31,8 +30,14 @@ class ExtendedValidation:
             differ.
     """
 
-    def __init__(self, given: Validation, actuator: Actuator | None = None, inputs: int = 0) -> None:
-        self.given, self.actuator, self.inputs = given, actuator, inputs
+    def __init__(
+        self,
+        given: Validation,
+        actuator: Actuator | None = None,
+        inputs: int = 0,
+        estimates: StateEstimates | None = None,
+    ) -> None:
+        self.given, self.actuator, self.inputs, self._known = given, actuator, inputs, estimates
         self._acting = WeakKeyDictionary[Trajectory, Trajectory]()
         self.validation = with_actuator(with_parameters_as_states(with_states_of_model(given)), actuator, inputs)
 
@@ -80,13 +85,16 @@ class ExtendedValidation:
             self._acting[trajectory] = replace(trajectory, inputs=self.actuator.acting(trajectory.inputs))
         return self._acting[trajectory]
 
+    def of(self, given: Validation) -> ExtendedValidation:
+        """Return the same with other physical parameters; the states of M along executions are the same."""
+        return ExtendedValidation(given, self.actuator, self.inputs, self._estimates)
+
     @functools.cached_property
     def _estimates(self) -> StateEstimates | None:
-        if self.given.outputs is None or self.loops is None:
-            return None
+        if self.given.outputs is None or self.loops is None or self._known is not None:
+            return self._known
         states = self.loops.states[..., : self.loops.states.shape[-1] - added_states(self.given)]
-        changes = np.diff(states, axis=-2).reshape(-1, states.shape[-1])
-        return StateEstimates(self.given, self.given.outputs, standard_deviations(changes[np.isfinite(changes).all(1)]))
+        return StateEstimates(self.given, self.given.outputs, states)
 
     def recorded(self, trajectory: Trajectory) -> Trajectory:
         """Return a closed loop as the system records it."""

@@ -25,6 +25,7 @@ class Features:
         linear: standard deviation of the linear part, relative to that of the Matern part.
         states, inputs: the numbers n and m; regressors begin with the state and the input.
         whiten: makes the weights of the Matern part independent, shape ``(M, M)``.
+        products: whether inputs times states are among the features.
     """
 
     centres: Array
@@ -33,14 +34,17 @@ class Features:
     states: int
     inputs: int
     whiten: Array
+    products: bool = True
 
     @classmethod
-    def of(cls, centres: Array, scales: Array, linear: float, states: int, inputs: int) -> Features:
+    def of(
+        cls, centres: Array, scales: Array, linear: float, states: int, inputs: int, products: bool = True
+    ) -> Features:
         """Return the features with length-scales ``(D,)``."""
         theta = np.concatenate([[0.0], np.log(scales)])
         K = Matern(2.5, ard=True)(theta, centres, centres)
         L = np.linalg.cholesky(K + 1e-8 * np.eye(len(K)))
-        return cls(centres, theta, linear, states, inputs, np.linalg.inv(L).T)
+        return cls(centres, theta, linear, states, inputs, np.linalg.inv(L).T, products)
 
     def __call__(self, z: Array) -> Array:
         """Return the features ``(N, F)`` of standardised regressors ``(N, D)``."""
@@ -78,9 +82,11 @@ class Features:
         return np.asarray(found)
 
     def _linear(self, z: Array) -> Array:
-        x, u = z[:, : self.states], z[:, self.states : self.states + self.inputs]
-        products = (u[:, :, None] * x[:, None, :]).reshape(len(z), -1)
-        return self.linear * np.concatenate([np.ones((len(z), 1)), z, _PRODUCTS * products], axis=1)
+        parts = [np.ones((len(z), 1)), z]
+        if self.products:
+            x, u = z[:, : self.states], z[:, self.states : self.states + self.inputs]
+            parts.append(_PRODUCTS * (u[:, :, None] * x[:, None, :]).reshape(len(z), -1))
+        return self.linear * np.concatenate(parts, axis=1)
 
 
 @dataclass(frozen=True, eq=False)

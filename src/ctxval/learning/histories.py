@@ -81,7 +81,8 @@ class History:
         n = len(scales)
         if not structure.ratio:
             return cls(model, structure, np.eye(n))
-        A = jacobian(lambda x: model.step(x, middle[1]), middle[0], 1e-4 * np.maximum(np.abs(middle[0]), 1.0))
+        steps = 1e-4 * np.maximum(np.abs(middle[0]), 1.0)
+        A = jacobian(lambda x: model.step(x, np.broadcast_to(middle[1], (len(x), len(middle[1])))), middle[0], steps)
         process = np.diag(scales**2 + 1e-18)
         P = process
         for _ in range(300):
@@ -154,7 +155,10 @@ def of_one_horizon(records: Sequence[Record]) -> Iterator[list[Record]]:
 
 
 def jacobian(function: Callable[[Array], Array], x: Array, steps: Array) -> Array:
-    """Return the derivatives ``(..., n, n)`` of a function of states ``(..., n)``, by central differences."""
-    moves = np.diag(steps)
-    differences = [(function(x + move) - function(x - move)) / (2 * h) for move, h in zip(moves, steps, strict=True)]
-    return np.stack(differences, axis=-1)
+    """Return the derivatives ``(..., n, n)`` of a function at states ``(..., n)``, by central differences.
+
+    The function is called once, with all moved states ``(2 n, ..., n)``.
+    """
+    moves = np.diag(steps).reshape(len(steps), *(1,) * (x.ndim - 1), len(steps))
+    up, down = np.split(function(np.concatenate([x + moves, x - moves])), 2)
+    return np.asarray(np.moveaxis(up - down, 0, -1) / (2 * steps))

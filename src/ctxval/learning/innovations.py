@@ -43,6 +43,7 @@ class Scaled:
         visited: standardised regressors of closed loops on M, from which centres are chosen too, shape ``(V, D)``.
         shift, scale: shapes ``(D,)``.
         inputs: the number m of inputs.
+        products: whether inputs times states are among the features.
     """
 
     Z: Array
@@ -51,13 +52,14 @@ class Scaled:
     shift: Array
     scale: Array
     inputs: int
+    products: bool = True
 
     @classmethod
-    def of(cls, Z: Array, E: Array, pairs: Array, inputs: int) -> Scaled:
+    def of(cls, Z: Array, E: Array, pairs: Array, inputs: int, products: bool = True) -> Scaled:
         """Return regressors of records; those of closed loops on M, ``(V, n + m)``, have no errors of M as lags."""
         shift, scale = Z.mean(axis=0), np.maximum(Z.std(axis=0), 1e-9 + 1e-6 * np.abs(Z).max(axis=0))
         visited = np.pad(pairs, ((0, 0), (0, Z.shape[1] - pairs.shape[1])))
-        return cls((Z - shift) / scale, E, (visited - shift) / scale, shift, scale, inputs)
+        return cls((Z - shift) / scale, E, (visited - shift) / scale, shift, scale, inputs, products)
 
     @functools.cached_property
     def sizes(self) -> Array:
@@ -86,7 +88,7 @@ class Scaled:
         pairs = self.states + self.inputs
         scales = np.exp(np.concatenate([theta[:pairs], np.full(self.Z.shape[1] - pairs, theta[pairs])]))
         chosen = self.centres if centres is None else centres
-        return Features.of(chosen, scales, float(np.exp(theta[-1])), self.states, self.inputs)
+        return Features.of(chosen, scales, float(np.exp(theta[-1])), self.states, self.inputs, self.products)
 
 
 @dataclass(frozen=True, eq=False)
@@ -266,10 +268,18 @@ def learn_theta(scaled: Scaled, live: Mask, lags: int) -> Array:
     return theta
 
 
-def fit_lagged(history: History, records: Sequence[Record], pairs: Array, theta: Array | None, live: Mask) -> LaggedFit:
+def fit_lagged(
+    history: History,
+    records: Sequence[Record],
+    pairs: Array,
+    theta: Array | None,
+    live: Mask,
+    *,
+    products: bool = True,
+) -> LaggedFit:
     """Return the posterior if records are the state; hyperparameters are learned if they are not given."""
     Z, E, _ = history.along(records)
-    scaled = Scaled.of(Z, E, pairs, records[0].inputs.shape[1])
+    scaled = Scaled.of(Z, E, pairs, records[0].inputs.shape[1], products)
     theta = learn_theta(scaled, live, history.structure.lags) if theta is None else theta
     fit = _conditioned(history, scaled, theta, live, np.ones((len(Z), 1)), None)
     local = local_noise(scaled.Z[:, : pairs.shape[1]], fit.innovations[:, live])
@@ -399,7 +409,11 @@ def _sensitivities(
             nonlocal psi
 
             def step(x: Array) -> Array:
-                return np.asarray(history.model.step(x, u) + residual(np.concatenate([x, z[:, n:]], axis=1)))
+                rest = np.broadcast_to(z[:, n:], (*x.shape[:-1], z.shape[1] - n))
+                moved = np.concatenate([x, rest], axis=-1).reshape(-1, z.shape[1])
+                inputs = np.broadcast_to(u, (*x.shape[:-1], u.shape[1])).reshape(-1, u.shape[1])
+                after = history.model.step(moved[:, :n], inputs) + residual(moved)
+                return np.asarray(after.reshape(x.shape))
 
             G = jacobian(step, memory.estimate, steps) @ psi
             own = G.reshape(len(z), n, F, n)

@@ -24,6 +24,8 @@ from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.validation import Validation
 from ctxval.learning.vector import Executed
+from ctxval.models.corrected import before_refinement
+from ctxval.models.scaling import standard_deviations
 
 _SHARES = np.array([1.0, 1e-1, 1e-2, 1e-3, 1e-4])
 """What M misses in recorded directions, beside what it misses in all others, as shares of their steps."""
@@ -84,13 +86,17 @@ class _OutputDistance:
 class StateEstimates:
     """The states of M along executions, estimated from their inputs and outputs; they are kept like these.
 
+    A refined model is estimated as the model before, whose residual is learned.
+
     Args:
         validation: the user's validation, which has outputs.
-        steps: typical changes of M's states in one step, ``(n,)``.
+        states: states of closed loops on M ``(..., H + 1, n)``, whose changes in one step are typical.
     """
 
-    def __init__(self, validation: Validation, outputs: Outputs, steps: Array) -> None:
+    def __init__(self, validation: Validation, outputs: Outputs, states: Array) -> None:
         self.validation, self.outputs = validation, outputs
+        changes = np.diff(states, axis=-2).reshape(-1, states.shape[-1])
+        steps = standard_deviations(changes[np.isfinite(changes).all(axis=1)])
         self.steps = np.maximum(steps, 1e-9 * max(float(steps.max(initial=0.0)), 1e-300))
         self._known: WeakKeyDictionary[Trajectory, tuple[Array, Array]] = WeakKeyDictionary()
 
@@ -123,9 +129,9 @@ class StateEstimates:
         if known is None:
             space = self.validation.space
             task = self.validation.task(space.parameters(space.from_unit(point)))
-            start = np.asarray(task.initial_state, dtype=np.float64)
+            start, model = np.asarray(task.initial_state, dtype=np.float64), before_refinement(self.validation.model)
             known = self._known[trajectory] = smoothed_states(
-                self.validation.model, self.outputs, start, trajectory.states, trajectory.inputs, self.steps
+                model, self.outputs, start, trajectory.states, trajectory.inputs, self.steps
             )
         return known
 

@@ -69,7 +69,8 @@ class FeedforwardReLU(IncrementModel):
         seeds = np.random.SeedSequence(seed).generate_state(restarts)
         perceptron = require_extra("sklearn.neural_network", "cases", "learned networks").MLPRegressor
         ignored = require_extra("sklearn.exceptions", "cases", "learned networks").ConvergenceWarning
-        trained = []
+        trained, targets = [], scaling.targets(data)
+        targets = targets.ravel() if targets.shape[1] == 1 else targets  # else it warns
         with single_threaded(), warnings.catch_warnings():
             warnings.simplefilter("ignore", ignored)  # stopping at the limit of iterations is intended
             for start in seeds:
@@ -81,7 +82,7 @@ class FeedforwardReLU(IncrementModel):
                     max_fun=2 * iterations,
                     random_state=int(start),
                 )
-                trained.append(regressor.fit(scaling.inputs(data.x, data.u), scaling.targets(data)))
+                trained.append(regressor.fit(scaling.inputs(data.x, data.u), targets))
         best = min(trained, key=lambda regressor: regressor.loss_)
         return cls(best.coefs_, best.intercepts_, scaling, data)
 

@@ -141,6 +141,7 @@ ATTACKS: dict[str, dict[str, Any]] = {
     "module": {**PLAIN, "task": "evil:task"},
     "module alone": {**PLAIN, "task": "evil"},
     "outputs": {**PLAIN, "outputs": "evil:outputs"},
+    "observer": {**PLAIN, "recordings": {"states": ["x"], "observer": "evil:estimate"}},
     "inner part": {**PLAIN, "synthesizer": {**FILTERED, "synthesizer": "evil:make"}},
     "inner class": {**PLAIN, "synthesizer": {**FILTERED, "synthesizer": {"type": "evil:Make"}}},
     "inner command": {**PLAIN, "system": {"type": "WithOutputs", "system": EVIL_CALL, "outputs": [0]}},

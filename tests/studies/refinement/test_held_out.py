@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -78,12 +80,27 @@ def test_a_model_that_cannot_be_learned_or_diverges_counts_as_the_first_one() ->
         np.testing.assert_array_equal(found.errors, found.before)
 
 
+def test_errors_that_add_up_choose_corrections() -> None:
+    """Of noisy records, the error of one step is hardly smaller with the true model; that of ten steps is."""
+    rng, noisy = np.random.default_rng(0), list[Trajectory]()
+    for run in executions(3):
+        noisy.append(replace(run, states=run.states + 0.3 * rng.normal(size=run.states.shape)))
+    true = models.Linear.fit(Records.of(FIRST, executions(3)).transitions)
+    found = held_out(lambda some: true, FIRST, Records.of(FIRST, noisy))
+    assert found.rms[1] > 0.8 * found.rms_before[1]
+    assert found.left < 0.7
+    assert len(found.later) == sum(run.horizon - 9 for run in noisy)
+    short = [Trajectory(run.times[:6], run.states[:6], run.inputs[:5]) for run in executions(3)]
+    of_short = held_out(lambda some: true, FIRST, Records.of(FIRST, short))
+    assert (len(of_short.later), of_short.left) == (0, pytest.approx(0, abs=1e-9))
+
+
 def errors_by_speed(count: int = 2000) -> HeldOut:
     """Errors that are ten times as large if the second coordinate is above 1."""
     rng = np.random.default_rng(0)
     pairs = rng.uniform(-2, 2, (count, 3))
     errors = 0.01 * rng.normal(size=(count, 2)) * np.where(pairs[:, 1:2] > 1, 10, 1)
-    return HeldOut(pairs, errors, errors, rng.normal(size=(count, 2)))
+    return HeldOut(pairs, errors, errors, rng.normal(size=(count, 2)), errors, errors)
 
 
 def test_regions_separate_large_residuals_from_small_ones() -> None:
@@ -108,7 +125,7 @@ def test_the_largest_residual_of_a_region_is_measured_in_it() -> None:
 
 def test_residuals_of_zero_have_one_region() -> None:
     given = errors_by_speed()
-    zero = HeldOut(given.pairs, 0 * given.errors, given.before, given.changes)
+    zero = replace(given, errors=0 * given.errors)
     found = measure_residual(zero, {"a": "", "b": ""}, {"c": ""})
     assert len(found.regions) == 1
     assert "everywhere" in found.text

@@ -152,6 +152,9 @@ def code_named(settings: Mapping[str, Any]) -> list[str]:
     ]
     try:
         code = [_shown(key, settings[key]) for key in ("task", "outputs") if isinstance(settings.get(key), str)]
+        recordings = settings.get("recordings")
+        if isinstance(recordings, Mapping) and "observer" in recordings:
+            code.append(_shown("recordings.observer", recordings["observer"]))
         for key, name_key, registry in named:
             code += _parts(key, settings.get(key), name_key, registry)
         return [*code, *_references("", settings)]

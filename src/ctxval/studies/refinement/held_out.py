@@ -19,6 +19,8 @@ from ctxval.core.trajectory import Trajectory, Transitions
 from ctxval.errors import CtxvalError, InputError
 from ctxval.studies.fitting.fit import part_of
 
+_LATER = 10  # steps after which the errors choose corrections
+
 
 @dataclass(frozen=True, eq=False)
 class Records(ShortRepr):
@@ -93,12 +95,16 @@ class HeldOut(ShortRepr):
         errors: those of the learned model, shape ``(N, n)``.
         before: those of the first model, shape ``(N, n)``.
         changes: the recorded changes of the states in one step, shape ``(N, n)``.
+        later, later_before: errors after ten steps along held-out executions, of both models, shapes ``(K, n)``. They
+            choose corrections, because noise of the records hides in one step what adds up in several.
     """
 
     pairs: Array
     errors: Array
     before: Array
     changes: Array
+    later: Array
+    later_before: Array
 
     @property
     def better(self) -> Mask:
@@ -107,7 +113,20 @@ class HeldOut(ShortRepr):
         A correction of the states that are chosen by these errors is also reported with them, so the reported errors
         are slightly too small. Those of the last round's executions, which chose nothing, are not.
         """
-        return np.asarray((self.errors**2).mean(axis=0) < (self.before**2).mean(axis=0))
+        after, before = self._choosing
+        return np.asarray((after**2).mean(axis=0) < (before**2).mean(axis=0))
+
+    @property
+    def left(self) -> float:
+        """The share of the first model's error that is left, of the states that are better corrected; at most 1."""
+        after, before = (np.sqrt((errors**2).mean(axis=0)) for errors in self._choosing)
+        known = before > 1e-7 * self.changes.std(axis=0)
+        shares = np.minimum(after, before)[known] / before[known]
+        return float(np.sqrt((shares**2).mean())) if known.any() else 1.0
+
+    @property
+    def _choosing(self) -> tuple[Array, Array]:
+        return (self.later, self.later_before) if len(self.later) else (self.errors, self.before)
 
     @property
     def rms(self) -> Array:
@@ -125,7 +144,7 @@ class HeldOut(ShortRepr):
 
     def with_executions(self, model: Model, before: Model, executed: Sequence[Trajectory]) -> HeldOut:
         """Return these errors and those on executions that the model itself was not learned from."""
-        return _joined([self, *(_compared(run.transitions(), model, before) for run in executed)])
+        return _joined([self, *(_compared(run.transitions(), [run], model, before) for run in executed)])
 
 
 def held_out(learn: Callable[[Records], Model], before: Model, records: Records) -> HeldOut:
@@ -140,17 +159,34 @@ def held_out(learn: Callable[[Records], Model], before: Model, records: Records)
             model = learn(known)
         except CtxvalError:
             model = before
-        parts.append(_compared(held.transitions, model, before))
+        parts.append(_compared(held.transitions, held.executed, model, before))
     return _joined(parts)
 
 
-def _compared(data: Transitions, model: Model, before: Model) -> HeldOut:
+def _compared(data: Transitions, runs: Sequence[Trajectory], model: Model, before: Model) -> HeldOut:
     with np.errstate(all="ignore"):
         errors, first = (data.x_next - compared.step(data.x, data.u) for compared in (model, before))
-    usable = np.isfinite(first).all(axis=1)
-    errors = np.where(np.isfinite(errors), errors, first)
+        later, later_first = (_errors_later(compared, runs, data.x.shape[1]) for compared in (model, before))
+    usable, later_usable = (np.isfinite(array).all(axis=1) for array in (first, later_first))
+    errors, later = np.where(np.isfinite(errors), errors, first), np.where(np.isfinite(later), later, later_first)
     pairs, changes = np.concatenate([data.x, data.u], axis=1), data.x_next - data.x
-    return HeldOut(*(array[usable] for array in (pairs, errors, first, changes)))
+    pairs, errors, first, changes = (array[usable] for array in (pairs, errors, first, changes))
+    return HeldOut(pairs, errors, first, changes, later[later_usable], later_first[later_usable])
+
+
+def _errors_later(model: Model, runs: Sequence[Trajectory], n: int) -> Array:
+    """Return the errors ``(K, n)`` of a model after ten steps with recorded inputs, from each state that has these."""
+    long = [run for run in runs if run.horizon >= _LATER]
+    if not long:
+        return np.zeros((0, n))
+    x, after = (np.concatenate([run.states[part] for run in long]) for part in (slice(-_LATER), slice(_LATER, None)))
+    try:
+        for k in range(_LATER):
+            u = np.concatenate([run.inputs[k : run.horizon - _LATER + 1 + k] for run in long])
+            x = np.asarray(model.step(x, u))
+    except Exception:  # users' models, at states that were not recorded
+        return np.full_like(after, np.nan)
+    return np.asarray(after - x)
 
 
 def _joined(parts: list[HeldOut]) -> HeldOut:

@@ -15,15 +15,16 @@ from ctxval._util.texts import reason_of
 from ctxval.core.model import Model, Step, as_model
 from ctxval.core.trajectory import Transitions
 from ctxval.errors import CtxvalError, InputError, ModelError, UnknownNameError
-from ctxval.learning import DynamicsPosterior, PosteriorSettings, learn_posterior
 from ctxval.models import Corrected, Correction, FeedforwardReLU, GaussianProcessModel, Linear, Parametric
 from ctxval.models.parametric import ParametricStep
 from ctxval.studies.fitting import FittedParameter, fit_parameters
 from ctxval.studies.fitting.fit import as_bounds, learned_model
+from ctxval.studies.refinement.corrections import averaged_correction, exact_correction
 from ctxval.studies.refinement.held_out import HeldOut, Records, held_out
 from ctxval.studies.replay.accuracy import stepped
 
 _CENTRES = 300  # largest number of transitions that a correction is conditioned on
+_MUCH = 0.1  # share of the error that a correction leaves on held-out executions, from which on another one is tried
 
 RefitKind = Literal["linear", "network", "gaussian-process"]
 NAMES = ("residual", *get_args(RefitKind), "parameters", "fit")
@@ -68,6 +69,8 @@ class ResidualCorrection(ShortRepr, Method):
 
     A state is corrected only if this lowers the error on executions that are held out. Outside the range of the
     records the correction fades, so that the model is as before. It is conditioned on at most ``centres`` transitions.
+    If this leaves much of the error, as with noise, it is compared with a process of low rank that is conditioned on
+    all transitions.
     """
 
     centres: int = _CENTRES
@@ -76,18 +79,25 @@ class ResidualCorrection(ShortRepr, Method):
 
     def learn(self, model: Model, records: Records) -> Learned:
         """Return the corrected model."""
-        # Matern 5/2 that does not grow with the inputs.
-        settings = PosteriorSettings(hyperparameters=1, centres=self.centres, families=((2.5, 0.0),), of_steps=False)
 
-        def correction(some: Records) -> Correction | None:
-            posterior = learn_posterior(model, some.transitions, some.sources, settings=settings)
-            return None if posterior is None else correction_of(posterior)
+        def left_by(correction: Callable[[Records], Correction | None]) -> HeldOut:
+            def corrected(some: Records) -> Model:
+                learned = correction(some)
+                return model if learned is None else Corrected(model, learned)
 
-        def corrected(some: Records) -> Model:
-            learned = correction(some)
-            return model if learned is None else Corrected(model, learned)
+            return held_out(corrected, model, records)
 
-        errors = held_out(corrected, model, records)
+        def exact(some: Records) -> Correction | None:
+            return exact_correction(model, some, self.centres)
+
+        def averaged(some: Records) -> Correction | None:
+            return averaged_correction(model, some)
+
+        correction, errors = exact, left_by(exact)
+        if errors.left > _MUCH:
+            other = left_by(averaged)
+            if other.left < errors.left:
+                correction, errors = averaged, other
         better = errors.better
         whole = correction(records)
         if whole is None or not better.any():
@@ -101,24 +111,6 @@ class ResidualCorrection(ShortRepr, Method):
         note = f"not corrected, because the error on held-out executions would not fall: state {rows}"
         learned = Corrected(model, whole.of_states(better), data=records.transitions)
         return Learned(learned, errors.kept(better), (note,) if rows else ())
-
-
-def correction_of(posterior: DynamicsPosterior) -> Correction:
-    """Return a learned residual as a correction, with the box of the records that it was learned from."""
-    # At least 24 centres are kept, if they predict the others with a relative error of 0.005: design on the model is
-    # then faster.
-    data, mean = posterior.data, posterior.with_few_centres(24, 0.005)
-    (centres,), values = mean.centres, np.exp(mean.thetas[0])
-    low, high = data.pairs.min(axis=0), data.pairs.max(axis=0)
-    scales, constant, slope = values[:-2], values[-2], values[-1]
-    weights = np.zeros((len(centres), len(data.units)))
-    weights[:, data.learned] = mean.weights[0]
-    weights *= data.units
-    linear = np.concatenate([slope * centres.T @ weights, constant * weights.sum(axis=0, keepdims=True)])
-    # A coordinate that the residual does not depend on fades the correction within one more range of the records.
-    fade = np.minimum(scales, np.maximum(high - low, 1.0))
-    limit = posterior.limit * data.units
-    return Correction(data.shift, data.scale, centres, scales, weights, linear, low, high, fade, limit)
 
 
 class _Replacement(Method):

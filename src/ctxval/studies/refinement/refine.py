@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import functools
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -20,6 +21,8 @@ from ctxval.core.trajectory import Trajectory, Transitions
 from ctxval.core.trial import Trial
 from ctxval.core.validation import Validation
 from ctxval.errors import CtxvalError, InputError
+from ctxval.learning.recorded import closed_loops_on_model
+from ctxval.learning.state_estimates import StateEstimates, with_states_of_model
 from ctxval.models import Refined, read_refined, write_model
 from ctxval.models.corrected import before_refinement
 from ctxval.models.saved import is_savable, read_note
@@ -55,6 +58,8 @@ def refine(
     An execution counts for one model only, that on which its controller was designed. The k-th refined model is judged
     with confidence ``1 - alpha / (k (k + 1))``, so that all of them together are wrong with probability at most alpha.
 
+    If the validation has outputs, models learn from the states of M, which are estimated along the executions.
+
     Args:
         campaign: the campaign of the first model. It is run until it is decided, if it is not yet.
         threshold: tau, in the units of the distance.
@@ -72,7 +77,6 @@ def refine(
             f"the campaign has {campaign.executions} executions already, and the budget of {budget} is a total: give "
             "more."
         )
-    campaign.validation.require_states("refine")
     chosen, options = method_of(method, seed=campaign.seed), certificate or CertificateOptions()
 
     def same_settings(validation: Validation, store: Path | None, *_: object) -> Campaign:
@@ -121,7 +125,7 @@ class _Loop:
         if learned is None:
             return refinement
         errors, n = learned.errors, learned.errors.errors.shape[1]
-        states, inputs = self.first.validation.names(n, errors.pairs.shape[1] - n)
+        states, inputs = self._of_states.names(n, errors.pairs.shape[1] - n)
         rms = zip(errors.rms_before.tolist(), errors.rms.tolist(), strict=True)
         accuracy = dict(zip(states, rms, strict=False))
         residual = measure_residual(errors, states, inputs)
@@ -193,8 +197,8 @@ class _Loop:
 
     def _learned_model(self, number: int, file: Path | None) -> tuple[Refined, tuple[str, ...], Path | None]:
         """Return the model of a round, learned from the executions before, with its notes; write its file."""
-        data = self._records(number).transitions
         with stage("learning the model again"):
+            data = self._records(number).transitions
             learned = self._learned(number)
             refined, of_design = with_best_jacobian(self.first.validation, Refined(learned.model, data, self._base))
         notes = learned.notes if of_design is None else (*learned.notes, of_design)
@@ -216,8 +220,36 @@ class _Loop:
 
     def _records(self, before: int) -> Records:
         """Return what the rounds before a number have recorded."""
-        executed = [trajectory for _, trajectory in self._executed(self.rounds[:before])]
-        return Records.of(self.first.validation.model, executed)
+        return Records.of(self.first.validation.model, self._with_states(self.rounds[:before]))
+
+    def _with_states(self, rounds: list[Round], judged: int | None = None) -> list[Trajectory]:
+        """Return the executions of some rounds; if outputs are recorded, with estimated states of M.
+
+        The first ``judged`` executions choose how they are estimated, by default all.
+        """
+        executed = [(trial.unit_point, trajectory) for trial, trajectory in self._executed(rounds)]
+        if self.first.validation.outputs is None:
+            return [trajectory for _, trajectory in executed]
+        judged = len(executed) if judged is None else judged
+        estimated = None if self._estimates is None else self._estimates.of(executed, judged)
+        if estimated is None:
+            raise InputError(
+                "the states of the model cannot be estimated from the recorded outputs: its closed loops, or its "
+                "derivatives along the executions, are not finite."
+            )
+        return estimated
+
+    @functools.cached_property
+    def _estimates(self) -> StateEstimates | None:
+        validation, loops = self.first.validation, closed_loops_on_model(self._of_states)
+        if loops is None or validation.outputs is None:
+            return None
+        return StateEstimates(validation, validation.outputs, loops.states)
+
+    @functools.cached_property
+    def _of_states(self) -> Validation:
+        """The validation whose trajectories have the states of M."""
+        return with_states_of_model(self.first.validation)
 
     def _beside(self, number: int, suffix: str) -> Path | None:
         """Return the path of a file of a round, next to the store of the first model."""
@@ -231,7 +263,8 @@ class _Loop:
                 learned = self._learned(last.number)
             except CtxvalError:  # the file of the model is there, but its executions are not
                 return None
-            executed = [trajectory for _, trajectory in self._executed([last])]
+            before = len(list(self._executed(self.rounds[:-1])))
+            executed = self._with_states(self.rounds, judged=before)[before:]
             return replace(learned, errors=learned.errors.with_executions(last.model, self._base, executed))
 
 
