@@ -51,7 +51,7 @@ def found(validation: Validation, count: int) -> Actuator | None:
         extended = ExtendedValidation(validation, actuator, 1)
         return extended.records(extended.executions(executed, count) or [])
 
-    return found_actuator(validation.model, records_of, ExtendedValidation(validation).pairs)
+    return found_actuator(validation.model, records_of)
 
 
 @given(st.floats(0, 5), st.sampled_from([0.0, 0.5, 3.0]), st.integers(1, 12))
@@ -93,6 +93,13 @@ def test_delays_and_lags_are_found_from_eight_executions(delay: float, lag: floa
     assert actuator.delay == pytest.approx(delay, abs=0.02)
     # A time constant of a fifth of a step is less than 1 % of an input.
     assert actuator.lag == pytest.approx(lag, abs=0.03 if lag else 0.2)
+
+
+@pytest.mark.slow
+def test_three_executions_suffice_without_noise() -> None:
+    actuator = found(cart(delay=2.0), 3)
+    assert actuator is not None
+    assert actuator.delay == pytest.approx(2.0, abs=0.05)
 
 
 def test_none_is_found_where_inputs_act_at_once() -> None:

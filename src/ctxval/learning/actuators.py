@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from scipy.optimize import minimize
 
-from ctxval._util.arrays import Array, Mask
+from ctxval._util.arrays import Array, Mask, Rows
 from ctxval.core.controller import Controller, ControllerWithMemory, Synthesizer
 from ctxval.core.distance import Distance
 from ctxval.core.model import Model
@@ -23,16 +23,14 @@ from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.validation import Validation
 from ctxval.learning.histories import History, Record, Structure
-from ctxval.learning.hyperparameters import FAMILIES, HyperparameterPosterior, learning_rows, log_posterior
-from ctxval.learning.innovations import fit_usual
+from ctxval.learning.hyperparameters import FAMILIES, HyperparameterPosterior, Mode, learning_rows, log_posterior
 from ctxval.learning.residual_data import NEGLIGIBLE
 from ctxval.models.scaling import standard_deviations
 
 _LONGEST = 6.0  # steps, of a delay and of a time constant
 _DELAYS, _LAGS = (0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0), (0.5, 1.0, 1.5, 2.0, 3.0, 4.0)
 _TRIED = [*((each, 0.0) for each in _DELAYS), *((0.0, each) for each in _LAGS), (1.0, 1.0), (1.0, 2.0), (2.0, 2.0)]
-_BETTER, _GOOD, _PROMISING, _EXACT = 0.1, 0.05, 0.5, 1e-3  # shares of squared errors; see `found_actuator`
-_LEFT_OUT = 4  # records
+_BETTER, _NEAR = 0.3, 0.1  # differences of the log evidence per recorded value; see `found_actuator`
 _LEARNED_FROM = 150  # transitions
 
 
@@ -77,72 +75,89 @@ RecordsOf = Callable[[Actuator], Sequence[Record]]
 
 
 def found_actuator(
-    model: Model,
-    records_of: RecordsOf,
-    pairs: Array,
-    before: Actuator | None = None,
-    evaluations: int = 80,
+    model: Model, records_of: RecordsOf, before: Actuator | None = None, evaluations: int = 80
 ) -> Actuator | None:
-    """Return the delay and the lag with which each record is best predicted from the others; None if they do not help.
+    """Return the delay and the lag with which the residual of M is most probably a function; None if they do not help.
 
-    They help if the squared error of left-out records, in the geometric mean, is at most a tenth of that without them,
-    and at most 5 % of the residual of M.
+    They help if the log evidence per recorded value, with the hyperparameters at their mode, is larger by 0.3 than
+    without them.
 
     Args:
-        pairs: states and inputs of closed loops on M, shape ``(V, n + m)``.
         before: one that was found in fewer executions.
         evaluations: how often records may be asked for while the actuator is refined, twice.
 
     Raises:
         LinAlgError: if states cannot be estimated.
     """
-    plain = records_of(Actuator())
-    history = History(model, Structure(0), np.eye(plain[0].states.shape[1]))
-    sizes = (history.along(plain)[1] ** 2).mean(axis=0)
-    steps = standard_deviations(np.concatenate([np.diff(record.states, axis=0) for record in plain]))
-    live = np.sqrt(sizes) > NEGLIGIBLE * steps
-    if not live.any():
+    evidence = _Evidence.of(model, records_of)
+    if not evidence.live.any():
         return None
-
-    def error(actuator: Actuator) -> float:
-        acting, squares = records_of(actuator), []
-        for k in range(len(acting) - min(_LEFT_OUT, len(acting) - 1), len(acting)):
-            fit = fit_usual(history, [*acting[:k], *acting[k + 1 :]], pairs, live)
-            squares.append((history.along([acting[k]], fit.residual)[2][:, live] ** 2).mean(axis=0) / sizes[live])
-        # A record that lies outside of the others is badly predicted with every actuator.
-        return float(np.exp(np.log(np.maximum(squares, 1e-300)).mean(axis=0)).max())
-
-    without = error(Actuator())
-    if not without > _EXACT:
-        return None
-    best = min([*(Actuator(*each) for each in _TRIED), *([before] if before else [])], key=error)
-    if not error(best) < _PROMISING * min(without, 1.0):
+    without = evidence.mode(Actuator()).height
+    tried = [*(Actuator(*each) for each in _TRIED), *([before] if before else [])]
+    height, best = max(((evidence.mode(each).height, each) for each in tried), key=lambda pair: pair[0])
+    values = len(evidence.rows) * int(evidence.live.sum())
+    if height < without - _NEAR * values:
         return None
     for _ in range(2):  # the noise that a wrong actuator seems to add is less the second time
-        best = _refined(best, history, records_of, live, evaluations)
-    return best if error(best) < min(_BETTER * without, _GOOD) else None
+        best = evidence.refined(best, evaluations)
+    return best if evidence.mode(best).height > without + _BETTER * values else None
 
 
-def _refined(start: Actuator, history: History, records_of: RecordsOf, live: Mask, evaluations: int) -> Actuator:
-    """Return the most likely actuator near one of which the hyperparameters of the residual are learned."""
-    records = records_of(start)
-    Z, E, _ = history.along(records)
-    shift, scale, sizes = Z.mean(axis=0), standard_deviations(Z), np.sqrt((E[:, live] ** 2).mean(axis=0))
-    inputs = records[0].inputs.shape[-1]
-    rows = learning_rows((Z - shift) / scale, inputs, _LEARNED_FROM)
-    Z, E = (Z[rows] - shift) / scale, E[rows][:, live] / sizes
-    mode = HyperparameterPosterior.given(Z, E, inputs, FAMILIES[:1]).mode
-    place = np.append(mode.theta, np.log(mode.noise))
+@dataclass(frozen=True, eq=False)
+class _Evidence:
+    """How probable residuals of M are if the inputs act late.
 
-    def unlikely(each: Array) -> float:
-        Z, E, _ = history.along(records_of(Actuator(*np.clip(each, 0.0, _LONGEST).tolist())))
-        Z, E = (Z[rows] - shift) / scale, E[rows][:, live] / sizes
-        return -log_posterior(mode.kernel, place, Z, E)[0]
+    Attributes:
+        rows: the transitions that count, shape ``(N,)``.
+        live: the states in which M errs, shape ``(n,)``.
+        sizes: of their residuals, if the inputs act at once.
+    """
 
-    at = np.array([start.delay, start.lag])
-    simplex = at + np.array([[0.0, 0.0], [0.25, 0.0], [0.0, 0.25]])
-    options = {"initial_simplex": simplex, "maxfev": evaluations, "xatol": 1e-5, "fatol": 1e-3}
-    return Actuator(*np.clip(minimize(unlikely, at, method="Nelder-Mead", options=options).x, 0.0, _LONGEST).tolist())
+    history: History
+    records_of: RecordsOf
+    rows: Rows
+    live: Mask
+    sizes: Array
+
+    @classmethod
+    def of(cls, model: Model, records_of: RecordsOf) -> _Evidence:
+        records = records_of(Actuator())
+        history = History(model, Structure(0), np.eye(records[0].states.shape[1]))
+        Z, E, _ = history.along(records)
+        sizes = np.sqrt((E**2).mean(axis=0))
+        live = sizes > NEGLIGIBLE * standard_deviations(
+            np.concatenate([np.diff(each.states, axis=0) for each in records])
+        )
+        scaled = (Z - Z.mean(axis=0)) / standard_deviations(Z)
+        rows = learning_rows(scaled, records[0].inputs.shape[-1], _LEARNED_FROM)
+        return cls(history, records_of, rows, live, sizes[live])
+
+    def data(self, actuator: Actuator) -> tuple[Array, Array]:
+        """Return states and acting inputs ``(N, n + m)``, and residuals over their sizes."""
+        Z, E, _ = self.history.along(self.records_of(actuator))
+        return Z[self.rows], E[self.rows][:, self.live] / self.sizes
+
+    def mode(self, actuator: Actuator) -> Mode:
+        """Return the most probable hyperparameters, and their log density."""
+        Z, E = self.data(actuator)
+        shift, scale = Z.mean(axis=0), standard_deviations(Z)
+        inputs = Z.shape[1] - len(self.live)
+        return HyperparameterPosterior.given((Z - shift) / scale, E, inputs, FAMILIES[:1]).highest
+
+    def refined(self, start: Actuator, evaluations: int) -> Actuator:
+        """Return the most likely actuator near one, with the hyperparameters that are most probable for that one."""
+        Z, _ = self.data(start)
+        shift, scale, mode = Z.mean(axis=0), standard_deviations(Z), self.mode(start)
+
+        def unlikely(each: Array) -> float:
+            Z, E = self.data(Actuator(*np.clip(each, 0.0, _LONGEST).tolist()))
+            return -log_posterior(mode.kernel, mode.place, (Z - shift) / scale, E)[0]
+
+        at = np.array([start.delay, start.lag])
+        simplex = at + np.array([[0.0, 0.0], [0.25, 0.0], [0.0, 0.25]])
+        options = {"initial_simplex": simplex, "maxfev": evaluations, "xatol": 1e-5, "fatol": 1e-3}
+        best = minimize(unlikely, at, method="Nelder-Mead", options=options).x
+        return Actuator(*np.clip(best, 0.0, _LONGEST).tolist())
 
 
 # A closed loop whose inputs are those that act, followed by those that were commanded

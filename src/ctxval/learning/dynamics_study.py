@@ -355,10 +355,9 @@ class DynamicsStudy(ShortRepr):
                     raise np.linalg.LinAlgError
                 return extended.records(known)
 
-            model, pairs = before_refinement(self.validation.model), self.extended.pairs
+            model, before = before_refinement(self.validation.model), self._found_actuator(executed[: some - 1])
             with single_threaded(), np.errstate(all="ignore"):
-                before, evaluations = self._found_actuator(executed[: some - 1]), 30 if estimated else 80
-                self._actuators[key] = found_actuator(model, records_of, pairs, before, evaluations)
+                self._actuators[key] = found_actuator(model, records_of, before, 30 if estimated else 80)
         return self._actuators[key]
 
     def _with_actuator(self, actuator: Actuator, inputs: int) -> DynamicsStudy:

@@ -132,7 +132,7 @@ class Hyperparameters:
 
 
 @dataclass(frozen=True, eq=False)
-class _Mode:
+class Mode:
     """The posterior of one family, given pairs and residuals, around one of its modes.
 
     Attributes:
@@ -182,7 +182,7 @@ class HyperparameterPosterior:
         families: the modes of each family of covariances.
     """
 
-    families: tuple[tuple[_Mode, ...], ...]
+    families: tuple[tuple[Mode, ...], ...]
 
     @classmethod
     def given(cls, Z: Array, Y: Array, inputs: int, families: Sequence[tuple[float, float]]) -> HyperparameterPosterior:
@@ -190,10 +190,14 @@ class HyperparameterPosterior:
         return cls(tuple(_modes_of(ResidualKernel(nu, growth, inputs), Z, Y) for nu, growth in families))
 
     @functools.cached_property
+    def highest(self) -> Mode:
+        """The highest mode of all families."""
+        return max((mode for family in self.families for mode in family), key=lambda mode: mode.height)
+
+    @functools.cached_property
     def mode(self) -> Hyperparameters:
-        """The mode of the most probable family."""
-        best = max((mode for family in self.families for mode in family), key=lambda mode: mode.height)
-        return _of(best.kernel, best.place)
+        """The most probable hyperparameters."""
+        return _of(self.highest.kernel, self.highest.place)
 
     def draw(self, count: int, rng: np.random.Generator) -> list[Hyperparameters]:
         """Return ``count`` draws; hyperparameters that are drawn again are the same object, and follow each other."""
@@ -275,11 +279,11 @@ def _box(kernel: ResidualKernel, dimension: int) -> tuple[Array, Array]:
     return low, high
 
 
-def _modes_of(kernel: ResidualKernel, Z: Array, Y: Array) -> tuple[_Mode, ...]:
+def _modes_of(kernel: ResidualKernel, Z: Array, Y: Array) -> tuple[Mode, ...]:
     """Return the modes of a family, the highest first: one with little noise, one with much, or one that is both."""
     (height, place), (lower, other) = found = _climbed(kernel, Z, Y)
     relevant = height - lower < 12.0 and np.abs(place - other).max() > 0.5  # else negligible, or the same mode
-    return tuple(_Mode(kernel, *one, Z, Y) for one in (found if relevant else found[:1]))
+    return tuple(Mode(kernel, *one, Z, Y) for one in (found if relevant else found[:1]))
 
 
 def _climbed(kernel: ResidualKernel, Z: Array, Y: Array) -> list[tuple[float, Array]]:
