@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import functools
-import hashlib
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -23,7 +22,6 @@ from ctxval.errors import InputError
 from ctxval.learning.actuators import Actuator, found_actuator
 from ctxval.learning.closed_loops import LoopPlanner, unseen_parameters
 from ctxval.learning.dynamics_posterior import (
-    DynamicsPosterior,
     LearnedCovariances,
     PosteriorSettings,
     condition,
@@ -32,17 +30,15 @@ from ctxval.learning.dynamics_posterior import (
 from ctxval.learning.extended import ExtendedValidation
 from ctxval.learning.histories import Record
 from ctxval.learning.learned_dynamics import LearnedDynamics
-from ctxval.learning.noise_effect import effect_of_noise, effect_of_starts
-from ctxval.learning.noisy_draws import MATTERS, REPLICATES, NoisyPosterior, learn_noisy, scatter_of
+from ctxval.learning.noise_study import NoiseStudy
+from ctxval.learning.noisy_draws import NoisyPosterior
 from ctxval.learning.prediction import predict_distance
-from ctxval.learning.recorded import data_near, recorded_transitions
-from ctxval.learning.structures import NOISY, ChosenStructure, predicted_by_history
+from ctxval.learning.recorded import data_near, digest, recorded_transitions, scheduled
 from ctxval.learning.vector import ErrorVectors, Executed, predict_composed
 from ctxval.learning.worst_case import WorstCaseSearch, WorstCaseSettings
 from ctxval.models.corrected import before_refinement
 from ctxval.searches import Prediction
 
-_TRIED = 32  # tasks of the pool among which those with the largest distances show what noise does
 _FEWEST_TOLD = 6  # executions from which on a task parameter is suspected of changing the dynamics
 _FEWEST_AGAINST = 3  # executions from which on the data that M was made from may be left out
 _ESTIMATED = 5  # latest executions from which an actuator is found if their states are estimated
@@ -77,7 +73,6 @@ class DynamicsStudy(ShortRepr):
         self.planner = LoopPlanner(self.validation)
         self._errors = ErrorVectors(self.planner if validation.outputs is None else LoopPlanner(validation))
         self._covariances = Latest[bytes, LearnedCovariances | None](8)
-        self._structures = Latest[bytes, ChosenStructure](8)
         self._found: dict[bytes, str | None] = {}
         self._others: dict[str, DynamicsStudy] = {}
         self._actuators: dict[bytes, Actuator | None] = {}
@@ -157,7 +152,7 @@ class DynamicsStudy(ShortRepr):
         recorded = self._recorded(executed, logged, with_data)
         if recorded is None:
             return None
-        some = _scheduled(len(executed))
+        some = scheduled(len(executed))
         known = recorded if some == len(executed) else None
         covariances = self._learned_covariances(executed[:some], logged, known, with_data)
         if covariances is None and some < len(executed):
@@ -182,7 +177,7 @@ class DynamicsStudy(ShortRepr):
 
     def _executions(self, executed: Executed) -> Executed | None:
         """Return executions as closed loops of the extended validation; None if states of M cannot be estimated."""
-        return self.extended.executions(executed, _scheduled(len(executed)))
+        return self.extended.executions(executed, scheduled(len(executed)))
 
     def recorded(self, trajectory: Trajectory) -> Trajectory:
         """Return a closed loop as the system records it."""
@@ -203,6 +198,11 @@ class DynamicsStudy(ShortRepr):
         points = np.array([point for point, _ in executed]).reshape(-1, self.validation.space.dimension)
         return LearnedDynamics(self, posterior, points, [trajectory for _, trajectory in executed], with_data)
 
+    @functools.cached_property
+    def noise(self) -> NoiseStudy:
+        """Learns dynamics with noise."""
+        return NoiseStudy(self.extended, self.planner, self.search, self.seed, self.quantile)
+
     def noisy(self, learned: LearnedDynamics) -> NoisyPosterior | None:
         """Return dynamics with noise and histories, learned from the executions.
 
@@ -210,23 +210,7 @@ class DynamicsStudy(ShortRepr):
         """
         if self._loops is None or not len(learned.executed):
             return None
-        posterior, pairs, records = learned.posterior, self.extended.pairs, self._records(learned)
-        if not self._needs_history(posterior, records, pairs):
-            return None
-        some = _scheduled(len(records))
-        key = _digest(records[:some])
-        # There are fewer sequences of noise if each closed loop is designed and run on its own.
-        replicates = REPLICATES if self.planner.batched else 4
-        learn = functools.partial(learn_noisy, posterior, pairs=pairs, replicates=replicates, quantile=self.quantile)
-        if key not in self._structures:
-            first = learn(records[:some], seed=(self.seed, some))
-            if first is None:
-                return None
-            self._structures[key] = first[1]
-            if some == len(records):
-                return self._with_effect(first[0])
-        again = learn(records, chosen=self._structures[key], seed=(self.seed, len(records)))
-        return None if again is None else self._with_effect(again[0])
+        return self.noise.learn(learned.posterior, self._records(learned))
 
     def _records(self, learned: LearnedDynamics) -> list[Record]:
         return self.extended.records(list(zip(learned.executed, learned.trajectories_of_system, strict=True)))
@@ -243,13 +227,8 @@ class DynamicsStudy(ShortRepr):
         noisy = learned.noisy
         if others is None or noisy is None:
             return others and others.with_noisy(None)
-        records = self._records(others)
-        chosen = self._structures[_digest(self._records(learned)[: _scheduled(len(executed) + 1)])]
-        again = learn_noisy(
-            others.posterior, records, self.extended.pairs, chosen,
-            replicates=noisy.replicates, quantile=noisy.quantile, seed=(self.seed, len(records)),
-        )  # fmt: skip
-        return None if again is None else others.with_noisy(again[0])
+        again = self.noise.again(noisy, self._records(learned), others.posterior, self._records(others))
+        return None if again is None else others.with_noisy(again)
 
     def with_states(self, executed: Executed, point: Array, trajectory: Trajectory) -> Trajectory | None:
         """Return a later execution with the states that are learned; None if they cannot be estimated.
@@ -262,27 +241,6 @@ class DynamicsStudy(ShortRepr):
         extended = self._executions([*executed, (point, trajectory)])
         return None if extended is None else extended[-1][1]
 
-    def _with_effect(self, noisy: NoisyPosterior) -> NoisyPosterior:
-        return noisy.with_effect(effect_of_noise(self.planner, noisy, self.search.pool[:_TRIED]))
-
-    def _needs_history(self, posterior: DynamicsPosterior, records: Sequence[Record], pairs: Array) -> bool:
-        """Return whether executions do not follow from task, state and input: noise, or what is not recorded, acts."""
-        if float((posterior.most_probable.noise**2).max()) > NOISY:
-            return True
-        if effect_of_noise(self.planner, posterior, self.search.pool[:_TRIED]) > MATTERS:
-            return True
-        scatter = scatter_of(records)
-        if effect_of_starts(self.planner, posterior, self.search.pool[:_TRIED], scatter) > MATTERS:
-            return True
-        if len(records) < 3:
-            return False
-        last = records[-1]
-        with contextlib.suppress(np.linalg.LinAlgError, InputError, ValueError), np.errstate(all="ignore"):
-            mean = posterior.means_without([[len(records) - 1]])
-            predicted = mean.step(last.states[None, :-1], last.inputs[None])[0]
-            return predicted_by_history(posterior, records, pairs, predicted)
-        return False
-
     def _learned_covariances(
         self,
         executed: Executed,
@@ -292,7 +250,7 @@ class DynamicsStudy(ShortRepr):
     ) -> LearnedCovariances | None:
         """Return the covariances learned from some executions, whose transitions may be known; the latest are kept."""
         together = [*(one for _, one in executed), *logged]
-        key = _digest(together) + bytes([with_data])
+        key = digest(together) + bytes([with_data])
         if key not in self._covariances:
             recorded = self._recorded(executed, logged, with_data) if recorded is None else recorded
             if recorded is None or self._loops is None:
@@ -322,7 +280,7 @@ class DynamicsStudy(ShortRepr):
         some = _FEWEST_TOLD
         while 2 * some <= len(executed):
             some *= 2
-        key = _digest(trajectory for _, trajectory in executed[:some])
+        key = digest(trajectory for _, trajectory in executed[:some])
         if key not in self._found:
             name, with_it, without_it = self._most_telling(executed[:some])
             # If errors remain, it may be a sign of noise, or of a state that is not recorded.
@@ -338,10 +296,10 @@ class DynamicsStudy(ShortRepr):
 
     def _found_actuator(self, executed: Executed) -> Actuator | None:
         """Return a delay and a lag of inputs that explain the errors of predictions."""
-        some = _scheduled(len(executed))
+        some = scheduled(len(executed))
         if self.actuator is not None or some < _FEWEST_AGAINST:
             return None
-        key = _digest(trajectory for _, trajectory in executed[:some])
+        key = digest(trajectory for _, trajectory in executed[:some])
         if key not in self._actuators:
             estimated = self.given.outputs is not None
             # Estimates of states cost as much as hundreds of steps, so few executions have to suffice.
@@ -427,19 +385,3 @@ class DynamicsStudy(ShortRepr):
         if vectors is None or not isinstance(distance, ComposedDistance):
             return None
         return predict_composed(np.array([point for point, _ in executed]), vectors, distance.compose)
-
-
-def _digest(runs: Iterable[Trajectory | Record]) -> bytes:
-    """Return what identifies the states and inputs of some runs."""
-    return hashlib.sha256(b"".join(part.tobytes() for run in runs for part in (run.states, run.inputs))).digest()
-
-
-def _scheduled(count: int) -> int:
-    """Return the largest number of executions, up to ``count``, at which hyperparameters are learned.
-
-    These are 0 to 4, 6, 8, 12, 16, 24 and so on, two in each doubling.
-    """
-    step = 1
-    while count >= 4 * step:
-        step *= 2
-    return count - count % step

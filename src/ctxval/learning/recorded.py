@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import hashlib
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -12,6 +13,7 @@ from ctxval._util.arrays import Rows
 from ctxval.core.model import Model
 from ctxval.core.trajectory import Trajectory, Transitions
 from ctxval.core.validation import Validation
+from ctxval.learning.histories import Record
 from ctxval.models.scaling import standard_deviations
 
 _POOL = 3000  # largest number of transitions that these are chosen from
@@ -93,3 +95,19 @@ def _nearest(data: Transitions, loops: Trajectory, count: int, *, many: bool = F
     else:
         gaps = cdist(here / scale, there / scale).min(axis=1)
     return np.sort(np.argsort(gaps, kind="stable")[:count])
+
+
+def digest(runs: Iterable[Trajectory | Record]) -> bytes:
+    """Return what identifies the states and inputs of some runs."""
+    return hashlib.sha256(b"".join(part.tobytes() for run in runs for part in (run.states, run.inputs))).digest()
+
+
+def scheduled(count: int) -> int:
+    """Return the largest number of executions, up to ``count``, at which hyperparameters are learned.
+
+    These are 0 to 4, 6, 8, 12, 16, 24 and so on, two in each doubling.
+    """
+    step = 1
+    while count >= 4 * step:
+        step *= 2
+    return count - count % step
