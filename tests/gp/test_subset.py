@@ -14,7 +14,7 @@ from ctxval.gp.kernels import Matern
 from ctxval.gp.subset import LONG, kept_rows, pivoted_cholesky, pivoted_rows
 from rig_thorough import more
 
-UNCUT = [("gp-ucb", 1), ("gp-ucb", 20), ("scalar", 1), ("scalar", 2)]
+UNCUT = [("gp-ucb", 1), ("gp-ucb", 20), ("bayesian-optimisation", 1), ("bayesian-optimisation", 2)]
 
 
 def long_history(count: int, dimension: int = 2, failed: int = 0) -> tuple[Array, Array]:
@@ -54,7 +54,7 @@ def test_copies_of_one_point_are_no_reason_to_stop() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "dimension"),
-    [("gp-ucb", 2), ("scalar", 20), *more(*UNCUT)],
+    [("gp-ucb", 2), ("bayesian-optimisation", 20), *more(*UNCUT)],
 )
 def test_a_search_goes_on_over_a_long_history_as_one_never_stopped(name: str, dimension: int) -> None:
     points, values = long_history(LONG + 3, dimension, failed=50)
@@ -73,7 +73,7 @@ def test_a_search_goes_on_over_a_long_history_as_one_never_stopped(name: str, di
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["gp-ucb", "scalar"])
+@pytest.mark.parametrize("name", ["gp-ucb", "bayesian-optimisation"])
 def test_a_long_history_leads_to_the_maximum_too(name: str) -> None:
     rng = np.random.default_rng(1)
     points = rng.random((LONG + 100, 2)) * [0.6, 1.0]  # the peak is where none of them is
