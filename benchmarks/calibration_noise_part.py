@@ -1,9 +1,19 @@
-"""The part of ``docs/calibration.md`` on verdicts under noise. Nothing is run here."""
+"""The part of ``docs/calibration.md`` on verdicts under noise, and its picture. Nothing is run here."""
 
 from __future__ import annotations
 
-from calibrate_noise import BUDGET, HALVES, QUANTILE, RULE, STORED, table
-from calibration_verdicts_part import validated_share
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from scipy.stats import binom
+
+from calibrate import ROOT
+from calibrate_noise import BUDGET, CONFIDENCES, HALVES, IMPERFECTIONS, QUANTILE, RULE, STORED, table
+from calibration_verdicts_part import interval, validated_share
+
+PICTURE, BINS = ROOT / "docs" / "calibration" / "noise_ranks.png", 10
 
 TEXT = """## Noise
 
@@ -15,6 +25,17 @@ that the table names ([noise](explanation/noise.md)). They were never tuned on. 
 **At 0.95 d_q*, {false} of {below} campaigns were validated falsely (the 95 % interval is {low:.1f} to {high:.1f} %).**
 
 {reported}
+
+Bounds of the posterior samples alone, at the end of the campaigns, without the tests and diagnostics that a verdict
+needs beside them: how many are at least d_q*.
+
+{coverage}
+
+Before each execution, noisy dynamics predict with which probability its distance is smaller than each value. With the
+right law, the probabilities of what was executed are uniform.
+
+![How often each tenth of the predicted probabilities was met, beside chance](calibration/noise_ranks.png)
+
 {developed}{misleading}"""
 
 DEVELOPED = """
@@ -48,6 +69,49 @@ def under_noise() -> str:
         count=len(results),
         **validated_share(below),
         reported=table("reporting"),
+        coverage=_coverage(results),
         developed=of("development", DEVELOPED),
         misleading=of("misleading", MISLEADING),
     )
+
+
+def _coverage(results: Sequence[dict[str, Any]]) -> str:
+    """Return how many bounds of each confidence hold, with noise and without it."""
+    lines = [f"| | {' | '.join(f'{each:.0%}' for each in CONFIDENCES)} |", "|---|" + "---|" * len(CONFIDENCES)]
+    for name, kinds in _kinds().items():
+        bounds = [line["bounds"] for line in results if line["imperfection"] in kinds and line["bounds"] is not None]
+        cells = []
+        for confidence in CONFIDENCES if bounds else ():
+            held = sum(each[str(confidence)] >= 1 - 1e-6 for each in bounds)
+            low, high = interval(len(bounds) - held, len(bounds))
+            cells.append(f"{held} of {len(bounds)} ({low:.0f} to {high:.0f} %)")
+        if cells:
+            lines.append(f"| {name} | {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def _kinds() -> dict[str, list[str]]:
+    late = [name for name in IMPERFECTIONS if name.startswith(("delay", "lag"))]
+    noisy = [name for name in IMPERFECTIONS if name not in ("none", *late)]
+    return {"no imperfection": ["none"], "delays and lags": late, "noise and encoders": noisy}
+
+
+def draw() -> None:
+    """Draw how often each tenth of the predicted probabilities was met on reporting plants, by kind of noise."""
+    stored = [line for line in STORED.select(rule=RULE) if line["plant"] in HALVES["reporting"]]
+    kinds = ["process", "measurement", "both", "encoder"]
+    figure = Figure(figsize=(10, 2.8), layout="constrained")
+    panels = figure.subplots(1, len(kinds), sharey=True)
+    for panel, kind in zip(panels, kinds, strict=True):
+        ranks = [rank for line in stored if line["imperfection"].startswith(kind) for rank in line["ranks"]]
+        panel.set(title=f"{kind} ({len(ranks)} executions)", xlabel="predicted probability of less", xlim=(0, 1))
+        if not ranks:
+            continue
+        low, high = binom.interval(0.95, len(ranks), 1 / BINS)
+        panel.axhspan(low * BINS / len(ranks), high * BINS / len(ranks), color="0.85", label="95 % of chance")
+        panel.axhline(1.0, color="0.4", linewidth=1)
+        density, edges = np.histogram(ranks, bins=BINS, range=(0, 1), density=True)
+        panel.stairs(density, edges, color="#0072b2", linewidth=1.8, label="executions")
+    panels[0].set_ylabel("share, relative to uniform")
+    panels[0].legend(loc="lower center", frameon=False, fontsize=8)
+    figure.savefig(PICTURE, dpi=110)

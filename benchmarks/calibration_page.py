@@ -13,6 +13,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from scipy.stats import binom
 
+import calibration_noise_part
 import study_retrain
 from calibrate import (
     CONFIDENCES,
@@ -28,7 +29,6 @@ from calibrate import (
     stored,
 )
 from calibration_dynamics_part import by_dynamics
-from calibration_noise_part import under_noise
 from calibration_outputs_part import from_outputs
 from calibration_strangers_part import of_strangers
 from calibration_verdicts_part import interval, table, until_decided
@@ -314,6 +314,7 @@ def main() -> None:
     all_cells = cells([*names, *systems, *noisy])
     draw_coverage()
     draw_tightness()
+    calibration_noise_part.draw()
     PAGE.write_text(
         TEXT.format(
             total=sum(len(stored(*name)) for name in [*names, *systems, *noisy]),
@@ -331,7 +332,7 @@ def main() -> None:
             until_decided=until_decided(),
             by_dynamics=by_dynamics(),
             of_strangers=of_strangers(),
-            under_noise=under_noise(),
+            under_noise=calibration_noise_part.under_noise(),
             from_outputs=from_outputs(),
             retrained=retrained(),
         )

@@ -52,8 +52,9 @@ def late(actuator: Sequence[float] | None) -> str:
     if actuator is None:
         return ""
     (delay, lag), at_once = actuator, 0.05
-    parts = [f"{delay:.2g} steps late"] if delay > at_once else []
-    parts += [f"with a time constant of {lag:.2g} steps"] if lag > 5 * at_once else []
+    delayed, slow = (f"{each:.2g} step{'' if f'{each:.2g}' == '1' else 's'}" for each in actuator)
+    parts = [f"{delayed} late"] if delay > at_once else []
+    parts += [f"with a time constant of {slow}"] if lag > 5 * at_once else []
     return f"acting {' and '.join(parts)}" if parts else ""
 
 
