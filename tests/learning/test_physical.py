@@ -145,7 +145,7 @@ def test_executed_tasks_are_replayed_in_the_states_of_the_user() -> None:
     validation, executed = loaded_cart(), []
     for unit in (np.array([0.2, 0.9]), np.array([0.7, 0.1]), np.array([1.0, 0.5])):
         executed.append((unit, validation.execute(validation.plan(validation.space.from_unit(unit)))))
-    for replay in replay_executed(validation, executed, [executed[0][0]]):
+    for replay in replay_executed(validation, DynamicsStudy(validation).learn(executed), [executed[0][0]]):
         assert replay is not None
         assert isinstance(replay.task, Carried)
         assert replay.corrected is not None

@@ -62,7 +62,7 @@ def test_executions_with_outputs_predict_as_well_as_with_states() -> None:
 def test_a_replay_has_the_outputs() -> None:
     validation = swing_validation()
     executed = executions_of(validation)
-    (replay,) = replay_executed(validation, executed, [executed[1][0]])
+    (replay,) = replay_executed(validation, DynamicsStudy(validation).learn(executed), [executed[1][0]])
     assert replay is not None
     assert replay.corrected is not None
     assert replay.corrected.states.shape == executed[1][1].states.shape

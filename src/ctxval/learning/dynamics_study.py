@@ -42,6 +42,7 @@ from ctxval.searches import Prediction
 _FEWEST_TOLD = 6  # executions from which on a task parameter is suspected of changing the dynamics
 _FEWEST_AGAINST = 3  # executions from which on the data that M was made from may be left out
 _ESTIMATED = 5  # latest executions from which an actuator is found if their states are estimated
+_EXACTLY = 0.02  # left-out error below which nobody asks whether inputs act late
 _WELL = 0.1  # left-out error below which neither these data nor task parameters are asked about
 _CLEARLY = 3.0  # factor by which predictions must err less without these data, or with a parameter, and err little
 _SLOW = 0.02  # seconds: if a single closed loop on M takes longer, closed loops are distributed over the cores
@@ -133,6 +134,8 @@ class DynamicsStudy(ShortRepr):
         learned = self._learn(extended, logged, with_data=True)
         with contextlib.suppress(np.linalg.LinAlgError, InputError, ValueError):
             if learned is None or len(executed) < _FEWEST_AGAINST:
+                return learned
+            if not learned.left_out_error > _EXACTLY:
                 return learned
             actuator = None if logged else self._found_actuator(executed)
             if actuator is not None:

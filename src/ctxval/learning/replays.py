@@ -21,7 +21,8 @@ from ctxval.core.trajectory import Trajectory
 from ctxval.core.validation import Validation
 from ctxval.learning.draws import DrawnModel
 from ctxval.learning.dynamics_study import DynamicsStudy
-from ctxval.learning.vector import Executed, executions_of
+from ctxval.learning.learned_dynamics import LearnedDynamics
+from ctxval.learning.vector import executions_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,21 +39,20 @@ class Replay(ShortRepr):
     distance: float
 
 
-def replay_executed(validation: Validation, executed: Executed, wanted: Sequence[Array]) -> list[Replay | None]:
+def replay_executed(
+    validation: Validation, learned: LearnedDynamics | None, wanted: Sequence[Array]
+) -> list[Replay | None]:
     """Return the replays of tasks; None for a task that cannot be planned.
 
     Args:
-        executed: points of the unit cube ``(d,)`` with the system's trajectories there; the dynamics are learned from
-            all of them, except those at the task that is replayed.
+        learned: what executions teach; those at the task that is replayed are left out.
         wanted: points of the unit cube ``(d,)`` of the tasks.
     """
     models: list[DrawnModel | None] = [None] * len(wanted)
-    study = DynamicsStudy(validation)
+    study = DynamicsStudy(validation) if learned is None else learned.study
     with single_threaded():
-        with contextlib.suppress(Exception):  # the user's own parts, at states that no execution has reached
-            learned = study.learn(executed)
-            if learned is not None:
-                study = learned.study
+        if learned is not None:
+            with contextlib.suppress(Exception):  # the user's own parts, at states that no execution has reached
                 without = learned.posterior.means_without(executions_of(learned.executed, wanted))
                 models = [without.model_of(k) for k in range(len(wanted))]
         return [_replayed(study, model, point) for model, point in zip(models, wanted, strict=True)]

@@ -13,7 +13,7 @@ from ctxval._util.arrays import Array
 from ctxval._util.progress import stage
 from ctxval._util.representation import ShortRepr
 from ctxval.campaign.campaign import Campaign
-from ctxval.campaign.dynamics import NEAR
+from ctxval.campaign.dynamics import NEAR, CampaignDynamics
 from ctxval.campaign.interval_search import with_next_task
 from ctxval.campaign.provenance import provenance_of_store
 from ctxval.campaign.storage.store import Store
@@ -53,6 +53,7 @@ class ReportContext(ShortRepr):
         trials: all trials, in the order of asking.
         verdict: the verdict; None if there is no threshold.
         validation: the map p -> d(p), which is never executed; None if the experiment is not loaded.
+        dynamics: what the campaign has learned; None if the experiment is not loaded.
         missing: why the experiment is not loaded, as a sentence; empty if it is.
         budget: the budget of the campaign; None if it is not known.
         settings, description: what the store knows of the experiment; the settings make it again.
@@ -66,6 +67,7 @@ class ReportContext(ShortRepr):
     store: Store
     verdict: Verdict | None = None
     validation: Validation | None = None
+    dynamics: CampaignDynamics | None = None
     missing: str = ""
     labels: Labels = field(default_factory=Labels)
     budget: int | None = None
@@ -232,13 +234,12 @@ class ReportContext(ShortRepr):
     @functools.cached_property
     def replays(self) -> dict[int, Replay]:
         """The replays of the trials with recordings on the corrected model, by number; empty without the experiment."""
-        if self.validation is None or not self.recordings:
+        if self.validation is None or self.dynamics is None or not self.recordings:
             return {}
-        executed = [(pair.trial.unit_point, pair.system) for pair in self.recordings.values()]
         # Designs that cannot be made in a batch take long.
-        points = [point for point, _ in executed[: 120 if self.batched else 40]]
+        points = [pair.trial.unit_point for pair in self.recordings.values()][: 120 if self.batched else 40]
         with stage("replaying executed tasks", len(points), "tasks"):
-            replays = replay_executed(self.validation, executed, points)
+            replays = replay_executed(self.validation, self.dynamics.learned(self.trials), points)
         return {k: replay for k, replay in zip(self.recordings, replays, strict=False) if replay is not None}
 
 
@@ -267,6 +268,7 @@ def context_of_campaign(
         campaign.store,
         verdict,
         campaign.validation,
+        campaign.recorder.dynamics,
         labels=campaign.validation.labels,
         budget=budget,
         settings=campaign.store.settings(),
