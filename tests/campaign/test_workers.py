@@ -312,7 +312,7 @@ def test_a_controller_that_cannot_be_sent_is_said_so(tmp_path: Path) -> None:
         ({"workers": 1.5}, "workers must be a positive integer"),
         ({"timeout": 0}, "timeout must be a positive number of seconds"),
         ({"timeout": float("nan")}, "timeout must be a positive number of seconds"),
-        ({"executor": 3}, "executor must be an Executor, got 3"),
+        ({"executor": 3}, "executor must be an Executor with submit"),
         ({"retries": -1}, "retries must be an integer >= 0"),
         ({"retry_failures": True}, "retry_failures must be an integer >= 0"),
         ({"retry_failures": 1}, "retry_failures needs workers"),

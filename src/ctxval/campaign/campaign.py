@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import concurrent.futures as cf
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -22,7 +21,7 @@ from ctxval.campaign.plot import overview
 from ctxval.campaign.provenance import provenance_of
 from ctxval.campaign.storage.store import Store
 from ctxval.campaign.trials import TrialRecorder
-from ctxval.campaign.workers import worker_pool
+from ctxval.campaign.workers import Executor, worker_pool
 from ctxval.certificates import RESOLUTION, Certificate, CertificateOptions, Provenance, Verdict, assess, judge
 from ctxval.certificates.options import CONFIDENCE, WITHIN
 from ctxval.core.distance import Distance
@@ -156,7 +155,7 @@ class Campaign:
         certificate: CertificateOptions | None = None,
         until: Callable[[Campaign], bool] | None = None,
         workers: PositiveInt | None = None,
-        executor: cf.Executor | None = None,
+        executor: Executor | None = None,
         timeout: Seconds | None = None,
         retries: NonNegativeInt = 2,
         retry_failures: NonNegativeInt = 0,
@@ -189,7 +188,8 @@ class Campaign:
             until: called before each execution; the campaign stops early if it returns True.
             workers: number of processes, each with its own copy of the system; with an executor, the number of
                 executions that it has at a time.
-            executor: an executor of ``concurrent.futures`` that replaces these processes.
+            executor: an executor that replaces these processes: one of ``concurrent.futures``, or any object whose
+                ``submit(function, *arguments)`` returns a job with ``done()``, ``result()`` and ``cancel()``.
             timeout: time limit of an execution in seconds; a longer execution has failed. With a time limit, the
                 system is executed in a separate process.
             retries: largest number of repetitions of an execution if its worker is lost.
@@ -232,7 +232,7 @@ class Campaign:
         on_trial: Callable[[Trial], None] | None = None,
         *,
         workers: PositiveInt | None = None,
-        executor: cf.Executor | None = None,
+        executor: Executor | None = None,
         timeout: Seconds | None = None,
         progress: bool | None = None,
     ) -> Campaign:

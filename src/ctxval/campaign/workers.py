@@ -1,4 +1,4 @@
-"""Pools of workers that execute tasks: processes of this computer, or any executor of ``concurrent.futures``."""
+"""Pools of workers that execute tasks: processes of this computer, or any executor."""
 
 from __future__ import annotations
 
@@ -8,16 +8,17 @@ import multiprocessing
 import os
 import pickle
 import random
+import re
 import signal
 import threading
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from multiprocessing.connection import wait as wait_for
 from types import FrameType
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -270,40 +271,53 @@ def _exit_with_parent(parent: int) -> None:
 # Any executor
 
 
+@runtime_checkable
+class Executor(Protocol):
+    """An executor of ``concurrent.futures``, or what submits functions as these do, such as those of Dask and Slurm."""
+
+    @abstractmethod
+    def submit(self, function: Callable[..., Any], /, *arguments: Any) -> Any:
+        """Return a job that calls the function: it has the methods ``done``, ``result`` and ``cancel`` of a future."""
+
+
 class ExecutorPool(WorkerPool):
-    """An executor of ``concurrent.futures``: a pool of threads or processes, Dask, and others.
+    """An executor: a pool of threads or processes, Dask, Slurm, Ray, and others.
 
     All threads of a pool share one system. An execution that takes longer than ``timeout`` seconds is cancelled; a
     thread cannot be cancelled and continues in the background.
     """
 
-    def __init__(self, system: System, executor: cf.Executor, size: int, timeout: float | None = None) -> None:
+    def __init__(self, system: System, executor: Executor, size: int, timeout: float | None = None) -> None:
         self.system, self.executor, self.size, self.timeout = system, executor, size, timeout
-        self._running: dict[cf.Future[Execution], tuple[int, float]] = {}
+        self._running: dict[int, tuple[Any, float]] = {}
 
     def start(self, number: int, plan: Plan) -> None:
         """Start the execution of a trial."""
         self._await_scheduler()
         try:
-            future = self.executor.submit(execute_task, self.system, plan.controller, plan.task)
+            job = self.executor.submit(execute_task, self.system, plan.controller, plan.task)
         except Exception as error:
             if _is_loss(error) or isinstance(error, RuntimeError):
                 raise CampaignError(f"the executor takes no more work: {reason_of(error).rstrip('.')}.") from error
             raise InputError(f"the execution cannot be sent to a worker: {reason_of(error)}.") from error
-        self._running[future] = number, time.monotonic()
+        self._running[number] = job, time.monotonic()
 
     def wait(self) -> tuple[int, Execution]:
         """Wait for the next execution that ends, or that takes too long."""
         while True:
-            cf.wait(self._running, timeout=0.5, return_when=cf.FIRST_COMPLETED)
-            for future, (number, started) in list(self._running.items()):
+            jobs = [job for job, _ in self._running.values()]
+            if all(isinstance(job, cf.Future) for job in jobs):
+                cf.wait(jobs, timeout=0.5, return_when=cf.FIRST_COMPLETED)
+            elif not any(job.done() for job in jobs):
+                time.sleep(0.1)  # jobs of a cluster take longer to start, and to be asked means to look for a file
+            for number, (job, started) in list(self._running.items()):
                 seconds = time.monotonic() - started
-                if future.done():
-                    del self._running[future]
-                    return number, self._result(future)
+                if job.done():
+                    del self._running[number]
+                    return number, self._result(job)
                 if self.timeout is not None and seconds >= self.timeout:
-                    del self._running[future]
-                    future.cancel()
+                    del self._running[number]
+                    _cancel(job)
                     return number, _timed_out(self.timeout, seconds)
             # A task that was sent while a client searched for its scheduler stays pending for ever.
             self._await_scheduler()
@@ -318,29 +332,44 @@ class ExecutorPool(WorkerPool):
     def _status(self) -> str:
         return str(getattr(getattr(self.executor, "_client", None), "status", "running"))
 
-    def _result(self, future: cf.Future[Execution]) -> Execution:
+    def _result(self, job: Any) -> Execution:
         try:
-            return future.result()
+            execution: Execution = job.result()
         except (Exception, cf.CancelledError) as error:
             if _is_loss(error):
                 self._await_scheduler()
                 return Execution(lost=reason_of(error))
-            raise InputError(f"the execution cannot be sent to a worker: {reason_of(error)}.") from error
+            # The message may be the traceback of another process, whose last error is the reason.
+            errors = re.findall(r"^[\w.]*(?:Error|Exception): .*$", str(error), re.MULTILINE)
+            reason = errors[-1] if errors else reason_of(error)
+            raise InputError(f"the execution cannot be sent to a worker: {reason.rstrip('.')}.") from error
+        return execution
 
     def close(self) -> None:
         """Cancel the executions that have not started; the owner of the executor closes it."""
-        for future in self._running:
-            future.cancel()
+        for job, _ in self._running.values():
+            _cancel(job)
+
+
+def _cancel(job: Any) -> None:
+    with contextlib.suppress(Exception):  # the command of a cluster that cancels its job may fail
+        job.cancel()
+
+
+_ENGINES = {"distributed", "ray", "submitit"}
+_RAISED_BY_FUNCTION = {"FailedJobError", "RayTaskError", "RaySystemError", "RuntimeEnvSetupError"}
 
 
 def _is_loss(error: BaseException) -> bool:
     """Return whether an error means that a worker was lost, which is not a failure of the system."""
     known = (cf.BrokenExecutor, cf.CancelledError, EOFError, OSError)
-    return isinstance(error, known) or type(error).__module__.split(".")[0] == "distributed"
+    of_engine = type(error).__module__.split(".")[0] in _ENGINES
+    raised = not _RAISED_BY_FUNCTION.isdisjoint(cls.__name__ for cls in type(error).__mro__)
+    return isinstance(error, known) or (of_engine and not raised)
 
 
 def worker_pool(
-    system: System, *, workers: int | None, executor: cf.Executor | None, timeout: float | None
+    system: System, *, workers: int | None, executor: Executor | None, timeout: float | None
 ) -> WorkerPool | None:
     """Return a pool of workers; None if the executions run one after the other in this process."""
     if getattr(system, "manual", False):
