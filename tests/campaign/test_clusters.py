@@ -14,7 +14,7 @@ import pytest
 
 from conftest import make_validation
 from ctxval import Campaign, Store, Trial, searches
-from ctxval.errors import InputError
+from ctxval.errors import CampaignError, InputError, StoreAccessError
 from test_how_to import DOCS, blocks
 
 # The simulator of the page; its first execution sends its own process a signal.
@@ -122,13 +122,16 @@ class Job:
 
 
 class Queue:
-    """The smallest executor."""
+    """The smallest executor; it takes no more than so many jobs in all, and knows the most that waited at a time."""
 
-    def __init__(self, asks: float) -> None:
-        self.asks, self.jobs = asks, list[Job]()
+    def __init__(self, asks: float, most: int = 1000) -> None:
+        self.asks, self.most, self.jobs, self.waiting = asks, most, list[Job](), 0
 
     def submit(self, function: Any, *arguments: Any) -> Job:
+        if len(self.jobs) == self.most:
+            raise RuntimeError("the queue is closed")
         self.jobs.append(Job(self.asks, function, arguments))
+        self.waiting = max(self.waiting, sum(job.asks >= 0 for job in self.jobs))
         return self.jobs[-1]
 
 
@@ -159,3 +162,85 @@ def test_what_cannot_be_executed_there_is_named_by_the_last_error_of_its_traceba
 
     with pytest.raises(InputError, match="cannot be sent to a worker: ModuleNotFoundError: No module 'rig'"):
         Campaign(make_validation()).run(1, executor=Elsewhere(0))
+
+
+# Executions whose choice depends on no result
+
+
+def random_campaign(store: Path | None = None) -> Campaign:
+    return Campaign(make_validation(), search=searches.Random(), store=store, seed=5)
+
+
+def facts(campaign: Campaign) -> list[tuple[object, ...]]:
+    return [(trial.number, trial.state, trial.unit_point.tobytes(), trial.distance) for trial in campaign.trials]
+
+
+def test_random_tasks_wait_for_a_free_worker_and_are_the_same() -> None:
+    queue = Queue(2)
+    campaign = random_campaign().run(40, executor=queue, workers=2)
+    assert 2 < queue.waiting <= 18
+    assert (len(queue.jobs), campaign.executions) == (40, 40)
+    assert facts(campaign) == facts(random_campaign().run(40))
+
+
+def test_tasks_of_an_audit_wait_for_a_free_worker() -> None:
+    queue = Queue(2)
+    campaign = random_campaign().audit(40, executor=queue, workers=2)
+    assert 2 < queue.waiting <= 18
+    assert facts(campaign) == facts(random_campaign().audit(40))
+
+
+@pytest.mark.parametrize(
+    ("search", "options"),
+    [
+        (searches.GPUCB(), {}),
+        (searches.Random(), {"until": lambda campaign: False}),
+        (searches.Random(), {"timeout": 60.0}),
+        (searches.Random(), {"threshold": 100.0, "explore": False}),
+    ],
+)
+def test_no_task_waits_if_results_matter_or_time_is_limited(search: searches.Search, options: dict[str, Any]) -> None:
+    queue = Queue(2)
+    Campaign(make_validation(), search=search, seed=5).run(8, executor=queue, workers=2, **options)
+    assert queue.waiting == 2
+
+
+def test_trials_are_stored_before_they_wait(tmp_path: Path) -> None:
+    path = tmp_path / "a.sqlite"
+
+    class Watching(Queue):
+        def submit(self, function: Any, *arguments: Any) -> Job:
+            stored = Store(path)
+            assert len(stored.trials()) > len(self.jobs)
+            stored.close()
+            return super().submit(function, *arguments)
+
+    assert random_campaign(path).run(20, executor=Watching(2), workers=2).executions == 20
+
+
+def test_what_waited_when_the_executor_ended_is_executed_later(tmp_path: Path) -> None:
+    path = tmp_path / "a.sqlite"
+    with pytest.raises(CampaignError, match="the executor takes no more work: RuntimeError: the queue is closed"):
+        random_campaign(path).run(30, executor=Queue(2, most=9), workers=2)
+    before = Store(path).trials()
+    assert any(trial.state == "open" and trial.attempts for trial in before)
+    resumed = random_campaign(path).run(30, executor=Queue(2), workers=2)
+    assert facts(resumed) == facts(random_campaign().run(30))
+    assert all(resumed.trials[trial.number].attempts == 1 + (trial.state == "open") for trial in before)
+
+
+def test_results_that_the_store_refuses_together_are_stored_alone(tmp_path: Path) -> None:
+    class Refusing(Store):
+        alone = 0
+
+        def close_trials(self, ended: Any, *, changes: int | None = None) -> None:
+            ended = list(ended)
+            if len(ended) > 1:
+                raise StoreAccessError("the disk is full.")
+            self.alone += 1
+            super().close_trials(ended, changes=changes)
+
+    store = Refusing(tmp_path / "a.sqlite")
+    campaign = Campaign(make_validation(), search=searches.Random(), store=store, seed=5)
+    assert facts(campaign.run(12, executor=Queue(0), workers=4)) == facts(random_campaign().run(12))
+    assert store.alone == 12

@@ -221,7 +221,8 @@ class Campaign:
             self.state_threshold(threshold)
         predicts = decides is not None and decides.predicts
         with self.recorder.predicting(predicts), progress_shown(progress):
-            schedule = Schedule(self.recorder, rule, budget)
+            independent = decides is None and self.recorder.search.iid and until is None
+            schedule = Schedule(self.recorder, rule, budget, independent=independent)
             execute_schedule(schedule, pool, on_trial, RetryPolicy(retries, retry_failures))
         return self
 
@@ -258,7 +259,7 @@ class Campaign:
                 "before an audit."
             )
         with progress_shown(progress):
-            schedule = Schedule(self.recorder, rule, expected=self.executions + missing())
+            schedule = Schedule(self.recorder, rule, expected=self.executions + missing(), independent=True)
             execute_schedule(schedule, pool, on_trial, RetryPolicy())
         return self
 

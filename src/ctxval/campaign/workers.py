@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import concurrent.futures as cf
 import contextlib
+import math
 import multiprocessing
 import os
 import pickle
@@ -39,6 +40,9 @@ _GRACE_PERIOD = 2.0
 _TERMINATED = 143
 """Exit status of a worker that ended after SIGTERM, as in shells."""
 
+_SHORT = 5.0
+"""Seconds of the longest execution behind which another one may wait."""
+
 
 def execute_task(system: System, controller: Controller, task: Task) -> Execution:
     """Execute a task on the system, here or in a worker; an exception of the system is returned as a failure."""
@@ -65,13 +69,18 @@ class WorkerPool(ABC):
 
     size: int
 
-    @abstractmethod
-    def start(self, number: int, plan: Plan) -> None:
-        """Start the execution of a trial on a free worker."""
+    @property
+    def ahead(self) -> int:
+        """The number of further plans that may wait for a free worker, if their choice depends on no result."""
+        return 0
 
     @abstractmethod
-    def wait(self) -> tuple[int, Execution]:
-        """Wait for the next execution that ends; return the number of its trial, and its result."""
+    def start(self, number: int, plan: Plan) -> None:
+        """Start the execution of a trial on a free worker, or let it wait for one."""
+
+    @abstractmethod
+    def wait(self) -> list[tuple[int, Execution]]:
+        """Wait for the next execution that ends; return the numbers and results of all trials that have ended."""
 
     @abstractmethod
     def close(self) -> None:
@@ -88,10 +97,10 @@ class SerialPool(WorkerPool):
         """Take a plan, which :meth:`wait` executes."""
         self._next = number, plan
 
-    def wait(self) -> tuple[int, Execution]:
+    def wait(self) -> list[tuple[int, Execution]]:
         """Execute the plan; return the number of its trial, and what the execution gave."""
         number, plan = self._next
-        return number, execute_task(self.system, plan.controller, plan.task)
+        return [(number, execute_task(self.system, plan.controller, plan.task))]
 
     def close(self) -> None:
         """Do nothing: no execution is running any more."""
@@ -161,7 +170,7 @@ class ProcessPool(WorkerPool):
         self._workers.append(worker)
         return worker
 
-    def wait(self) -> tuple[int, Execution]:
+    def wait(self) -> list[tuple[int, Execution]]:
         """Wait for the next execution that ends, or that takes too long."""
         while True:
             busy = [worker for worker in self._workers if worker.number is not None]
@@ -169,14 +178,13 @@ class ProcessPool(WorkerPool):
             if self.timeout is not None:
                 remaining = max(0.0, min(worker.started for worker in busy) + self.timeout - time.monotonic())
             ready = wait_for([worker.pipe for worker in busy], remaining)
-            for worker in busy:
-                if worker.pipe in ready:
-                    return self._received(worker)
+            if ready:
+                return [self._received(worker) for worker in busy if worker.pipe in ready]
             for worker in busy:
                 elapsed = time.monotonic() - worker.started
                 if self.timeout is not None and elapsed >= self.timeout:
                     self._stop([worker])
-                    return worker.release(), _timed_out(self.timeout, elapsed)
+                    return [(worker.release(), _timed_out(self.timeout, elapsed))]
 
     def _received(self, worker: _Worker) -> tuple[int, Execution]:
         number = worker.release()
@@ -290,6 +298,16 @@ class ExecutorPool(WorkerPool):
     def __init__(self, system: System, executor: Executor, size: int, timeout: float | None = None) -> None:
         self.system, self.executor, self.size, self.timeout = system, executor, size, timeout
         self._running: dict[int, tuple[Any, float]] = {}
+        self._seconds = np.inf
+
+    @property
+    def ahead(self) -> int:
+        """The number of further plans that wait for a free worker: half a second of work, if executions are short.
+
+        Ctrl-C waits for them. There are none with a time limit, because it is not known when they start.
+        """
+        short = self.timeout is None and self._seconds <= _SHORT
+        return self.size * min(8, math.ceil(0.5 / self._seconds)) if short else 0
 
     def start(self, number: int, plan: Plan) -> None:
         """Start the execution of a trial."""
@@ -302,7 +320,7 @@ class ExecutorPool(WorkerPool):
             raise InputError(f"the execution cannot be sent to a worker: {reason_of(error)}.") from error
         self._running[number] = job, time.monotonic()
 
-    def wait(self) -> tuple[int, Execution]:
+    def wait(self) -> list[tuple[int, Execution]]:
         """Wait for the next execution that ends, or that takes too long."""
         while True:
             jobs = [job for job, _ in self._running.values()]
@@ -310,15 +328,19 @@ class ExecutorPool(WorkerPool):
                 cf.wait(jobs, timeout=0.5, return_when=cf.FIRST_COMPLETED)
             elif not any(job.done() for job in jobs):
                 time.sleep(0.1)  # jobs of a cluster take longer to start, and to be asked means to look for a file
+            ended = list[tuple[int, Execution]]()
             for number, (job, started) in list(self._running.items()):
                 seconds = time.monotonic() - started
                 if job.done():
                     del self._running[number]
-                    return number, self._result(job)
-                if self.timeout is not None and seconds >= self.timeout:
+                    ended.append((number, self._result(job)))
+                elif self.timeout is not None and seconds >= self.timeout:
                     del self._running[number]
                     _cancel(job)
-                    return number, _timed_out(self.timeout, seconds)
+                    ended.append((number, _timed_out(self.timeout, seconds)))
+            if ended:
+                self._seconds = next((each.seconds for _, each in ended if each.seconds), self._seconds)
+                return ended
             # A task that was sent while a client searched for its scheduler stays pending for ever.
             self._await_scheduler()
 
