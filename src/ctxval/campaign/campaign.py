@@ -15,13 +15,13 @@ from ctxval._util.progress_display import progress_shown
 from ctxval.campaign import display
 from ctxval.campaign.choices import Choice, Execution, OpenTrial
 from ctxval.campaign.execution import RetryPolicy, Schedule, execute_schedule
+from ctxval.campaign.executors import Executor, worker_pool
 from ctxval.campaign.identity import description_of, identify, search_of
 from ctxval.campaign.interval_search import IntervalSearch, with_next_task
 from ctxval.campaign.plot import overview
 from ctxval.campaign.provenance import provenance_of
 from ctxval.campaign.storage.store import Store
 from ctxval.campaign.trials import TrialRecorder
-from ctxval.campaign.workers import Executor, worker_pool
 from ctxval.certificates import RESOLUTION, Certificate, CertificateOptions, Provenance, Verdict, assess, judge
 from ctxval.certificates.options import CONFIDENCE, WITHIN
 from ctxval.core.distance import Distance

@@ -23,6 +23,9 @@ from ctxval.errors import CtxvalError, ExecutionError, InputError, StoreError
 OnTrial = Callable[[Trial], None]
 """Called with each trial that has ended."""
 
+BATCH = 32
+"""Largest number of tasks that are executed in one call of a system that takes batches."""
+
 
 @checked
 @dataclass(frozen=True)
@@ -77,7 +80,8 @@ def execute_schedule(schedule: Schedule, pool: WorkerPool | None, on_trial: OnTr
         recorder.refresh()
         if any(trial.state == "unmeasured" for trial in recorder.trials):
             recorder.remeasure()
-        workers = SerialPool(recorder.validation.system) if pool is None else pool
+        system = recorder.validation.system
+        workers = SerialPool(system, BATCH if getattr(system, "batched", False) else 1) if pool is None else pool
         total = schedule.expected if schedule.budget is None else schedule.budget
         try:
             with stage("executions", total, done=recorder.executions):
@@ -113,8 +117,9 @@ class _Loop:
         interrupts.raise_if_asked()
 
     def _fill_pool(self, interrupts: Interrupts) -> None:
+        ahead = self.pool.ahead if self.schedule.independent else 0
         while self.stopped is None and not interrupts.asked:
-            free = self.pool.size + (self.pool.ahead if self.schedule.independent else 0) - len(self.running)
+            free = self.pool.size + ahead - len(self.running)
             if free <= 0:
                 return
             try:
@@ -128,6 +133,8 @@ class _Loop:
                     opened = [self.recorder.start(chosen)]
                 for each in opened:
                     self._start(each)
+                if len(self.running) >= self.pool.size:
+                    return  # results may have come in the meantime
             except (CtxvalError, KeyboardInterrupt) as error:
                 self.stopped = error
                 if self.running and isinstance(error, KeyboardInterrupt):
