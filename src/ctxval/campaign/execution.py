@@ -14,7 +14,7 @@ from ctxval._util.progress import advance, is_heard, stage
 from ctxval._util.representation import named
 from ctxval.campaign.choices import Choice, Execution, OpenTrial
 from ctxval.campaign.trials import TrialRecorder
-from ctxval.campaign.workers import SerialPool, WorkerPool
+from ctxval.campaign.workers import AHEAD, SerialPool, WorkerPool
 from ctxval.core.preflight import start_offset
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import CONVERGED, Trial
@@ -22,9 +22,6 @@ from ctxval.errors import CtxvalError, ExecutionError, InputError, StoreError
 
 OnTrial = Callable[[Trial], None]
 """Called with each trial that has ended."""
-
-BATCH = 32
-"""Largest number of tasks that are executed in one call of a system that takes batches."""
 
 
 @checked
@@ -65,7 +62,7 @@ class Schedule:
 
     def choices(self, first: Choice, most: int) -> Iterator[Choice]:
         """Yield a choice and those that follow it: at most so many, and no more after half a second."""
-        until = time.monotonic() + 0.5
+        until = time.monotonic() + AHEAD
         chosen: Choice | Trial | None = first
         while isinstance(chosen, Choice):
             yield chosen
@@ -80,8 +77,7 @@ def execute_schedule(schedule: Schedule, pool: WorkerPool | None, on_trial: OnTr
         recorder.refresh()
         if any(trial.state == "unmeasured" for trial in recorder.trials):
             recorder.remeasure()
-        system = recorder.validation.system
-        workers = SerialPool(system, BATCH if getattr(system, "batched", False) else 1) if pool is None else pool
+        workers = SerialPool(recorder.validation.system) if pool is None else pool
         total = schedule.expected if schedule.budget is None else schedule.budget
         try:
             with stage("executions", total, done=recorder.executions):

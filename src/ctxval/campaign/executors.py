@@ -15,7 +15,7 @@ import numpy as np
 
 from ctxval._util.texts import reason_of
 from ctxval.campaign.choices import Execution
-from ctxval.campaign.workers import ProcessPool, WorkerPool, execute_task, timed_out
+from ctxval.campaign.workers import AHEAD, ProcessPool, WorkerPool, execute_task, timed_out
 from ctxval.core.plan import Plan
 from ctxval.core.system import System
 from ctxval.errors import CampaignError, InputError
@@ -52,7 +52,7 @@ class ExecutorPool(WorkerPool):
         Ctrl-C waits for them. There are none with a time limit, because it is not known when they start.
         """
         short = self.timeout is None and self._seconds <= _SHORT
-        return self.size * min(8, math.ceil(0.5 / self._seconds)) if short else 0
+        return self.size * min(8, math.ceil(AHEAD / self._seconds)) if short else 0
 
     def start(self, number: int, plan: Plan) -> None:
         """Start the execution of a trial."""

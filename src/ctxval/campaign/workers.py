@@ -36,6 +36,12 @@ from ctxval.errors import CampaignError, InputError
 _GRACE_PERIOD = 2.0
 """Seconds that a worker has to clean up before it is killed."""
 
+AHEAD = 0.5
+"""Seconds of work that is begun before its turn, if its choice depends on no result; Ctrl-C waits for it."""
+
+_BATCH = 128
+"""Largest number of tasks that are executed in one call."""
+
 _TERMINATED = 143
 """Exit status of a worker that ended after SIGTERM, as in shells."""
 
@@ -50,19 +56,6 @@ def execute_task(system: System, controller: Controller, task: Task) -> Executio
             raise
         return Execution(failed=reason_of(error), seconds=time.perf_counter() - started)
     return Execution(trajectory, seconds=time.perf_counter() - started)
-
-
-def execute_together(system: System, plans: Sequence[Plan]) -> list[Execution]:
-    """Execute plans in one call if their tasks are a batch; a task that fails in it is executed alone."""
-    started = time.perf_counter()
-    together = _executed_batch(system, plans)
-    seconds = (time.perf_counter() - started) / len(plans)
-    return [
-        execute_task(system, plan.controller, plan.task)
-        if together is None or not together.finite[k]
-        else Execution(together[k], seconds=seconds)
-        for k, plan in enumerate(plans)
-    ]
 
 
 def _executed_batch(system: System, plans: Sequence[Plan]) -> Trajectory | None:
@@ -120,16 +113,21 @@ class WorkerPool(ABC):
 
 
 class SerialPool(WorkerPool):
-    """This process, which executes one plan at a time, or all that wait in one batch."""
+    """This process, which executes one plan at a time, or all that wait in one call if batches of the system are exact.
 
-    def __init__(self, system: System, batch: int = 1) -> None:
-        self.system, self.size, self._batch = system, 1, batch
+    A task that fails in a batch is executed again alone, because the batch does not tell its reason.
+    """
+
+    def __init__(self, system: System) -> None:
+        self.system, self.size = system, 1
         self._next: list[tuple[int, Plan]] = []
+        self._seconds = np.inf
 
     @property
     def ahead(self) -> int:
-        """The number of plans that are executed together with another one."""
-        return self._batch - 1
+        """The number of further plans that are executed in one call with the next one: half a second of work."""
+        exact = getattr(self.system, "exact_batches", False)
+        return min(_BATCH - 1, int(AHEAD / max(self._seconds, 1e-9))) if exact else 0
 
     def start(self, number: int, plan: Plan) -> None:
         """Take a plan, which :meth:`wait` executes."""
@@ -138,8 +136,17 @@ class SerialPool(WorkerPool):
     def wait(self) -> list[tuple[int, Execution]]:
         """Execute the plans; return the numbers of their trials, and what the executions gave."""
         taken, self._next = self._next, []
-        executions = execute_together(self.system, [plan for _, plan in taken])
-        return [(number, execution) for (number, _), execution in zip(taken, executions, strict=True)]
+        started = time.perf_counter()
+        together = _executed_batch(self.system, [plan for _, plan in taken])
+        seconds = (time.perf_counter() - started) / len(taken)
+        ended = [
+            (number, execute_task(self.system, plan.controller, plan.task))
+            if together is None or not together.finite[k]
+            else (number, Execution(together[k], seconds=seconds))
+            for k, (number, plan) in enumerate(taken)
+        ]
+        self._seconds = max(execution.seconds or 0.0 for _, execution in ended)
+        return ended
 
     def close(self) -> None:
         """Do nothing: no execution is running any more."""
