@@ -79,17 +79,17 @@ def facts(done: Campaign) -> list[tuple[object, ...]]:
 
 def test_random_tasks_are_executed_in_one_call_as_if_alone() -> None:
     system = Together()
-    done = campaign(system).run(40)
-    assert system.sizes == [1, 39]
+    done = campaign(system).run(20)
+    assert system.sizes == [1, 19]
     assert all(trial.seconds is not None for trial in done.trials)
-    assert facts(done) == facts(campaign(Alone()).run(40))
+    assert facts(done) == facts(campaign(Alone()).run(20))
 
 
 def test_no_call_has_more_than_so_many_tasks(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(workers, "_BATCH", 16)
+    monkeypatch.setattr(workers, "_BATCH", 8)
     system = Together()
-    campaign(system).run(40)
-    assert system.sizes == [1, 16, 16, 7]
+    campaign(system).run(20)
+    assert system.sizes == [1, 8, 8, 3]
 
 
 def test_draws_of_an_audit_are_executed_in_one_call_as_if_alone() -> None:
