@@ -73,8 +73,9 @@ class WithOutputs(ShortRepr):
 
     @property
     def exact_batches(self) -> bool:
-        """Whether outputs in a batch are to the last digit those of each task alone."""
-        return self.outputs.indices is not None and bool(getattr(self.system, "exact_batches", False))
+        """Whether outputs in a batch are to the last digit those of each task alone, which functions do not promise."""
+        functions = self.outputs.indices is None or self.start is not None
+        return not functions and bool(getattr(self.system, "exact_batches", False))
 
     def execute(self, controller: Controller, task: Task) -> Trajectory:
         """Execute the system, and return the inputs and outputs."""
