@@ -118,18 +118,20 @@ class _Loop:
             free = self.pool.size + ahead - len(self.running)
             if free <= 0:
                 return
+            idle = self.pool.size - len(self.running)
+            most = idle if idle > 0 else free  # no worker is idle while the tasks that will wait are chosen
             try:
                 with interrupts.at_once():  # a choice may take long, and nothing is lost with it
                     chosen = self.schedule.next()
                 if chosen is None:
                     return
-                if isinstance(chosen, Choice) and self.schedule.independent and free > 1:
-                    opened = self.recorder.start_together(self.schedule.choices(chosen, free))
+                if isinstance(chosen, Choice) and self.schedule.independent and most > 1:
+                    opened = self.recorder.start_together(self.schedule.choices(chosen, most))
                 else:
                     opened = [self.recorder.start(chosen)]
                 for each in opened:
                     self._start(each)
-                if len(self.running) >= self.pool.size:
+                if idle <= 0:
                     return  # results may have come in the meantime
             except (CtxvalError, KeyboardInterrupt) as error:
                 self.stopped = error
