@@ -194,10 +194,10 @@ class SimulatedPool(WorkerPool):
         lasts = 1 + SPREAD * np.random.default_rng([self.seed, number, 47]).random()
         heapq.heappush(self._running, (self.now + lasts, number, plan))
 
-    def wait(self) -> tuple[int, Execution]:
+    def wait(self) -> list[tuple[int, Execution]]:
         """Go on to the time at which the next execution ends."""
         self.now, number, plan = heapq.heappop(self._running)
-        return number, execute_task(self.system, plan.controller, plan.task)
+        return [(number, execute_task(self.system, plan.controller, plan.task))]
 
     def close(self) -> None:
         """End all executions."""

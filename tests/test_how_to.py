@@ -25,9 +25,10 @@ NEEDS |= {"onnx": ["onnx", "onnxruntime"], "scikit-learn": ["sklearn"], "state-s
 NEEDS |= {"noisy-environment": ["gymnasium", "mujoco"]}
 NEEDS |= {"gymnasium-and-network": ["gymnasium", "mujoco", "sklearn"]}
 NEEDS |= {"fit": ["mujoco", "sklearn", "onnx"]}
+NEEDS |= {"clusters": ["submitit", "ray", "distributed"]}
 NEEDS |= {"operate": ["starlette", "uvicorn", "jinja2", "python_multipart"]}
-LONG = ("aspect1", "compare-controllers", "controllers", "fit", "gymnasium-and-network", "noise")
-LONG += ("noisy-environment", "read-certificate", "retrain", "workers")
+LONG = ("aspect1", "clusters", "compare-controllers", "controllers", "fit", "gymnasium-and-network")
+LONG += ("noise", "noisy-environment", "read-certificate", "retrain", "workers")
 """Pages that only `make docs` and `make thorough` run: campaigns on several models, with noise or in many processes."""
 CTXVAL = ["-c", "from ctxval.cli import main; main()"]
 

@@ -11,6 +11,7 @@ import pytest
 from conftest import make_validation
 from ctxval import Task, Trajectory, controllers, distances, models, searches, systems, testing
 from ctxval._util.arrays import Array
+from ctxval.core.controller import Controller
 from ctxval.core.rollout import rollout
 from ctxval.errors import ConformanceError
 
@@ -76,6 +77,21 @@ def test_noise_beyond_the_tolerance_is_named() -> None:
     with pytest.raises(ConformanceError, match="the first execution differs from the second"):
         testing.check_system(noisy, controller, TASKS[0])
     testing.check_system(noisy, controller, TASKS[0], tolerance=0.1)
+
+
+def test_batches_that_are_exact_only_to_rounding_are_named() -> None:
+    class Rounded(systems.Simulated):
+        exact_batches = True
+
+        def execute(self, controller: Controller, task: Task) -> Trajectory:
+            done = super().execute(controller, task)
+            done.states[..., 3, :] += 1e-13 * len(task.batch_shape)
+            return done
+
+    controller = LQR.design(TASKS[0], MODEL)
+    testing.check_system(systems.Simulated(MODEL), controller, TASKS[0])
+    with pytest.raises(ConformanceError, match="an execution in a batch differs"):
+        testing.check_system(Rounded(MODEL), controller, TASKS[0])
 
 
 def test_sound_synthesizers_pass_and_one_that_mixes_tasks_is_named() -> None:

@@ -33,11 +33,11 @@ class Pool(WorkerPool):
     def start(self, number: int, plan: Plan) -> None:
         self.running.append((number, plan))
 
-    def wait(self) -> tuple[int, Execution]:
+    def wait(self) -> list[tuple[int, Execution]]:
         self.together.append([number for number, _ in self.running])
         row = np.random.default_rng([self.seed, len(self.together)]).integers(len(self.running))
         number, plan = self.running.pop(row)
-        return number, execute_task(self.validation.system, plan.controller, plan.task)
+        return [(number, execute_task(self.validation.system, plan.controller, plan.task))]
 
     def close(self) -> None:
         self.running.clear()

@@ -312,7 +312,7 @@ def test_a_controller_that_cannot_be_sent_is_said_so(tmp_path: Path) -> None:
         ({"workers": 1.5}, "workers must be a positive integer"),
         ({"timeout": 0}, "timeout must be a positive number of seconds"),
         ({"timeout": float("nan")}, "timeout must be a positive number of seconds"),
-        ({"executor": 3}, "executor must be an Executor, got 3"),
+        ({"executor": 3}, "executor must be an Executor with submit"),
         ({"retries": -1}, "retries must be an integer >= 0"),
         ({"retry_failures": True}, "retry_failures must be an integer >= 0"),
         ({"retry_failures": 1}, "retry_failures needs workers"),
@@ -485,7 +485,7 @@ def test_the_first_interrupt_ends_after_the_running_executions(tmp_path: Path, w
 
 
 @pytest.mark.parametrize("workers", [1, 2])
-@pytest.mark.parametrize(("part", "method"), [("TrialRecorder", "start"), ("ProcessPool", "_start_worker")])
+@pytest.mark.parametrize(("part", "method"), [("TrialRecorder", "_open"), ("ProcessPool", "_start_worker")])
 def test_an_interrupt_while_an_execution_begins_leaves_it_to_end(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, part: str, method: str, workers: int
 ) -> None:
@@ -493,9 +493,9 @@ def test_an_interrupt_while_an_execution_begins_leaves_it_to_end(
     begin = getattr(owner, method)
     calls = itertools.count(1)
 
-    def interrupted(*arguments: Any) -> Any:
-        begun = begin(*arguments)
-        if next(calls) == workers:
+    def interrupted(*arguments: Any, **options: Any) -> Any:
+        begun = begin(*arguments, **options)
+        if next(calls) == (1 if method == "_open" else workers):
             signal.raise_signal(signal.SIGINT)
         return begun
 

@@ -107,6 +107,17 @@ def test_a_system_may_have_other_states_than_the_model() -> None:
     check_system(slow, outcome.plan.controller, outcome.plan.task, outputs=[0])
 
 
+def test_batches_of_outputs_are_exact_if_those_of_the_system_are_and_no_function_is_called() -> None:
+    class Exact(systems.Simulated):
+        exact_batches = True
+
+    exact, rounded = Exact(swing(0.4), vectorized=True), systems.Simulated(swing(0.4), vectorized=True)
+    assert systems.WithOutputs(exact, [0]).exact_batches
+    assert not systems.WithOutputs(rounded, [0]).exact_batches
+    assert not systems.WithOutputs(exact, lambda x: x[..., :1]).exact_batches
+    assert not systems.WithOutputs(exact, [0], start=lambda x: x).exact_batches
+
+
 @pytest.mark.parametrize("goal", [[0.3, 0.0], [0.3, 0.0, 0.0]])
 def test_goals_are_outputs(goal: list[float]) -> None:
     validation = swing_validation(task=lambda p: Task([0.2, 0.0], goal=goal, horizon=H, dt=DT))

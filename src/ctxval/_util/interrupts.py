@@ -63,7 +63,8 @@ def raised_by_signal(error: BaseException) -> bool:
     """
     if isinstance(error, Exception):
         return False
-    ending = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGBREAK") if hasattr(signal, name)]
+    names = ("SIGINT", "SIGTERM", "SIGHUP", "SIGBREAK", "SIGUSR1", "SIGUSR2")  # the last two preempt jobs of clusters
+    ending = [getattr(signal, name) for name in names if hasattr(signal, name)]
     handlers = [signal.getsignal(number) for number in ending]
     codes = {getattr(getattr(handler, "__func__", handler), "__code__", None) for handler in handlers}
     if any(frame.f_code in codes for frame, _ in traceback.walk_tb(error.__traceback__)):

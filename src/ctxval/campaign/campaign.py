@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import concurrent.futures as cf
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,6 +15,7 @@ from ctxval._util.progress_display import progress_shown
 from ctxval.campaign import display
 from ctxval.campaign.choices import Choice, Execution, OpenTrial
 from ctxval.campaign.execution import RetryPolicy, Schedule, execute_schedule
+from ctxval.campaign.executors import Executor, worker_pool
 from ctxval.campaign.identity import description_of, identify, search_of
 from ctxval.campaign.interval_search import IntervalSearch, with_next_task
 from ctxval.campaign.plot import overview
@@ -23,7 +23,6 @@ from ctxval.campaign.provenance import provenance_of
 from ctxval.campaign.storage.store import Store
 from ctxval.campaign.trials import TrialRecorder
 from ctxval.campaign.watching import FALSE_ALARMS, Watch
-from ctxval.campaign.workers import worker_pool
 from ctxval.certificates import RESOLUTION, Certificate, CertificateOptions, Provenance, Verdict, assess, judge
 from ctxval.certificates.expiry import WatchState
 from ctxval.certificates.options import CONFIDENCE, WITHIN
@@ -158,7 +157,7 @@ class Campaign:
         certificate: CertificateOptions | None = None,
         until: Callable[[Campaign], bool] | None = None,
         workers: PositiveInt | None = None,
-        executor: cf.Executor | None = None,
+        executor: Executor | None = None,
         timeout: Seconds | None = None,
         retries: NonNegativeInt = 2,
         retry_failures: NonNegativeInt = 0,
@@ -191,7 +190,8 @@ class Campaign:
             until: called before each execution; the campaign stops early if it returns True.
             workers: number of processes, each with its own copy of the system; with an executor, the number of
                 executions that it has at a time.
-            executor: an executor of ``concurrent.futures`` that replaces these processes.
+            executor: an executor that replaces these processes: one of ``concurrent.futures``, or any object whose
+                ``submit(function, *arguments)`` returns a job with ``done()``, ``result()`` and ``cancel()``.
             timeout: time limit of an execution in seconds; a longer execution has failed. With a time limit, the
                 system is executed in a separate process.
             retries: largest number of repetitions of an execution if its worker is lost.
@@ -223,7 +223,8 @@ class Campaign:
             self.state_threshold(threshold)
         predicts = decides is not None and decides.predicts
         with self.recorder.predicting(predicts), progress_shown(progress):
-            schedule = Schedule(self.recorder, rule, budget)
+            independent = decides is None and self.recorder.search.iid and until is None
+            schedule = Schedule(self.recorder, rule, budget, independent=independent)
             execute_schedule(schedule, pool, on_trial, RetryPolicy(retries, retry_failures))
         return self
 
@@ -234,7 +235,7 @@ class Campaign:
         on_trial: Callable[[Trial], None] | None = None,
         *,
         workers: PositiveInt | None = None,
-        executor: cf.Executor | None = None,
+        executor: Executor | None = None,
         timeout: Seconds | None = None,
         progress: bool | None = None,
     ) -> Campaign:
@@ -260,7 +261,7 @@ class Campaign:
                 "before an audit."
             )
         with progress_shown(progress):
-            schedule = Schedule(self.recorder, rule, expected=self.executions + missing())
+            schedule = Schedule(self.recorder, rule, expected=self.executions + missing(), independent=True)
             execute_schedule(schedule, pool, on_trial, RetryPolicy())
         return self
 

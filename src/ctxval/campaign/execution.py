@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 
 from ctxval._util.checked import NonNegativeInt, checked
@@ -12,9 +14,11 @@ from ctxval._util.progress import advance, is_heard, stage
 from ctxval._util.representation import named
 from ctxval.campaign.choices import Choice, Execution, OpenTrial
 from ctxval.campaign.trials import TrialRecorder
-from ctxval.campaign.workers import SerialPool, WorkerPool
+from ctxval.campaign.workers import AHEAD, SerialPool, WorkerPool
+from ctxval.core.preflight import start_offset
+from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import CONVERGED, Trial
-from ctxval.errors import CtxvalError, ExecutionError, InputError
+from ctxval.errors import CtxvalError, ExecutionError, InputError, StoreError
 
 OnTrial = Callable[[Trial], None]
 """Called with each trial that has ended."""
@@ -39,13 +43,15 @@ class Schedule:
     """The order of the executions: first the interrupted trials, then the choices of a rule.
 
     The rule returns None if there is no choice at present; it is called again after an execution has ended. Without a
-    budget, the total number of executions, only the rule ends the campaign, after about the expected number.
+    budget, the total number of executions, only the rule ends the campaign, after about the expected number. If the
+    choices are ``independent`` of results, they are made before the executions in front of them have ended.
     """
 
     recorder: TrialRecorder
     rule: Callable[[], Choice | None]
     budget: int | None = None
     expected: int | None = None
+    independent: bool = False
 
     def next(self) -> Choice | Trial | None:
         """Return an interrupted trial, or the choice of a new one; None if there is nothing to execute at present."""
@@ -53,6 +59,15 @@ class Schedule:
         if self.budget is not None and recorder.executions + recorder.executing >= self.budget:
             return None
         return recorder.interrupted or self.rule()
+
+    def choices(self, first: Choice, most: int) -> Iterator[Choice]:
+        """Yield a choice and those that follow it: at most so many, and no more after half a second."""
+        until = time.monotonic() + AHEAD
+        chosen: Choice | Trial | None = first
+        while isinstance(chosen, Choice):
+            yield chosen
+            most -= 1
+            chosen = self.next() if most and time.monotonic() < until else None
 
 
 def execute_schedule(schedule: Schedule, pool: WorkerPool | None, on_trial: OnTrial | None, retry: RetryPolicy) -> None:
@@ -90,7 +105,7 @@ class _Loop:
                     self._fill_pool(interrupts)
                     if not self.running:
                         break
-                    self._take(*self.pool.wait())
+                    self._take(self.pool.wait())
             finally:
                 self.pool.close()
         if self.stopped is not None:
@@ -99,13 +114,26 @@ class _Loop:
             raise KeyboardInterrupt
 
     def _fill_pool(self, interrupts: Interrupts) -> None:
-        while self.stopped is None and not interrupts.asked and len(self.running) < self.pool.size:
+        ahead = self.pool.ahead if self.schedule.independent else 0
+        while self.stopped is None and not interrupts.asked:
+            free = self.pool.size + ahead - len(self.running)
+            if free <= 0:
+                return
+            idle = self.pool.size - len(self.running)
+            most = idle if idle > 0 else free  # no worker is idle while the tasks that will wait are chosen
             try:
                 with interrupts.shielded(False):  # a choice may take long, and nothing is lost with it
                     chosen = self.schedule.next()
                 if chosen is None:
                     return
-                self._start(self.recorder.start(chosen))
+                if isinstance(chosen, Choice) and self.schedule.independent and most > 1:
+                    opened = self.recorder.start_together(self.schedule.choices(chosen, most))
+                else:
+                    opened = [self.recorder.start(chosen)]
+                for each in opened:
+                    self._start(each)
+                if idle <= 0:
+                    return  # results may have come in the meantime
             except (CtxvalError, KeyboardInterrupt) as error:
                 self.stopped = error
                 if self.running and isinstance(error, KeyboardInterrupt):
@@ -115,28 +143,40 @@ class _Loop:
         self.pool.start(opened.number, opened.plan)
         self.running[opened.number] = opened
 
-    def _take(self, number: int, execution: Execution) -> None:
-        """Record an execution that has ended, or repeat it."""
-        try:
-            ended = self._recorded(self.running.pop(number), execution)
-        except CtxvalError as error:
-            self.stopped = self.stopped or error
-            return
-        if ended is not None and is_heard():
-            advance(int(ended.executed), _result(self.recorder, ended))
-        if ended is not None and self.on_trial is not None:
-            self.on_trial(ended)
+    def _take(self, executions: Sequence[tuple[int, Execution]]) -> None:
+        """Record executions that have ended, or repeat them."""
+        measured = list[tuple[Trial, Execution]]()
+        for number, execution in executions:
+            try:
+                measured += self._measured(self.running.pop(number), execution)
+            except CtxvalError as error:
+                self.stopped = self.stopped or error
+        ended = list[Trial]()
+        by_number = {trial.number: execution.trajectory for trial, execution in measured}
+        if len(measured) > 1 and all(each.distance is not None or each.failed for _, each in measured):
+            with suppress(StoreError, InputError):  # one alone says what is wrong with it
+                ended, measured = self.recorder.close_together(measured), []
+        for trial, execution in measured:
+            try:
+                ended.append(self.recorder.close(trial, execution))
+            except CtxvalError as error:
+                self.stopped = self.stopped or error
+        for trial in ended:
+            if is_heard():
+                advance(int(trial.executed), _result(self.recorder, trial, by_number[trial.number]))
+            if self.on_trial is not None:
+                self.on_trial(trial)
 
-    def _recorded(self, opened: OpenTrial, execution: Execution) -> Trial | None:
-        """Return the trial of an execution that was stored; None if the execution is repeated."""
+    def _measured(self, opened: OpenTrial, execution: Execution) -> list[tuple[Trial, Execution]]:
+        """Return the trial of an execution with what is recorded of it; nothing if the execution is repeated."""
         if execution.lost is not None:
             self.losses[opened.number] += 1
             losses = self.losses[opened.number]
             if losses <= self.retry.retries:
                 self._repeat(opened)
-                return None
+                return []
             failure = f"the worker was lost {losses} times, at last: {execution.lost}"
-            return self.recorder.close(opened.trial, Execution(failed=failure))
+            return [(opened.trial, Execution(failed=failure))]
         try:
             execution = execution.measured(self.recorder.validation, opened.plan)
         except (ExecutionError, InputError) as error:
@@ -145,15 +185,15 @@ class _Loop:
             self.failures[opened.number] += 1
             if self.failures[opened.number] <= self.retry.retry_failures:
                 self._repeat(opened)
-                return None
-        return self.recorder.close(opened.trial, execution)
+                return []
+        return [(opened.trial, execution)]
 
     def _repeat(self, opened: OpenTrial) -> None:
         if self.stopped is None:
             self._start(self.recorder.repeat(opened))
 
 
-def _result(recorder: TrialRecorder, ended: Trial) -> str:
+def _result(recorder: TrialRecorder, ended: Trial, executed: Trajectory | None) -> str:
     """Return a trial in one line: its task, what was predicted, and what was executed."""
     validation, predicted = recorder.validation, recorder.dynamics.stored_prediction(ended)
     parts = [f"trial {ended.number:<2}", str(named(ended.parameters, validation.space.units))]
@@ -168,9 +208,10 @@ def _result(recorder: TrialRecorder, ended: Trial) -> str:
         parts.append(f"executed {ended.distance:.4g} {validation.labels.units}".rstrip())
     if ended.seconds is not None and ended.seconds >= 1:
         parts.append(f"{ended.seconds:.2g} s")
-    offset = recorder.start_offset(ended)
-    if offset is not None and offset.size:
-        parts.append(f"its start was off by {offset.text}")
+    if executed is not None and ended.distance is not None:
+        offset = start_offset(validation, validation.space.point(ended.parameters), executed)
+        if offset.size:
+            parts.append(f"its start was off by {offset.text}")
     if (ended.note or {}).get(CONVERGED) is False:
         parts.append("the design of its controller did not converge")
     return "   ".join(parts)

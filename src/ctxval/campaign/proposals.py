@@ -192,7 +192,7 @@ class Proposals:
         """
         note = _plain_note(self._search.note())
         repeats = self._validation.space.members is None
-        if repeats and any(np.array_equal(point, trial.unit_point) for trial in trials):
+        if repeats and any(point.tobytes() == trial.unit_point.tobytes() for trial in trials):
             return point, note
         if not self._search.iid:
             point = self._steady(point, trials, steady)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from typing import Any
@@ -170,18 +170,26 @@ class TrialRecorder:
 
     def open(self, choice: Choice) -> OpenTrial:
         """Store a new trial that people execute."""
-        return self._open(choice, attempts=0)
+        return self._open([choice], attempts=0)[0]
 
     def start(self, chosen: Choice | Trial) -> OpenTrial:
         """Store that an execution starts: the first one of a new trial, or a repetition of an interrupted trial."""
         if isinstance(chosen, Choice):
-            return self._open(chosen, attempts=1)
+            return self._open([chosen], attempts=1)[0]
         try:
             plan = self.plan(chosen)
         except CtxvalError as error:
             self.close(chosen, Execution(failed=text_of(error)), executed=False)
             raise
         return self.repeat(OpenTrial(chosen, plan))
+
+    def start_together(self, choices: Iterable[Choice]) -> list[OpenTrial]:
+        """Store in one transaction that the first executions of new trials start.
+
+        Each choice is made when the trials before it are known. If a task cannot be planned, the trials end before it;
+        if it is the first one, the error is raised.
+        """
+        return self._open(choices, attempts=1)
 
     def repeat(self, opened: OpenTrial) -> OpenTrial:
         """Store that another execution of an open trial starts."""
@@ -191,36 +199,44 @@ class TrialRecorder:
         self._executing.add(begun.number)
         return OpenTrial(begun, opened.plan)
 
-    def _open(self, choice: Choice, attempts: int) -> OpenTrial:
+    def _open(self, choices: Iterable[Choice], attempts: int) -> list[OpenTrial]:
+        opened, executing, unplanned = list[OpenTrial](), set(self._executing), False
         try:
-            return self._store_next(choice, attempts)
+            for choice in choices:
+                trial = self._next_trial(choice, attempts)
+                try:
+                    plan = self.plan(trial)
+                except CtxvalError as error:
+                    if not opened:
+                        failed = replace(trial, state="failed", failure=text_of(error), attempts=0)
+                        self.store.add([(failed, None, None)], changes=self._changes)
+                        raise
+                    unplanned = True
+                    break
+                if not self._distance_tried:
+                    try_distance(self.validation, plan)
+                    self._distance_tried = True
+                with suppress(InputError):  # an attribute of a user's controller with this name that is something else
+                    if (converged := converged_of(plan.controller)) is not None:
+                        trial = replace(trial, note={**(trial.note or {}), CONVERGED: bool(converged)})
+                opened.append(OpenTrial(trial, plan))
+                self._trials.append(trial)
+                if attempts:
+                    self._executing.add(trial.number)
+            if opened and not opened[0].number and self.store.path is not None:
+                self.draws.of_model()  # by which other stores of the same model are found
+            new = [(each.trial, each.plan.model_trajectory, None) for each in opened]
+            self.store.add(new, changes=self._changes)
         except BaseException:
             # After every error, the search must know exactly the stored trials.
+            self._executing = executing
             self.replay()
             raise
-
-    def _store_next(self, choice: Choice, attempts: int) -> OpenTrial:
-        trial = self._next_trial(choice, attempts)
-        try:
-            plan = self.plan(trial)
-        except CtxvalError as error:
-            failed = replace(trial, state="failed", failure=text_of(error), attempts=0)
-            self.store.add([(failed, None, None)], changes=self._changes)
-            raise
-        if not self._distance_tried:
-            try_distance(self.validation, plan)
-            self._distance_tried = True
-        if not self._trials and self.store.path is not None:
-            self.draws.of_model()  # by which other stores of the same model are found
-        with suppress(InputError):  # an attribute of a user's controller that has this name and is something else
-            if (converged := converged_of(plan.controller)) is not None:
-                trial = replace(trial, note={**(trial.note or {}), CONVERGED: bool(converged)})
-        self.store.add([(trial, plan.model_trajectory, None)], changes=self._changes)
-        self._trials.append(trial)
-        if attempts:
-            self._executing.add(trial.number)
-        self._goals_of_model.watch(plan)
-        return OpenTrial(trial, plan)
+        if unplanned:
+            self.replay()
+        for each in opened:
+            self._goals_of_model.watch(each.plan)
+        return opened
 
     def _next_trial(self, choice: Choice, attempts: int) -> Trial:
         """Return the trial of a choice, and tell the search that its point has no value yet."""
@@ -250,7 +266,8 @@ class TrialRecorder:
         if self.predicts and (predicted := self.dynamics.predict(self._trials, unit_point)) is not None:
             note = {**(note or {}), **self.dynamics.to_note(predicted)}
         space, number = self.validation.space, len(self._trials)
-        same = (trial.parameters for trial in self._trials if np.array_equal(trial.unit_point, unit_point))
+        key = unit_point.tobytes()
+        same = (trial.parameters for trial in self._trials if trial.unit_point.tobytes() == key)
         parameters = choice.parameters or next(same, None) or space.describe_point(space.from_unit(unit_point))
         return Trial(number, origin, "open", unit_point, dict(parameters), attempts, note=note, because=choice.because)
 
@@ -273,16 +290,28 @@ class TrialRecorder:
                 self.store.close_trial(ended, trajectory, changes=self._changes)
             except (StoreError, InputError) as error:
                 raise error_with_fallback(ended, trajectory, self.store.path, error) from error
-            self._executing.discard(ended.number)
-            self._trials[ended.number] = ended
-            if ended.distance is not None:
-                self._tell_search([ended])
+            self._closed([ended])
         if ended.state == "unmeasured":
             raise DistanceError(
                 f"{ended.failure} The execution of trial {ended.number} is stored: correct the distance, and "
                 "`ctxval remeasure STORE` computes it without another execution."
             )
         return ended
+
+    def close_together(self, executions: Sequence[tuple[Trial, Execution]]) -> list[Trial]:
+        """Store measured executions of open trials in one transaction; if an error is raised, none is stored."""
+        ended = [execution.ended(trial) for trial, execution in executions]
+        trajectories = (None if execution.failed is not None else execution.trajectory for _, execution in executions)
+        self.store.close_trials(zip(ended, trajectories, strict=True), changes=self._changes)
+        self._closed(ended)
+        return ended
+
+    def _closed(self, ended: Sequence[Trial]) -> None:
+        for trial in ended:
+            self._executing.discard(trial.number)
+            self._trials[trial.number] = trial
+            if trial.distance is not None:
+                self._tell_search([trial])
 
     def abandon_executions(self) -> None:
         """End the executions of this process; the trials that are still open become interrupted ones."""

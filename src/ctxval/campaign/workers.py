@@ -1,8 +1,7 @@
-"""Pools of workers that execute tasks: processes of this computer, or any executor of ``concurrent.futures``."""
+"""Pools of workers that execute tasks: this process, or others of this computer."""
 
 from __future__ import annotations
 
-import concurrent.futures as cf
 import contextlib
 import multiprocessing
 import os
@@ -27,13 +26,21 @@ from ctxval._util.progress import mute
 from ctxval._util.texts import reason_of
 from ctxval.campaign.choices import Execution
 from ctxval.core.controller import Controller
+from ctxval.core.controller import started as run_of
 from ctxval.core.plan import Plan
 from ctxval.core.system import System
 from ctxval.core.task import Task
+from ctxval.core.trajectory import COMPLETE, Trajectory
 from ctxval.errors import CampaignError, InputError
 
 _GRACE_PERIOD = 2.0
 """Seconds that a worker has to clean up before it is killed."""
+
+AHEAD = 0.5
+"""Seconds of work that is begun before its turn, if its choice depends on no result; Ctrl-C waits for it."""
+
+_BATCH = 128
+"""Largest number of tasks that are executed in one call."""
 
 _TERMINATED = 143
 """Exit status of a worker that ended after SIGTERM, as in shells."""
@@ -51,7 +58,30 @@ def execute_task(system: System, controller: Controller, task: Task) -> Executio
     return Execution(trajectory, seconds=time.perf_counter() - started)
 
 
-def _timed_out(timeout: float, seconds: float) -> Execution:
+def _executed_batch(system: System, plans: Sequence[Plan]) -> Trajectory | None:
+    """Return the trajectories of plans; None if they cannot be a batch, or if it is not known which of them failed."""
+    kinds = {(task.horizon, task.dt, task.has_goal, task.reference.shape) for task in (plan.task for plan in plans)}
+    if len(plans) == 1 or len(kinds) > 1:
+        return None
+    try:
+        trajectory = system.execute(_each_alone(plans), Task.stacked([plan.task for plan in plans]))
+    except BaseException as error:
+        if raised_by_signal(error):
+            raise
+        return None
+    if not isinstance(trajectory, Trajectory) or trajectory.batch_shape != (len(plans),):
+        return None
+    return trajectory if trajectory.ended == COMPLETE or not trajectory.finite.all() else None
+
+
+def _each_alone(plans: Sequence[Plan]) -> Controller:
+    """Return the controllers of plans as one of their batch, whose inputs are to the last digit those of each alone."""
+    runs = [run_of(plan.controller, plan.task) for plan in plans]
+    return lambda t, x: np.stack([np.asarray(run(t, state)) for run, state in zip(runs, x, strict=True)])
+
+
+def timed_out(timeout: float, seconds: float) -> Execution:
+    """Return the result of an execution that took longer than the timeout."""
     return Execution(failed=f"the execution did not end within {timeout:g} s", seconds=seconds)
 
 
@@ -64,13 +94,18 @@ class WorkerPool(ABC):
 
     size: int
 
-    @abstractmethod
-    def start(self, number: int, plan: Plan) -> None:
-        """Start the execution of a trial on a free worker."""
+    @property
+    def ahead(self) -> int:
+        """The number of further plans that may wait for a free worker, if their choice depends on no result."""
+        return 0
 
     @abstractmethod
-    def wait(self) -> tuple[int, Execution]:
-        """Wait for the next execution that ends; return the number of its trial, and its result."""
+    def start(self, number: int, plan: Plan) -> None:
+        """Start the execution of a trial on a free worker, or let it wait for one."""
+
+    @abstractmethod
+    def wait(self) -> list[tuple[int, Execution]]:
+        """Wait for the next execution that ends; return the numbers and results of all trials that have ended."""
 
     @abstractmethod
     def close(self) -> None:
@@ -78,19 +113,40 @@ class WorkerPool(ABC):
 
 
 class SerialPool(WorkerPool):
-    """This process, which executes one plan at a time."""
+    """This process, which executes one plan at a time, or all that wait in one call if batches of the system are exact.
+
+    A task that fails in a batch is executed again alone, because the batch does not tell its reason.
+    """
 
     def __init__(self, system: System) -> None:
         self.system, self.size = system, 1
+        self._next: list[tuple[int, Plan]] = []
+        self._seconds = np.inf
+
+    @property
+    def ahead(self) -> int:
+        """The number of further plans that are executed in one call with the next one: half a second of work."""
+        exact = getattr(self.system, "exact_batches", False)
+        return min(_BATCH - 1, int(AHEAD / max(self._seconds, 1e-9))) if exact else 0
 
     def start(self, number: int, plan: Plan) -> None:
         """Take a plan, which :meth:`wait` executes."""
-        self._next = number, plan
+        self._next.append((number, plan))
 
-    def wait(self) -> tuple[int, Execution]:
-        """Execute the plan; return the number of its trial, and what the execution gave."""
-        number, plan = self._next
-        return number, execute_task(self.system, plan.controller, plan.task)
+    def wait(self) -> list[tuple[int, Execution]]:
+        """Execute the plans; return the numbers of their trials, and what the executions gave."""
+        taken, self._next = self._next, []
+        started = time.perf_counter()
+        together = _executed_batch(self.system, [plan for _, plan in taken])
+        seconds = (time.perf_counter() - started) / len(taken)
+        ended = [
+            (number, execute_task(self.system, plan.controller, plan.task))
+            if together is None or not together.finite[k]
+            else (number, Execution(together[k], seconds=seconds))
+            for k, (number, plan) in enumerate(taken)
+        ]
+        self._seconds = max(execution.seconds or 0.0 for _, execution in ended)
+        return ended
 
     def close(self) -> None:
         """Do nothing: no execution is running any more."""
@@ -160,7 +216,7 @@ class ProcessPool(WorkerPool):
         self._workers.append(worker)
         return worker
 
-    def wait(self) -> tuple[int, Execution]:
+    def wait(self) -> list[tuple[int, Execution]]:
         """Wait for the next execution that ends, or that takes too long."""
         while True:
             busy = [worker for worker in self._workers if worker.number is not None]
@@ -168,14 +224,13 @@ class ProcessPool(WorkerPool):
             if self.timeout is not None:
                 remaining = max(0.0, min(worker.started for worker in busy) + self.timeout - time.monotonic())
             ready = wait_for([worker.pipe for worker in busy], remaining)
-            for worker in busy:
-                if worker.pipe in ready:
-                    return self._received(worker)
+            if ready:
+                return [self._received(worker) for worker in busy if worker.pipe in ready]
             for worker in busy:
                 elapsed = time.monotonic() - worker.started
                 if self.timeout is not None and elapsed >= self.timeout:
                     self._stop([worker])
-                    return worker.release(), _timed_out(self.timeout, elapsed)
+                    return [(worker.release(), timed_out(self.timeout, elapsed))]
 
     def _received(self, worker: _Worker) -> tuple[int, Execution]:
         number = worker.release()
@@ -265,93 +320,3 @@ def _exit_with_parent(parent: int) -> None:
     time.sleep(_GRACE_PERIOD)
     allow_exits()  # the execution may be going on, in code that no signal handler interrupts
     os._exit(1)
-
-
-# Any executor
-
-
-class ExecutorPool(WorkerPool):
-    """An executor of ``concurrent.futures``: a pool of threads or processes, Dask, and others.
-
-    All threads of a pool share one system. An execution that takes longer than ``timeout`` seconds is cancelled; a
-    thread cannot be cancelled and continues in the background.
-    """
-
-    def __init__(self, system: System, executor: cf.Executor, size: int, timeout: float | None = None) -> None:
-        self.system, self.executor, self.size, self.timeout = system, executor, size, timeout
-        self._running: dict[cf.Future[Execution], tuple[int, float]] = {}
-
-    def start(self, number: int, plan: Plan) -> None:
-        """Start the execution of a trial."""
-        self._await_scheduler()
-        try:
-            future = self.executor.submit(execute_task, self.system, plan.controller, plan.task)
-        except Exception as error:
-            if _is_loss(error) or isinstance(error, RuntimeError):
-                raise CampaignError(f"the executor takes no more work: {reason_of(error).rstrip('.')}.") from error
-            raise InputError(f"the execution cannot be sent to a worker: {reason_of(error)}.") from error
-        self._running[future] = number, time.monotonic()
-
-    def wait(self) -> tuple[int, Execution]:
-        """Wait for the next execution that ends, or that takes too long."""
-        while True:
-            cf.wait(self._running, timeout=0.5, return_when=cf.FIRST_COMPLETED)
-            for future, (number, started) in list(self._running.items()):
-                seconds = time.monotonic() - started
-                if future.done():
-                    del self._running[future]
-                    return number, self._result(future)
-                if self.timeout is not None and seconds >= self.timeout:
-                    del self._running[future]
-                    future.cancel()
-                    return number, _timed_out(self.timeout, seconds)
-            # A task that was sent while a client searched for its scheduler stays pending for ever.
-            self._await_scheduler()
-
-    def _await_scheduler(self) -> None:
-        """Wait while a Dask client searches for a scheduler that it has lost."""
-        while self._status() == "connecting":
-            time.sleep(0.5)
-        if self._status() == "closed":
-            raise CampaignError("the executor takes no more work: its scheduler is gone.")
-
-    def _status(self) -> str:
-        return str(getattr(getattr(self.executor, "_client", None), "status", "running"))
-
-    def _result(self, future: cf.Future[Execution]) -> Execution:
-        try:
-            return future.result()
-        except (Exception, cf.CancelledError) as error:
-            if _is_loss(error):
-                self._await_scheduler()
-                return Execution(lost=reason_of(error))
-            raise InputError(f"the execution cannot be sent to a worker: {reason_of(error)}.") from error
-
-    def close(self) -> None:
-        """Cancel the executions that have not started; the owner of the executor closes it."""
-        for future in self._running:
-            future.cancel()
-
-
-def _is_loss(error: BaseException) -> bool:
-    """Return whether an error means that a worker was lost, which is not a failure of the system."""
-    known = (cf.BrokenExecutor, cf.CancelledError, EOFError, OSError)
-    return isinstance(error, known) or type(error).__module__.split(".")[0] == "distributed"
-
-
-def worker_pool(
-    system: System, *, workers: int | None, executor: cf.Executor | None, timeout: float | None
-) -> WorkerPool | None:
-    """Return a pool of workers; None if the executions run one after the other in this process."""
-    if getattr(system, "manual", False):
-        raise InputError(
-            "this system is executed by people, not by run or audit: get tasks with `ctxval ask` and record the "
-            "results with `ctxval tell` (ask and tell in Python)."
-        )
-    if executor is not None:
-        # Every pool of the standard library has its size under this name.
-        size = getattr(executor, "_max_workers", 1) if workers is None else workers
-        return ExecutorPool(system, executor, int(size), timeout)
-    if (workers or 1) > 1 or timeout is not None:
-        return ProcessPool(system, workers or 1, timeout)
-    return None

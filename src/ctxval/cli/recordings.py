@@ -323,20 +323,17 @@ def collect(
         out_.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"{out_} cannot be made: {error.strerror}.") from error
-    recorded, failed, known = list[str](), list[dict[str, Any]](), 0
-    for number in range(runs):
-        path = out_ / f"run{number:04d}.csv"
-        if path.exists():
-            known += 1
-            continue
-        try:
-            run = excitation.run(number)
+    paths = [out_ / f"run{number:04d}.csv" for number in range(runs)]
+    missing = [number for number, path in enumerate(paths) if not path.exists()]
+    recorded, failed, known = list[str](), list[dict[str, Any]](), runs - len(missing)
+    for number, run in excitation.runs(missing):
+        if isinstance(run, ExecutionError):
+            failed.append({"run": number, "reason": str(run)})
+            err.say((f"run {number} failed", "yellow"), f": {run}")
+        else:
             states, inputs = experiment.names(run.states.shape[-1], run.inputs.shape[-1])
-            run.to_csv(path, states=labels_of(states), inputs=labels_of(inputs))
-            recorded.append(str(path))
-        except ExecutionError as error:
-            failed.append({"run": number, "reason": str(error)})
-            err.say((f"run {number} failed", "yellow"), f": {error}")
+            run.to_csv(paths[number], states=labels_of(states), inputs=labels_of(inputs))
+            recorded.append(str(paths[number]))
     out.say(f"{len(recorded)} executions recorded in {out_}, {known} were there before, {len(failed)} failed.")
     report = {"recorded": recorded, "known": known, "failed": failed, "folder": str(out_)}
     return (report, CANNOT_GO_ON) if failed and not recorded and not known else report

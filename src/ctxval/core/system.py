@@ -22,7 +22,9 @@ from ctxval.core.trajectory import Trajectory
 class System(Protocol):
     """The true system S: hardware, a simulator, a function.
 
-    A system that can execute a batch of tasks in one call has an attribute ``batched = True``.
+    A system that can execute a batch of tasks in one call has an attribute ``batched = True``. If each trajectory of a
+    batch is also to the last digit that of its task alone, ``exact_batches = True`` lets campaigns execute tasks
+    together that depend on no result.
     """
 
     def execute(self, controller: Controller, task: Task) -> Trajectory:
@@ -68,6 +70,12 @@ class WithOutputs(ShortRepr):
     def batched(self) -> bool:
         """Whether the system takes a batch of tasks in one call."""
         return bool(getattr(self.system, "batched", False))
+
+    @property
+    def exact_batches(self) -> bool:
+        """Whether outputs in a batch are to the last digit those of each task alone, which functions do not promise."""
+        functions = self.outputs.indices is None or self.start is not None
+        return not functions and bool(getattr(self.system, "exact_batches", False))
 
     def execute(self, controller: Controller, task: Task) -> Trajectory:
         """Execute the system, and return the inputs and outputs."""

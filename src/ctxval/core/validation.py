@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
+from copy import copy
 from dataclasses import replace
 from typing import Any, NoReturn
 from weakref import WeakSet
@@ -351,6 +352,8 @@ class Validation:
             raise
         except (Exception, SystemExit) as error:
             raise DesignError(f"the synthesizer failed: {reason_of(error)}.") from error
+        if isinstance(controller, Synthesizer):  # its next design would change this one, before it is executed
+            controller = copy(controller)
         try:
             trajectory = self.closed_loop(controller, task)
         except CtxvalError:

@@ -40,7 +40,7 @@ class MuJoCo(ShortRepr):
         threads: number of threads for a batch; the results do not depend on it.
     """
 
-    batched = True
+    batched = exact_batches = True
 
     def __init__(
         self,

@@ -10,8 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from conftest import make_validation
-from ctxval import controllers, systems
-from ctxval.errors import InputError, ShapeError, UnknownNameError
+from ctxval import Task, Trajectory, controllers, systems
+from ctxval.campaign import workers
+from ctxval.errors import DesignError, ExecutionError, InputError, ShapeError, UnknownNameError
 from ctxval.studies.fitting import Excitation, excitation
 
 KINDS: list[Any] = ["random", "multisine", "chirp"]
@@ -59,6 +60,63 @@ def test_a_controller_with_memory_is_excited_too() -> None:
     inputs = np.stack([pi(t, x) for t, x in enumerate(first.states[:-1])])
     signal = excitation("random", plan.task.horizon, np.array([2.0]), np.random.default_rng([4, 0, 1]))
     np.testing.assert_allclose(first.inputs, np.clip(inputs + signal, -3, 3), atol=1e-12)
+
+
+class Failing(systems.Simulated):
+    """A pendulum whose runs fail if their input at step 10 is positive. It knows the sizes of its calls."""
+
+    def __init__(self, exact: bool) -> None:
+        super().__init__(make_validation().system.model)
+        self.exact_batches, self.calls = exact, list[int]()
+
+    def execute(self, controller: Any, task: Task) -> Trajectory:
+        self.calls.append(len(task.initial_state) if task.batch_shape else 1)
+        done = super().execute(controller, task)
+        done.states[done.inputs[..., 10, 0] > 0] = np.nan
+        return done
+
+
+def test_runs_are_executed_together_and_are_those_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(workers, "AHEAD", 1e9)  # on slow computers as on fast ones
+    numbers = [0, 1, 2, 5, 6, 7, 8, 9]
+    together, alone = Failing(True), Failing(False)
+    results = [
+        list(Excitation(make_validation(system), "random", 2.0, 3.0, seed=4).runs(numbers))
+        for system in (together, alone)
+    ]
+    assert alone.calls == [1] * 8
+    assert together.calls[:2] == [1, 7]
+    assert [number for number, _ in results[0]] == numbers
+    failed = 0
+    for (_, run), (_, expected) in zip(*results, strict=True):
+        if isinstance(expected, ExecutionError):
+            assert str(run) == str(expected)
+            failed += 1
+        else:
+            assert isinstance(run, Trajectory)
+            np.testing.assert_array_equal(run.states, expected.states)
+            np.testing.assert_array_equal(run.inputs, expected.inputs)
+    assert 0 < failed < 7
+
+
+def test_a_run_that_cannot_be_planned_ends_the_runs_after_those_before_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(workers, "AHEAD", 1e9)
+    made = Excitation(make_validation(Failing(True)), "random", 2.0, 30.0, seed=4)
+    synthesizer, designs = made.validation.synthesizer, list[int]()
+
+    class Third:
+        def design(self, task: Task, model: Any) -> Any:
+            designs.append(1)
+            if len(designs) == 3:
+                raise DesignError("no gains.")
+            return synthesizer.design(task, model)
+
+    made.validation.synthesizer = Third()
+    ended = list[int]()
+    runs = (ended.append(number) for number, _ in made.runs(range(5)))
+    with pytest.raises(DesignError, match="no gains"):
+        list(runs)
+    assert ended == [0, 1]
 
 
 @pytest.mark.parametrize(

@@ -233,10 +233,15 @@ class Store:
 
     def close_trial(self, trial: Trial, system_trajectory: Trajectory | None, *, changes: int | None = None) -> None:
         """Store the result of an open trial; of two results for one trial, the first is stored."""
+        self.close_trials([(trial, system_trajectory)], changes=changes)
+
+    def close_trials(self, ended: Iterable[tuple[Trial, Trajectory | None]], *, changes: int | None = None) -> None:
+        """Store the results of open trials with their trajectories of the system in one transaction: all, or none."""
         with self._database.transaction():
             self._require_unchanged(changes)
-            self._update_open(trial, f"AND state = 'open' AND attempts = {trial.attempts:d}", closed_at=now())
-            self._trajectories.write(trial.number, "system", system_trajectory)
+            for trial, system_trajectory in ended:
+                self._update_open(trial, f"AND state = 'open' AND attempts = {trial.attempts:d}", closed_at=now())
+                self._trajectories.write(trial.number, "system", system_trajectory)
 
     def replace_result(
         self, before: Trial, after: Trial, trajectory: Trajectory | None, why: str, *, changes: int | None = None

@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from itertools import islice
 from typing import Any, Literal, get_args
 
 import numpy as np
 
 from ctxval._util.arrays import Array, ArrayLike, as_finite
 from ctxval._util.representation import ShortRepr
+from ctxval.campaign.workers import SerialPool
 from ctxval.core.controller import Controller, ControllerWithMemory, Limits
 from ctxval.core.plan import Plan
 from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.validation import Validation
-from ctxval.errors import InputError, ShapeError, UnknownNameError
+from ctxval.errors import CtxvalError, ExecutionError, InputError, ShapeError, UnknownNameError
 
 SignalKind = Literal["random", "multisine", "chirp"]
 
@@ -112,7 +115,37 @@ class Excitation(ShortRepr):
 
     def run(self, number: int) -> Trajectory:
         """Execute S once and return its trajectory."""
+        return self.validation.execute(self._excited(number))
+
+    def runs(self, numbers: Iterable[int]) -> Iterator[tuple[int, Trajectory | ExecutionError]]:
+        """Execute S once for each number; yield the numbers with the trajectories, or with the errors of failed runs.
+
+        Runs are executed together if batches of the system are exact (``exact_batches``), and are the same as alone.
+        """
+        pool, waiting, stopped = SerialPool(self.validation.system), iter(numbers), None
+        while stopped is None:
+            plans = dict[int, Plan]()
+            try:
+                for number in islice(waiting, 1 + pool.ahead):
+                    plans[number] = self._excited(number)
+                    pool.start(number, plans[number])
+            except CtxvalError as error:  # after the runs before it
+                stopped = error
+            if not plans:
+                break
+            for number, execution in pool.wait():
+                run: Trajectory | ExecutionError
+                try:
+                    run = self.validation.require(plans[number], execution.trajectory)
+                except (ExecutionError, InputError) as error:
+                    run = ExecutionError(execution.failed or str(error))
+                yield number, run
+        if stopped is not None:
+            raise stopped
+
+    def _excited(self, number: int) -> Plan:
+        """Return the plan of a run, whose controller adds the signal."""
         plan = self.plan(number)
         signal = excitation(self.kind, plan.task.horizon, self.amplitude, np.random.default_rng([self.seed, number, 1]))
         excited = Excited(plan.controller, signal, self.limits)
-        return self.validation.execute(Plan(plan.parameters, plan.task, excited, plan.model_trajectory))
+        return Plan(plan.parameters, plan.task, excited, plan.model_trajectory)
