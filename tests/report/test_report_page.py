@@ -273,7 +273,7 @@ def test_markdown_names_the_verdict_and_the_worst_tasks(swing: ReportContext) ->
 
 
 def test_the_appendix_covers_the_vocabulary_of_both_standards(swing: ReportContext) -> None:
-    entries = appendix.appendix(swing)
+    entries = list(appendix.appendix(swing))
     assert all(entry.content.strip() for entry in entries)
     for standard in ("NASA-STD-7009B", "ASME V&V 10", "ASME V&V 20"):
         assert any(standard in entry.standard for entry in entries)
