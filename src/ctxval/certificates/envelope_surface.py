@@ -1,0 +1,144 @@
+"""Numbers that are known at some tasks, interpolated to all others, with margins from tasks that are left out.
+
+The interpolant is the smoothest one in the sense of Duchon (1977): a sum of ``|p - p_j|^3`` and a linear function. Its
+errors are known without any further task: what each task would be if it were interpolated from the others follows from
+one inverse matrix (Rippa 1999).
+"""
+
+from __future__ import annotations
+
+import base64
+import inspect
+import io
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ctxval._util.arrays import Array
+from ctxval._util.files import MADE_BY
+
+_NUGGET = 1e-9  # added to the matrix, so that two tasks that are nearly the same do not make it singular
+
+
+def surfaces_at(points: Array, centres: Array, weights: Array) -> Array:
+    """Return interpolated numbers ``(n, c)`` at points ``(n, d)`` of the unit cube."""
+    blocks = []
+    for first in range(0, len(points), 1000):
+        some = points[first : first + 1000]
+        squares = ((some[:, None, :] - centres) ** 2).sum(axis=-1)
+        tail = np.concatenate([np.ones((len(some), 1)), some], axis=1)
+        blocks.append(np.concatenate([squares * np.sqrt(squares), tail], axis=1) @ weights)
+    return np.concatenate([np.zeros((0, weights.shape[1])), *blocks])
+
+
+@dataclass(frozen=True, eq=False)
+class Surfaces:
+    """Interpolants of c numbers over the unit cube.
+
+    Attributes:
+        centres: the tasks at which the numbers are known, shape ``(K, d)``.
+        weights: shape ``(K + 1 + d, c)``.
+        left_out: what each number would be if its task were left out, shape ``(K, c)``.
+    """
+
+    centres: Array
+    weights: Array
+    left_out: Array
+
+    @classmethod
+    def through(cls, points: Array, values: Array) -> Surfaces:
+        """Return the interpolants of values ``(K, c)`` at different points ``(K, d)``, K at least d + 2."""
+        K, d = points.shape
+        distances = np.sqrt(((points[:, None] - points) ** 2).sum(axis=-1))
+        tail = np.concatenate([np.ones((K, 1)), points], axis=1)
+        matrix = np.zeros((K + 1 + d, K + 1 + d))
+        matrix[:K, :K] = distances**3 + _NUGGET * np.eye(K)
+        matrix[:K, K:], matrix[K:, :K] = tail, tail.T
+        inverse = np.linalg.inv(matrix)
+        weights = inverse[:, :K] @ values
+        return cls(points, weights, values - weights[:K] / np.diag(inverse)[:K, None])
+
+    def __call__(self, points: Array) -> Array:
+        """Return interpolated numbers ``(..., c)`` at points ``(..., d)``."""
+        found = surfaces_at(points.reshape(-1, points.shape[-1]), self.centres, self.weights)
+        return np.asarray(found.reshape(*points.shape[:-1], self.weights.shape[1]))
+
+
+def margins_of(surfaces: Surfaces, values: Array) -> Array:
+    """Return what must be added to interpolated numbers ``(c,)`` so that no task above 1 that is left out is below 1."""
+    above = values > 1
+    short = np.where(above, 1 - surfaces.left_out, 0.0)
+    return np.asarray(np.maximum(short.max(axis=0, initial=0.0), 0.0))
+
+
+_EXPORTED = '''# {made_by}. This file needs NumPy alone.
+"""The tasks that are trusted: see STATEMENT."""
+
+from __future__ import annotations
+
+import base64
+import io
+
+import numpy as np
+
+STATEMENT = {title!r}
+NAMES = {names!r}  # the parameters of a task, in this order
+LABELS = {labels!r}  # with their units
+LOW = np.array({low!r})
+HIGH = np.array({high!r})
+THRESHOLD = {threshold!r}
+CONFIDENCE = {confidence!r}
+MARGINS = np.array({margins!r})
+ERROR = {error!r}  # of the interpolated bound, as a share of the threshold
+
+
+def _array(text):
+    return np.load(io.BytesIO(base64.b64decode(text)), allow_pickle=False)
+
+
+{source}
+
+def trusted(task):
+    """Return whether tasks ``(..., d)`` are trusted ``(...)``, and bounds on their distances ``(...)``.
+
+    A bound is infinity if its task is not trusted.
+    """
+    task = np.asarray(task, dtype=np.float64)
+    if task.ndim == 0 or task.shape[-1] != len(NAMES):
+        raise ValueError("a task has the parameters " + ", ".join(NAMES))
+    unit = (task - LOW) / (HIGH - LOW)
+    inside = ((unit >= 0) & (unit <= 1)).all(axis=-1)
+    rows = np.where(inside[..., None], unit, 0.5).reshape(-1, len(NAMES))
+    found = surfaces_at(rows, CENTRES, WEIGHTS).reshape(*inside.shape, -1)
+    kept = inside & (found + MARGINS <= 1).all(axis=-1)
+    bound = np.where(kept, THRESHOLD * np.clip(found[..., 0] + ERROR, 0, 1), np.inf)
+    return kept[()], bound[()]
+
+
+CENTRES = _array(
+    {centres}
+)
+WEIGHTS = _array(
+    {weights}
+)
+'''
+
+
+def exported(surfaces: Surfaces, **values: Any) -> str:
+    """Return the source of a Python module with a function ``trusted``, which needs NumPy alone."""
+    return _EXPORTED.format(
+        made_by=MADE_BY,
+        source=inspect.getsource(surfaces_at),
+        centres=_as_text(surfaces.centres),
+        weights=_as_text(surfaces.weights),
+        **values,
+    )
+
+
+def _as_text(array: Array) -> str:
+    """Return the bytes of an array as a literal of Python over several lines."""
+    buffer = io.BytesIO()
+    np.save(buffer, np.ascontiguousarray(array), allow_pickle=False)
+    text = base64.b64encode(buffer.getvalue()).decode("ascii")
+    return "\n    ".join(repr(text[first : first + 100]) for first in range(0, len(text), 100))
