@@ -32,7 +32,7 @@ from ctxval.learning import LearnedDynamics
 
 _BOUNDARY = 512  # tasks next to the boundary at which closed loops are run, beside those of the pool
 _CANDIDATES = 8192  # tasks among which these are chosen
-_NOISY, _NOISY_BOUNDARY = 256, 128  # the same numbers for the pool and the boundary if each draw has sequences of noise
+_NOISY, _NOISY_BOUNDARY = 192, 64  # the same numbers for the pool and the boundary if each draw has sequences of noise
 _SCREENED = 256  # tasks of the pool among which the next one is chosen
 _SPREADS = 3.0  # spreads above the mean within which a task is uncertain
 _SETTLED = 0.03  # share of the tasks predicted below the threshold that may be uncertain or uncovered at the end
@@ -109,9 +109,9 @@ class EnvelopeSearch:
         nearest = boundary_tasks(drawn, evidence, threshold, confidence, candidates, count)
         return drawn.and_others(self._at(learned, nearest))
 
-    def _at(self, learned: LearnedDynamics, points: Array) -> DrawnDistances:
+    def _at(self, learned: LearnedDynamics, points: Array, *, settled: bool = True) -> DrawnDistances:
         draws = draws_for(self.interval.options.confidence)
-        return DrawnDistances(points, *learned.drawn_distances(points, draws))
+        return DrawnDistances(points, *learned.drawn_distances(points, draws, settled=settled))
 
     def choose(self) -> Choice | None:
         """Return the next task that enlarges the envelope, or a test of it; None if it would hardly grow.
@@ -133,10 +133,10 @@ class EnvelopeSearch:
         if missing and interval.budget - recorder.executions - waiting <= missing:
             return interval.test()
         pool = learned.study.search.pool
-        drawn = self._at(learned, pool[:_SCREENED] if recorder.validation.space.members is None else pool)
-        below = drawn.planned & (drawn.mean <= self._threshold)
-        spread = drawn.spread(self._threshold)
-        straddle = _SPREADS * spread - np.abs(drawn.mean - self._threshold)  # Bryan et al. 2006
+        some = pool[:_SCREENED] if recorder.validation.space.members is None else pool
+        drawn = self._at(learned, some, settled=False)
+        below = drawn.mean <= self._threshold
+        straddle = _SPREADS * drawn.spread(self._threshold) - np.abs(drawn.mean - self._threshold)  # Bryan et al. 2006
         uncertain = below & (straddle > 0)
         uncovered = below & (drawn.beyond > most_beyond(evidence))
         few = evidence.executions < fewest_executions(evidence)
@@ -145,7 +145,7 @@ class EnvelopeSearch:
         if few or (uncertain | uncovered).sum() > _SETTLED * below.sum():
             score = np.where(uncovered, drawn.beyond, -np.inf)
             if uncertain.sum() >= uncovered.sum():
-                score = np.where(drawn.planned & np.isfinite(spread), straddle, -np.inf)
+                score = straddle
             new = self._is_new(drawn.points)
             if (np.isfinite(score) & new).any():
                 return _choice(drawn.points[int(np.where(new, score, -np.inf).argmax())])

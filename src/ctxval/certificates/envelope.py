@@ -66,29 +66,32 @@ class DrawnDistances(ShortRepr):
 
     Attributes:
         points: tasks, points of the unit cube ``(K, d)``.
-        mean: distances on the posterior mean ``(K,)``; infinity if the loop diverges, NaN if no controller can be
-            designed.
-        draws: those on S draws ``(S, K)``.
+        draws: distances on S draws ``(S, K)``; infinity if the loop diverges, NaN if no controller can be designed.
         beyond: how far the loop on the mean leaves the records in a coordinate, as a share of the visited range
             ``(K,)``.
     """
 
     points: Array
-    mean: Array
     draws: Array
     beyond: Array
 
     @property
-    def planned(self) -> Mask:
-        """Which tasks can be planned and do not diverge on the mean, ``(K,)``."""
-        return np.isfinite(self.mean)
+    def known(self) -> Mask:
+        """Which tasks have a finite distance on each draw, ``(K,)``."""
+        return np.asarray(np.isfinite(self.draws).all(axis=0))
+
+    @property
+    def mean(self) -> Array:
+        """The means over the draws ``(K,)``; infinity if a distance is not known."""
+        return np.where(self.known, self._finite.mean(axis=0), np.inf)
 
     def spread(self, threshold: float) -> Array:
-        """Return the standard deviations over the draws ``(K,)``, infinity if one of them diverges."""
-        spread = np.full(len(self.points), np.inf)
-        finite = np.isfinite(self.draws).all(axis=0)
-        spread[finite] = np.maximum(self.draws[:, finite].std(axis=0), FLOOR * threshold)
-        return spread
+        """Return the standard deviations over the draws ``(K,)``, at least a share of the threshold."""
+        return np.asarray(np.maximum(self._finite.std(axis=0), FLOOR * threshold))
+
+    @property
+    def _finite(self) -> Array:
+        return np.where(self.known, self.draws, 0.0)
 
     def factor(self, threshold: float, confidence: float) -> float:
         """Return k: the order statistic of the largest standardised excesses of the draws; at least 0.
@@ -96,9 +99,8 @@ class DrawnDistances(ShortRepr):
         Raises:
             CertificateError: if the confidence is too high for the number of draws.
         """
-        spread = self.spread(threshold)
-        known = np.isfinite(spread) & self.planned
-        excess = ((self.draws[:, known] - self.mean[known]) / spread[known]).max(axis=1, initial=0.0)
+        known, spread = self.known, self.spread(threshold)
+        excess = ((self.draws - self.mean)[:, known] / spread[known]).max(axis=1, initial=0.0)
         rank = int(np.ceil((len(excess) + 1) * confidence - 1e-9))
         if rank > len(excess):
             raise CertificateError(
@@ -108,8 +110,11 @@ class DrawnDistances(ShortRepr):
 
     def and_others(self, others: DrawnDistances) -> DrawnDistances:
         """Return these tasks together with others on the same draws."""
-        pairs = ((getattr(self, name), getattr(others, name)) for name in ("points", "mean", "draws", "beyond"))
-        return DrawnDistances(*(np.concatenate(pair, axis=-2 if k == 0 else -1) for k, pair in enumerate(pairs)))
+        return DrawnDistances(
+            np.concatenate([self.points, others.points]),
+            np.concatenate([self.draws, others.draws], axis=1),
+            np.concatenate([self.beyond, others.beyond]),
+        )
 
 
 def rises_of(evidence: DynamicsEvidence, threshold: float) -> list[tuple[float, CheckedPrediction]]:
@@ -252,7 +257,7 @@ class Envelope(ShortRepr):
         if self.tasks is not None:
             return f"Trusted: {enumerated(self.tasks, 40)}." if self.tasks else "No task is trusted."
         if not self.regions:
-            return "No task is trusted." if not self.share else "It holds no box of more than 1 % of the tasks."
+            return "No task is trusted." if not self.share else "It holds no box of more than 2 % of the tasks."
         each = "; or ".join(f"{region.text} ({100 * region.share:.0f} % of the tasks)" for region in self.regions)
         return f"Trusted: {each}."
 
@@ -312,9 +317,7 @@ def withdrawn(space: TaskSpace, threshold: float, confidence: float, doubt: str)
 
 def upper_bounds(drawn: DrawnDistances, factor: float, threshold: float) -> Array:
     """Return mean + k spread as shares of the threshold ``(K,)``; 2 if it is more or not known."""
-    with np.errstate(invalid="ignore"):
-        upper = (drawn.mean + factor * drawn.spread(threshold)) / threshold
-    return np.where(drawn.planned, np.minimum(np.nan_to_num(upper, nan=_LARGEST), _LARGEST), _LARGEST)
+    return np.asarray(np.minimum((drawn.mean + factor * drawn.spread(threshold)) / threshold, _LARGEST))
 
 
 def boundary_tasks(
@@ -340,11 +343,8 @@ def must_outlive_a_test(drawn: DrawnDistances, evidence: DynamicsEvidence, thres
     """Return whether a drawn test raises k by so much that the tests of another hypercube are worth their executions."""
     rises = (rise for rise, test in rises_of(evidence, threshold) if test.origin in DRAWN)
     largest = max(rises, default=0.0)
-    spread = drawn.spread(threshold)
-    known = drawn.planned & np.isfinite(spread)
-    upper = (drawn.mean[known] + largest * spread[known]) <= threshold
-    below = drawn.mean[known] <= threshold
-    return bool(upper.sum() < _WORTH * below.sum())
+    kept = drawn.mean + largest * drawn.spread(threshold) <= threshold
+    return bool(kept.sum() < _WORTH * (drawn.mean <= threshold).sum())
 
 
 def _interpolated(
@@ -356,7 +356,7 @@ def _interpolated(
 ) -> tuple[Surfaces, Array]:
     """Return the interpolants of the bounds and, if loops leave the records, of by how much; and their values."""
     bounds = upper_bounds(drawn, factor, threshold)
-    beyond = np.minimum(np.nan_to_num(drawn.beyond, nan=np.inf, posinf=np.inf) / most_beyond(evidence), _LARGEST)
+    beyond = np.minimum(drawn.beyond / most_beyond(evidence), _LARGEST)
     points, values = drawn.points, np.stack([bounds, beyond], axis=1)
     excesses = [(point, d / threshold) for point, d in executed if d > threshold and evidence.quantile is None]
     for point, ratio in excesses:

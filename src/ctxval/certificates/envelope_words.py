@@ -19,10 +19,10 @@ from ctxval._util.texts import parted
 from ctxval.core.space import TaskSpace
 
 REGIONS = 3  # largest number of regions
-LEAST = 0.01  # least share of the tasks that a further region holds and no other one
-_SEEDS = 300  # tasks from which boxes grow
+LEAST = 0.02  # least share of the tasks that a region holds and no larger one
+_SEEDS, _BEST = 200, 20  # tasks from which boxes grow, and those from which they grow again
 _CHECKED = 4096  # tasks in a box that must all lie inside the set
-_ROUNDS = 12  # times that a box may be shrunk
+_ROUNDS = 40  # times that boxes may grow again, each time to a smaller share of the way to tasks outside
 _DIGITS = 3
 
 
@@ -81,10 +81,12 @@ def regions_inside(
         seeds = np.flatnonzero(left)
         if len(seeds) < LEAST * len(unit):
             break
-        for _ in range(_ROUNDS):
-            grown = [_grown(values[k], outside, ends) for k in rng.permutation(seeds)[:_SEEDS]]
-            counts = [int((left & _within(values, box)).sum()) for box in grown]
-            box = _rounded(grown[int(np.argmax(counts))], ends)
+        seeds = rng.permutation(seeds)[:_SEEDS]
+        for k in range(_ROUNDS):
+            grown = [_grown(values[seed], outside, ends, 0.98 - 0.01 * k) for seed in seeds]
+            counts = np.array([(left & _within(values, box)).sum() for box in grown])
+            seeds = seeds[np.argsort(-counts, kind="stable")[:_BEST]]
+            box = _rounded(grown[int(counts.argmax())], ends)
             tried = _tasks_within(space, sides, box, rng)
             wrong = tried[~contains(tried)]
             if not len(wrong):
@@ -119,10 +121,11 @@ def _corners(space: TaskSpace, sides: Array) -> Array:
     return np.stack([low.sum(axis=1), high.sum(axis=1)])
 
 
-def _grown(start: Array, outside: Array, ends: Array) -> Array:
+def _grown(start: Array, outside: Array, ends: Array, reach: float) -> Array:
     """Return the limits ``(2, m)`` of a box around values ``(m,)`` that grows in all sides until none can grow.
 
-    At each time, all free sides are at the same share of their ranges; a side stops where it would meet a task outside.
+    At each time, all free sides are at the same share of their ranges. A side stops at a share of the way to the task
+    outside that it would meet.
     """
     width = ends[1] - ends[0]
     away = (outside - start) / width  # shares at which a side meets each task
@@ -133,7 +136,7 @@ def _grown(start: Array, outside: Array, ends: Array) -> Array:
         rows = np.flatnonzero(blocked)
         first = rows[np.abs(away[rows]).max(axis=1).argmin()]
         side = int(np.abs(away[first]).argmax())
-        limit = start[side] + 0.98 * (outside[first, side] - start[side])
+        limit = start[side] + reach * (outside[first, side] - start[side])
         if away[first, side] >= 0:
             box[1, side] = min(box[1, side], limit)
             blocked &= outside[:, side] < box[1, side]

@@ -110,12 +110,12 @@ def beyond_records(posterior: DynamicsPosterior, of_pool: Sequence[Loops], loops
 
 def _widths(visited: Array) -> Array:
     low, high = np.quantile(visited, [1e-3, 1 - 1e-3], axis=(0, 1))
-    return np.maximum(high - low, 1e-9)
+    return np.asarray(np.maximum(high - low, 1e-9))
 
 
 def _beyond(recorded: Array, visited: Array) -> Array:
     """Return the excess of each coordinate over its largest record, or below its smallest one."""
-    return np.maximum(np.maximum(visited - recorded.max(axis=0), recorded.min(axis=0) - visited), 0.0)
+    return np.asarray(np.maximum(np.maximum(visited - recorded.max(axis=0), recorded.min(axis=0) - visited), 0.0))
 
 
 def _visited(posterior: DynamicsPosterior, loops: Sequence[Loops]) -> Array:
