@@ -13,19 +13,23 @@ from ctxval._util.texts import reason_of
 from ctxval.campaign.choices import Choice
 from ctxval.campaign.dynamics import NEAR
 from ctxval.campaign.interval_search import IntervalSearch
+from ctxval.campaign.trials import TrialRecorder
 from ctxval.certificates.automatic import Automatic
+from ctxval.certificates.drawn_distances import DrawnDistances
 from ctxval.certificates.dynamics import Dynamics, draws_for
 from ctxval.certificates.dynamics_diagnostics import fewest_executions, missing_tests, untried_parameter
 from ctxval.certificates.dynamics_evidence import DynamicsEvidence
 from ctxval.certificates.envelope import (
-    DrawnDistances,
     Envelope,
     boundary_tasks,
+    doubt_of_envelope,
     envelope_of,
     most_beyond,
     must_outlive_a_test,
     withdrawn,
 )
+from ctxval.certificates.options import CertificateOptions
+from ctxval.certificates.prediction_tests import DRAWN
 from ctxval.core.trial import Trial
 from ctxval.errors import InputError
 from ctxval.learning import LearnedDynamics
@@ -67,17 +71,19 @@ class EnvelopeSearch:
         dynamics, trials = self.interval.recorder.dynamics, self._trials
         failed = [trial.number for trial in trials if trial.distance is None]
         if failed:
-            doubt = f"trial {failed[0]} has no distance, so nothing is known of its task; execute it again"
-            return withdrawn(space, self._threshold, confidence, doubt)
+            why = f"trial {failed[0]} has no distance, so nothing is known of its task; execute it again"
+            return withdrawn(space, self._threshold, confidence, why)
         with stage("computing the envelope", unit="closed loops"):
             known = self._known(trials)
             if known is None:
-                why = dynamics.failure or (
+                unknown = dynamics.failure or (
                     "no dynamics can be learned: there are no recorded trajectories, or M explains all of them, or no "
                     "controller can be designed"
                 )
-                return withdrawn(space, self._threshold, confidence, why)
+                return withdrawn(space, self._threshold, confidence, unknown)
             learned, evidence = known
+            if (doubt := doubt_of_envelope(evidence, self._threshold)) is not None:
+                return withdrawn(space, self._threshold, confidence, doubt)
             try:
                 drawn = self._drawn(learned, evidence)
             except Exception as error:  # users' parts, at states that no execution has reached
@@ -160,3 +166,12 @@ class EnvelopeSearch:
 
 def _choice(point: Array) -> Choice:
     return Choice(point, "covering", planned_draws=0, rejected=0)
+
+
+def has_tests(recorder: TrialRecorder, options: CertificateOptions) -> bool:
+    """Return whether the tests of an envelope were executed, so that it is worth computing; nothing is learned."""
+    if not isinstance(options.kind, Automatic | Dynamics) or not recorder.search.uses_prediction:
+        return False
+    drawn = [trial for trial in recorder.trials if trial.state == "completed" and trial.origin in DRAWN]
+    stored = sum(recorder.dynamics.stored_prediction(trial) is not None for trial in drawn)
+    return bool(drawn) and stored >= options.kind.tests

@@ -3,8 +3,8 @@ r"""The envelope: the tasks on which d stays below a threshold, with a confidenc
 Draws r_s of the learned dynamics have distances ``d_s(p)`` at some tasks, with a mean and a spread at each of them. The
 largest standardised excess of a draw is ``max_p (d_s(p) - mean(p)) / spread(p)``; its order statistic k of rank
 ``ceil((S + 1) * confidence)`` holds for a draw that was left out, so for the system, at all tasks together. The
-envelope is ``{p : mean(p) + k spread(p) <= tau}``. It is the simultaneous band of a Gaussian process (French and Hoeting
-2016; compare the excursion sets of Bolin and Lindgren 2015), with draws in closed loop in the place of its values.
+envelope is ``{p : mean(p) + k spread(p) <= tau}``. It is the simultaneous band of a Gaussian process (French and
+Hoeting 2016; compare the excursion sets of Bolin and Lindgren 2015), with draws in closed loop in the place of values.
 
 Draws that are learned from few executions are overconfident. So k is at least the largest standardised excess of the
 executions that were predicted beforehand at drawn tasks. A task is no part of the envelope if its closed loop leaves
@@ -24,12 +24,13 @@ from typing import Any
 
 import numpy as np
 
-from ctxval._util.arrays import Array, ArrayLike, Mask, as_floats, require_shape
+from ctxval._util.arrays import Array, ArrayLike, as_floats, require_shape
 from ctxval._util.boxes import separated_rows
 from ctxval._util.files import write_text
 from ctxval._util.representation import ShortRepr
 from ctxval._util.texts import enumerated
 from ctxval.certificates.bounds import at_most, percent
+from ctxval.certificates.drawn_distances import FLOOR, LARGEST, DrawnDistances
 from ctxval.certificates.dynamics_diagnostics import (
     ACCURATE,
     BEYOND,
@@ -50,71 +51,12 @@ from ctxval.certificates.prediction_tests import DRAWN
 from ctxval.certificates.sentences import dynamics_assumptions
 from ctxval.core.space import TaskSpace
 from ctxval.core.task_suite import TaskSuite
-from ctxval.errors import CertificateError, InputError
+from ctxval.errors import InputError
 
-FLOOR = 0.005  # least spread, as a share of the threshold
 COUNTED = 4096  # tasks of which the share in the envelope is counted
-_LARGEST = 2.0  # distances are interpolated up to this multiple of the threshold
 _EXCEEDED = 1.02  # an executed distance above the threshold counts as at least this multiple of it
 _SAME = 1e-9
 _WORTH = 0.8  # share of the tasks predicted below the threshold that tests may leave in the envelope
-
-
-@dataclass(frozen=True, eq=False)
-class DrawnDistances(ShortRepr):
-    """The distances of some tasks on draws of the learned dynamics.
-
-    Attributes:
-        points: tasks, points of the unit cube ``(K, d)``.
-        draws: distances on S draws ``(S, K)``; infinity if the loop diverges, NaN if no controller can be designed.
-        beyond: how far the loop on the mean leaves the records in a coordinate, as a share of the visited range
-            ``(K,)``.
-    """
-
-    points: Array
-    draws: Array
-    beyond: Array
-
-    @property
-    def known(self) -> Mask:
-        """Which tasks have a finite distance on each draw, ``(K,)``."""
-        return np.asarray(np.isfinite(self.draws).all(axis=0))
-
-    @property
-    def mean(self) -> Array:
-        """The means over the draws ``(K,)``; infinity if a distance is not known."""
-        return np.where(self.known, self._finite.mean(axis=0), np.inf)
-
-    def spread(self, threshold: float) -> Array:
-        """Return the standard deviations over the draws ``(K,)``, at least a share of the threshold."""
-        return np.asarray(np.maximum(self._finite.std(axis=0), FLOOR * threshold))
-
-    @property
-    def _finite(self) -> Array:
-        return np.where(self.known, self.draws, 0.0)
-
-    def factor(self, threshold: float, confidence: float) -> float:
-        """Return k: the order statistic of the largest standardised excesses of the draws; at least 0.
-
-        Raises:
-            CertificateError: if the confidence is too high for the number of draws.
-        """
-        known, spread = self.known, self.spread(threshold)
-        excess = ((self.draws - self.mean)[:, known] / spread[known]).max(axis=1, initial=0.0)
-        rank = int(np.ceil((len(excess) + 1) * confidence - 1e-9))
-        if rank > len(excess):
-            raise CertificateError(
-                f"a confidence of {confidence:g} needs more than {len(excess)} posterior samples of the dynamics."
-            )
-        return float(np.sort(excess)[rank - 1])
-
-    def and_others(self, others: DrawnDistances) -> DrawnDistances:
-        """Return these tasks together with others on the same draws."""
-        return DrawnDistances(
-            np.concatenate([self.points, others.points]),
-            np.concatenate([self.draws, others.draws], axis=1),
-            np.concatenate([self.beyond, others.beyond]),
-        )
 
 
 def rises_of(evidence: DynamicsEvidence, threshold: float) -> list[tuple[float, CheckedPrediction]]:
@@ -150,9 +92,10 @@ def unexplained(evidence: DynamicsEvidence, threshold: float) -> CheckedPredicti
     """Return a test whose distance what is learned by now does not have, by more than a share of the threshold."""
     for test in evidence.predictions:
         known = test.explained
-        if known is not None and not test.is_noisy and min(test.distance, known) <= threshold:
-            if not agrees(test.distance, known, threshold):
-                return test
+        if known is None or test.is_noisy or min(test.distance, known) > threshold:
+            continue
+        if not agrees(test.distance, known, threshold):
+            return test
     return None
 
 
@@ -165,9 +108,9 @@ def doubt_of_envelope(evidence: DynamicsEvidence, threshold: float) -> str | Non
         return doubt
     if (test := unexplained(evidence, threshold)) is not None:
         return (
-            f"trial {test.trial} has the distance {test.distance:.4g} and {test.explained:.4g} on the learned dynamics, "
-            f"a difference of more than {100 * ACCURATE:g} % of the threshold: the next state is no function of what "
-            "is recorded, or the dynamics depend on the task; record more states"
+            f"trial {test.trial} has the distance {test.distance:.4g}, and {test.explained:.4g} on the learned "
+            f"dynamics, a difference of more than {100 * ACCURATE:g} % of the threshold: the next state is no function "
+            "of what is recorded, or the dynamics depend on the task; record more states"
         )
     missing = missing_tests(evidence.predictions, evidence.tests)
     if missing:
@@ -315,15 +258,10 @@ def withdrawn(space: TaskSpace, threshold: float, confidence: float, doubt: str)
     return Envelope(space, threshold, confidence, "No envelope is stated.", doubt=doubt.rstrip("."))
 
 
-def upper_bounds(drawn: DrawnDistances, factor: float, threshold: float) -> Array:
-    """Return mean + k spread as shares of the threshold ``(K,)``; 2 if it is more or not known."""
-    return np.asarray(np.minimum((drawn.mean + factor * drawn.spread(threshold)) / threshold, _LARGEST))
-
-
 def boundary_tasks(
     drawn: DrawnDistances, evidence: DynamicsEvidence, threshold: float, confidence: float, tasks: Array, count: int
 ) -> Array:
-    """Return those of other tasks ``(N, d)`` that are nearest to the boundary of the envelope, ``(at most count, d)``."""
+    """Return at most so many of other tasks ``(N, d)``: those that are nearest to the boundary of the envelope."""
     surfaces, _ = _interpolated(drawn, evidence, threshold, _raised(drawn, evidence, threshold, confidence)[0], ())
     near = np.argsort(np.abs(surfaces(tasks)[:, 0] - 1), kind="stable")[: 3 * count]
     reach = 0.25 * count ** (-1 / tasks.shape[1])
@@ -340,7 +278,7 @@ def _raised(
 
 
 def must_outlive_a_test(drawn: DrawnDistances, evidence: DynamicsEvidence, threshold: float) -> bool:
-    """Return whether a drawn test raises k by so much that the tests of another hypercube are worth their executions."""
+    """Return whether a drawn test raises k by so much that the tests of another hypercube are worth while."""
     rises = (rise for rise, test in rises_of(evidence, threshold) if test.origin in DRAWN)
     largest = max(rises, default=0.0)
     kept = drawn.mean + largest * drawn.spread(threshold) <= threshold
@@ -355,15 +293,15 @@ def _interpolated(
     executed: Sequence[tuple[Array, float]],
 ) -> tuple[Surfaces, Array]:
     """Return the interpolants of the bounds and, if loops leave the records, of by how much; and their values."""
-    bounds = upper_bounds(drawn, factor, threshold)
-    beyond = np.minimum(drawn.beyond / most_beyond(evidence), _LARGEST)
+    bounds = drawn.upper(factor, threshold)
+    beyond = np.minimum(drawn.beyond / most_beyond(evidence), LARGEST)
     points, values = drawn.points, np.stack([bounds, beyond], axis=1)
     excesses = [(point, d / threshold) for point, d in executed if d > threshold and evidence.quantile is None]
     for point, ratio in excesses:
         near = np.abs(points - point).max(axis=1) <= 1e-6
         points, values = points[~near], values[~near]
         points = np.concatenate([points, point[None]])
-        values = np.concatenate([values, [[float(np.clip(ratio, _EXCEEDED, _LARGEST)), 0.0]]])
+        values = np.concatenate([values, [[float(np.clip(ratio, _EXCEEDED, LARGEST)), 0.0]]])
     _, rows = np.unique(points.round(9), axis=0, return_index=True)
     points, values = points[np.sort(rows)], values[np.sort(rows)]
     if not ((values[:, 1] > 1) & (values[:, 0] <= 1)).any():
@@ -379,14 +317,11 @@ def envelope_of(
     threshold: float,
     confidence: float,
 ) -> Envelope:
-    """Return the envelope from drawn distances and evidence of the same executions.
+    """Return the envelope from drawn distances and evidence of the same executions, which nothing withdraws.
 
     Args:
         executed: points of the unit cube ``(d,)`` with their distances.
     """
-    doubt = doubt_of_envelope(evidence, threshold)
-    if doubt is not None:
-        return withdrawn(space, threshold, confidence, doubt)
     factor, raised_by = _raised(drawn, evidence, threshold, confidence)
     envelope = Envelope(
         space,
@@ -425,7 +360,7 @@ def _of_suite(
 ) -> Envelope:
     """Return the envelope of the members of a suite, of which executed ones are known."""
     threshold, bounds = envelope.threshold, np.full(len(suite), np.inf)
-    upper = threshold * upper_bounds(drawn, envelope.factor or 0.0, threshold)
+    upper = threshold * drawn.upper(envelope.factor or 0.0, threshold)
     rows = suite.rows_at(drawn.points)
     bounds[rows] = np.where((upper <= threshold) & (drawn.beyond <= most), upper, np.inf)
     if envelope.quantile is None:
@@ -442,15 +377,6 @@ def _statement(envelope: Envelope) -> str:
         return f"With {percent(envelope.confidence)} confidence, d stays below {limit} on no task that can be named."
     what = "d" if envelope.quantile is None else f"the {envelope.quantile:g} quantile of d"
     tasks = f"{share:.3g} % of the tasks" if envelope.tasks is None else f"{len(envelope.tasks)} tasks"
-    return f"With {percent(envelope.confidence)} confidence, {what} stays below {limit} on all tasks of a set of {tasks}."
-
-
-__all__ = [
-    "COUNTED",
-    "DrawnDistances",
-    "Envelope",
-    "boundary_tasks",
-    "doubt_of_envelope",
-    "envelope_of",
-    "withdrawn",
-]
+    return (
+        f"With {percent(envelope.confidence)} confidence, {what} stays below {limit} on all tasks of a set of {tasks}."
+    )

@@ -66,7 +66,7 @@ class Surfaces:
 
 
 def margins_of(surfaces: Surfaces, values: Array) -> Array:
-    """Return what must be added to interpolated numbers ``(c,)`` so that no task above 1 that is left out is below 1."""
+    """Return what must be added to interpolated numbers ``(c,)``: no task above 1 is below 1 if it is left out."""
     above = values > 1
     short = np.where(above, 1 - surfaces.left_out, 0.0)
     return np.asarray(np.maximum(short.max(axis=0, initial=0.0), 0.0))
