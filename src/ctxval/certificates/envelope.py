@@ -11,8 +11,8 @@ executions that were predicted beforehand at drawn tasks. A task is no part of t
 the records, or if it was executed with a larger distance. Without tests the envelope is withdrawn, as the bound on d*
 is, and if the learned dynamics do not explain the executions.
 
-Between these tasks, ``mean + k spread`` is interpolated (:mod:`ctxval.certificates.envelope_surface`), with a margin
-so large that no task outside of the envelope would be inside if it were interpolated from the others.
+Between these tasks, ``mean + k spread`` is interpolated (:mod:`ctxval.certificates.envelope_surface`). The largest
+error of the nearest tasks, if each of them is interpolated from all others, is added.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ from ctxval.certificates.dynamics_diagnostics import (
     untried_parameter,
 )
 from ctxval.certificates.dynamics_evidence import CheckedPrediction, DynamicsEvidence
-from ctxval.certificates.envelope_surface import Surfaces, exported, margins_of
+from ctxval.certificates.envelope_surface import Surfaces, exported
 from ctxval.certificates.envelope_words import Region, regions_inside
 from ctxval.certificates.prediction_tests import DRAWN
 from ctxval.certificates.sentences import dynamics_assumptions
@@ -134,7 +134,7 @@ class Envelope(ShortRepr):
         tasks: the names of the trusted tasks of a suite; None if the task space is no suite.
         factor: k, by how many spreads the mean must stay below the threshold.
         raised_by: the trial whose excess over its prediction raised k; None if there is none.
-        margin: what the interpolation adds, as a share of the threshold.
+        margin: the median of what the interpolation adds next to evaluated tasks, as a share of the threshold.
         evaluated: the number of tasks at which closed loops were run.
         executions, tests: numbers of executions, and of those that were predicted beforehand at drawn tasks.
         quantile: the share of the executions of a task whose distances are below tau; None if the system is not noisy.
@@ -159,8 +159,6 @@ class Envelope(ShortRepr):
     assumptions: tuple[str, ...] = ()
     doubt: str | None = None
     _surfaces: Surfaces | None = None
-    _margins: Array | None = None
-    _error: float = 0.0
     _bounds: Array | None = None
 
     def trusted(self, task: Mapping[str, Any] | ArrayLike) -> Any:
@@ -186,11 +184,10 @@ class Envelope(ShortRepr):
             rows = self.space.rows_at(unit)
             same = np.abs(self.space.members[rows] - unit).max(axis=-1) <= _SAME
             return np.where(same, self._bounds[rows], np.inf)
-        if self._surfaces is None or self._margins is None:
+        if self._surfaces is None:
             return np.full(unit.shape[:-1], np.inf)
         found = self._surfaces(unit)
-        kept = (found + self._margins <= 1).all(axis=-1)
-        return np.where(kept, self.threshold * np.clip(found[..., 0] + self._error, 0, 1), np.inf)
+        return np.where((found <= 1).all(axis=-1), self.threshold * np.maximum(found[..., 0], 0), np.inf)
 
     @property
     def words(self) -> str:
@@ -235,7 +232,7 @@ class Envelope(ShortRepr):
         """
         if Path(path).suffix != ".py":
             raise InputError(f"the envelope is written to a Python file, such as envelope.py, got {str(path)!r}.")
-        if self._surfaces is None or self._margins is None:
+        if self._surfaces is None:
             reason = "the tasks of a suite are a list" if self.tasks is not None else "no task is trusted"
             raise InputError(f"there is no function to write: {reason}.")
         text = exported(
@@ -247,8 +244,6 @@ class Envelope(ShortRepr):
             high=self.space.high.tolist(),
             threshold=self.threshold,
             confidence=self.confidence,
-            margins=self._margins.tolist(),
-            error=self._error,
         )
         return write_text(path, text)
 
@@ -262,7 +257,7 @@ def boundary_tasks(
     drawn: DrawnDistances, evidence: DynamicsEvidence, threshold: float, confidence: float, tasks: Array, count: int
 ) -> Array:
     """Return at most so many of other tasks ``(N, d)``: those that are nearest to the boundary of the envelope."""
-    surfaces, _ = _interpolated(drawn, evidence, threshold, _raised(drawn, evidence, threshold, confidence)[0], ())
+    surfaces = _interpolated(drawn, evidence, threshold, _raised(drawn, evidence, threshold, confidence)[0], ())
     near = np.argsort(np.abs(surfaces(tasks)[:, 0] - 1), kind="stable")[: 3 * count]
     reach = 0.25 * count ** (-1 / tasks.shape[1])
     return np.asarray(tasks[near][separated_rows(tasks[near], reach, count)])
@@ -291,8 +286,8 @@ def _interpolated(
     threshold: float,
     factor: float,
     executed: Sequence[tuple[Array, float]],
-) -> tuple[Surfaces, Array]:
-    """Return the interpolants of the bounds and, if loops leave the records, of by how much; and their values."""
+) -> Surfaces:
+    """Return the surfaces of the bounds and, if loops of trusted tasks leave the records, of by how much."""
     bounds = drawn.upper(factor, threshold)
     beyond = np.minimum(drawn.beyond / most_beyond(evidence), LARGEST)
     points, values = drawn.points, np.stack([bounds, beyond], axis=1)
@@ -306,7 +301,7 @@ def _interpolated(
     points, values = points[np.sort(rows)], values[np.sort(rows)]
     if not ((values[:, 1] > 1) & (values[:, 0] <= 1)).any():
         values = values[:, :1]
-    return Surfaces.through(points, values), values
+    return Surfaces.through(points, values)
 
 
 def envelope_of(
@@ -339,11 +334,8 @@ def envelope_of(
     if isinstance(space, TaskSuite):
         envelope = _of_suite(envelope, space, drawn, most_beyond(evidence), executed)
     else:
-        surfaces, values = _interpolated(drawn, evidence, threshold, factor, executed)
-        margins = margins_of(surfaces, values)
-        kept = (surfaces.left_out + margins <= 1).all(axis=1)
-        error = float((values[kept, 0] - surfaces.left_out[kept, 0]).max(initial=0.0))
-        envelope = replace(envelope, margin=float(margins[0]), _surfaces=surfaces, _margins=margins, _error=error)
+        surfaces = _interpolated(drawn, evidence, threshold, factor, executed)
+        envelope = replace(envelope, margin=float(np.median(surfaces.errors[:, 0])), _surfaces=surfaces)
         tasks = space.unit_draws(COUNTED, np.random.default_rng(0))
         inside = np.isfinite(envelope.bound_at(tasks))
         regions = regions_inside(space, tasks, inside, lambda unit: np.isfinite(envelope.bound_at(unit)))

@@ -1,4 +1,4 @@
-"""Numbers that are known at some tasks, interpolated to all others, with margins from tasks that are left out.
+"""Numbers that are known at some tasks, interpolated to all others, with errors from tasks that are left out.
 
 The interpolant is the smoothest one in the sense of Duchon (1977): a sum of ``|p - p_j|^3`` and a linear function. Its
 errors are known without any further task: what each task would be if it were interpolated from the others follows from
@@ -14,62 +14,66 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from scipy.spatial.distance import cdist
 
 from ctxval._util.arrays import Array
 from ctxval._util.files import MADE_BY
 
+ENOUGH = 1.2  # multiple of the limit up to which an error of what exceeds it matters
 _NUGGET = 1e-9  # added to the matrix, so that two tasks that are nearly the same do not make it singular
 
 
-def surfaces_at(points: Array, centres: Array, weights: Array) -> Array:
-    """Return interpolated numbers ``(n, c)`` at points ``(n, d)`` of the unit cube."""
-    blocks = []
+def upper_at(points: Array, centres: Array, weights: Array, errors: Array) -> Array:
+    """Return interpolated numbers ``(n, c)`` plus local errors at points ``(n, d)`` of the unit cube."""
+    blocks = [np.zeros((0, weights.shape[1]))]
+    nearest = min(2 * (centres.shape[1] + 1), len(centres))
     for first in range(0, len(points), 1000):
         some = points[first : first + 1000]
-        squares = ((some[:, None, :] - centres) ** 2).sum(axis=-1)
+        squares = (some**2).sum(axis=1)[:, None] + (centres**2).sum(axis=1) - 2 * some @ centres.T
+        squares = np.maximum(squares, 0)
         tail = np.concatenate([np.ones((len(some), 1)), some], axis=1)
-        blocks.append(np.concatenate([squares * np.sqrt(squares), tail], axis=1) @ weights)
-    return np.concatenate([np.zeros((0, weights.shape[1])), *blocks])
+        found = np.concatenate([squares * np.sqrt(squares), tail], axis=1) @ weights
+        near = np.argpartition(squares, nearest - 1, axis=1)[:, :nearest]
+        blocks.append(found + errors[near].max(axis=1))
+    return np.concatenate(blocks)
 
 
 @dataclass(frozen=True, eq=False)
 class Surfaces:
-    """Interpolants of c numbers over the unit cube.
+    """Upper bounds of c numbers over the unit cube: interpolated, plus the largest local error.
 
     Attributes:
         centres: the tasks at which the numbers are known, shape ``(K, d)``.
         weights: shape ``(K + 1 + d, c)``.
         left_out: what each number would be if its task were left out, shape ``(K, c)``.
+        errors: by how much that is too small, shape ``(K, c)``; the largest of the nearest tasks is the local error.
     """
 
     centres: Array
     weights: Array
     left_out: Array
+    errors: Array
 
     @classmethod
     def through(cls, points: Array, values: Array) -> Surfaces:
-        """Return the interpolants of values ``(K, c)`` at different points ``(K, d)``, K at least d + 2."""
+        """Return the surfaces of values ``(K, c)`` at different points ``(K, d)``, K at least d + 2.
+
+        The values are shares of a limit. How far they exceed it does not matter, so an error counts up to ``ENOUGH``.
+        """
         K, d = points.shape
-        distances = np.sqrt(((points[:, None] - points) ** 2).sum(axis=-1))
         tail = np.concatenate([np.ones((K, 1)), points], axis=1)
         matrix = np.zeros((K + 1 + d, K + 1 + d))
-        matrix[:K, :K] = distances**3 + _NUGGET * np.eye(K)
+        matrix[:K, :K] = cdist(points, points) ** 3 + _NUGGET * np.eye(K)
         matrix[:K, K:], matrix[K:, :K] = tail, tail.T
         inverse = np.linalg.inv(matrix)
         weights = inverse[:, :K] @ values
-        return cls(points, weights, values - weights[:K] / np.diag(inverse)[:K, None])
+        left_out = values - weights[:K] / np.diag(inverse)[:K, None]
+        return cls(points, weights, left_out, np.maximum(np.minimum(values, ENOUGH) - left_out, 0.0))
 
     def __call__(self, points: Array) -> Array:
-        """Return interpolated numbers ``(..., c)`` at points ``(..., d)``."""
-        found = surfaces_at(points.reshape(-1, points.shape[-1]), self.centres, self.weights)
+        """Return the upper bounds ``(..., c)`` at points ``(..., d)``."""
+        found = upper_at(points.reshape(-1, points.shape[-1]), self.centres, self.weights, self.errors)
         return np.asarray(found.reshape(*points.shape[:-1], self.weights.shape[1]))
-
-
-def margins_of(surfaces: Surfaces, values: Array) -> Array:
-    """Return what must be added to interpolated numbers ``(c,)``: no task above 1 is below 1 if it is left out."""
-    above = values > 1
-    short = np.where(above, 1 - surfaces.left_out, 0.0)
-    return np.asarray(np.maximum(short.max(axis=0, initial=0.0), 0.0))
 
 
 _EXPORTED = '''# {made_by}. This file needs NumPy alone.
@@ -89,8 +93,6 @@ LOW = np.array({low!r})
 HIGH = np.array({high!r})
 THRESHOLD = {threshold!r}
 CONFIDENCE = {confidence!r}
-MARGINS = np.array({margins!r})
-ERROR = {error!r}  # of the interpolated bound, as a share of the threshold
 
 
 def _array(text):
@@ -110,9 +112,9 @@ def trusted(task):
     unit = (task - LOW) / (HIGH - LOW)
     inside = ((unit >= 0) & (unit <= 1)).all(axis=-1)
     rows = np.where(inside[..., None], unit, 0.5).reshape(-1, len(NAMES))
-    found = surfaces_at(rows, CENTRES, WEIGHTS).reshape(*inside.shape, -1)
-    kept = inside & (found + MARGINS <= 1).all(axis=-1)
-    bound = np.where(kept, THRESHOLD * np.clip(found[..., 0] + ERROR, 0, 1), np.inf)
+    found = upper_at(rows, CENTRES, WEIGHTS, ERRORS).reshape(*inside.shape, -1)
+    kept = inside & (found <= 1).all(axis=-1)
+    bound = np.where(kept, THRESHOLD * np.maximum(found[..., 0], 0), np.inf)
     return kept[()], bound[()]
 
 
@@ -122,6 +124,9 @@ CENTRES = _array(
 WEIGHTS = _array(
     {weights}
 )
+ERRORS = _array(
+    {errors}
+)
 '''
 
 
@@ -129,9 +134,10 @@ def exported(surfaces: Surfaces, **values: Any) -> str:
     """Return the source of a Python module with a function ``trusted``, which needs NumPy alone."""
     return _EXPORTED.format(
         made_by=MADE_BY,
-        source=inspect.getsource(surfaces_at),
+        source=inspect.getsource(upper_at),
         centres=_as_text(surfaces.centres),
         weights=_as_text(surfaces.weights),
+        errors=_as_text(surfaces.errors),
         **values,
     )
 

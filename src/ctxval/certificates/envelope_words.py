@@ -20,9 +20,9 @@ from ctxval.core.space import TaskSpace
 
 REGIONS = 3  # largest number of regions
 LEAST = 0.02  # least share of the tasks that a region holds and no larger one
-_SEEDS, _BEST = 200, 20  # tasks from which boxes grow, and those from which they grow again
-_CHECKED = 4096  # tasks in a box that must all lie inside the set
-_ROUNDS = 40  # times that boxes may grow again, each time to a smaller share of the way to tasks outside
+_SEEDS, _BEST = 100, 10  # tasks from which boxes grow, and those from which they grow again
+_CHECKED = 2000  # tasks in a box that must all lie inside the set
+_ROUNDS = 30  # times that boxes may grow again, each time to a smaller share of the way to tasks outside
 _DIGITS = 3
 
 
@@ -82,10 +82,13 @@ def regions_inside(
         if len(seeds) < LEAST * len(unit):
             break
         seeds = rng.permutation(seeds)[:_SEEDS]
+        speeds = np.exp(rng.normal(scale=1.5, size=(len(seeds), len(labels))))
         for k in range(_ROUNDS):
-            grown = [_grown(values[seed], outside, ends, 0.98 - 0.01 * k) for seed in seeds]
+            reach = 0.98 - 0.02 * k
+            grown = [_grown(values[s], outside, ends, v, reach) for s, v in zip(seeds, speeds, strict=True)]
             counts = np.array([(left & _within(values, box)).sum() for box in grown])
-            seeds = seeds[np.argsort(-counts, kind="stable")[:_BEST]]
+            best = np.argsort(-counts, kind="stable")[:_BEST]
+            seeds, speeds = seeds[best], speeds[best]
             box = _rounded(grown[int(counts.argmax())], ends)
             tried = _tasks_within(space, sides, box, rng)
             wrong = tried[~contains(tried)]
@@ -121,14 +124,12 @@ def _corners(space: TaskSpace, sides: Array) -> Array:
     return np.stack([low.sum(axis=1), high.sum(axis=1)])
 
 
-def _grown(start: Array, outside: Array, ends: Array, reach: float) -> Array:
+def _grown(start: Array, outside: Array, ends: Array, speeds: Array, reach: float) -> Array:
     """Return the limits ``(2, m)`` of a box around values ``(m,)`` that grows in all sides until none can grow.
 
-    At each time, all free sides are at the same share of their ranges. A side stops at a share of the way to the task
-    outside that it would meet.
+    Each side has a speed, in ranges. It stops at a share of the way to the task outside that it would meet.
     """
-    width = ends[1] - ends[0]
-    away = (outside - start) / width  # shares at which a side meets each task
+    away = (outside - start) / ((ends[1] - ends[0]) * speeds)  # times at which a side meets each task
     box = ends.copy()
     blocked = np.ones(len(outside), dtype=bool)  # tasks that no side keeps out yet
     while blocked.any():
