@@ -8,7 +8,7 @@ CAMPAIGNS ?= 120
 # Small dense algebra is faster on one thread.
 export OMP_NUM_THREADS = 1
 
-.PHONY: demo test quick thorough check docs reliability interleavings crash-states attack lowest bench bench-peers study study-refine reproduce search global-search calibrate drawn-tests parts pictures posterior-ranks servo clean
+.PHONY: demo test quick thorough check docs reliability interleavings crash-states attack lowest bench bench-peers study study-refine reproduce search global-search calibrate drawn-tests parts pictures posterior-ranks servo envelope clean
 
 demo: .venv/.installed
 	$(BIN)/ctxval run pendulum
@@ -95,6 +95,9 @@ compare-study: .venv/.test  ## how many executions comparisons need; writes docs
 servo: .venv/.test  ## campaigns on the recordings of a real servo; writes docs/servo.md, and resumes
 	$(BIN)/python benchmarks/study_servo.py
 	$(BIN)/python benchmarks/servo_page.py
+
+envelope: .venv/.test  ## which part of the true set envelopes find; writes docs/envelope.md, and resumes
+	$(BIN)/python benchmarks/study_envelope.py
 
 posterior-ranks: .venv/.test  ## are draws of the learned dynamics as uncertain as they should be? Resumes
 	$(BIN)/python benchmarks/study_posterior_ranks.py

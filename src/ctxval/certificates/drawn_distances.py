@@ -48,7 +48,9 @@ class DrawnDistances(ShortRepr):
         return np.where(self.known, self.draws, 0.0)
 
     def factor(self, threshold: float, confidence: float) -> float:
-        """Return k: the order statistic of the largest standardised excesses of the draws; at least 0.
+        """Return k: the order statistic of the largest standardised excesses of the draws; at least 1.
+
+        At least 1, because nothing is claimed to be known better than the least spread.
 
         Raises:
             CertificateError: if the confidence is too high for the number of draws.
@@ -60,7 +62,7 @@ class DrawnDistances(ShortRepr):
             raise CertificateError(
                 f"a confidence of {confidence:g} needs more than {len(excess)} posterior samples of the dynamics."
             )
-        return float(np.sort(excess)[rank - 1])
+        return max(1.0, float(np.sort(excess)[rank - 1]))
 
     def and_others(self, others: DrawnDistances) -> DrawnDistances:
         """Return these tasks together with others on the same draws."""

@@ -186,8 +186,8 @@ class Envelope(ShortRepr):
             return np.where(same, self._bounds[rows], np.inf)
         if self._surfaces is None:
             return np.full(unit.shape[:-1], np.inf)
-        found = self._surfaces(unit)
-        return np.where((found <= 1).all(axis=-1), self.threshold * np.maximum(found[..., 0], 0), np.inf)
+        upper = self._surfaces(unit)
+        return np.where((upper <= 1).all(axis=-1), self.threshold * np.maximum(upper[..., 0], 0), np.inf)
 
     @property
     def words(self) -> str:

@@ -32,9 +32,9 @@ def upper_at(points: Array, centres: Array, weights: Array, errors: Array) -> Ar
         squares = (some**2).sum(axis=1)[:, None] + (centres**2).sum(axis=1) - 2 * some @ centres.T
         squares = np.maximum(squares, 0)
         tail = np.concatenate([np.ones((len(some), 1)), some], axis=1)
-        found = np.concatenate([squares * np.sqrt(squares), tail], axis=1) @ weights
+        smooth = np.concatenate([squares * np.sqrt(squares), tail], axis=1) @ weights
         near = np.argpartition(squares, nearest - 1, axis=1)[:, :nearest]
-        blocks.append(found + errors[near].max(axis=1))
+        blocks.append(smooth + errors[near].max(axis=1))
     return np.concatenate(blocks)
 
 
@@ -72,8 +72,8 @@ class Surfaces:
 
     def __call__(self, points: Array) -> Array:
         """Return the upper bounds ``(..., c)`` at points ``(..., d)``."""
-        found = upper_at(points.reshape(-1, points.shape[-1]), self.centres, self.weights, self.errors)
-        return np.asarray(found.reshape(*points.shape[:-1], self.weights.shape[1]))
+        upper = upper_at(points.reshape(-1, points.shape[-1]), self.centres, self.weights, self.errors)
+        return np.asarray(upper.reshape(*points.shape[:-1], self.weights.shape[1]))
 
 
 _EXPORTED = '''# {made_by}. This file needs NumPy alone.
@@ -112,9 +112,9 @@ def trusted(task):
     unit = (task - LOW) / (HIGH - LOW)
     inside = ((unit >= 0) & (unit <= 1)).all(axis=-1)
     rows = np.where(inside[..., None], unit, 0.5).reshape(-1, len(NAMES))
-    found = upper_at(rows, CENTRES, WEIGHTS, ERRORS).reshape(*inside.shape, -1)
-    kept = inside & (found <= 1).all(axis=-1)
-    bound = np.where(kept, THRESHOLD * np.maximum(found[..., 0], 0), np.inf)
+    upper = upper_at(rows, CENTRES, WEIGHTS, ERRORS).reshape(*inside.shape, -1)
+    kept = inside & (upper <= 1).all(axis=-1)
+    bound = np.where(kept, THRESHOLD * np.maximum(upper[..., 0], 0), np.inf)
     return kept[()], bound[()]
 
 

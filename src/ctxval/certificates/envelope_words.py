@@ -76,7 +76,7 @@ def regions_inside(
     rng = np.random.default_rng(0)
     values = space.from_unit(unit) @ sides.T
     ends = _corners(space, sides)
-    outside, left, found = values[~inside], inside.copy(), []
+    outside, left, regions = values[~inside], inside.copy(), []
     for _ in range(REGIONS):
         seeds = np.flatnonzero(left)
         if len(seeds) < LEAST * len(unit):
@@ -100,9 +100,9 @@ def regions_inside(
         held = _within(values, box)
         if (held & left).sum() < LEAST * len(unit):
             break
-        found.append(Region(_limits(labels, box, ends), float(held.mean())))
+        regions.append(Region(_limits(labels, box, ends), float(held.mean())))
         left &= ~held
-    return tuple(sorted(found, key=lambda region: -region.share))
+    return tuple(sorted(regions, key=lambda region: -region.share))
 
 
 def _sides(space: TaskSpace) -> tuple[list[str], Array]:

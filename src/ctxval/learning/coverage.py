@@ -105,7 +105,7 @@ def beyond_records(posterior: DynamicsPosterior, of_pool: Sequence[Loops], loops
     """
     width = _widths(_visited(posterior, of_pool))
     recorded = posterior.data.pairs / width
-    return [_beyond(recorded, _visited(posterior, [one]) / width).max(axis=(1, 2)) for one in loops]
+    return [_beyond(recorded, _visited(posterior, [each]) / width).max(axis=(1, 2)) for each in loops]
 
 
 def _widths(visited: Array) -> Array:
