@@ -29,7 +29,7 @@ from study_auto import RESULTS
 
 STORED = JsonLines(RESULTS / "envelope.jsonl", ("system", "seed", "rule"))
 PAGE = Path(__file__).parents[1] / "docs" / "envelope.md"
-RULE = 2  # the version of the method; 1 had one margin for all tasks, and was seen on four reported campaigns
+RULE = 3  # the version of the method; 1 had one margin for all tasks, and 2 did not check its interpolation
 BUDGET, KEPT, CONFIDENCE = 15, 0.7, 0.95
 TASKS, NOISY_TASKS, REPEATS = 4000, 1000, 60
 
@@ -89,7 +89,8 @@ TEXT = """# The envelope, measured
 `make envelope` makes this page. {count} campaigns of at most {budget} executions ran with `envelope=True` on {systems}
 systems that are reported and were not tuned on. (Four campaigns of an earlier version, on reactor, heated-rooms,
 boat-in-current and ball-on-beam, showed that its interpolation lost much in five parameters. It was replaced by one
-that was chosen on development systems.) Of each system, 70 % of the tasks keep the threshold. "Found" is the
+that was chosen on development systems, and which further tasks check since a system with short waves was made to
+mislead it.) Of each system, 70 % of the tasks keep the threshold. "Found" is the
 share of these tasks that the envelope trusts; "false" is the share of all tasks that it trusts although their true
 distance is larger. True sets are known at {tasks} random tasks, of noisy systems at {noisy_tasks} tasks by {repeats}
 executions each. [How to use an envelope](how-to/envelope.md) says what it is.

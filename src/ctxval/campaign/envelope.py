@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -37,6 +38,7 @@ from ctxval.learning import LearnedDynamics
 _BOUNDARY = 512  # tasks next to the boundary at which closed loops are run, beside those of the pool
 _CANDIDATES = 8192  # tasks among which these are chosen
 _NOISY, _NOISY_BOUNDARY = 192, 64  # the same numbers for the pool and the boundary if each draw has sequences of noise
+_CHECKS, _NOISY_CHECKS = 256, 64  # further tasks that check the interpolation between these
 _SCREENED = 256  # tasks of the pool among which the next one is chosen
 _SPREADS = 3.0  # spreads above the mean within which a task is uncertain
 _SETTLED = 0.03  # share of the tasks predicted below the threshold that may be uncertain or uncovered at the end
@@ -84,12 +86,22 @@ class EnvelopeSearch:
             learned, evidence = known
             if (doubt := doubt_of_envelope(evidence, self._threshold)) is not None:
                 return withdrawn(space, self._threshold, confidence, doubt)
+            executed = [(trial.unit_point, float(trial.distance or 0.0)) for trial in trials]
+            # Each further task of a planner without batches costs a design of its own.
+            checks = (_CHECKS if evidence.quantile is None else _NOISY_CHECKS) if learned.study.planner.batched else 0
             try:
-                drawn = self._drawn(learned, evidence)
+                return envelope_of(
+                    space,
+                    self._drawn(learned, evidence),
+                    evidence,
+                    executed,
+                    self._threshold,
+                    confidence,
+                    partial(self._at, learned) if checks else None,
+                    checks,
+                )
             except Exception as error:  # users' parts, at states that no execution has reached
                 return withdrawn(space, self._threshold, confidence, reason_of(error))
-        executed = [(trial.unit_point, float(trial.distance or 0.0)) for trial in trials]
-        return envelope_of(space, drawn, evidence, executed, self._threshold, confidence)
 
     def _known(self, trials: Sequence[Trial]) -> tuple[LearnedDynamics, DynamicsEvidence] | None:
         """Return what the executions teach, and what they say of the predictions."""

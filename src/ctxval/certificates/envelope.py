@@ -12,12 +12,13 @@ the records, or if it was executed with a larger distance. Without tests the env
 is, and if the learned dynamics do not explain the executions.
 
 Between these tasks, ``mean + k spread`` is interpolated (:mod:`ctxval.certificates.envelope_surface`). The largest
-error of the nearest tasks, if each of them is interpolated from all others, is added.
+error of the nearest tasks, if each of them is interpolated from all others, is added. Further tasks of the set check
+this: errors are multiplied until hardly any of these tasks has ``mean + k spread`` above the threshold.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -311,11 +312,15 @@ def envelope_of(
     executed: Sequence[tuple[Array, float]],
     threshold: float,
     confidence: float,
+    evaluate: Callable[[Array], DrawnDistances] | None = None,
+    checks: int = 0,
 ) -> Envelope:
     """Return the envelope from drawn distances and evidence of the same executions, which nothing withdraws.
 
     Args:
         executed: points of the unit cube ``(d,)`` with their distances.
+        evaluate: returns the distances of further tasks on the same draws; None if the interpolation is not checked.
+        checks: the number of these tasks.
     """
     factor, raised_by = _raised(drawn, evidence, threshold, confidence)
     envelope = Envelope(
@@ -335,6 +340,12 @@ def envelope_of(
         envelope = _of_suite(envelope, space, drawn, most_beyond(evidence), executed)
     else:
         surfaces = _interpolated(drawn, evidence, threshold, factor, executed)
+        tasks = space.unit_draws(COUNTED, np.random.default_rng(2))
+        tasks = tasks[(surfaces(tasks) <= 1).all(axis=1)][:checks]
+        if evaluate is not None and len(tasks):
+            checked = evaluate(tasks)
+            outside = (checked.upper(factor, threshold) > 1) | (checked.beyond > most_beyond(evidence))
+            surfaces = surfaces.without(tasks[outside], len(tasks))
         envelope = replace(envelope, margin=float(np.median(surfaces.errors[:, 0])), _surfaces=surfaces)
         tasks = space.unit_draws(COUNTED, np.random.default_rng(0))
         inside = np.isfinite(envelope.bound_at(tasks))

@@ -10,7 +10,7 @@ from __future__ import annotations
 import base64
 import inspect
 import io
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -20,6 +20,8 @@ from ctxval._util.arrays import Array
 from ctxval._util.files import MADE_BY
 
 ENOUGH = 1.2  # multiple of the limit up to which an error of what exceeds it matters
+FALSE = 0.005  # share of the checked points that may be below the limit falsely
+_MULTIPLES = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0)  # of the errors
 _NUGGET = 1e-9  # added to the matrix, so that two tasks that are nearly the same do not make it singular
 
 
@@ -46,7 +48,8 @@ class Surfaces:
         centres: the tasks at which the numbers are known, shape ``(K, d)``.
         weights: shape ``(K + 1 + d, c)``.
         left_out: what each number would be if its task were left out, shape ``(K, c)``.
-        errors: by how much that is too small, shape ``(K, c)``; the largest of the nearest tasks is the local error.
+        errors: by how much that is wrong, shape ``(K, c)``; the largest of the nearest tasks is the local error. Its
+            sign does not count: what is too large at a task is too small between others.
     """
 
     centres: Array
@@ -68,7 +71,21 @@ class Surfaces:
         inverse = np.linalg.inv(matrix)
         weights = inverse[:, :K] @ values
         left_out = values - weights[:K] / np.diag(inverse)[:K, None]
-        return cls(points, weights, left_out, np.maximum(np.minimum(values, ENOUGH) - left_out, 0.0))
+        errors = np.abs(np.minimum(values, ENOUGH) - np.minimum(left_out, ENOUGH))
+        return cls(points, weights, left_out, errors)
+
+    def without(self, outside: Array, checked: int) -> Surfaces:
+        """Return these surfaces with larger errors, so that hardly any point known to be above its limit is below it.
+
+        Args:
+            outside: the points ``(n, d)`` above a limit, of all that were checked.
+            checked: the number of points that were checked, all of them below the limits by these surfaces.
+        """
+        for multiple in _MULTIPLES:
+            raised = replace(self, errors=multiple * self.errors)
+            if (raised(outside) <= 1).all(axis=-1).sum() <= FALSE * checked:
+                break
+        return raised
 
     def __call__(self, points: Array) -> Array:
         """Return the upper bounds ``(..., c)`` at points ``(..., d)``."""
