@@ -99,6 +99,7 @@ class EnvelopeSearch:
                     confidence,
                     partial(self._at, learned) if checks else None,
                     checks,
+                    self.interval.recorder.validation.labels.units,
                 )
             except Exception as error:  # users' parts, at states that no execution has reached
                 return withdrawn(space, self._threshold, confidence, reason_of(error))

@@ -141,6 +141,7 @@ class Envelope(ShortRepr):
         quantile: the share of the executions of a task whose distances are below tau; None if the system is not noisy.
         assumptions: what it assumes.
         doubt: why it is withdrawn; then no task is trusted.
+        units: the units of the distance.
     """
 
     space: TaskSpace
@@ -159,6 +160,7 @@ class Envelope(ShortRepr):
     quantile: float | None = None
     assumptions: tuple[str, ...] = ()
     doubt: str | None = None
+    units: str = ""
     _surfaces: Surfaces | None = None
     _bounds: Array | None = None
 
@@ -207,6 +209,7 @@ class Envelope(ShortRepr):
         return {
             "threshold": self.threshold,
             "confidence": self.confidence,
+            "units": self.units,
             "statement": self.statement,
             "words": self.words,
             "share": self.share,
@@ -314,6 +317,7 @@ def envelope_of(
     confidence: float,
     evaluate: Callable[[Array], DrawnDistances] | None = None,
     checks: int = 0,
+    units: str = "",
 ) -> Envelope:
     """Return the envelope from drawn distances and evidence of the same executions, which nothing withdraws.
 
@@ -321,6 +325,7 @@ def envelope_of(
         executed: points of the unit cube ``(d,)`` with their distances.
         evaluate: returns the distances of further tasks on the same draws; None if the interpolation is not checked.
         checks: the number of these tasks.
+        units: the units of the distance.
     """
     factor, raised_by = _raised(drawn, evidence, threshold, confidence)
     envelope = Envelope(
@@ -335,6 +340,7 @@ def envelope_of(
         tests=sum(each.stored and each.origin in DRAWN for each in evidence.predictions),
         quantile=evidence.quantile,
         assumptions=dynamics_assumptions(evidence),
+        units=units,
     )
     if isinstance(space, TaskSuite):
         envelope = _of_suite(envelope, space, drawn, most_beyond(evidence), executed)
@@ -375,7 +381,7 @@ def _of_suite(
 
 def _statement(envelope: Envelope) -> str:
     """Return what an envelope says."""
-    limit, share = at_most(envelope.threshold), 100 * envelope.share
+    limit, share = f"{at_most(envelope.threshold)} {envelope.units}".rstrip(), 100 * envelope.share
     if not envelope.share:
         return f"With {percent(envelope.confidence)} confidence, d stays below {limit} on no task that can be named."
     what = "d" if envelope.quantile is None else f"the {envelope.quantile:g} quantile of d"

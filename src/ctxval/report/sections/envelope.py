@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from markupsafe import Markup
 
-from ctxval._util.arrays import Array
+from ctxval._util.arrays import Array, Mask
 from ctxval.certificates.envelope import Envelope
 from ctxval.report.charts import Axis, Chart
 from ctxval.report.context import ReportContext
@@ -34,16 +34,19 @@ def _picture(context: ReportContext, known: Envelope) -> Chart:
         unit = np.linspace(0, 1, _CURVE)[:, None]
         points, bounds = space.from_unit(unit)[:, 0], known.bound_at(unit)
         axes = Axis(space.labels[0], float(space.low[0]), float(space.high[0])), _axis_of(context, known, bounds)
-        chart = Chart("Bound on the distance of trusted tasks", *axes)
+        chart = Chart("Trusted tasks, and a bound on their distance", *axes)
+        trusted = np.isfinite(bounds)
+        for run in _runs(trusted):
+            chart.band(points[run], np.zeros_like(points[run]), bounds[run], "trusted")
         chart.limit(known.threshold, "threshold", "threshold")
-        chart.line(points, np.where(np.isfinite(bounds), bounds, np.nan), "bound", "bound where the model is trusted")
+        chart.line(points, np.where(trusted, bounds, np.nan), "bound", "bound on the distance there")
         return chart.marks(context.coordinates(context.completed)[:, 0], context.distances, "sample", "executed")
     i, j, centre = _shown(context, known)
     side = (np.arange(_GRID) + 0.5) / _GRID
     unit = np.broadcast_to(centre, (_GRID, _GRID, space.dimension)).copy()
     unit[..., i], unit[..., j] = np.meshgrid(side, side, indexing="xy")
     trusted = np.isfinite(known.bound_at(unit))
-    title = "Trusted tasks (hatched)"
+    title = "Trusted tasks (shaded)"
     if space.dimension > 2:
         values = space.from_unit(centre)
         others = [k for k in range(space.dimension) if k not in (i, j)]
@@ -52,10 +55,10 @@ def _picture(context: ReportContext, known: Envelope) -> Chart:
     x, y = (Axis(space.labels[k], float(space.low[k]), float(space.high[k])) for k in (i, j))
     chart = Chart(title, x, y, height=330)
     low, width = space.low[[i, j]], (space.high - space.low)[[i, j]] / _GRID
-    cells = np.argwhere(trusted)[:, ::-1]  # columns before rows
-    corners = low + cells * width
-    # A line through each trusted cell: hatching, which survives grey print.
-    chart.edges(np.stack([corners, corners + width], axis=1), "trusted")
+    for row in range(_GRID):
+        bottom, top = low[1] + width[1] * np.array([row, row + 1])
+        for run in _runs(trusted[row]):
+            chart.band(low[0] + width[0] * np.array([run.start, run.stop]), [bottom] * 2, [top] * 2, "trusted")
     if space.dimension == 2:
         points = context.coordinates(context.completed)
         above = context.distances > known.threshold
@@ -63,6 +66,12 @@ def _picture(context: ReportContext, known: Envelope) -> Chart:
             if chosen.any():
                 chart.marks(points[chosen, 0], points[chosen, 1], kind, label)  # type: ignore[arg-type]
     return chart
+
+
+def _runs(mask: Mask) -> list[slice]:
+    """Return the runs of trusted points."""
+    ends = np.flatnonzero(np.diff(mask, prepend=False, append=False)).tolist()
+    return [slice(*pair) for pair in zip(ends[::2], ends[1::2], strict=True)]
 
 
 def _axis_of(context: ReportContext, known: Envelope, bounds: Array) -> Axis:
