@@ -182,3 +182,19 @@ def test_of_a_suite_it_is_a_list_and_executed_tasks_are_facts() -> None:
     assert found.trusted({"task": "b"})
     assert not found.trusted({"task": "a"})
     assert found.bound({"task": "d"}) == 0.55
+
+
+@pytest.mark.slow
+def test_further_tasks_check_what_is_interpolated() -> None:
+    def waves(points: np.ndarray) -> DrawnDistances:
+        heights = 0.4 + 0.3 * np.sin(25 * points[:, 0]) * np.sin(25 * points[:, 1])
+        return DrawnDistances(points, np.tile(heights, (40, 1)), np.zeros(len(points)))
+
+    others = np.random.default_rng(8).random((3000, 2))
+    false = []
+    for evaluate in (None, waves):
+        known = envelope_of(SPACE, waves(POINTS), evidence_of(), [], 0.6, 0.95, evaluate, 200, "m")
+        assert "stays below 0.6 m on all tasks" in known.statement
+        false.append((np.isfinite(known.bound_at(others)) & (waves(others).mean > 0.6)).mean())
+    assert false[0] > 0.01
+    assert false[1] < 0.5 * false[0]

@@ -92,11 +92,11 @@ def run(
         who = "Only experiments with a `truth` function have it, such as the cases of the paper"
         raise InputError(f"the true maximum of {experiment.name!r} is not known. {who}.")
     limit, units = limit_of(experiment, settings), experiment.units
+    if envelope and limit is None:
+        raise InputError("--envelope needs --threshold: it is the largest acceptable distance.")
     path = settings.store_path(experiment.name)
     campaign = settings.campaign(experiment, path, accept_change=accept_change)
     total = budget_of(experiment, settings)
-    if envelope and limit is None:
-        raise InputError("--envelope needs --threshold: it is the largest acceptable distance.")
     if limit is not None:
         certificate.kind.require_usable(certificate.confidence, total)  # before executions are paid for
     parts = experiment.validation

@@ -82,7 +82,7 @@ def _shown(context: ReportContext, known: Envelope) -> tuple[int, int, Array]:
     """Return the two parameters of a picture, and a trusted task whose other parameters it shows."""
     space = context.space
     limited = [] if not known.regions else [space.labels.index(x) for x in known.regions[0].limits if x in space.labels]
-    i, j, *_ = sorted({*limited[:2]} or {0}) + [k for k in range(space.dimension) if k not in limited[:2]]
+    i, j = sorted([*limited, *(k for k in range(space.dimension) if k not in limited)][:2])
     tasks = np.random.default_rng(0).random((1000, space.dimension))
     bounds = known.bound_at(tasks)
-    return min(i, j), max(i, j), np.asarray(tasks[bounds.argmin()])
+    return i, j, np.asarray(tasks[bounds.argmin()])
