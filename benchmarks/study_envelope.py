@@ -95,9 +95,9 @@ share of these tasks that the envelope trusts; "false" is the share of all tasks
 distance is larger. True sets are known at {tasks} random tasks, of noisy systems at {noisy_tasks} tasks by {repeats}
 executions each. [How to use an envelope](how-to/envelope.md) says what it is.
 
-**The median share found is {found:.0f} % (the goal is 80 %). In {above} of {count} campaigns, the falsely included
-volume is above 1 % ({above_share:.0f} %; the goal is at most 5 %); the largest is {largest:.1f} %. In {withdrawn}
-campaigns no envelope was stated.**
+**The median share found is {found:.0f} %; it is at least 80 % on {enough} of {systems} systems (the goal is 80 % on 8, of
+which 2 have contacts and 2 noise). In {above} of {count} campaigns, the falsely included volume is above 1 % (the goal
+is at most 5 % of 200 campaigns); the largest is {largest:.1f} %. In {withdrawn} campaigns no envelope was stated.**
 
 {table}
 
@@ -118,12 +118,14 @@ def write_page(page: Path = PAGE) -> None:
         "| system | parameters | campaigns | executions | found | false | false, at most | words | CPU s |",
         "|---" * 9 + "|",
     ]
+    medians = []
     for system in SYSTEMS:
         lines = [line for line in results if line["system"] == system]
         if not lines:
             continue
         kind = " (contact)" if system in CONTACTS else ""
         middle = {name: float(np.median([line[name] for line in lines])) for name in ("found", "in_words", "seconds")}
+        medians.append(middle["found"])
         executions = ", ".join(str(line["executions"]) for line in lines)
         worst = max(lines, key=lambda line: line["false"])
         at_most = f"{worst['worst_false']:.2f}" if worst["false"] else "-"
@@ -141,7 +143,7 @@ def write_page(page: Path = PAGE) -> None:
         repeats=REPEATS,
         found=100 * np.median([line["found"] for line in results]),
         above=int((false > 0.01).sum()),
-        above_share=100 * (false > 0.01).mean(),
+        enough=sum(median >= 0.8 for median in medians),
         largest=100 * false.max(),
         withdrawn=len(reasons),
         table="\n".join(rows),
