@@ -97,7 +97,7 @@ executions each. [How to use an envelope](how-to/envelope.md) says what it is.
 
 **The median share found is {found:.0f} %; it is at least 80 % on {enough} of {systems} systems (the goal is 80 % on 8,
 of which 2 have contacts and 2 noise). In {above} of {count} campaigns, the falsely included volume is above 1 % (the
-goal is at most 5 % of 200 campaigns); the largest is {largest:.1f} %. In {withdrawn} campaigns no envelope was stated.**
+goal is at most 5 % of 200 campaigns); the largest is {largest:.1f} %. {withdrawn} campaigns stated no envelope.**
 
 {table}
 
