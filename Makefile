@@ -8,7 +8,7 @@ CAMPAIGNS ?= 120
 # Small dense algebra is faster on one thread.
 export OMP_NUM_THREADS = 1
 
-.PHONY: demo test quick thorough check docs reliability interleavings crash-states attack lowest bench bench-peers study study-refine reproduce search global-search calibrate drawn-tests parts pictures posterior-ranks servo watch clean
+.PHONY: demo test quick thorough check docs reliability interleavings crash-states attack lowest bench bench-peers study study-refine reproduce search global-search calibrate drawn-tests parts pictures posterior-ranks servo watch envelope clean
 
 demo: .venv/.installed
 	$(BIN)/ctxval run pendulum
@@ -100,6 +100,9 @@ watch: .venv/.test  ## does a watch notice that a system has changed? Writes doc
 	$(BIN)/python benchmarks/study_watch.py development --tasks 300
 	$(BIN)/python benchmarks/study_watch.py reporting --tasks 300
 	$(BIN)/python benchmarks/watch_page.py
+
+envelope: .venv/.test  ## which part of the true set envelopes find; writes docs/envelope.md, and resumes
+	$(BIN)/python benchmarks/study_envelope.py
 
 posterior-ranks: .venv/.test  ## are draws of the learned dynamics as uncertain as they should be? Resumes
 	$(BIN)/python benchmarks/study_posterior_ranks.py

@@ -14,6 +14,7 @@ from ctxval._util.progress import stage
 from ctxval._util.progress_display import progress_shown
 from ctxval.campaign import display
 from ctxval.campaign.choices import Choice, Execution, OpenTrial
+from ctxval.campaign.envelope import EnvelopeSearch
 from ctxval.campaign.execution import RetryPolicy, Schedule, execute_schedule
 from ctxval.campaign.executors import Executor, worker_pool
 from ctxval.campaign.identity import description_of, identify, search_of
@@ -24,6 +25,7 @@ from ctxval.campaign.storage.store import Store
 from ctxval.campaign.trials import TrialRecorder
 from ctxval.campaign.watching import FALSE_ALARMS, Watch
 from ctxval.certificates import RESOLUTION, Certificate, CertificateOptions, Provenance, Verdict, assess, judge
+from ctxval.certificates.envelope import Envelope
 from ctxval.certificates.expiry import WatchState
 from ctxval.certificates.options import CONFIDENCE, WITHIN
 from ctxval.core.distance import Distance
@@ -150,6 +152,7 @@ class Campaign:
         on_trial: Callable[[Trial], None] | None = None,
         *,
         explore: bool | None = None,
+        envelope: bool = False,
         within: PositiveFloat = WITHIN,
         confidence: float = CONFIDENCE,
         stochastic: bool = False,
@@ -182,6 +185,8 @@ class Campaign:
             on_trial: called with each trial that has ended.
             explore: whether the search alone chooses the tasks, and the whole budget is spent; None if this holds
                 unless there is a threshold or the search is ``auto``.
+            envelope: whether to go on after the model is falsified, with executions that enlarge the set of tasks on
+                which the distance stays below the threshold; see :meth:`envelope`.
             within: without a threshold, the share by which the bound may exceed the largest executed distance at the
                 end.
             confidence, stochastic, resolution, certificate: as in :meth:`verdict`; unless the campaign explores, the
@@ -209,12 +214,20 @@ class Campaign:
         if explore is None:
             explore = threshold is None and not isinstance(self.search, Auto)
         decides = None if explore else IntervalSearch(self.recorder, options, budget, threshold, within)
+        enlarges: EnvelopeSearch | None = None
+        if envelope:
+            if decides is None or threshold is None:
+                raise InputError("an envelope needs a threshold, and a campaign that does not explore.")
+            enlarges = EnvelopeSearch(decides)
         by_search = Choice(planned_draws=budget if until is None else 0)
 
         def rule() -> Choice | None:
             if not self.recorder.has_tasks or (until is not None and until(self)):
                 return None
-            return by_search if decides is None else decides.choose()
+            if decides is None:
+                return by_search
+            choice = decides.choose()
+            return enlarges.choose() if choice is None and enlarges is not None and decides.is_falsified else choice
 
         pool = worker_pool(self.validation.system, workers=workers, executor=executor, timeout=timeout)
         if retry_failures and pool is None:
@@ -536,6 +549,35 @@ class Campaign:
             raise InputError(f"false_alarms must be less than 1, such as 0.001, got {false_alarms:g}.")
         with progress_shown(progress):
             return Watch(self, threshold, false_alarms, state)
+
+    @checked
+    def envelope(
+        self,
+        threshold: PositiveFloat,
+        confidence: float = CONFIDENCE,
+        *,
+        certificate: CertificateOptions | None = None,
+        progress: bool | None = None,
+    ) -> Envelope:
+        """Return the set of tasks on which d stays below a threshold, with a confidence for all of them at once.
+
+        It follows from the learned dynamics, and says why it is not stated if these do not suffice: it needs the tests
+        that a validation needs. ``run(..., envelope=True)`` executes what is missing.
+
+        Args:
+            threshold: tau, in the units of the distance.
+            confidence: the confidence that d stays below the threshold on all tasks of the set.
+            certificate: the options ``auto`` or ``dynamics``, in place of the confidence.
+            progress: as in :meth:`run`.
+
+        Raises:
+            InputError: if the certificate is of another kind.
+            CertificateError: if the confidence needs too many posterior samples.
+        """
+        options = CertificateOptions.or_automatic(certificate, confidence, False, RESOLUTION)
+        search = EnvelopeSearch(IntervalSearch(self.recorder, options, self.executions + 1, threshold, keeps=False))
+        with progress_shown(progress):
+            return search.envelope()
 
     def surrogate(self) -> Surrogate:
         """Return the Gaussian process of the distance over the task space, for every search, from two distances on."""

@@ -117,7 +117,7 @@ class IntervalSearch:
         if self.best > self.limit:
             if (repeated := self._against_noise()) is not None:
                 return repeated
-            if self._is_falsified:
+            if self.is_falsified:
                 return None
         if isinstance(self.options.kind, AnytimeAudit):
             return self._by_draws(self.options.kind)
@@ -148,7 +148,7 @@ class IntervalSearch:
         return self._by_evidence(evidence)
 
     @property
-    def _is_falsified(self) -> bool:
+    def is_falsified(self) -> bool:
         """Whether the executed distances falsify the limit; of a noisy system, one above it may not suffice."""
         kind, confidence = self.options.kind, self.options.confidence
         known = Quantities(space=self.recorder.validation.space)
@@ -187,7 +187,7 @@ class IntervalSearch:
         bound = self._bound(evidence)
         missing = only_tests_missing(evidence, best, bound) or only_a_failed_test(evidence, best, bound, limit)
         if max(bound, evidence.highest) <= limit and missing:
-            return self._test()
+            return self.test()
         learned = self.recorder.dynamics.learned(trials)
         steady = Steadiness(self.recorder.dynamics.planner, None if learned is None else learned.expected)
         point = next_task(evidence, self._points(self._ended), best, limit, confidence, steady, self._near)
@@ -270,7 +270,7 @@ class IntervalSearch:
         predictions = self.recorder.dynamics.checked(trials)
         if not predictions or not held(predictions[-1], self.best):
             return None
-        return self._test() if missing_tests(predictions, self.tests) else None
+        return self.test() if missing_tests(predictions, self.tests) else None
 
     def _beside_a_failed_test(self, evidence: DynamicsEvidence) -> Array | None:
         """Return a task where a test that failed may be worst; None if there is no such test, or all are executed.
@@ -301,7 +301,7 @@ class IntervalSearch:
         """The largest change of each coordinate to a task that is no new one."""
         return NEAR if self._suite is None else SAME
 
-    def _test(self) -> Choice:
+    def test(self) -> Choice:
         """Return the next task that tests predictions where nobody chose to look; see ``prediction_tests``."""
         trials = self.recorder.trials
         # A hypercube that was begun is completed, because what a part of it shows must not decide that it is left.
@@ -330,7 +330,7 @@ class IntervalSearch:
         if not now.decided:
             return Choice(now.next_point, "covering", planned_draws=0)
         missing = isinstance(kind, Automatic) and kind.missing_tests(Sample.of(self._ended))
-        return self._test() if missing else None
+        return self.test() if missing else None
 
 
 def is_decisive(options: CertificateOptions) -> bool:

@@ -68,6 +68,16 @@ def uncovered(evidence: DynamicsEvidence) -> str | None:
     return next(_uncovered(evidence), None)
 
 
+def unlearned(evidence: DynamicsEvidence, bound: float) -> str | None:
+    """Return that too little is known of the dynamics; None if enough is."""
+    return next(_unlearned(evidence, bound), None)
+
+
+def untried_parameter(evidence: DynamicsEvidence) -> str | None:
+    """Return that values of a parameter which the loops of M do not depend on were not tried; None if they were."""
+    return next(_untried(evidence), None)
+
+
 def untested(evidence: DynamicsEvidence, best: float, bound: float) -> str | None:
     """Return that the bound is not tested where distances are large; None if it is."""
     # Executions are chosen for predictions that hold, not for a bound that their errors raise.
@@ -251,7 +261,7 @@ def _unlearned(evidence: DynamicsEvidence, bound: float) -> Iterator[str]:
 
 def _uncovered(evidence: DynamicsEvidence) -> Iterator[str]:
     """Yield what the records and executions do not cover."""
-    coverage, pair, untried = evidence.coverage, evidence.coverage.pair, evidence.untried
+    coverage, pair = evidence.coverage, evidence.coverage.pair
     goes_there = "`ctxval run` executes a task that goes there"
     if coverage.beyond.size > (GAP if pair is None else BEYOND if evidence.quantile is None else NOISY_BEYOND):
         yield f"predicted runs leave the recorded range of {_at(coverage.beyond)}; {goes_there}"
@@ -259,6 +269,12 @@ def _uncovered(evidence: DynamicsEvidence) -> Iterator[str]:
         yield f"predicted runs enter a gap in the records of {_at(coverage.marginal)}; {goes_there}"
     if pair is not None and pair.size > PAIR_GAP:
         yield f"predicted runs enter a gap in the joint records of {_at(pair)}; {goes_there}"
+    yield from _untried(evidence)
+
+
+def _untried(evidence: DynamicsEvidence) -> Iterator[str]:
+    """Yield that a parameter which the loops of M do not depend on was not tried."""
+    untried = evidence.untried
     if untried is not None and untried.gap > GAP:
         yield (
             f"the parameter {untried.name} hardly changes the closed loops of the model, so what it changes in the "

@@ -35,6 +35,7 @@ from ctxval.cli.base import (
 from ctxval.cli.certify import page_path
 from ctxval.cli.config.settings import Settings, read_settings
 from ctxval.cli.config.stored_settings import budget_of, limit_of
+from ctxval.cli.envelope import print_envelope
 from ctxval.cli.hand import web_server
 from ctxval.cli.options import named_values
 from ctxval.core.trajectory import Transitions
@@ -56,6 +57,7 @@ def run(
     threshold: float | None = None,
     confidence: float | None = None,
     explore: bool | None = None,
+    envelope: bool = False,
     within: float | None = None,
     tests: int | None = None,
     quantile: float | None = None,
@@ -82,6 +84,8 @@ def run(
         who = "Only experiments with a `truth` function have it, such as the cases of the paper"
         raise InputError(f"the true maximum of {experiment.name!r} is not known. {who}.")
     limit, units = limit_of(experiment, settings), experiment.units
+    if envelope and limit is None:
+        raise InputError("--envelope needs --threshold: it is the largest acceptable distance.")
     path = settings.store_path(experiment.name)
     campaign = settings.campaign(experiment, path, accept_change=accept_change)
     total = budget_of(experiment, settings)
@@ -102,6 +106,7 @@ def run(
                 limit,
                 None if shown is None else shown.take,
                 explore=settings.explores,
+                envelope=envelope,
                 within=settings.within,
                 certificate=certificate,
                 timeout=timeout,
@@ -111,6 +116,9 @@ def run(
         digest = campaign.store.digest()
         verdict = None if limit is None else campaign.verdict(limit, certificate=certificate)
         bound = None if verdict is None else verdict.certificate
+        trusted = None
+        if envelope and limit is not None:
+            trusted = campaign.envelope(limit, certificate.confidence, certificate=certificate)
         if verdict is None and not settings.explores:
             with suppress(CertificateError):
                 bound = campaign.certify(certificate=certificate)
@@ -131,6 +139,7 @@ def run(
             "units": units,
             **(dict.fromkeys(("verdict", "reason", "rests_on", "threshold")) if verdict is None else verdict.to_json()),
             "certificate": None if bound is None else bound.to_json(),
+            **({} if trusted is None else {"envelope": trusted.to_json()}),
             "expected": None if expected is None else asdict(expected),
             "store": str(path),
             "other_stores": [str(other.path) for other in other_stores(path)],
@@ -146,7 +155,7 @@ def run(
             # An earlier run may have written the same report.
             current = page.is_file() and campaign.store.computed(RUN) == {**result, "report": str(page)}
             try:
-                context = None if current else context_of_campaign(campaign, verdict, budget=total)
+                context = None if current else context_of_campaign(campaign, verdict, budget=total, envelope=trusted)
                 report["report"] = str(page if context is None else write_page(context, page))
             except Exception as error:  # it must not hide the verdict, for which executions were paid
                 err.say(f"no report: {reason_of(error)}")
@@ -156,9 +165,11 @@ def run(
             shown.end(verdict, bound, report.get("report"))
     if verdict is not None:
         print_verdict(verdict, units)
-    elif bound is not None:
+    if trusted is not None:
+        print_envelope(trusted)
+    if verdict is None and bound is not None:
         print_table({"certificate": bound.doubt or bound.statement})
-    elif report["controllers"]:  # a verdict says it
+    elif verdict is None and report["controllers"]:  # a verdict says it
         out.say(f"{report['controllers']}.", wrap=True)
     print_failures(report["failures"])
     failed = f", of which {report['failed']} failed" if report["failed"] else ""

@@ -70,10 +70,9 @@ def coverage(
 ) -> Coverage:
     """Return how well the records cover the closed loops of tasks ``(q, d)`` on the posterior mean."""
     visited, rows = _visited(posterior, loops), np.concatenate([tasks.rows for tasks in planned])
-    low, high = np.quantile(visited, [1e-3, 1 - 1e-3], axis=(0, 1))
-    width = np.maximum(high - low, 1e-9)
+    width = _widths(visited)
     recorded, scaled = posterior.data.pairs / width, visited / width
-    beyond = np.maximum(np.maximum(scaled - recorded.max(axis=0), recorded.min(axis=0) - scaled), 0.0)
+    beyond = _beyond(recorded, scaled)
     # Gaps between the records are looked for in a part of the tasks and of the steps.
     compared = _some(len(scaled), 256)
     some = scaled[compared][:, _some(scaled.shape[1], 40)]
@@ -97,6 +96,26 @@ def coverage(
         np.maximum(gaps.max(axis=(0, 1)), beyond.max(axis=(0, 1))) * width * posterior.data.scale,
         len(rows),
     )
+
+
+def beyond_records(posterior: DynamicsPosterior, of_pool: Sequence[Loops], loops: Sequence[Loops]) -> list[Array]:
+    """Return how far closed loops leave the records in any coordinate, as a share of the range of the pool's loops.
+
+    Each array has a number for each task, in the order of the loops.
+    """
+    width = _widths(_visited(posterior, of_pool))
+    recorded = posterior.data.pairs / width
+    return [_beyond(recorded, _visited(posterior, [each]) / width).max(axis=(1, 2)) for each in loops]
+
+
+def _widths(visited: Array) -> Array:
+    low, high = np.quantile(visited, [1e-3, 1 - 1e-3], axis=(0, 1))
+    return np.asarray(np.maximum(high - low, 1e-9))
+
+
+def _beyond(recorded: Array, visited: Array) -> Array:
+    """Return the excess of each coordinate over its largest record, or below its smallest one."""
+    return np.asarray(np.maximum(np.maximum(visited - recorded.max(axis=0), recorded.min(axis=0) - visited), 0.0))
 
 
 def _visited(posterior: DynamicsPosterior, loops: Sequence[Loops]) -> Array:

@@ -12,11 +12,11 @@ import numpy as np
 from ctxval._util.arrays import Array, single_threaded
 from ctxval._util.representation import ShortRepr
 from ctxval.core.trajectory import Trajectory
-from ctxval.learning.closed_loops import distances_of, loop_pairs
-from ctxval.learning.coverage import Coverage, Pocket, coverage, largest_pocket
+from ctxval.learning.closed_loops import AnyDraws, distances_of, loop_pairs
+from ctxval.learning.coverage import Coverage, Pocket, beyond_records, coverage, largest_pocket
 from ctxval.learning.dynamics_posterior import DynamicsPosterior
 from ctxval.learning.execution_prediction import ExecutionPrediction, predict_execution
-from ctxval.learning.noisy_draws import NoisyPosterior
+from ctxval.learning.noisy_draws import SETTLED, NoisyDraws, NoisyPosterior
 from ctxval.learning.tolerance import PushResponse, push_response
 from ctxval.learning.worst_case import WorstCase
 
@@ -42,6 +42,7 @@ class LearnedDynamics(ShortRepr):
     with_data: bool = True
 
     _worst_cases: dict[int, WorstCase] = field(default_factory=dict, init=False)
+    _draws: dict[tuple[int, bool], AnyDraws] = field(default_factory=dict, init=False)
 
     @functools.cached_property
     def noisy(self) -> NoisyPosterior | None:
@@ -104,6 +105,36 @@ class LearnedDynamics(ShortRepr):
     def worst_of_mean(self) -> WorstCase:
         """The largest distance over some tasks on the posterior mean alone, as if it were the only draw."""
         return self.study.search.on_mean(self.drawn_from, self._on_pool[0], self.executed, self._rng(4), globally=False)
+
+    def drawn_distances(self, points: Array, draws: int, *, settled: bool = True) -> tuple[Array, Array]:
+        """Return the distances ``(S, m)`` of tasks ``(m, d)`` on draws, and how far their loops leave the records.
+
+        The latter is the largest excess ``(m,)`` of the loop on the mean over the records in a coordinate, as a share
+        of the range of the loops of the pool; it is infinity if a task cannot be planned. The draws, at least so many,
+        are the same for all points; if the system is noisy and not ``settled``, they have fewer sequences of noise.
+        """
+        search, planner = self.study.search, self.study.planner
+        with single_threaded():
+            planned = planner.plan(points)
+            values = planner.distances(self._draws_for_all_tasks(draws, settled), planned, len(points))
+            of_pool, loops = (planner.run(self.drawn_from.silent, plans) for plans in (search.plans, planned))
+            beyond = np.full(len(points), np.inf)
+            for plan, each in zip(planned, beyond_records(self.posterior, of_pool, loops), strict=True):
+                beyond[plan.rows] = each
+        return values, beyond
+
+    def _draws_for_all_tasks(self, draws: int, settled: bool) -> AnyDraws:
+        """Return at least so many draws whose pivots lie on the loops of all tasks."""
+        functions = max(self.drawn_from.functions, -(-draws // self.drawn_from.groups))
+        key = functions, settled
+        if key not in self._draws:
+            search, rng = self.study.search, self._rng(6)
+            some = search.pool[rng.permutation(len(search.pool))[:64]]
+            drawn = self.drawn_from.draw(search.relevant(self.drawn_from, some, rng), rng, functions)
+            if settled and isinstance(drawn, NoisyDraws):
+                drawn = drawn.with_replicates(SETTLED, rng)
+            self._draws[key] = drawn
+        return self._draws[key]
 
     def worst_case_of(self, draws: int) -> WorstCase:
         """Return the largest distance over all tasks, for each of at least so many draws of the dynamics."""

@@ -238,7 +238,7 @@ class WorstCaseSearch:
         """Return the largest distances of a few draws over the elites, known tasks and random ones: a lower bound."""
         with single_threaded():
             tasks = self._shared_tasks(of_mean, known, self.settings.shared // 4, rng)
-            draws = posterior.draw(self._relevant(posterior, tasks, rng), rng, 1, _SCREENED[0])
+            draws = posterior.draw(self.relevant(posterior, tasks, rng), rng, 1, _SCREENED[0])
             values = _finite(self.planner.distances(draws, self.planner.plan(tasks), len(tasks)))
         best = values.argmax(axis=1)
         return self._worst_case(of_mean, draws, values.max(axis=1), tasks[best], values.size, 0.0)
@@ -254,7 +254,7 @@ class WorstCaseSearch:
         """Return the largest distances of so many functions for each draw of the posterior's hyperparameters."""
         with single_threaded():
             tasks = self._shared_tasks(of_mean, known, self.settings.shared, rng)
-            draws = posterior.draw(self._relevant(posterior, tasks, rng), rng, functions)
+            draws = posterior.draw(self.relevant(posterior, tasks, rng), rng, functions)
             points, maxima, loops = self._search_draws(draws, tasks, rng)
             if isinstance(draws, NoisyDraws):
                 # The search has chosen tasks with few sequences of noise, which its own maxima exaggerate.
@@ -306,7 +306,7 @@ class WorstCaseSearch:
         lost = np.divide(peak - next_to_it, peak, out=np.zeros(len(peak)), where=peak > 0)
         return float(max(lost.max(initial=0.0), 0.0))
 
-    def _relevant(self, posterior: AnyPosterior, tasks: Array, rng: np.random.Generator) -> Array:
+    def relevant(self, posterior: AnyPosterior, tasks: Array, rng: np.random.Generator) -> Array:
         """Return standardised pairs on the mean's closed loops, from which pivots are chosen; noisy draws have none."""
         if isinstance(posterior, NoisyPosterior):
             return np.empty((0, 0))

@@ -14,10 +14,12 @@ from ctxval._util.progress import stage
 from ctxval._util.representation import ShortRepr
 from ctxval.campaign.campaign import Campaign
 from ctxval.campaign.dynamics import NEAR, CampaignDynamics
+from ctxval.campaign.envelope import has_tests
 from ctxval.campaign.interval_search import with_next_task
 from ctxval.campaign.provenance import provenance_of_store
 from ctxval.campaign.storage.store import Store
 from ctxval.certificates import Certificate, CertificateOptions, Provenance, Verdict, judge
+from ctxval.certificates.envelope import Envelope
 from ctxval.core.labels import Labels, labels_of
 from ctxval.core.space import TaskSpace
 from ctxval.core.task_suite import TASK, TaskSuite
@@ -59,6 +61,7 @@ class ReportContext(ShortRepr):
         settings, description: what the store knows of the experiment; the settings make it again.
         changes: the later changes of the store.
         provenance: what a certificate knows besides the trials.
+        envelope: the tasks on which the threshold is kept; None if it was not computed.
     """
 
     name: str
@@ -75,6 +78,7 @@ class ReportContext(ShortRepr):
     description: Mapping[str, Any] = field(default_factory=dict)
     changes: tuple[Change, ...] = ()
     provenance: Provenance = field(default_factory=Provenance)
+    envelope: Envelope | None = None
 
     # Trials
 
@@ -250,10 +254,12 @@ def context_of_campaign(
     threshold: float | None = None,
     certificate: CertificateOptions | None = None,
     budget: int | None = None,
+    envelope: Envelope | None = None,
 ) -> ReportContext:
     """Return what a report of a campaign is made from.
 
-    Its verdict is ``verdict``, if that was computed before, or else that against ``threshold`` by ``certificate``.
+    Its verdict is ``verdict``, if that was computed before, or else that against ``threshold`` by ``certificate``. If
+    it is falsified and the tests of an envelope were executed, the envelope is ``envelope`` or computed.
     """
     known = campaign.provenance
     if verdict is None and threshold is not None:
@@ -261,6 +267,10 @@ def context_of_campaign(
         options = certificate or CertificateOptions()
         with stage("certifying"):
             verdict = with_next_task(judge(campaign.trials, threshold, options, known), campaign.recorder, options)
+    options = certificate or CertificateOptions()
+    falsified = verdict is not None and verdict.answer == "falsified"
+    if envelope is None and verdict is not None and falsified and has_tests(campaign.recorder, options):
+        envelope = campaign.envelope(verdict.threshold, options.confidence, certificate=options)
     return ReportContext(
         campaign.name,
         campaign.validation.space,
@@ -275,6 +285,7 @@ def context_of_campaign(
         description=campaign.store.description(),
         changes=tuple(campaign.store.history()),
         provenance=known,
+        envelope=envelope,
     )
 
 

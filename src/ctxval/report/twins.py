@@ -31,6 +31,7 @@ def to_json(context: ReportContext) -> dict[str, Any]:
             "executions": context.executions,
             "failed": [trial.number for trial in context.failed],
             "certificate": None if certificate is None else certificate.to_json(),
+            "envelope": None if context.envelope is None else context.envelope.to_json(),
             "missing": context.missing or None,
             "diagnostics": [asdict(finding) for finding in context.diagnostics],
             "insights": [asdict(finding) for finding in context.insights],
@@ -89,7 +90,7 @@ def junit(context: ReportContext) -> str:
 
 def markdown(context: ReportContext) -> str:
     """Return the report without its charts as Markdown; texts of the store cannot become markup."""
-    units, verdict = context.labels.units, context.verdict
+    units, verdict, known = context.labels.units, context.verdict, context.envelope
     answer = "No verdict: no threshold was given." if verdict is None else f"{verdict}"
     trials = context.worst_tasks()
     rows = []
@@ -118,6 +119,7 @@ def markdown(context: ReportContext) -> str:
         f"# Validation of {markdown_text(context.name) or 'campaign'}",
         f"**{markdown_text(answer)}**",
         f"{context.executions} executions, {len(context.failed)} without a distance.",
+        *([] if known is None else [markdown_text(f"{known.statement} {known.words}", UNCUT)]),
         *(block for title, lines in parts.items() for block in (f"## {title}", "\n".join(lines))),
         f"<!-- {MADE_BY} -->",
     ]

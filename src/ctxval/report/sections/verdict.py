@@ -14,6 +14,7 @@ from ctxval.report.distance_model import distance_of
 from ctxval.report.findings import WORDS, Finding
 from ctxval.report.markup import UNCUT, bullets, element, heading, joined, paragraph, percent, quantity, table, text
 from ctxval.report.sections.distances import distance_over_task, distances_in_order
+from ctxval.report.sections.envelope import envelope
 from ctxval.report.sections.repeat import command_of, path_of
 from ctxval.report.sections.trials import task_of
 
@@ -36,7 +37,7 @@ def verdict(context: ReportContext) -> Markup:
     beside = element("div", heading("What next"), paragraph(advice), block, _facts(context), *_remarks(context))
     stated = "No threshold was given." if context.verdict is None else markup.sentence(context.verdict.reason)
     head = element("div", word, paragraph(stated, class_="sentence"), class_=f"answer {answer}")
-    return joined([head, element("div", picture, beside, class_="first")])
+    return joined([head, element("div", picture, beside, class_="first"), envelope(context)])
 
 
 def _shape(answer: str) -> Markup:
@@ -71,6 +72,8 @@ def _next(context: ReportContext) -> tuple[str, str]:
         )
         if not context.settings:
             return advice, ""
+        if context.envelope is None:
+            advice += " `ctxval run --envelope` finds the tasks on which the model keeps it."
         better = "This learns a better model from the recorded executions, and validates it:"
         return f"{advice} {better}", shlex.join(["ctxval", "refine", path])
     by_hand = any(trial.told for trial in context.trials)

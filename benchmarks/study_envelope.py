@@ -1,0 +1,173 @@
+"""Which part of the tasks that keep a threshold an envelope finds within 15 executions, and what it includes falsely.
+
+The threshold is the 0.7 quantile of the true distance over the tasks, so it is below d* and 70 % of the tasks keep it.
+The true set is known at 4,000 random tasks, by executions of the true system that count as none; a noisy system is
+executed 60 times at each of 1,000 tasks, and its distance is the 0.9 quantile. The method was tuned on systems of the
+development lists alone (hanging-pendulum, two-tanks, docking-magnet, and the carts and pendulums with noise).
+
+``python benchmarks/study_envelope.py --seeds 4`` runs the campaigns that are not stored yet, and writes
+``docs/envelope.md``. With ``--seeds 0``, it only writes the page.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ctxval import Campaign, Validation
+from ctxval._util.json_lines import JsonLines
+from ctxval.core.quantiles import QUANTILE
+from dynamics_reporting import REPORTING as DYNAMICS
+from noise_reporting import PLANTS
+from strangers_reporting import REPORTING as STRANGERS
+from study_auto import RESULTS
+
+STORED = JsonLines(RESULTS / "envelope.jsonl", ("system", "seed", "rule"))
+PAGE = Path(__file__).parents[1] / "docs" / "envelope.md"
+RULE = 3  # the version of the method; 1 had one margin for all tasks, and 2 did not check its interpolation
+BUDGET, KEPT, CONFIDENCE = 15, 0.7, 0.95
+TASKS, NOISY_TASKS, REPEATS = 4000, 1000, 60
+
+SMOOTH = ("reactor", "heated-rooms", "boat-in-current", "ball-on-beam", "far-barge", "warm-bearing", "ground-effect")
+CONTACTS = ("table-top", "oblique-wall", "taut-tether")
+NOISY = {"ship, noise": ("ship", "process 0.1 %"), "tanks, noise": ("tanks", "measurement 0.5 %")}
+SYSTEMS = (*SMOOTH, *CONTACTS, *NOISY)
+
+
+def validation_of(system: str, seed: int) -> Validation:
+    """Return the validation of a system."""
+    if system in NOISY:
+        plant, imperfection = NOISY[system]
+        return PLANTS[plant](imperfection, seed).validation
+    return {**DYNAMICS, **STRANGERS}[system](seed).validation
+
+
+def study(system: str, seed: int) -> dict[str, Any]:
+    """Return what one campaign finds."""
+    validation, noisy = validation_of(system, seed), system in NOISY
+    space = validation.space
+    points = space.iid(NOISY_TASKS if noisy else TASKS, np.random.default_rng(7))
+    repeats = [validation.distances(points) for _ in range(REPEATS if noisy else 1)]
+    distances = np.quantile(repeats, QUANTILE, axis=0)
+    threshold = float(np.quantile(distances, KEPT))
+    kept = distances <= threshold
+    begun = time.process_time()
+    campaign = Campaign(validation_of(system, seed), seed=seed)
+    campaign.run(BUDGET, threshold, envelope=True, confidence=CONFIDENCE)
+    envelope = campaign.envelope(threshold, CONFIDENCE)
+    trusted = envelope.trusted(points)
+    false = trusted & ~kept
+    return {
+        "system": system,
+        "seed": seed,
+        "rule": RULE,
+        "dimension": space.dimension,
+        "threshold": threshold,
+        "answer": campaign.verdict(threshold).answer,
+        "executions": campaign.executions,
+        "tests": envelope.tests,
+        "found": float(trusted[kept].mean()),
+        "false": float(false.mean()),
+        "worst_false": float((distances[false] / threshold).max(initial=0.0)),
+        "in_words": sum(region.share for region in envelope.regions[:1]),
+        "factor": envelope.factor,
+        "raised_by": envelope.raised_by,
+        "margin": envelope.margin,
+        "doubt": envelope.doubt,
+        "words": envelope.words,
+        "seconds": round(time.process_time() - begun, 1),
+    }
+
+
+TEXT = """# The envelope, measured
+
+`make envelope` makes this page. {count} campaigns of at most {budget} executions ran with `envelope=True` on {systems}
+systems that are reported and were not tuned on. (Four campaigns of an earlier version, on reactor, heated-rooms,
+boat-in-current and ball-on-beam, showed that its interpolation lost much in five parameters. It was replaced by one
+that was chosen on development systems, and which further tasks check since a system with short waves was made to
+mislead it.) Of each system, 70 % of the tasks keep the threshold. "Found" is the
+share of these tasks that the envelope trusts; "false" is the share of all tasks that it trusts although their true
+distance is larger. True sets are known at {tasks} random tasks, of noisy systems at {noisy_tasks} tasks by {repeats}
+executions each. [How to use an envelope](how-to/envelope.md) says what it is.
+
+**The median share found is {found:.0f} %; it is at least 80 % on {enough} of {systems} systems (the goal is 80 % on 8,
+of which 2 have contacts and 2 noise). In {above} of {count} campaigns, the falsely included volume is above 1 % (the
+goal is at most 5 % of 200 campaigns); the largest is {largest:.1f} %. {withdrawn} campaigns stated no envelope.**
+
+{table}
+
+"Words" is the share of the tasks in the largest box that the envelope names. "False, at most" is the largest true
+distance of a falsely trusted task, divided by the threshold. Figures of systems are medians, except for the false ones,
+which are the largest.
+
+{reasons}
+"""
+
+
+def write_page(page: Path = PAGE) -> None:
+    """Write the page of the stored results."""
+    results = [line for line in STORED.select(rule=RULE) if line["system"] in SYSTEMS]
+    if not results:
+        return
+    rows = [
+        "| system | parameters | campaigns | executions | found | false | false, at most | words | CPU s |",
+        "|---" * 9 + "|",
+    ]
+    medians = []
+    for system in SYSTEMS:
+        lines = [line for line in results if line["system"] == system]
+        if not lines:
+            continue
+        kind = " (contact)" if system in CONTACTS else ""
+        middle = {name: float(np.median([line[name] for line in lines])) for name in ("found", "in_words", "seconds")}
+        medians.append(middle["found"])
+        executions = ", ".join(str(line["executions"]) for line in lines)
+        worst = max(lines, key=lambda line: line["false"])
+        at_most = f"{worst['worst_false']:.2f}" if worst["false"] else "-"
+        cells = [f"{system}{kind}", lines[0]["dimension"], len(lines), executions, f"{100 * middle['found']:.0f} %"]
+        cells += [f"{100 * worst['false']:.1f} %", at_most, f"{100 * middle['in_words']:.0f} %"]
+        rows.append(f"| {' | '.join(map(str, [*cells, round(middle['seconds'])]))} |")
+    false = np.array([line["false"] for line in results])
+    reasons = [f"* {line['system']}, seed {line['seed']}: {line['doubt']}." for line in results if line["doubt"]]
+    text = TEXT.format(
+        count=len(results),
+        budget=BUDGET,
+        systems=len({line["system"] for line in results}),
+        tasks=f"{TASKS:,}",
+        noisy_tasks=f"{NOISY_TASKS:,}",
+        repeats=REPEATS,
+        found=100 * np.median([line["found"] for line in results]),
+        above=int((false > 0.01).sum()),
+        enough=sum(median >= 0.8 for median in medians),
+        largest=100 * false.max(),
+        withdrawn=len(reasons),
+        table="\n".join(rows),
+        reasons="Why no envelope was stated:\n\n" + "\n".join(reasons) if reasons else "",
+    )
+    page.write_text(text.rstrip() + "\n")
+
+
+def main() -> None:
+    """Run the campaigns that are missing, and write the page."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seeds", type=int, default=4)
+    parser.add_argument("--systems", nargs="*", default=SYSTEMS)
+    given = parser.parse_args()
+    warnings.simplefilter("ignore")
+    for seed in range(given.seeds):
+        for system in given.systems:
+            if (system, seed, RULE) not in STORED:
+                result = study(system, seed)
+                STORED.append(result)
+                shown = {name: result[name] for name in ("executions", "found", "false", "factor", "doubt", "seconds")}
+                print(system, seed, shown, flush=True)
+    write_page()
+
+
+if __name__ == "__main__":
+    main()

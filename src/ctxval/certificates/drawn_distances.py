@@ -1,0 +1,77 @@
+"""The distances of some tasks on draws of the learned dynamics, and what they say of all these tasks together."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ctxval._util.arrays import Array, Mask
+from ctxval._util.representation import ShortRepr
+from ctxval.errors import CertificateError
+
+FLOOR = 0.005  # least spread, as a share of the threshold
+LARGEST = 2.0  # multiple of the threshold up to which bounds are told apart
+
+
+@dataclass(frozen=True, eq=False)
+class DrawnDistances(ShortRepr):
+    """The distances of some tasks on draws of the learned dynamics.
+
+    Attributes:
+        points: tasks, points of the unit cube ``(K, d)``.
+        draws: distances on S draws ``(S, K)``; infinity if the loop diverges, NaN if no controller can be designed.
+        beyond: how far the loop on the mean leaves the records in a coordinate, as a share of the visited range
+            ``(K,)``.
+    """
+
+    points: Array
+    draws: Array
+    beyond: Array
+
+    @property
+    def known(self) -> Mask:
+        """Which tasks have a finite distance on each draw, ``(K,)``."""
+        return np.asarray(np.isfinite(self.draws).all(axis=0))
+
+    @property
+    def mean(self) -> Array:
+        """The means over the draws ``(K,)``; infinity if a distance is not known."""
+        return np.where(self.known, self._finite.mean(axis=0), np.inf)
+
+    def spread(self, threshold: float) -> Array:
+        """Return the standard deviations over the draws ``(K,)``, at least a share of the threshold."""
+        return np.asarray(np.maximum(self._finite.std(axis=0), FLOOR * threshold))
+
+    @property
+    def _finite(self) -> Array:
+        return np.where(self.known, self.draws, 0.0)
+
+    def factor(self, threshold: float, confidence: float) -> float:
+        """Return k: the order statistic of the largest standardised excesses of the draws; at least 1.
+
+        At least 1, because nothing is claimed to be known better than the least spread.
+
+        Raises:
+            CertificateError: if the confidence is too high for the number of draws.
+        """
+        known, spread = self.known, self.spread(threshold)
+        excess = ((self.draws - self.mean)[:, known] / spread[known]).max(axis=1, initial=0.0)
+        rank = int(np.ceil((len(excess) + 1) * confidence - 1e-9))
+        if rank > len(excess):
+            raise CertificateError(
+                f"a confidence of {confidence:g} needs more than {len(excess)} posterior samples of the dynamics."
+            )
+        return max(1.0, float(np.sort(excess)[rank - 1]))
+
+    def and_others(self, others: DrawnDistances) -> DrawnDistances:
+        """Return these tasks together with others on the same draws."""
+        return DrawnDistances(
+            np.concatenate([self.points, others.points]),
+            np.concatenate([self.draws, others.draws], axis=1),
+            np.concatenate([self.beyond, others.beyond]),
+        )
+
+    def upper(self, factor: float, threshold: float) -> Array:
+        """Return mean + k spread as shares of the threshold ``(K,)``, at most ``LARGEST``."""
+        return np.asarray(np.minimum((self.mean + factor * self.spread(threshold)) / threshold, LARGEST))

@@ -1,0 +1,391 @@
+r"""The envelope: the tasks on which d stays below a threshold, with a confidence for all of them at once.
+
+Draws r_s of the learned dynamics have distances ``d_s(p)`` at some tasks, with a mean and a spread at each of them. The
+largest standardised excess of a draw is ``max_p (d_s(p) - mean(p)) / spread(p)``; its order statistic k of rank
+``ceil((S + 1) * confidence)`` holds for a draw that was left out, so for the system, at all tasks together. The
+envelope is ``{p : mean(p) + k spread(p) <= tau}``. It is the simultaneous band of a Gaussian process (French and
+Hoeting 2016; compare the excursion sets of Bolin and Lindgren 2015), with draws in closed loop in the place of values.
+
+Draws that are learned from few executions are overconfident. So k is at least the largest standardised excess of the
+executions that were predicted beforehand at drawn tasks. A task is no part of the envelope if its closed loop leaves
+the records, or if it was executed with a larger distance. Without tests the envelope is withdrawn, as the bound on d*
+is, and if the learned dynamics do not explain the executions.
+
+Between these tasks, ``mean + k spread`` is interpolated (:mod:`ctxval.certificates.envelope_surface`). The largest
+error of the nearest tasks, if each of them is interpolated from all others, is added. Further tasks of the set check
+this: errors are multiplied until hardly any of these tasks has ``mean + k spread`` above the threshold.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ctxval._util.arrays import Array, ArrayLike, as_floats, require_shape
+from ctxval._util.boxes import separated_rows
+from ctxval._util.files import write_text
+from ctxval._util.representation import ShortRepr
+from ctxval._util.texts import enumerated
+from ctxval.certificates.bounds import at_most, percent
+from ctxval.certificates.drawn_distances import FLOOR, LARGEST, DrawnDistances
+from ctxval.certificates.dynamics_diagnostics import (
+    ACCURATE,
+    BEYOND,
+    GAP,
+    NOISY_BEYOND,
+    PREDICTIONS,
+    agrees,
+    counted,
+    missing_tests,
+    tested,
+    unlearned,
+    untried_parameter,
+)
+from ctxval.certificates.dynamics_evidence import CheckedPrediction, DynamicsEvidence
+from ctxval.certificates.envelope_surface import Surfaces, exported
+from ctxval.certificates.envelope_words import Region, regions_inside
+from ctxval.certificates.prediction_tests import DRAWN
+from ctxval.certificates.sentences import dynamics_assumptions
+from ctxval.core.space import TaskSpace
+from ctxval.core.task_suite import TaskSuite
+from ctxval.errors import InputError
+
+COUNTED = 4096  # tasks of which the share in the envelope is counted
+_EXCEEDED = 1.02  # an executed distance above the threshold counts as at least this multiple of it
+_SAME = 1e-9
+_WORTH = 0.8  # share of the tasks predicted below the threshold that tests may leave in the envelope
+
+
+def rises_of(evidence: DynamicsEvidence, threshold: float) -> list[tuple[float, CheckedPrediction]]:
+    """Return the standardised excesses of predictions that count over what was predicted, with the predictions.
+
+    These are the tests that count and the last other predictions. A prediction counts only if the task or its
+    prediction is below the threshold: nothing is claimed of the others.
+    """
+    drawn = [test for test in tested(evidence.predictions, evidence.tests) if test.origin in DRAWN]
+    last = {each.trial: each for each in [*drawn, *counted(evidence, threshold)[-PREDICTIONS:]]}.values()
+    return [(_standardised(each, threshold), each) for each in last if _matters(each, threshold)]
+
+
+def _matters(prediction: CheckedPrediction, threshold: float) -> bool:
+    return min(prediction.distance, prediction.median) <= threshold
+
+
+def _standardised(prediction: CheckedPrediction, threshold: float) -> float:
+    if not np.isfinite(prediction.upper):
+        return 0.0  # it said nothing
+    spread = (prediction.upper - prediction.median) / 1.645  # the 0.95 quantile of a normal distribution
+    return prediction.excess / max(spread, 2 * FLOOR * threshold)
+
+
+def most_beyond(evidence: DynamicsEvidence) -> float:
+    """Return by how much the closed loop of a trusted task may leave the records, as a share of the visited range."""
+    if evidence.coverage.pair is None:
+        return GAP
+    return BEYOND if evidence.quantile is None else NOISY_BEYOND
+
+
+def unexplained(evidence: DynamicsEvidence, threshold: float) -> CheckedPrediction | None:
+    """Return a test whose distance what is learned by now does not have, by more than a share of the threshold."""
+    for test in evidence.predictions:
+        known = test.explained
+        if known is None or test.is_noisy or min(test.distance, known) > threshold:
+            continue
+        if not agrees(test.distance, known, threshold):
+            return test
+    return None
+
+
+def doubt_of_envelope(evidence: DynamicsEvidence, threshold: float) -> str | None:
+    """Return why no envelope can be stated, and what would help; None if one can."""
+    # Tasks that cannot be planned are no part of the envelope.
+    if (doubt := unlearned(replace(evidence, unplanned=0.0), threshold)) is not None:
+        return doubt
+    if (doubt := untried_parameter(evidence)) is not None:
+        return doubt
+    if (test := unexplained(evidence, threshold)) is not None:
+        return (
+            f"trial {test.trial} has the distance {test.distance:.4g}, and {test.explained:.4g} on the learned "
+            f"dynamics, a difference of more than {100 * ACCURATE:g} % of the threshold: the next state is no function "
+            "of what is recorded, or the dynamics depend on the task; record more states"
+        )
+    missing = missing_tests(evidence.predictions, evidence.tests)
+    if missing:
+        return (
+            f"{missing} more {'execution' if missing == 1 else 'executions'} must be predicted beforehand, at tasks "
+            "drawn over the whole task space (`ctxval run --envelope` executes them)"
+        )
+    return None
+
+
+@dataclass(frozen=True, eq=False)
+class Envelope(ShortRepr):
+    """The set of tasks on which d stays below a threshold, with a confidence for all of them at once.
+
+    Attributes:
+        space: the task space.
+        threshold, confidence: tau and the confidence.
+        statement: what it says, in one sentence.
+        share: the share of the tasks that are trusted.
+        regions: the largest boxes and half-spaces inside it, the largest first; empty for a suite.
+        tasks: the names of the trusted tasks of a suite; None if the task space is no suite.
+        factor: k, by how many spreads the mean must stay below the threshold.
+        raised_by: the trial whose excess over its prediction raised k; None if there is none.
+        margin: the median of what the interpolation adds next to evaluated tasks, as a share of the threshold.
+        evaluated: the number of tasks at which closed loops were run.
+        executions, tests: numbers of executions, and of those that were predicted beforehand at drawn tasks.
+        quantile: the share of the executions of a task whose distances are below tau; None if the system is not noisy.
+        assumptions: what it assumes.
+        doubt: why it is withdrawn; then no task is trusted.
+        units: the units of the distance.
+    """
+
+    space: TaskSpace
+    threshold: float
+    confidence: float
+    statement: str
+    share: float = 0.0
+    regions: tuple[Region, ...] = ()
+    tasks: tuple[str, ...] | None = None
+    factor: float | None = None
+    raised_by: int | None = None
+    margin: float = 0.0
+    evaluated: int = 0
+    executions: int = 0
+    tests: int = 0
+    quantile: float | None = None
+    assumptions: tuple[str, ...] = ()
+    doubt: str | None = None
+    units: str = ""
+    _surfaces: Surfaces | None = None
+    _bounds: Array | None = None
+
+    def trusted(self, task: Mapping[str, Any] | ArrayLike) -> Any:
+        """Return whether tasks are trusted: of a mapping by name a bool, of points ``(..., d)`` of the space ``(...)``.
+
+        Tasks outside of the task space are not trusted.
+        """
+        return np.isfinite(self.bound(task))
+
+    def bound(self, task: Mapping[str, Any] | ArrayLike) -> Any:
+        """Return bounds on the distances of trusted tasks, at most tau; infinity if a task is not trusted."""
+        if isinstance(task, Mapping):
+            points = self.space.point(task)
+        else:
+            points = require_shape("task", as_floats("task", task), (self.space.dimension,))
+        unit = self.space.to_unit(points)
+        inside = np.asarray(((unit >= -_SAME) & (unit <= 1 + _SAME)).all(axis=-1))
+        return np.where(inside, self.bound_at(np.clip(unit, 0, 1)), np.inf)[()]
+
+    def bound_at(self, unit: Array) -> Array:
+        """Return :meth:`bound` at points ``(..., d)`` of the unit cube."""
+        if self._bounds is not None and isinstance(self.space, TaskSuite):
+            rows = self.space.rows_at(unit)
+            same = np.abs(self.space.members[rows] - unit).max(axis=-1) <= _SAME
+            return np.where(same, self._bounds[rows], np.inf)
+        if self._surfaces is None:
+            return np.full(unit.shape[:-1], np.inf)
+        upper = self._surfaces(unit)
+        return np.where((upper <= 1).all(axis=-1), self.threshold * np.maximum(upper[..., 0], 0), np.inf)
+
+    @property
+    def words(self) -> str:
+        """The envelope in words: the largest boxes and half-spaces inside it, or the tasks of a suite."""
+        if self.doubt is not None:
+            return f"No envelope is stated: {self.doubt}."
+        if self.tasks is not None:
+            return f"Trusted: {enumerated(self.tasks, 40)}." if self.tasks else "No task is trusted."
+        if not self.regions:
+            return "No task is trusted." if not self.share else "It holds no box of more than 2 % of the tasks."
+        each = "; or ".join(f"{region.text} ({100 * region.share:.0f} % of the tasks)" for region in self.regions)
+        return f"Trusted: {each}."
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the statement and its numbers, ready for JSON."""
+        return {
+            "threshold": self.threshold,
+            "confidence": self.confidence,
+            "units": self.units,
+            "statement": self.statement,
+            "words": self.words,
+            "share": self.share,
+            "regions": [region.to_json() for region in self.regions],
+            "tasks": None if self.tasks is None else list(self.tasks),
+            "factor": self.factor,
+            "raised_by_trial": self.raised_by,
+            "margin": self.margin,
+            "evaluated": self.evaluated,
+            "executions": self.executions,
+            "tests": self.tests,
+            "quantile": self.quantile,
+            "assumptions": list(self.assumptions),
+            "doubt": self.doubt,
+        }
+
+    def save(self, path: str | Path) -> Path:
+        """Write a Python file with a function ``trusted(task) -> (bool, bound)`` that needs NumPy alone.
+
+        It is the same function as :meth:`trusted` and :meth:`bound`.
+
+        Raises:
+            InputError: if the path does not end with ``.py``, nothing is trusted, or the task space is a suite.
+        """
+        if Path(path).suffix != ".py":
+            raise InputError(f"the envelope is written to a Python file, such as envelope.py, got {str(path)!r}.")
+        if self._surfaces is None:
+            reason = "the tasks of a suite are a list" if self.tasks is not None else "no task is trusted"
+            raise InputError(f"there is no function to write: {reason}.")
+        text = exported(
+            self._surfaces,
+            title=self.statement,
+            labels=list(self.space.labels),
+            names=list(self.space.names),
+            low=self.space.low.tolist(),
+            high=self.space.high.tolist(),
+            threshold=self.threshold,
+            confidence=self.confidence,
+        )
+        return write_text(path, text)
+
+
+def withdrawn(space: TaskSpace, threshold: float, confidence: float, doubt: str) -> Envelope:
+    """Return an envelope that is not stated, for a reason."""
+    return Envelope(space, threshold, confidence, "No envelope is stated.", doubt=doubt.rstrip("."))
+
+
+def boundary_tasks(
+    drawn: DrawnDistances, evidence: DynamicsEvidence, threshold: float, confidence: float, tasks: Array, count: int
+) -> Array:
+    """Return at most so many of other tasks ``(N, d)``: those that are nearest to the boundary of the envelope."""
+    surfaces = _interpolated(drawn, evidence, threshold, _raised(drawn, evidence, threshold, confidence)[0], ())
+    near = np.argsort(np.abs(surfaces(tasks)[:, 0] - 1), kind="stable")[: 3 * count]
+    reach = 0.25 * count ** (-1 / tasks.shape[1])
+    return np.asarray(tasks[near][separated_rows(tasks[near], reach, count)])
+
+
+def _raised(
+    drawn: DrawnDistances, evidence: DynamicsEvidence, threshold: float, confidence: float
+) -> tuple[float, int | None]:
+    """Return k, at least the largest standardised excess of the predictions that count, and whose it is."""
+    factor = drawn.factor(threshold, confidence)
+    largest, which = max(rises_of(evidence, threshold), key=lambda rise: rise[0], default=(0.0, None))
+    return (factor, None) if which is None or largest <= factor else (largest, which.trial)
+
+
+def must_outlive_a_test(drawn: DrawnDistances, evidence: DynamicsEvidence, threshold: float) -> bool:
+    """Return whether a drawn test raises k by so much that the tests of another hypercube are worth while."""
+    rises = (rise for rise, test in rises_of(evidence, threshold) if test.origin in DRAWN)
+    largest = max(rises, default=0.0)
+    kept = drawn.mean + largest * drawn.spread(threshold) <= threshold
+    return bool(kept.sum() < _WORTH * (drawn.mean <= threshold).sum())
+
+
+def _interpolated(
+    drawn: DrawnDistances,
+    evidence: DynamicsEvidence,
+    threshold: float,
+    factor: float,
+    executed: Sequence[tuple[Array, float]],
+) -> Surfaces:
+    """Return the surfaces of the bounds and, if loops of trusted tasks leave the records, of by how much."""
+    bounds = drawn.upper(factor, threshold)
+    beyond = np.minimum(drawn.beyond / most_beyond(evidence), LARGEST)
+    points, values = drawn.points, np.stack([bounds, beyond], axis=1)
+    excesses = [(point, d / threshold) for point, d in executed if d > threshold and evidence.quantile is None]
+    for point, ratio in excesses:
+        near = np.abs(points - point).max(axis=1) <= 1e-6
+        points, values = points[~near], values[~near]
+        points = np.concatenate([points, point[None]])
+        values = np.concatenate([values, [[float(np.clip(ratio, _EXCEEDED, LARGEST)), 0.0]]])
+    _, rows = np.unique(points.round(9), axis=0, return_index=True)
+    points, values = points[np.sort(rows)], values[np.sort(rows)]
+    if not ((values[:, 1] > 1) & (values[:, 0] <= 1)).any():
+        values = values[:, :1]
+    return Surfaces.through(points, values)
+
+
+def envelope_of(
+    space: TaskSpace,
+    drawn: DrawnDistances,
+    evidence: DynamicsEvidence,
+    executed: Sequence[tuple[Array, float]],
+    threshold: float,
+    confidence: float,
+    evaluate: Callable[[Array], DrawnDistances] | None = None,
+    checks: int = 0,
+    units: str = "",
+) -> Envelope:
+    """Return the envelope from drawn distances and evidence of the same executions, which nothing withdraws.
+
+    Args:
+        executed: points of the unit cube ``(d,)`` with their distances.
+        evaluate: returns the distances of further tasks on the same draws; None if the interpolation is not checked.
+        checks: the number of these tasks.
+        units: the units of the distance.
+    """
+    factor, raised_by = _raised(drawn, evidence, threshold, confidence)
+    envelope = Envelope(
+        space,
+        threshold,
+        confidence,
+        "",
+        factor=factor,
+        raised_by=raised_by,
+        evaluated=len(drawn.points),
+        executions=evidence.executions,
+        tests=sum(each.stored and each.origin in DRAWN for each in evidence.predictions),
+        quantile=evidence.quantile,
+        assumptions=dynamics_assumptions(evidence),
+        units=units,
+    )
+    if isinstance(space, TaskSuite):
+        envelope = _of_suite(envelope, space, drawn, most_beyond(evidence), executed)
+    else:
+        surfaces = _interpolated(drawn, evidence, threshold, factor, executed)
+        tasks = space.unit_draws(COUNTED, np.random.default_rng(2))
+        tasks = tasks[(surfaces(tasks) <= 1).all(axis=1)][:checks]
+        if evaluate is not None and len(tasks):
+            checked = evaluate(tasks)
+            outside = (checked.upper(factor, threshold) > 1) | (checked.beyond > most_beyond(evidence))
+            surfaces = surfaces.without(tasks[outside], len(tasks))
+        envelope = replace(envelope, margin=float(np.median(surfaces.errors[:, 0])), _surfaces=surfaces)
+        tasks = space.unit_draws(COUNTED, np.random.default_rng(0))
+        inside = np.isfinite(envelope.bound_at(tasks))
+        regions = regions_inside(space, tasks, inside, lambda unit: np.isfinite(envelope.bound_at(unit)))
+        envelope = replace(envelope, share=float(inside.mean()), regions=regions)
+    return replace(envelope, statement=_statement(envelope))
+
+
+def _of_suite(
+    envelope: Envelope,
+    suite: TaskSuite,
+    drawn: DrawnDistances,
+    most: float,
+    executed: Sequence[tuple[Array, float]],
+) -> Envelope:
+    """Return the envelope of the members of a suite, of which executed ones are known."""
+    threshold, bounds = envelope.threshold, np.full(len(suite), np.inf)
+    upper = threshold * drawn.upper(envelope.factor or 0.0, threshold)
+    rows = suite.rows_at(drawn.points)
+    bounds[rows] = np.where((upper <= threshold) & (drawn.beyond <= most), upper, np.inf)
+    if envelope.quantile is None:
+        for point, distance in executed:
+            bounds[int(suite.rows_at(point))] = distance if distance <= threshold else np.inf
+    names = tuple(name for name, bound in zip(suite.task_names, bounds, strict=True) if np.isfinite(bound))
+    return replace(envelope, tasks=names, share=len(names) / len(suite), _bounds=bounds)
+
+
+def _statement(envelope: Envelope) -> str:
+    """Return what an envelope says."""
+    limit, share = f"{at_most(envelope.threshold)} {envelope.units}".rstrip(), 100 * envelope.share
+    if not envelope.share:
+        return f"With {percent(envelope.confidence)} confidence, d stays below {limit} on no task that can be named."
+    what = "d" if envelope.quantile is None else f"the {envelope.quantile:g} quantile of d"
+    tasks = f"{share:.3g} % of the tasks" if envelope.tasks is None else f"{len(envelope.tasks)} tasks"
+    return (
+        f"With {percent(envelope.confidence)} confidence, {what} stays below {limit} on all tasks of a set of {tasks}."
+    )

@@ -1,0 +1,167 @@
+"""Numbers that are known at some tasks, interpolated to all others, with errors from tasks that are left out.
+
+The interpolant is the smoothest one in the sense of Duchon (1977): a sum of ``|p - p_j|^3`` and a linear function. Its
+errors are known without any further task: what each task would be if it were interpolated from the others follows from
+one inverse matrix (Rippa 1999).
+"""
+
+from __future__ import annotations
+
+import base64
+import inspect
+import io
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from scipy.spatial.distance import cdist
+
+from ctxval._util.arrays import Array
+from ctxval._util.files import MADE_BY
+
+ENOUGH = 1.2  # multiple of the limit up to which an error of what exceeds it matters
+FALSE = 0.005  # share of the checked points that may be below the limit falsely
+_MULTIPLES = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0)  # of the errors
+_NUGGET = 1e-9  # added to the matrix, so that two tasks that are nearly the same do not make it singular
+
+
+def upper_at(points: Array, centres: Array, weights: Array, errors: Array) -> Array:
+    """Return interpolated numbers ``(n, c)`` plus local errors at points ``(n, d)`` of the unit cube."""
+    blocks = [np.zeros((0, weights.shape[1]))]
+    nearest = min(2 * (centres.shape[1] + 1), len(centres))
+    for first in range(0, len(points), 1000):
+        some = points[first : first + 1000]
+        squares = (some**2).sum(axis=1)[:, None] + (centres**2).sum(axis=1) - 2 * some @ centres.T
+        squares = np.maximum(squares, 0)
+        tail = np.concatenate([np.ones((len(some), 1)), some], axis=1)
+        smooth = np.concatenate([squares * np.sqrt(squares), tail], axis=1) @ weights
+        near = np.argpartition(squares, nearest - 1, axis=1)[:, :nearest]
+        blocks.append(smooth + errors[near].max(axis=1))
+    return np.concatenate(blocks)
+
+
+@dataclass(frozen=True, eq=False)
+class Surfaces:
+    """Upper bounds of c numbers over the unit cube: interpolated, plus the largest local error.
+
+    Attributes:
+        centres: the tasks at which the numbers are known, shape ``(K, d)``.
+        weights: shape ``(K + 1 + d, c)``.
+        left_out: what each number would be if its task were left out, shape ``(K, c)``.
+        errors: by how much that is wrong, shape ``(K, c)``; the largest of the nearest tasks is the local error. Its
+            sign does not count: what is too large at a task is too small between others.
+    """
+
+    centres: Array
+    weights: Array
+    left_out: Array
+    errors: Array
+
+    @classmethod
+    def through(cls, points: Array, values: Array) -> Surfaces:
+        """Return the surfaces of values ``(K, c)`` at different points ``(K, d)``, K at least d + 2.
+
+        The values are shares of a limit. How far they exceed it does not matter, so an error counts up to ``ENOUGH``.
+        """
+        K, d = points.shape
+        tail = np.concatenate([np.ones((K, 1)), points], axis=1)
+        matrix = np.zeros((K + 1 + d, K + 1 + d))
+        matrix[:K, :K] = cdist(points, points) ** 3 + _NUGGET * np.eye(K)
+        matrix[:K, K:], matrix[K:, :K] = tail, tail.T
+        inverse = np.linalg.inv(matrix)
+        weights = inverse[:, :K] @ values
+        left_out = values - weights[:K] / np.diag(inverse)[:K, None]
+        errors = np.abs(np.minimum(values, ENOUGH) - np.minimum(left_out, ENOUGH))
+        return cls(points, weights, left_out, errors)
+
+    def without(self, outside: Array, checked: int) -> Surfaces:
+        """Return these surfaces with larger errors, so that hardly any point known to be above its limit is below it.
+
+        Args:
+            outside: the points ``(n, d)`` above a limit, of all that were checked.
+            checked: the number of points that were checked, all of them below the limits by these surfaces.
+        """
+        for multiple in _MULTIPLES:
+            raised = replace(self, errors=multiple * self.errors)
+            if (raised(outside) <= 1).all(axis=-1).sum() <= FALSE * checked:
+                break
+        return raised
+
+    def __call__(self, points: Array) -> Array:
+        """Return the upper bounds ``(..., c)`` at points ``(..., d)``."""
+        upper = upper_at(points.reshape(-1, points.shape[-1]), self.centres, self.weights, self.errors)
+        return np.asarray(upper.reshape(*points.shape[:-1], self.weights.shape[1]))
+
+
+_EXPORTED = '''# {made_by}. This file needs NumPy alone.
+"""The tasks that are trusted: see STATEMENT."""
+
+from __future__ import annotations
+
+import base64
+import io
+
+import numpy as np
+
+STATEMENT = {title!r}
+NAMES = {names!r}  # the parameters of a task, in this order
+LABELS = {labels!r}  # with their units
+LOW = np.array({low!r})
+HIGH = np.array({high!r})
+THRESHOLD = {threshold!r}
+CONFIDENCE = {confidence!r}
+
+
+def _array(text):
+    return np.load(io.BytesIO(base64.b64decode(text)), allow_pickle=False)
+
+
+{source}
+
+def trusted(task):
+    """Return whether tasks ``(..., d)`` are trusted ``(...)``, and bounds on their distances ``(...)``.
+
+    A bound is infinity if its task is not trusted.
+    """
+    task = np.asarray(task, dtype=np.float64)
+    if task.ndim == 0 or task.shape[-1] != len(NAMES):
+        raise ValueError("a task has the parameters " + ", ".join(NAMES))
+    unit = (task - LOW) / (HIGH - LOW)
+    inside = ((unit >= 0) & (unit <= 1)).all(axis=-1)
+    rows = np.where(inside[..., None], unit, 0.5).reshape(-1, len(NAMES))
+    upper = upper_at(rows, CENTRES, WEIGHTS, ERRORS).reshape(*inside.shape, -1)
+    kept = inside & (upper <= 1).all(axis=-1)
+    bound = np.where(kept, THRESHOLD * np.maximum(upper[..., 0], 0), np.inf)
+    return kept[()], bound[()]
+
+
+CENTRES = _array(
+    {centres}
+)
+WEIGHTS = _array(
+    {weights}
+)
+ERRORS = _array(
+    {errors}
+)
+'''
+
+
+def exported(surfaces: Surfaces, **values: Any) -> str:
+    """Return the source of a Python module with a function ``trusted``, which needs NumPy alone."""
+    return _EXPORTED.format(
+        made_by=MADE_BY,
+        source=inspect.getsource(upper_at),
+        centres=_as_text(surfaces.centres),
+        weights=_as_text(surfaces.weights),
+        errors=_as_text(surfaces.errors),
+        **values,
+    )
+
+
+def _as_text(array: Array) -> str:
+    """Return the bytes of an array as a literal of Python over several lines."""
+    buffer = io.BytesIO()
+    np.save(buffer, np.ascontiguousarray(array), allow_pickle=False)
+    text = base64.b64encode(buffer.getvalue()).decode("ascii")
+    return "\n    ".join(repr(text[first : first + 100]) for first in range(0, len(text), 100))

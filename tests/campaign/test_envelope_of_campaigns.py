@@ -1,0 +1,86 @@
+"""The envelope of a campaign: executions that enlarge it after a falsification, and what it says of the true set."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from conftest import make_validation, make_validation_without_inputs
+from ctxval import Campaign, Store, certificates
+from ctxval.errors import InputError
+
+TAU, BUDGET = 0.3, 14
+
+
+def campaign_of(store: Path | None = None) -> Campaign:
+    validation = make_validation_without_inputs()
+    tau = threshold_of(validation)
+    return Campaign(validation, seed=2, store=store).run(BUDGET, tau, envelope=True)
+
+
+def threshold_of(validation) -> float:  # type: ignore[no-untyped-def]
+    return float(np.quantile(validation.distances(validation.space.grid(15)), 0.6))
+
+
+@pytest.mark.slow
+@pytest.mark.in_full
+def test_it_finds_the_true_set_after_a_falsification_and_includes_nothing_else() -> None:
+    campaign = campaign_of()
+    validation = campaign.validation
+    tau = threshold_of(validation)
+    assert campaign.verdict(tau).answer == "falsified"
+    envelope = campaign.envelope(tau)
+    assert envelope.doubt is None
+    assert envelope.tests == 8
+    assert envelope.executions == campaign.executions <= BUDGET
+    tasks = validation.space.iid(2000, np.random.default_rng(9))
+    true, trusted = validation.distances(tasks), envelope.trusted(tasks)
+    assert trusted[true <= tau].mean() > 0.9
+    assert not trusted[true > tau].any()
+    assert (envelope.bound(tasks)[trusted] >= true[trusted]).all()
+    for trial in campaign.completed:
+        known = envelope.trusted(trial.parameters)
+        assert not (known and (trial.distance or 0) > tau)
+
+
+@pytest.mark.slow
+def test_a_resumed_campaign_makes_the_same_choices(tmp_path: Path) -> None:
+    whole = campaign_of()
+    path = tmp_path / "c.sqlite"
+    validation = make_validation_without_inputs()
+    tau = threshold_of(validation)
+    for _ in range(3):  # budgets below the present number execute nothing more
+        Campaign(validation, seed=2, store=path).run(
+            BUDGET, tau, envelope=True, until=lambda c: c.executions >= len(Store(path).trials()) + 4
+        )
+    again = Campaign(validation, seed=2, store=path).run(BUDGET, tau, envelope=True)
+    assert [t.parameters for t in again.trials] == [t.parameters for t in whole.trials]
+
+
+@pytest.mark.slow
+def test_without_tests_it_says_what_is_missing() -> None:
+    campaign = Campaign(make_validation_without_inputs(), seed=2).run(8)
+    envelope = campaign.envelope(TAU)
+    assert envelope.share == 0
+    assert "executions must be predicted beforehand" in str(envelope.doubt)
+    assert not envelope.trusted(campaign.validation.space.grid(5)).any()
+
+
+def test_before_any_execution_nothing_is_stated() -> None:
+    envelope = Campaign(make_validation(), seed=1).envelope(TAU)
+    assert envelope.doubt is not None
+    assert envelope.words.startswith("No envelope is stated: ")
+
+
+def test_bad_input_is_refused() -> None:
+    campaign = Campaign(make_validation(), seed=1)
+    with pytest.raises(InputError, match="an envelope needs a threshold, and a campaign that does not explore"):
+        campaign.run(5, envelope=True)
+    with pytest.raises(InputError, match="an envelope needs a threshold, and a campaign that does not explore"):
+        campaign.run(5, TAU, explore=True, envelope=True)
+    by = certificates.CertificateOptions(certificates.Posterior())
+    with pytest.raises(InputError, match="needs one of the certificates auto and dynamics, got 'posterior'"):
+        campaign.envelope(TAU, certificate=by)
+    assert campaign.executions == 0

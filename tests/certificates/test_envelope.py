@@ -1,0 +1,200 @@
+"""The envelope: one factor for all tasks together, raised by tests, and what it does not trust."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ctxval import TaskSpace, TaskSuite
+from ctxval.certificates import CheckedPrediction, DynamicsEvidence
+from ctxval.certificates.drawn_distances import DrawnDistances
+from ctxval.certificates.envelope import (
+    Envelope,
+    boundary_tasks,
+    doubt_of_envelope,
+    envelope_of,
+    must_outlive_a_test,
+    withdrawn,
+)
+from ctxval.errors import CertificateError, InputError
+from rig_evidence import GOOD
+
+SPACE = TaskSpace(goal=(-2.0, 2.0, "m"), load=(0.0, 4.0, "kg"))
+
+
+def drawn_from(points: np.ndarray, draws: int = 40, size: float = 0.05, seed: int = 0) -> DrawnDistances:
+    """Draws of a distance that grows with the load, with smooth errors of this size."""
+    rng = np.random.default_rng(seed)
+    phases, frequencies = rng.uniform(0, 6, (draws, 3)), rng.uniform(1, 4, (draws, 3, 2))
+    waves = np.sin(np.einsum("skd,nd->snk", frequencies, points) + phases[:, None]).mean(axis=2)
+    return DrawnDistances(points, points[:, 1] + size * waves, np.zeros(len(points)))
+
+
+def evidence_of(**changes: Any) -> DynamicsEvidence:
+    tests = tuple(
+        CheckedPrediction(k, 0.5, 0.4, 0.42, 0.4, origin="spread", point=(k / 9, 0.4), explained=0.4)
+        for k in range(2, 10)
+    )
+    return replace(GOOD, predictions=tests, tests=8, executions=10, **changes)
+
+
+POINTS = np.random.default_rng(3).random((250, 2))
+EXECUTED = [(np.array([0.5, 0.9]), 0.9)]
+
+
+def envelope(evidence: DynamicsEvidence | None = None, **changes: Any) -> Envelope:
+    drawn = replace(drawn_from(POINTS), **changes)
+    return envelope_of(SPACE, drawn, evidence or evidence_of(), EXECUTED, 0.6, 0.95)
+
+
+def test_the_factor_holds_for_all_tasks_of_a_further_draw() -> None:
+    held = 0
+    for seed in range(300):
+        drawn = drawn_from(POINTS[:60], draws=41, seed=seed)
+        some = replace(drawn, draws=drawn.draws[:40])
+        k = some.factor(0.6, 0.9)
+        held += bool((drawn.draws[40] <= some.mean + k * some.spread(0.6) + 1e-12).all())
+    assert 0.86 <= held / 300 <= 0.97  # 0.9 and a little more, because the rank is rounded up
+
+
+def test_a_confidence_that_needs_more_draws_is_refused() -> None:
+    with pytest.raises(CertificateError, match=r"a confidence of 0\.99 needs more than 40 posterior samples"):
+        drawn_from(POINTS).factor(0.6, 0.99)
+
+
+def test_tasks_below_the_threshold_are_trusted_in_their_own_units() -> None:
+    found = envelope()
+    assert found.doubt is None
+    loads = np.array([0.2, 1.5, 2.0, 2.8, 3.9])
+    tasks = np.stack([np.linspace(-1.5, 1.5, 5), loads], axis=1)
+    np.testing.assert_array_equal(found.trusted(tasks), loads < 2.1)
+    assert found.trusted({"goal": 0.3, "load": 1.0}) is np.True_
+    bounds = found.bound(tasks[:3])
+    assert (bounds >= loads[:3] / 4).all()
+    assert (bounds <= 0.6).all()
+    assert found.bound([0.0, 3.9]) == np.inf
+    assert not found.trusted([[-2.1, 0.1], [0.0, -0.1]]).any()  # no tasks of the space
+    assert 0.4 < found.share < 0.6
+    assert found.regions[0].text.startswith("load below 2.")
+    assert "95 % confidence" in found.statement
+
+
+def test_an_executed_excess_is_never_trusted() -> None:
+    point = np.array([0.31, 0.2])
+    executed = [*EXECUTED, (point, 0.601)]
+    found = envelope_of(SPACE, drawn_from(POINTS), evidence_of(), executed, 0.6, 0.95)
+    assert not found.trusted(SPACE.from_unit(point))
+    assert envelope().trusted(SPACE.from_unit(point))
+
+
+def test_tasks_that_leave_the_records_or_cannot_be_planned_are_not_trusted() -> None:
+    beyond = np.where(POINTS[:, 0] > 0.5, 0.1, 0.0)
+    draws = np.where(POINTS[:, 0] < 0.2, np.nan, drawn_from(POINTS).draws)
+    found = envelope(beyond=beyond, draws=draws)
+    low = np.column_stack([np.linspace(0.02, 0.98, 25), np.full(25, 0.1)])
+    trusted = np.isfinite(found.bound_at(low))
+    assert trusted.any()
+    assert (low[trusted, 0] < 0.52).all()
+    assert (low[trusted, 0] > 0.2).all()
+
+
+def test_a_test_that_exceeds_its_prediction_raises_the_factor() -> None:
+    usual, evidence = envelope(), evidence_of()
+    worse = replace(evidence.predictions[3], distance=0.48)
+    predictions = (*evidence.predictions[:3], worse, *evidence.predictions[4:])
+    raised = envelope(replace(evidence, predictions=predictions))
+    assert usual.raised_by is None
+    assert raised.raised_by == worse.trial
+    assert raised.factor == pytest.approx(0.08 / (0.02 / 1.645))
+    assert raised.share < usual.share
+    drawn = drawn_from(POINTS)
+    assert must_outlive_a_test(drawn, replace(evidence, predictions=predictions), 0.6)
+    assert not must_outlive_a_test(drawn, evidence, 0.6)
+    # Nothing is claimed of a task far above the threshold.
+    far = replace(worse, median=0.8, upper=0.81, distance=0.95, explained=0.95)
+    assert envelope(replace(evidence, predictions=(*predictions[:3], far, *predictions[4:]))).raised_by is None
+
+
+def test_what_withdraws_it() -> None:
+    evidence = evidence_of()
+    assert doubt_of_envelope(evidence, 0.6) is None
+    few = replace(evidence, predictions=evidence.predictions[:6])
+    assert "2 more executions must be predicted beforehand" in str(doubt_of_envelope(few, 0.6))
+    moved = replace(evidence.predictions[0], explained=0.5)
+    other = replace(evidence, predictions=(moved, *evidence.predictions[1:]))
+    assert "trial 2 has the distance 0.4, and 0.5 on the learned dynamics" in str(doubt_of_envelope(other, 0.6))
+    assert "at least 3" in str(doubt_of_envelope(replace(evidence, executions=2), 0.6))
+    assert doubt_of_envelope(replace(evidence, unplanned=0.3), 0.6) is None
+    none = withdrawn(SPACE, 0.6, 0.95, "too little is known.")
+    assert none.words == "No envelope is stated: too little is known."
+    assert not none.trusted(np.zeros((3, 2))).any()
+    assert none.to_json()["doubt"] == "too little is known"
+
+
+def test_an_envelope_without_tasks_says_so(tmp_path: Path) -> None:
+    found = envelope(draws=drawn_from(POINTS).draws + 2)
+    assert found.share == 0
+    assert found.words == "No task is trusted."
+    with pytest.raises(InputError, match=r"there is no function to write: no task is trusted\."):
+        withdrawn(SPACE, 0.6, 0.95, "why").save(tmp_path / "e.py")
+
+
+def test_the_exported_function_is_the_same_and_needs_numpy_alone(tmp_path: Path) -> None:
+    found = envelope(beyond=np.where(POINTS[:, 0] > 0.9, 0.1, 0.0))
+    source = found.save(tmp_path / "folder" / "envelope.py").read_text()
+    assert "ctxval" not in source.split("import base64", 1)[1]
+    names: dict[str, Any] = {}
+    exec(compile(source, "envelope.py", "exec"), names)
+    tasks = SPACE.from_unit(np.random.default_rng(4).uniform(0, 1, (3, 500, 2)))
+    trusted, bounds = names["trusted"](tasks)
+    np.testing.assert_array_equal(trusted, found.trusted(tasks))
+    np.testing.assert_array_equal(bounds, found.bound(tasks))
+    one, bound = names["trusted"]([0.0, 1.0])
+    assert one
+    assert bound < 0.6
+    assert names["trusted"]([-2.5, 1.0]) == (False, np.inf)
+    with pytest.raises(ValueError, match="a task has the parameters goal, load"):
+        names["trusted"]([1.0])
+    with pytest.raises(InputError, match=r"written to a Python file, such as envelope\.py, got 'e\.onnx'"):
+        found.save("e.onnx")
+
+
+def test_boundary_tasks_lie_next_to_the_boundary() -> None:
+    candidates = np.random.default_rng(6).random((2000, 2))
+    near = boundary_tasks(drawn_from(POINTS), evidence_of(), 0.6, 0.95, candidates, 30)
+    assert 5 < len(near) <= 30
+    assert (np.abs(near[:, 1] - 0.53) < 0.1).all()
+
+
+def test_of_a_suite_it_is_a_list_and_executed_tasks_are_facts() -> None:
+    suite = TaskSuite({name: {"load": load} for name, load in zip("abcde", (0.0, 0.3, 0.5, 0.9, 1.0), strict=True)})
+    points = suite.members
+    draws = np.tile(points[:, 0], (40, 1)) + 0.01 * np.random.default_rng(0).normal(size=(40, 1))
+    executed = [(points[0], 0.7), (points[3], 0.55)]  # nothing is predicted of these
+    found = envelope_of(suite, DrawnDistances(points, draws, np.zeros(5)), evidence_of(), executed, 0.6, 0.95)
+    assert found.tasks == ("b", "c", "d")
+    assert found.words == "Trusted: b, c, d."
+    assert found.share == pytest.approx(0.6)
+    assert found.trusted({"task": "b"})
+    assert not found.trusted({"task": "a"})
+    assert found.bound({"task": "d"}) == 0.55
+
+
+@pytest.mark.slow
+def test_further_tasks_check_what_is_interpolated() -> None:
+    def waves(points: np.ndarray) -> DrawnDistances:
+        heights = 0.4 + 0.3 * np.sin(25 * points[:, 0]) * np.sin(25 * points[:, 1])
+        return DrawnDistances(points, np.tile(heights, (40, 1)), np.zeros(len(points)))
+
+    others = np.random.default_rng(8).random((3000, 2))
+    false = []
+    for evaluate in (None, waves):
+        known = envelope_of(SPACE, waves(POINTS), evidence_of(), [], 0.6, 0.95, evaluate, 200, "m")
+        assert "stays below 0.6 m on all tasks" in known.statement
+        false.append((np.isfinite(known.bound_at(others)) & (waves(others).mean > 0.6)).mean())
+    assert false[0] > 0.01
+    assert false[1] < 0.5 * false[0]

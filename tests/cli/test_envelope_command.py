@@ -1,0 +1,40 @@
+"""``ctxval envelope`` and ``ctxval run --envelope``: what they refuse, and an envelope that is not stated."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from rig_cli import calling, report
+
+pytestmark = pytest.mark.slow
+
+
+def test_without_a_threshold_there_is_no_envelope(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    Path("aimless_pendulum.py").write_text(
+        "from dataclasses import replace\nfrom ctxval import cases\n"
+        "experiment = replace(cases.by_name('pendulum'), threshold=None)\n"
+    )
+    refused = calling("run")("aimless_pendulum:experiment", "--budget", "2", "--store", "p.sqlite", "--envelope")
+    assert refused.exit_code == 2
+    assert "--envelope needs --threshold" in refused.output
+    assert not Path("p.sqlite").exists()
+    assert calling("run")("aimless_pendulum:experiment", "--budget", "1", "--store", "p.sqlite").exit_code == 0
+    refused = calling("envelope")("p.sqlite")
+    assert refused.exit_code == 2
+    assert "an envelope needs --threshold" in refused.output
+
+
+def test_one_that_is_not_stated_says_why_and_writes_no_function(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    calling("run")("pendulum", "--budget", "1", "--store", "p.sqlite")
+    stated = report(calling("envelope")("p.sqlite", "--threshold", "0.3", "--out", "trusted.py", "--json"))
+    assert stated["words"] == f"No envelope is stated: {stated['doubt']}."
+    assert stated["share"] == 0
+    assert stated["file"] is None
+    assert not Path("trusted.py").exists()
