@@ -135,8 +135,6 @@ class DynamicsStudy(ShortRepr):
         with contextlib.suppress(np.linalg.LinAlgError, InputError, ValueError):
             if learned is None or len(executed) < _FEWEST_AGAINST:
                 return learned
-            if not learned.left_out_error > _EXACTLY:
-                return learned
             actuator = None if logged else self._found_actuator(executed)
             if actuator is not None:
                 return self._with_actuator(actuator, executed[0][1].inputs.shape[-1]).learn(executed) or learned
@@ -316,7 +314,13 @@ class DynamicsStudy(ShortRepr):
                     raise np.linalg.LinAlgError
                 return extended.records(known)
 
-            model, before = before_refinement(self.validation.model), self._found_actuator(executed[: some - 1])
+            before, self._actuators[key] = self._found_actuator(executed[: some - 1]), None
+            if before is None:
+                extended = self._executions(executed[:some])
+                plain = None if extended is None else self._learn(extended, (), with_data=True)
+                if plain is None or not plain.left_out_error > _EXACTLY:
+                    return None
+            model = before_refinement(self.validation.model)
             with single_threaded(), np.errstate(all="ignore"):
                 self._actuators[key] = found_actuator(model, records_of, before, 30 if estimated else 80)
         return self._actuators[key]
