@@ -83,7 +83,7 @@ def found_actuator(
     without them.
 
     Args:
-        before: one that was found in fewer executions.
+        before: one that was found in fewer executions, which is refined.
         evaluations: how often records may be asked for while the actuator is refined, twice.
 
     Raises:
@@ -93,7 +93,7 @@ def found_actuator(
     if not evidence.live.any():
         return None
     without = evidence.mode(Actuator()).height
-    tried = [*(Actuator(*each) for each in _TRIED), *([before] if before else [])]
+    tried = [before] if before else [Actuator(*each) for each in _TRIED]
     height, best = max(((evidence.mode(each).height, each) for each in tried), key=lambda pair: pair[0])
     values = len(evidence.rows) * int(evidence.live.sum())
     if height < without - _NEAR * values:
@@ -156,8 +156,12 @@ class _Evidence:
         at = np.array([start.delay, start.lag])
         simplex = at + np.array([[0.0, 0.0], [0.25, 0.0], [0.0, 0.25]])
         options = {"initial_simplex": simplex, "maxfev": evaluations, "xatol": 1e-5, "fatol": 1e-3}
-        best = minimize(unlikely, at, method="Nelder-Mead", options=options).x
-        return Actuator(*np.clip(best, 0.0, _LONGEST).tolist())
+        best = np.clip(minimize(unlikely, at, method="Nelder-Mead", options=options).x, 0.0, _LONGEST)
+        # Whole steps and no lag are preferred as by the Bayesian information criterion.
+        whole, each = np.array([np.round(best[0]), best[1]]), 0.5 * np.log(len(self.rows))
+        near = [(best, 2), (whole, 1), (best * [1, 0], 1), (whole * [1, 0], 0)]
+        chosen, _ = min(near, key=lambda pair: unlikely(pair[0]) + each * pair[1])
+        return Actuator(*chosen.tolist())
 
 
 # A closed loop whose inputs are those that act, followed by those that were commanded
