@@ -53,7 +53,7 @@ class Actuator:
         for weight, back in ((1.0 - share, whole), (share, whole + 1)):
             if weight and back < len(commanded):
                 due = due + weight * commanded[back]
-        return acting + (due - acting) * (1 - np.exp(-1 / self.lag)) if self.lag else due
+        return self._followed(acting, due)
 
     @property
     def remembered(self) -> int:
@@ -62,12 +62,16 @@ class Actuator:
 
     def acting(self, inputs: Array) -> Array:
         """Return the inputs that act in each step, for commanded ones ``(..., H, m)``."""
-        result, acting = np.empty_like(inputs), np.zeros_like(inputs[..., 0, :])
-        for t in range(inputs.shape[-2]):
-            latest = [inputs[..., t - back, :] for back in range(min(t + 1, self.remembered))]
-            acting = self.follow(acting, latest)
-            result[..., t, :] = acting
-        return result
+        H, (whole, share) = inputs.shape[-2], (int(self.delay), self.delay % 1.0)
+        due = np.zeros_like(inputs)
+        for weight, back in ((1.0 - share, whole), (share, whole + 1)):
+            due[..., back:, :] += weight * inputs[..., : max(H - back, 0), :]
+        for t in range(H) if self.lag else ():
+            due[..., t, :] = self._followed(due[..., t - 1, :] if t else np.zeros_like(due[..., 0, :]), due[..., t, :])
+        return due
+
+    def _followed(self, acting: Array, due: Array) -> Array:
+        return np.asarray(acting + (due - acting) * (1 - np.exp(-1 / self.lag)) if self.lag else due)
 
 
 RecordsOf = Callable[[Actuator], Sequence[Record]]
