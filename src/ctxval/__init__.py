@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from ctxval import models as models
     from ctxval import report as report
     from ctxval import searches as searches
+    from ctxval import specs as specs
     from ctxval import systems as systems
     from ctxval import testing as testing
     from ctxval._util.arrays import Array
@@ -105,6 +106,7 @@ _MODULES = {
     "report": "report",
     "reproduce": "paper.reproduce",
     "searches": "searches",
+    "specs": "specs",
     "systems": "systems",
     "testing": "testing",
 }

@@ -88,7 +88,10 @@ def read_task(path: str | Path) -> Task:
 
     def build(content: Mapping[str, Any]) -> Task:
         start = as_finite("initial_state", content["initial_state"])
-        more = {"name": str(content.get("name", "")), "environment": dict(content.get("environment") or {})}
+        more: dict[str, Any] = {
+            "name": str(content.get("name", "")),
+            "environment": dict(content.get("environment", {})),
+        }
         return Task(start, horizon=content["horizon"], dt=content["dt"], reference=content["reference"], **more)
 
     return _read(Path(path), TASK_FORMAT, build)

@@ -125,9 +125,7 @@ class Task:
     def _like(self, initial_state: Array, reference: Array, name: Any, environment: Mapping[str, Array]) -> Task:
         name = name if np.ndim(name) else str(name)
         aim = reference if self.has_goal else None
-        return Task(
-            initial_state, horizon=self.horizon, dt=self.dt, reference=aim, name=name, environment=environment
-        )
+        return Task(initial_state, horizon=self.horizon, dt=self.dt, reference=aim, name=name, environment=environment)
 
     def describe(self) -> dict[str, Any]:
         """Return what identifies one task in a store."""

@@ -132,7 +132,11 @@ def test_a_described_experiment_can_be_asked_by_hand(invoke: Any) -> None:
         ('goal = ["goal", 0.0]', 'goal = ["gaol", 0.0]', "did you mean 'goal'"),
         ('goal = ["goal", 0.0]', "goal = 3", "goal of [task] must be a list"),
         ('goal = ["goal", 0.0]', "goal = [0.0, 0.0]\nenvironment = 3", "environment of [task] must be a table"),
-        ('goal = ["goal", 0.0]', "goal = [0.0, 0.0]\nenvironment = { o = 3 }", "environment 'o' of [task] must be a list"),
+        (
+            'goal = ["goal", 0.0]',
+            "goal = [0.0, 0.0]\nenvironment = { o = 3 }",
+            "environment 'o' of [task] must be a list",
+        ),
         ('goal = ["goal", 0.0]', "goal = [1.0]", "goal or reference of a task must have 2 components"),
         ('goal = ["goal", 0.0]', 'goal = ["goal[1]", 0.0]', "[task] cannot be used"),
         ("horizon = 60            # number of time steps", "", "[task] needs horizon"),
