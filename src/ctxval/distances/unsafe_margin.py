@@ -43,9 +43,12 @@ class UnsafeMargin(ShortRepr):
     to_task: ClassVar[bool] = True
     """Whether it measures trajectories against the task."""
 
+    kinked: ClassVar[bool] = True
+    """Whether it is a continuous function of the trajectories with kinks, which are no jumps."""
+
     spec: Any
     margin: PositiveFloat | None = None
-    penalty: PositiveFloat = 4.0
+    penalty: PositiveFloat = 2.0
 
     def __post_init__(self) -> None:
         if isinstance(self.spec, dict):

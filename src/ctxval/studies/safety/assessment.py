@@ -33,7 +33,6 @@ from ctxval.errors import CertificateError, InputError
 from ctxval.learning import DynamicsStudy
 from ctxval.learning.closed_loops import LoopPlanner
 from ctxval.specs import ReachAvoid
-from ctxval.studies.safety.draws import DrawnTasks
 from ctxval.studies.safety.margins import on_model, spec_distance
 
 TASKS = 4000
@@ -79,8 +78,7 @@ class SafetyReport(ShortRepr):
         share_by_deviation: the share whose rho_M exceeds the bound of d_a; None if there is none.
         tightened: the specification whose sets to avoid have grown, and whose set to reach has shrunk, by the bound;
             None if there is no bound, no sets, or nothing left of the set to reach.
-        drawn: what independent draws of tasks show; None if there are none.
-        executions: the number of executions of S, without those of the draws.
+        executions: the number of executions of S.
         confidence: the confidence of the certificate.
         units: the unit of all distances.
     """
@@ -101,7 +99,6 @@ class SafetyReport(ShortRepr):
     share_certified: float | None
     share_by_deviation: float | None
     tightened: ReachAvoid | None
-    drawn: DrawnTasks | None
     executions: int
     confidence: float
     units: str
@@ -116,7 +113,6 @@ class SafetyReport(ShortRepr):
             "certificate": self.certificate and self.certificate.to_json(),
             "avoid": None if self.tightened is None else [repr(one) for one in self.tightened.avoid],
             "reach": None if self.tightened is None or self.tightened.reach is None else repr(self.tightened.reach),
-            "drawn": self.drawn and asdict(self.drawn),
         }
 
     @property
@@ -178,7 +174,6 @@ def assess(
     campaign: Campaign,
     certificate: CertificateOptions | None = None,
     *,
-    drawn: DrawnTasks | None = None,
     tasks: PositiveInt = TASKS,
     progress: bool | None = None,
 ) -> SafetyReport:
@@ -187,7 +182,6 @@ def assess(
     Args:
         campaign: a campaign whose distance is a :class:`ctxval.distances.UnsafeMargin`.
         certificate: the kind and options of the certificate; that of learned dynamics by default.
-        drawn: what :func:`draw_tasks` has shown.
         tasks: number of tasks on M that the shares are of.
         progress: whether to show the progress on standard error; None to show it at a terminal and in a notebook.
 
@@ -252,7 +246,6 @@ def assess(
         share_certified=None if bound is None else float((rho > bound).mean()),
         share_by_deviation=None if of_deviation is None else float((rho > max(of_deviation, deviation)).mean()),
         tightened=tightened,
-        drawn=drawn,
         executions=campaign.executions,
         confidence=options.confidence,
         units=validation.labels.units,
