@@ -80,6 +80,11 @@ def test_signed_distances_of_a_box_are_euclidean() -> None:
     np.testing.assert_allclose(box.signed_distance(positions, TASK), [5.0, -0.5, 2.0, -1.0, 1.0])
 
 
+def test_a_box_may_lack_ends() -> None:
+    for of in (Box(low=[0.0, 1.0]), Box(low=[0.0, 1.0], high=[None, None]), Box(low=[0, 1], high=[np.inf, np.inf])):
+        np.testing.assert_array_equal(of.signed_distance(np.array([[2.0, 0.5], [3.0, 3.0]]), TASK), [0.5, -2.0])
+
+
 def test_batches_of_tasks_have_obstacles_of_their_own() -> None:
     tasks = Task(np.zeros((3, 2)), horizon=4, dt=0.5, environment={"obstacle": [np.array([0.0, 1.0, 2.0]), 0.0]})
     distances = Ball("obstacle", radius=0.5).signed_distance(np.zeros((7, 3, 5, 2)), tasks)
@@ -110,6 +115,8 @@ def test_what_shrinks_away_is_refused() -> None:
         (lambda: Box(low=[0, 0], high=[1]), "two equally long lists"),
         (lambda: Box(low=[0, 2], high=[1, 1]), r"must be low < high, got \[0.0, 2.0\] and \[1.0, 1.0\]"),
         (lambda: Box(low=[-np.inf], high=[np.inf]), "must have an end"),
+        (lambda: Box(), "must have an end: give low, high or both"),
+        (lambda: Box(low=["a"]), "low of the Box must be numbers"),
         (lambda: Polytope(A=[1.0, 2.0], b=[1.0]), r"needs A \(q, k\) and b \(q,\), got \(2,\) and \(1,\)"),
         (lambda: Polytope(A=[[0.0, 0.0]], b=[1.0]), "must not be zero"),
         (lambda: Polytope(A=[[1.0], [-1.0]], b=[0.0, -1.0]), "must have an inside"),

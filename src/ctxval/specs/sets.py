@@ -14,7 +14,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from ctxval._util.arrays import Array, ArrayLike, as_finite
+from ctxval._util.arrays import Array, ArrayLike, as_finite, as_floats
 from ctxval._util.checked import PositiveFloat, checked
 from ctxval._util.registry import Registry
 from ctxval._util.representation import ShortRepr
@@ -115,20 +115,27 @@ class Ball(_Placed):
 @checked
 @dataclass(frozen=True, eq=False)
 class Box(_Placed):
-    """All positions between two corners, which are relative to the center; infinite where there is no end.
+    """All positions between two corners, which are relative to the center.
 
     Attributes:
-        low, high: the corners, ``(k,)``.
+        low, high: the corners, ``(k,)``; infinite or None where there is no end. One of them may be left out.
     """
 
     _: dataclasses.KW_ONLY
-    low: ArrayLike
-    high: ArrayLike
+    low: Any = None
+    high: Any = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name in ("low", "high"):
-            object.__setattr__(self, name, np.asarray(getattr(self, name), dtype=np.float64))
+        known: Any = self.high if self.low is None else self.low
+        if known is None:
+            raise InputError("a Box must have an end: give low, high or both.")
+        for name, none in (("low", -np.inf), ("high", np.inf)):
+            given: Any = getattr(self, name)
+            corner = np.full(np.shape(known), none) if given is None else given
+            if isinstance(corner, list | tuple):
+                corner = [none if end is None else end for end in corner]
+            object.__setattr__(self, name, as_floats(f"{name} of the Box", corner))
         low, high = self._corners
         if low.ndim != 1 or low.shape != high.shape or not len(low):
             raise ShapeError(f"low and high of a Box must be two equally long lists, got {self.low!r}, {self.high!r}.")
