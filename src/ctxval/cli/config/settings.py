@@ -267,13 +267,16 @@ class Settings(BaseModel):
         outputs: Any = self.outputs
         if isinstance(self.outputs, str):
             outputs = require_function("outputs", reference(self.outputs, self.folder), "x -> y")
+        default: Part = "FinalState"
+        if self.spec is not None:  # d_a, of the states that the specification looks at
+            default = {"type": "MaximumDeviation", "components": (self.spec.model_extra or {}).get("components")}
         validation = Validation(
             space=space,
             task=task_function(self.task or {}, space, system, self.folder),
             system=system,
             model=part("model", self.model or {}, self.folder),
             synthesizer=part("synthesizer", self.synthesizer or {}, self.folder),
-            distance=part("distance", self.distance or "FinalState", self.folder),
+            distance=part("distance", self.distance or default, self.folder),
             labels=Labels(labels_of(self.states), labels_of(self.inputs), self.units or ""),
             outputs=outputs,
         )
