@@ -51,6 +51,7 @@ if TYPE_CHECKING:
     from ctxval.studies import fitting as fitting
     from ctxval.studies import refinement as refinement
     from ctxval.studies import replay as replay
+    from ctxval.studies import safety as safety
     from ctxval.studies.comparison import Comparison, compare
     from ctxval.studies.refinement import refine
 
@@ -105,6 +106,7 @@ _MODULES = {
     "replay": "studies.replay",
     "report": "report",
     "reproduce": "paper.reproduce",
+    "safety": "studies.safety",
     "searches": "searches",
     "specs": "specs",
     "systems": "systems",

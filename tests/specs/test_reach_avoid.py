@@ -63,6 +63,13 @@ def test_a_batch_has_the_robustness_of_each() -> None:
         np.testing.assert_allclose(rho[s, k], SPEC.robustness(trajectory(states[s, k]), tasks[k]), rtol=1e-12)
 
 
+def test_one_trajectory_is_judged_in_many_environments() -> None:
+    states = np.random.default_rng(0).normal(size=(H + 1, 3))
+    tasks = Task(np.zeros((5, 3)), horizon=H, dt=DT, environment={"goal": np.linspace([0, 0], [1, 1], 5)})
+    rho = SPEC.robustness(trajectory(states[None]), tasks)
+    np.testing.assert_allclose(rho, [SPEC.robustness(trajectory(states), tasks[k]) for k in range(5)])
+
+
 def test_a_drift_with_one_wall_has_its_closed_form() -> None:
     # x(t) = v t, and the wall is at 1: rho = 1 - v H dt.
     v = np.linspace(0.1, 1.0, 7)

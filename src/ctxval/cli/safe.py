@@ -12,6 +12,7 @@ from ctxval.cli.base import FALSIFIED, command, failures_of, notes, out, print_f
 from ctxval.cli.config.settings import Settings, read_settings
 from ctxval.cli.config.stored_settings import budget_of
 from ctxval.errors import CtxvalError, InputError
+from ctxval.specs import ReachAvoid
 from ctxval.studies.safety import DrawnTasks, SafetyReport, assess, draw_tasks, require_safe_tasks
 
 
@@ -108,6 +109,8 @@ def _print(report: SafetyReport, drawn: DrawnTasks | None) -> None:
             rows["avoid on the model"] = enumerated([repr(one) for one in report.tightened.avoid], 6)
         if report.tightened.reach is not None:
             rows["reach on the model"] = repr(report.tightened.reach)
+    elif report.d_b_bound is not None and isinstance(report.spec, ReachAvoid):
+        rows["sets on the model"] = "nothing is left of a set that grows or shrinks by the bound"
     if drawn is not None:
         rows["independent draws"] = (
             f"{drawn.unsafe} of {drawn.draws} tasks with a margin above {of(drawn.margin)} are unsafe: at most "

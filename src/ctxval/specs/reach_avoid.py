@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
@@ -76,7 +77,7 @@ class ReachAvoid(NamedStates):
         if self.reach is not None:
             depths = -self.reach.signed_distance(positions, task)
             least.append(depths[..., self._steps(task)].max(axis=-1))
-        return np.asarray(np.minimum.reduce(least))
+        return np.asarray(functools.reduce(np.minimum, least))
 
     def _steps(self, task: Task) -> Rows:
         """Return the steps at which the set may be reached."""

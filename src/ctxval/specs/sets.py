@@ -7,6 +7,7 @@ in the Euclidean norm. A set grows by r to the positions whose signed distance i
 from __future__ import annotations
 
 import dataclasses
+import functools
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -238,7 +239,7 @@ class Union(Set):
         object.__setattr__(self, "sets", as_sets("sets of a Union", self.sets))
 
     def signed_distance(self, positions: Array, task: Task) -> Array:
-        return np.asarray(np.minimum.reduce([one.signed_distance(positions, task) for one in self.sets]))
+        return np.asarray(functools.reduce(np.minimum, (one.signed_distance(positions, task) for one in self.sets)))
 
     def grown(self, by: float) -> Union:
         if by >= 0:

@@ -32,11 +32,22 @@ def test_a_specification_that_is_missing_is_asked_for() -> None:
         Settings.model_validate({"experiment": "pendulum", "judge": "spec"}).load()
 
 
+def test_the_margin_is_the_threshold() -> None:
+    settings = Settings.model_validate({"experiment": "pendulum", "spec": SPEC, "judge": "spec", "threshold": 0.5})
+    with pytest.raises(InputError, match=r"its margin is the threshold, got 0\.5"):
+        settings.load()
+
+
 def test_with_a_specification_the_default_distance_is_the_deviation_of_its_states(tmp_path: Path) -> None:
     described = {
         "space": {"goal": [0.0, 1.0]},
         "task": {"initial_state": [0.0, 0.0], "goal": ["goal", 0.0], "horizon": 5, "dt": 0.1},
-        "system": {"type": "Manual"},
+        "system": {
+            "type": "Manual",
+            "states": {"angle": "rad", "rate": "rad/s"},
+            "inputs": {"torque": "N m"},
+            "dt": 0.1,
+        },
         "model": {"type": "Linear", "A": [[1.0, 0.1], [0.0, 1.0]], "B": [[0.0], [0.1]]},
         "synthesizer": {"type": "LQR", "Q": [1.0, 1.0], "R": [1.0]},
         "states": {"angle": "rad", "rate": "rad/s"},

@@ -60,6 +60,15 @@ def test_a_margin_is_falsified_by_a_counterexample_or_certified(margin: float, a
         assert found.d_b_bound == margin
 
 
+@pytest.mark.slow
+def test_without_any_violation_in_sight_nothing_is_certified_and_it_says_why() -> None:
+    given = validation()
+    exact = given.with_parts(system=systems.Simulated(given.model))
+    found = assess(Campaign(exact, seed=0).run(4, explore=False, progress=False), tasks=200, progress=False)
+    assert (found.d_a, found.d_b, found.d_b_bound) == (0.0, 0.0, None)
+    assert "no executed task came near a violation" in found.statement
+
+
 def random_linear(seed: int) -> tuple[Validation, Validation]:
     """Return tasks of a random linear system among balls, with the deviation and with the margin as distance."""
     rng = np.random.default_rng(seed)

@@ -6,7 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from ctxval import Task, TaskSpace, Validation, controllers, distances, models, systems
+from ctxval import Task, TaskSpace, Validation, controllers, distances, models, rollout, systems
+from ctxval.core.controller import AffineFeedback, Limits
 from ctxval.errors import InputError, ShapeError
 from ctxval.studies.safety import Disturbance, Tube, tube, tube_of
 
@@ -73,6 +74,30 @@ def test_tightened_limits_leave_room_for_the_tube() -> None:
         found.tightened(0.01)
     with pytest.raises(InputError, match="of must be 'states' or 'inputs', got 'outputs'"):
         found.tightened(1.0, "outputs")
+
+
+@pytest.mark.slow
+def test_a_plan_of_mpc_within_tightened_limits_keeps_the_given_ones() -> None:
+    pytest.importorskip("casadi")
+    found, limit = made(), 0.9
+    steep = Task([0.0, 0.0], goal=[2.0, 0.0], horizon=H, dt=0.1)
+    gains, w = VALIDATION.plan([1.0]).controller.gains, np.zeros((H, 2))  # type: ignore[attr-defined]
+    row = np.array([0.0, 1.0])
+    for t in reversed(range(H)):  # pushes the speed up as far as it goes
+        w[t], row = np.sign(row) * W, row @ found.loops[t]
+    fastest = {}
+    given_limits = Limits([-np.inf, -limit], [np.inf, limit])
+    for name, speeds in (("given", given_limits), ("tightened", found.tightened(given_limits))):
+        mpc = controllers.MPC([5.0, 0.0], [0.01], steps=8, state_limits=speeds)
+        planned = rollout(MODEL.step, mpc.design(steep, MODEL), steep)
+        followed = AffineFeedback(gains, planned.inputs, planned.states)
+        x, fastest[name] = np.zeros(2), 0.0
+        for t in range(H):
+            x = MODEL.step(x, followed(t, x)) + w[t]
+            fastest[name] = max(fastest[name], float(x[1]))
+        assert planned.states[:, 1].max() > 0.9 * speeds.high[1]  # the limit matters
+    assert fastest["given"] > limit
+    assert fastest["tightened"] <= limit + 1e-9
 
 
 def test_what_has_no_tube_is_refused() -> None:

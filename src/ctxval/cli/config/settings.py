@@ -236,6 +236,8 @@ class Settings(BaseModel):
             return experiment
         if self.spec is None:
             raise InputError("a specification is needed: the experiment file has no table [spec].")
+        if self.threshold not in (None, self.spec.margin):
+            raise InputError(f"if a specification is judged, its margin is the threshold, got {self.threshold:g}.")
         return self.spec.on(experiment)
 
     def _named(self, experiment: str) -> Experiment:

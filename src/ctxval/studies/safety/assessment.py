@@ -121,10 +121,12 @@ class SafetyReport(ShortRepr):
         unit = f" {self.units}".rstrip()
         if self.d_b_bound is None:
             return f"no margin is certified: {self.doubt}."
+        quantile = None if self.certificate is None else self.certificate.details.get("quantile")
+        often = "" if quantile is None else f" in {100 * quantile:g} % of its executions"
         return (
             f"With {100 * self.confidence:g} % confidence, every task that M satisfies with a robustness above "
-            f"{self.d_b_bound:.4g}{unit} is safe on S: {100 * (self.share_certified or 0):.1f} % of the tasks, and M "
-            f"satisfies {100 * self.share_satisfied:.1f} %."
+            f"{self.d_b_bound:.4g}{unit} is safe on S{often}: {100 * (self.share_certified or 0):.1f} % of the tasks, "
+            f"and M satisfies {100 * self.share_satisfied:.1f} %."
         )
 
     def __repr__(self) -> str:
@@ -224,6 +226,11 @@ def assess(
             rho = on_model(planner, spec, unit)
     if not (rho > 0).any():
         raise InputError(f"none of {len(unit)} drawn tasks satisfies the specification on the model.")
+    if bound is None and not (campaign.worst is not None and campaign.worst.distance):
+        doubt = (
+            "no executed task came near a violation, so that no prediction of one was tested; ask for a margin, or "
+            "draw tasks with an audit"
+        )
     deviation = max((moved for _, moved in executed), default=0.0)
     tightened = None
     if bound is not None and isinstance(spec, ReachAvoid):
