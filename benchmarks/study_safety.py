@@ -26,7 +26,7 @@ from safety_systems import SYSTEMS, WALL_D_A, WALL_D_B
 
 STORED = JsonLines(Path(__file__).parent / "results" / "safety.jsonl", ("part", "case", "seed", "asked"))
 
-BUDGET, SEEDS, ASKED_SEEDS = 30, 5, 2
+BUDGET, SEEDS, ASKED_SEEDS = 30, 4, 2
 ASKED = (0.7, 1.3)
 """Margins that are asked for, as shares of the true d_b."""
 TRUTH = 200_000  # tasks that the truth is of
