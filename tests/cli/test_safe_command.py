@@ -133,6 +133,17 @@ def test_bad_input_is_one_sentence(folder: Path, invoke: Invoke, old: str, new: 
     assert not (folder / "runs").exists()
 
 
+def test_bad_options_are_refused_before_anything_is_executed(folder: Path, invoke: Invoke) -> None:
+    for option, value, expected in (
+        ("--margin", "-0.1", "--margin must be a positive number"),
+        ("--audit", "0", "--audit must be a positive integer, got 0"),
+    ):
+        refused = invoke("safe", "wall.toml", option, value)
+        assert refused.exit_code == 2
+        assert expected in refused.stderr
+    assert not (folder / "runs").exists()
+
+
 def test_an_experiment_without_a_specification_is_refused(folder: Path, invoke: Invoke) -> None:
     refused = invoke("safe", "pendulum")
     assert refused.exit_code == 2

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from ctxval._util.checked import PositiveFloat, PositiveInt, require
 from ctxval._util.representation import task_text
 from ctxval._util.texts import enumerated
 from ctxval.campaign.storage.store import Store
@@ -14,6 +15,7 @@ from ctxval.cli.config.stored_settings import budget_of
 from ctxval.errors import CtxvalError, InputError
 from ctxval.specs import ReachAvoid
 from ctxval.studies.safety import DrawnTasks, SafetyReport, assess, draw_tasks, require_safe_tasks
+from ctxval.studies.safety.draws import require_box
 
 
 @command()
@@ -30,6 +32,8 @@ def safe(
     accept_change: str | None = None,
 ) -> Any:
     """``ctxval safe``."""
+    require("margin", PositiveFloat | None, margin)
+    require("audit", PositiveInt | None, audit)
     given = read_settings(target, {"budget": budget, "confidence": confidence, "seed": seed})
     if given.spec is None:
         raise InputError(f"{target} has no table [spec] with sets to avoid or to reach.")
@@ -40,6 +44,8 @@ def safe(
     settings = given.model_copy(update=asked)
     experiment = settings.load()
     path = _store_path(settings, experiment.name, store)
+    if audit is not None:
+        require_box(experiment.validation)
     share = require_safe_tasks(experiment.validation)
     campaign = settings.campaign(
         experiment, path, accept_change=accept_change, remeasure=_has_another_margin(path, settings)

@@ -17,6 +17,7 @@ from ctxval.campaign.storage.store import Store
 from ctxval.certificates.options import CONFIDENCE
 from ctxval.certificates.scenario import volume_bound
 from ctxval.core.space import TaskSpace
+from ctxval.core.validation import Validation
 from ctxval.distances import UnsafeMargin
 from ctxval.errors import InputError
 from ctxval.learning.closed_loops import LoopPlanner
@@ -77,6 +78,12 @@ class TasksWithMargin:
         return {"margin": self.margin, "of": self.space}
 
 
+def require_box(validation: Validation) -> None:
+    """Refuse a suite of tasks, of which draws bound no share."""
+    if validation.space.members is not None:
+        raise InputError("a suite has finitely many tasks, so no share of it is bounded by draws: execute its tasks.")
+
+
 @checked
 def draw_tasks(
     campaign: Campaign,
@@ -100,8 +107,7 @@ def draw_tasks(
         progress: as in :meth:`ctxval.Campaign.run`.
     """
     validation = campaign.validation
-    if validation.space.members is not None:
-        raise InputError("a suite has finitely many tasks, so no share of it is bounded by draws: execute its tasks.")
+    require_box(validation)
     spec = spec_distance(validation).spec
     sampler = TasksWithMargin(LoopPlanner(validation), validation.space, spec, float(margin))
     sampler(np.random.default_rng(0), 1)  # refuses a margin that no task has
