@@ -39,7 +39,8 @@ at most {budget} executions and does not know the truth; shares are of all tasks
 
 {table}
 
-{outcome}
+{outcome} The rules for kinks, and the 1 % by which a bound is raised because a search may end below a ridge, were
+chosen on seed 0 of these systems; without that 1 %, two of three bounds were below the true $d_b$ by up to 0.2 %.
 
 {asked}
 
@@ -196,7 +197,7 @@ def draw() -> None:
         spec.robustness(Trajectory(tasks.times, np.array(stored[name])[None], np.zeros((1, steps, 1))), tasks)
         for name in ("model", "system")
     )
-    figure, axes = plt.subplots(figsize=(6.0, 4.6), layout="constrained")
+    figure, axes = plt.subplots(figsize=(5.2, 6.6), layout="constrained")
     kinds = np.select([rho > stored["bound"], (rho > 0) & (of_system > 0), rho > 0], [0, 1, 2], 3).reshape(size)
     colours = matplotlib.colors.ListedColormap(["#d5ead8", "#f3e3ae", "#d9534f", "#e6e6e6"])
     ends = tuple(stored["ends"])
@@ -211,7 +212,7 @@ def draw() -> None:
     ):
         axes.plot([], [], "s", color=colour, ms=10, markeredgecolor="#888888", label=label)
     axes.set(xlim=ends[:2], ylim=ends[2:], xlabel="ox [m]", ylabel="oy [m]", title="Where the obstacle may be")
-    figure.legend(loc="outside right upper", frameon=False, fontsize=8)
+    figure.legend(loc="outside lower center", ncols=2, frameon=False, fontsize=8)
     figure.savefig(PICTURE, dpi=130, metadata={"Software": None})
 
 
