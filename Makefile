@@ -8,7 +8,7 @@ CAMPAIGNS ?= 120
 # Small dense algebra is faster on one thread.
 export OMP_NUM_THREADS = 1
 
-.PHONY: demo test quick thorough check docs reliability interleavings crash-states attack lowest bench bench-peers study study-refine reproduce search global-search calibrate drawn-tests parts pictures posterior-ranks servo watch envelope clean
+.PHONY: demo test quick thorough check docs reliability interleavings crash-states attack lowest bench bench-peers study study-refine reproduce search global-search calibrate drawn-tests parts pictures posterior-ranks servo watch envelope safety clean
 
 demo: .venv/.installed
 	$(BIN)/ctxval run pendulum
@@ -95,6 +95,10 @@ compare-study: .venv/.test  ## how many executions comparisons need; writes docs
 servo: .venv/.test  ## campaigns on the recordings of a real servo; writes docs/servo.md, and resumes
 	$(BIN)/python benchmarks/study_servo.py
 	$(BIN)/python benchmarks/servo_page.py
+
+safety: .venv/.test  ## which environments are safe: certified beside true ones? Writes docs/how-to/safety.md, and resumes
+	$(BIN)/python benchmarks/study_safety.py
+	$(BIN)/python benchmarks/safety_page.py
 
 watch: .venv/.test  ## does a watch notice that a system has changed? Writes docs/how-to/watch.md, and resumes
 	$(BIN)/python benchmarks/study_watch.py development --tasks 300

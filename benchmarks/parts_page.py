@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ctxval import cases, certificates, controllers, distances, models, searches, systems
+from ctxval import cases, certificates, controllers, distances, models, searches, specs, systems
 from ctxval._util.registry import Declaration, Registry, declaration_of
 from ctxval.cli.config.parts import plain_options
 
@@ -40,6 +40,10 @@ SECTIONS = (
     Section(
         "Distances", distances.REGISTRY, '`[distance]` with `type = "FinalState"`; `distances.by_name("FinalState")`'
     ),
+    Section(
+        "Specifications", specs.REGISTRY, '`[spec]` with `type = "ReachAvoid"`; `specs.by_name("ReachAvoid", ...)`'
+    ),
+    Section("Sets", specs.SETS, '`avoid = [{ type = "Ball", ... }]` of `[spec]`; `specs.Ball(...)`'),
     Section(
         "Searches", searches.REGISTRY, '`[search]` with `name = "auto"`; `--search auto`; `searches.by_name("auto")`'
     ),

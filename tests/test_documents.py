@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import tomllib
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any, get_args
 
@@ -38,6 +38,7 @@ from ctxval.models import Linear
 from ctxval.studies.fitting import FittedParameter, fit
 from ctxval.studies.refinement import HeldOut, measure_residual
 from ctxval.studies.replay import PredictedTask, PredictedTasks, Suggestion, replay
+from ctxval.studies.safety import Disturbance, DrawnTasks, SafetyReport, UnsafeTask
 from ctxval.testing import check_search
 from rig_logs import run
 
@@ -162,6 +163,12 @@ def test_the_glossary_explains_what_a_watch_says() -> None:
     explained = re.findall(r"`([^`]+)`", (ROOT / "docs" / "glossary.md").read_text())
     said = {"watch", "skipped", "again", "statistic", "evidence", "ratio", "run", "task"}
     assert keys(state.to_json()) | said <= set(explained)
+
+
+def test_the_glossary_explains_what_is_said_of_safety() -> None:
+    said = {field.name for of in (SafetyReport, UnsafeTask, DrawnTasks, Disturbance) for field in fields(of)}
+    explained = re.findall(r"`([^`]+)`", (ROOT / "docs" / "glossary.md").read_text())
+    assert (said | {"avoid", "reach", "drawn", "store"}) - {"tightened"} <= set(explained)
 
 
 def test_the_glossary_is_in_alphabetical_order() -> None:

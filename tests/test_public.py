@@ -17,7 +17,7 @@ from ctxval import errors
 
 ROOT = Path(__file__).parents[1]
 PACKAGES = ["", *(f".{module}" for module in ctxval._MODULES.values())]
-COMPLETE = [".paper.cases", ".certificates", ".controllers", ".distances", ".models", ".searches", ".systems"]
+COMPLETE = [".paper.cases", ".certificates", ".controllers", ".distances", ".models", ".searches", ".specs", ".systems"]
 
 
 @pytest.mark.parametrize("package", PACKAGES)

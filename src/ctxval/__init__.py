@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from ctxval import models as models
     from ctxval import report as report
     from ctxval import searches as searches
+    from ctxval import specs as specs
     from ctxval import systems as systems
     from ctxval import testing as testing
     from ctxval._util.arrays import Array
@@ -50,6 +51,7 @@ if TYPE_CHECKING:
     from ctxval.studies import fitting as fitting
     from ctxval.studies import refinement as refinement
     from ctxval.studies import replay as replay
+    from ctxval.studies import safety as safety
     from ctxval.studies.comparison import Comparison, compare
     from ctxval.studies.refinement import refine
 
@@ -104,7 +106,9 @@ _MODULES = {
     "replay": "studies.replay",
     "report": "report",
     "reproduce": "paper.reproduce",
+    "safety": "studies.safety",
     "searches": "searches",
+    "specs": "specs",
     "systems": "systems",
     "testing": "testing",
 }

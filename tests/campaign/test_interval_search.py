@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from conftest import interrupt_at_once, make_validation, make_validation_without_inputs
-from ctxval import Campaign, cases, searches
+from ctxval import Campaign, cases, distances, searches, specs
 from ctxval.campaign.dynamics import NEAR, PREDICTION
 from ctxval.campaign.interval_search import IntervalSearch, next_task
 from ctxval.certificates import (
@@ -361,3 +361,11 @@ def test_evidence_is_the_same_after_it_was_kept() -> None:
 def test_a_threshold_must_be_positive() -> None:
     with pytest.raises(InputError, match="threshold"):
         Campaign(linear()[0]).run(5, -1.0)
+
+
+def test_a_distance_with_kinks_may_be_large_next_to_executed_tasks() -> None:
+    spec = specs.ReachAvoid(avoid=specs.Ball([0.0], radius=0.1), components=(0,))
+    known = np.array([[0.5]])
+    for distance, is_new in ((distances.UnsafeMargin(spec), True), (distances.FinalState(), False)):
+        search = IntervalSearch(Campaign(make_validation(distance=distance)).recorder, CertificateOptions(), 10)
+        assert (search._near < np.abs(known - 0.51).max()) == is_new

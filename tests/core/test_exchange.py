@@ -103,6 +103,16 @@ def test_a_task_comes_back_bit_for_bit(tmp_path: Path) -> None:
     assert found.initial_state.tobytes() == TASK.initial_state.tobytes()
     assert found.reference.tobytes() == np.ascontiguousarray(TASK.reference).tobytes()
     assert json.loads(path.read_text())["state_units"] == ["rad", "rad/s"]
+    assert found.environment == {}
+
+
+def test_the_environment_of_a_task_comes_back_bit_for_bit(tmp_path: Path) -> None:
+    path = tmp_path / "task.json"
+    write_task(path, Task([0.0, 1.0], horizon=2, dt=0.1, environment={"obstacle": [0.1, 1 / 3, 2.0]}))
+    assert read_task(path).environment["obstacle"].tolist() == [0.1, 1 / 3, 2.0]
+    path.write_text(path.read_text().replace("[0.1,", "[null,"))
+    with pytest.raises(InputError, match="environment 'obstacle'"):
+        read_task(path)
 
 
 # What cannot be written

@@ -135,3 +135,23 @@ def test_components_of_different_batches_are_refused_with_their_shapes() -> None
 def test_a_goal_of_another_batch_than_the_initial_state_is_refused_with_both_shapes() -> None:
     with pytest.raises(ShapeError, match=r"must have the same batch shape, got \(3,\) and \(2,\)"):
         task(initial_state=[np.zeros(2), 0], goal=[np.zeros(3), 0])
+
+
+def test_the_environment_follows_the_task_through_batches() -> None:
+    ox = np.array([0.1, 0.2, 0.3])
+    batch = task(environment={"obstacle": [ox, 0.5], "wind": [1.0]})
+    assert batch.batch_shape == (3,)
+    np.testing.assert_array_equal(batch.environment["wind"], np.ones((3, 1)))
+    np.testing.assert_array_equal(batch[1].environment["obstacle"], [0.2, 0.5])
+    again = Task.stacked([batch[0], batch[1], batch[2]]).named("x")
+    np.testing.assert_array_equal(again.environment["obstacle"], batch.environment["obstacle"])
+    assert again.starting_at(np.zeros((4, 3, 2))).environment["obstacle"].shape == (4, 3, 2)
+    assert "environment" not in task().describe()
+    assert list(batch[0].describe()["environment"]) == ["obstacle", "wind"]
+
+
+def test_an_environment_that_cannot_be_is_refused() -> None:
+    with pytest.raises(ShapeError, match=r"and environment must have the same batch shape, got \(\), \(3,\)|\(2,\)"):
+        task(initial_state=[np.zeros(2), 0], environment={"wall": [np.zeros(3)]})
+    with pytest.raises(InputError, match="environment 'wall' must be finite"):
+        task(environment={"wall": [np.nan]})

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ctxval import Task, TaskSpace, Transitions, Validation, controllers, distances, models, systems
+from ctxval import Task, TaskSpace, Trajectory, Transitions, Validation, controllers, distances, models, systems
 from ctxval._util.arrays import Array
 from ctxval.gp.ascent import Ascent
 from ctxval.learning import worst_case
@@ -144,6 +144,30 @@ def test_controllers_that_jump_from_task_to_task_are_seen(height: float, jumps: 
     assert (share > 0.01) == jumps
     if not jumps:
         assert share < 1e-3
+
+
+class Folded(distances.MeanDeviation):
+    """A distance that is continuous in the trajectories, and steep with many kinks."""
+
+    def __call__(self, model_trajectory: Trajectory, system_trajectory: Trajectory, task: Task) -> Array:
+        plain = super().__call__(model_trajectory, system_trajectory, task)
+        return np.asarray(np.abs((500 * plain) % 2 - 1))
+
+
+class Kinked(Folded):
+    kinked = True
+
+
+@pytest.mark.slow
+def test_kinks_of_a_distance_that_says_so_are_no_jumps_and_jumps_are_still_seen() -> None:
+    def largest(height: float, distance: distances.Distance) -> float:
+        planner = LoopPlanner(jumping(height).validation.with_distance(distance))
+        settings = replace(WorstCaseSettings.for_dimension(2), pool=256)
+        return WorstCaseSearch(planner, 0, settings).largest_jump(learned())
+
+    assert largest(0.0, Folded()) > 0.05
+    assert largest(0.0, Kinked()) < 0.01
+    assert largest(1.0, Kinked()) > 0.2
 
 
 FEW = WorstCaseSettings(pool=64, evaluations=300, elites=6, shared=6, moves=4, relevant=100)

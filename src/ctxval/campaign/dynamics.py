@@ -38,7 +38,7 @@ from ctxval.learning.closed_loops import LoopPlanner
 from ctxval.learning.coverage import Coverage, Gap
 from ctxval.learning.tolerance import LEVELS, PushResponse
 from ctxval.learning.vector import Executed
-from ctxval.learning.worst_case import WorstCase
+from ctxval.learning.worst_case import WorstCase, is_kinked
 from ctxval.searches import Prediction
 from ctxval.searches.base import Pending
 
@@ -389,9 +389,12 @@ def _explained(predictions: Sequence[CheckedPrediction], learned: LearnedDynamic
 
 
 def _with_jumps(evidence: DynamicsEvidence, learned: LearnedDynamics, bound: float) -> DynamicsEvidence:
-    """Return evidence with the largest jump between tasks; if there are jumps, with what deeper searches have found."""
+    """Return evidence with the largest jump between tasks; if there are jumps, with what deeper searches have found.
+
+    The maxima of a distance with kinks lie on ridges, which deeper searches climb higher.
+    """
     evidence = replace(evidence, jump=learned.largest_jump)
-    if not evidence.dense or not jumps(evidence, bound):
+    if not (is_kinked(learned.study.given.distance) or (evidence.dense and jumps(evidence, bound))):
         return evidence
     values, points = learned.deeper
     low, high = values.min(), values.max()

@@ -47,6 +47,7 @@ from ctxval.certificates.verdict import counterexample, quantile_of, require_sui
 from ctxval.certificates.verdict_sentences import Quantities
 from ctxval.core.trial import Trial
 from ctxval.errors import CertificateError, InputError
+from ctxval.learning.worst_case import is_kinked
 
 _FAILING = 6  # of so many last predictions, at least half must hold
 
@@ -298,8 +299,13 @@ class IntervalSearch:
 
     @property
     def _near(self) -> float:
-        """The largest change of each coordinate to a task that is no new one."""
-        return NEAR if self._suite is None else SAME
+        """The largest change of each coordinate to a task that is no new one.
+
+        A distance with kinks may be large in a few tasks only, which are next to others where it is 0.
+        """
+        if self._suite is not None:
+            return SAME
+        return 0.1 * NEAR if is_kinked(self.recorder.validation.distance) else NEAR
 
     def test(self) -> Choice:
         """Return the next task that tests predictions where nobody chose to look; see ``prediction_tests``."""

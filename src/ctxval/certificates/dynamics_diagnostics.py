@@ -332,7 +332,7 @@ def _unsearched(evidence: DynamicsEvidence, bound: float) -> Iterator[str]:
             "does; use a smoother model, or an audit"
         )
     share = max(evidence.missed - 1, evidence.disagreement)
-    if evidence.dense and share > AGREE:
+    if share > AGREE:
         yield (
             f"searches of the learned dynamics find largest distances that differ by {100 * share:.0f} %, because the "
             "controllers or the closed loop change abruptly from task to task; an execution of the task of the largest "

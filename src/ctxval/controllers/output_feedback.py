@@ -51,8 +51,8 @@ class OutputFeedback(ShortRepr):
         zero = np.zeros(n)
         lift = np.linalg.pinv(self.outputs.jacobian(zero)).T
         reference = (task.reference - self.outputs(zero)) @ lift if task.has_goal else None
-        start, name = task.initial_state, task.name
-        of_states = Task(start, horizon=task.horizon, dt=task.dt, reference=reference, name=name)
+        start, more = task.initial_state, {"name": task.name, "environment": task.environment}
+        of_states = Task(start, horizon=task.horizon, dt=task.dt, reference=reference, **more)
         covariances = tuple(
             np.diag(np.broadcast_to(_deviations(name, value, size), (size,)) ** 2)
             for name, value, size in (("process", self.process, n), ("measurement", self.measurement, p))

@@ -78,6 +78,8 @@ def write_task(path: str | Path, task: Task, *, states: Names | None = None) -> 
     about = {"format": TASK_FORMAT, "version": VERSION, "dt": task.dt, "horizon": task.horizon}
     about |= _named("state", states, task.initial_state.size)
     about |= {"name": task.name} if task.name else {}
+    if task.environment:
+        about["environment"] = {name: given.tolist() for name, given in task.environment.items()}
     _write(Path(path), about, {"initial_state": task.initial_state, "reference": task.reference})
 
 
@@ -86,8 +88,11 @@ def read_task(path: str | Path) -> Task:
 
     def build(content: Mapping[str, Any]) -> Task:
         start = as_finite("initial_state", content["initial_state"])
-        aim, name = content["reference"], str(content.get("name", ""))
-        return Task(start, horizon=content["horizon"], dt=content["dt"], reference=aim, name=name)
+        more: dict[str, Any] = {
+            "name": str(content.get("name", "")),
+            "environment": dict(content.get("environment", {})),
+        }
+        return Task(start, horizon=content["horizon"], dt=content["dt"], reference=content["reference"], **more)
 
     return _read(Path(path), TASK_FORMAT, build)
 

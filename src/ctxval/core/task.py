@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -27,6 +27,8 @@ class Task:
         reference: the states, or outputs, to follow, array ``(..., H + 1, n)``; give this or ``goal``, not both.
         name: the name of the task, or an array of names over the batch. A task of a :class:`ctxval.TaskSuite` gets
             that of the suite.
+        environment: what else a design, a distance or a specification reads, such as the place of an obstacle: names
+            with lists of numbers, each given like ``initial_state`` and with a width of its own.
     """
 
     def __init__(
@@ -38,6 +40,7 @@ class Task:
         goal: Any = None,
         reference: Any = None,
         name: Any = "",
+        environment: Mapping[str, Any] | None = None,
     ) -> None:
         if goal is not None and reference is not None:
             raise InputError("a task must have a goal or a reference, not both.")
@@ -55,12 +58,18 @@ class Task:
             target = np.zeros((1, n))
         if not (np.isfinite(state).all() and np.isfinite(target).all()):
             raise InputError("a task must have a finite initial_state and a finite goal or reference.")
+        around = {key: _components(f"environment {key!r}", given) for key, given in (environment or {}).items()}
+        for key, given in around.items():
+            if not np.isfinite(given).all():
+                raise InputError(f"environment {key!r} must be finite, got {given.tolist()}.")
+        shapes = [given.shape[:-1] for given in around.values()]
         try:
-            self.batch_shape: tuple[int, ...] = np.broadcast_shapes(state.shape[:-1], target.shape[:-2])
+            self.batch_shape: tuple[int, ...] = np.broadcast_shapes(state.shape[:-1], target.shape[:-2], *shapes)
         except ValueError:
-            got = f"{target.shape[:-2]} and {state.shape[:-1]}"
+            also = " and environment" if around else ""
+            got = " and ".join(map(str, (target.shape[:-2], state.shape[:-1], *shapes)))
             raise ShapeError(
-                f"goal or reference and initial_state must have the same batch shape, got {got}."
+                f"goal or reference and initial_state{also} must have the same batch shape, got {got}."
             ) from None
         self.initial_state: Array = np.broadcast_to(state, (*self.batch_shape, n))
         """Shape ``(..., n)``."""
@@ -70,6 +79,10 @@ class Task:
         """Whether a goal or a reference was given."""
         self.name: Any = name
         """The name of the task, or those of a batch, ``(...)``; empty if it has none."""
+        self.environment: dict[str, Array] = {
+            key: np.broadcast_to(given, (*self.batch_shape, given.shape[-1])) for key, given in around.items()
+        }
+        """What else is known of the task, by name, arrays ``(..., k)``; empty if nothing is."""
 
     @property
     def goal(self) -> Array:
@@ -92,31 +105,33 @@ class Task:
         """Return single tasks with one horizon and one time step as a batch."""
         first, names = tasks[0], [one.name for one in tasks]
         starts, references = np.stack([one.initial_state for one in tasks]), np.stack([one.reference for one in tasks])
-        return first._like(starts, references, np.array(names) if any(names) else "")
+        around = {key: np.stack([one.environment[key] for one in tasks]) for key in first.environment}
+        return first._like(starts, references, np.array(names) if any(names) else "", around)
 
     def __getitem__(self, index: int | slice) -> Task:
         """Return one task of the batch, or some of them."""
         names = np.broadcast_to(self.name, self.batch_shape)
-        return self._like(self.initial_state[index], self.reference[index], names[index])
+        around = {key: given[index] for key, given in self.environment.items()}
+        return self._like(self.initial_state[index], self.reference[index], names[index], around)
 
     def starting_at(self, states: Array) -> Task:
         """Return the task from other initial states ``(..., n)``, which may have further axes in front."""
-        return self._like(states, self.reference, self.name)
+        return self._like(states, self.reference, self.name, self.environment)
 
     def named(self, name: Any) -> Task:
         """Return the task with a name, or a batch with an array of names."""
-        return self._like(self.initial_state, self.reference, name)
+        return self._like(self.initial_state, self.reference, name, self.environment)
 
-    def _like(self, initial_state: Array, reference: Array, name: Any) -> Task:
+    def _like(self, initial_state: Array, reference: Array, name: Any, environment: Mapping[str, Array]) -> Task:
         name = name if np.ndim(name) else str(name)
         aim = reference if self.has_goal else None
-        return Task(initial_state, horizon=self.horizon, dt=self.dt, reference=aim, name=name)
+        return Task(initial_state, horizon=self.horizon, dt=self.dt, reference=aim, name=name, environment=environment)
 
     def describe(self) -> dict[str, Any]:
         """Return what identifies one task in a store."""
         start, named = self.initial_state.tolist(), {"name": self.name} if self.name else {}
         about = {"horizon": self.horizon, "dt": self.dt, "initial_state": start, "reference": self.reference}
-        return about | named
+        return about | named | ({"environment": self.environment} if self.environment else {})
 
     def __repr__(self) -> str:
         if self.batch_shape:
@@ -125,7 +140,8 @@ class Task:
         constant = bool((self.reference == self.goal).all())
         aim = {"goal": self.goal} if constant else {"reference": self.reference}
         named = {"name": self.name} if self.name else {}
-        return call(self, **named, initial_state=self.initial_state, **aim, horizon=self.horizon, dt=self.dt)
+        around = {"environment": self.environment} if self.environment else {}
+        return call(self, **named, initial_state=self.initial_state, **aim, **around, horizon=self.horizon, dt=self.dt)
 
 
 def _components(name: str, value: Any) -> Array:

@@ -155,8 +155,8 @@ class Validation:
         if self.outputs is None:
             return task
         reference = task.reference if task.has_goal else None
-        start = self.recorded(task.initial_state)
-        return Task(start, horizon=task.horizon, dt=task.dt, reference=reference, name=task.name)
+        start, more = self.recorded(task.initial_state), {"name": task.name, "environment": task.environment}
+        return Task(start, horizon=task.horizon, dt=task.dt, reference=reference, **more)
 
     def closed_loop(self, controller: Controller, task: Task) -> Trajectory:
         """Return the closed loop of a controller with M, as it is recorded."""
@@ -380,7 +380,8 @@ class Validation:
     def _state_cost(self, parameters: Parameters, task: Task) -> None:
         """State the cost of a long horizon once, from the first steps of a plan; refuse one that is too long."""
         steps, probed = task.horizon, min(100, task.horizon)
-        first = Task(task.initial_state, horizon=probed, dt=task.dt, reference=task.reference[..., : probed + 1, :])
+        start, reference, more = task.initial_state, task.reference[..., : probed + 1, :], task.environment
+        first = Task(start, horizon=probed, dt=task.dt, reference=reference, environment=more)
         begun = time.process_time()
         trajectory = self.plan_of(parameters, first).model_trajectory
         seconds = (time.process_time() - begun) * steps / probed

@@ -16,6 +16,7 @@ from ctxval.distances.deviations import (
     TrackingError,
     WholeTrajectory,
 )
+from ctxval.distances.unsafe_margin import UnsafeMargin
 
 __all__ = [
     "REGISTRY",
@@ -31,6 +32,7 @@ __all__ = [
     "RelativeDeviation",
     "StateNorm",
     "TrackingError",
+    "UnsafeMargin",
     "WholeTrajectory",
     "by_name",
 ]

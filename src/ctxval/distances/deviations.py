@@ -11,9 +11,10 @@ import numpy as np
 from ctxval._util.arrays import Array
 from ctxval._util.checked import Norm
 from ctxval._util.registry import part
+from ctxval.core.components import selected
 from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory
-from ctxval.distances.base import ErrorNorm, StateNorm, require_numbers, selected
+from ctxval.distances.base import ErrorNorm, StateNorm, require_numbers
 from ctxval.errors import InputError
 
 

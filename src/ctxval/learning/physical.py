@@ -90,7 +90,8 @@ class _ExtendedTask(Task):
         self.plain, self.values = plain, values
         reference = _joined(plain.reference, values[..., None, :]) if plain.has_goal else None
         start = _joined(plain.initial_state, values)
-        super().__init__(start, horizon=plain.horizon, dt=plain.dt, reference=reference, name=plain.name)
+        more = {"name": plain.name, "environment": plain.environment}
+        super().__init__(start, horizon=plain.horizon, dt=plain.dt, reference=reference, **more)
 
     def __getitem__(self, index: int | slice) -> Task:
         return _ExtendedTask(self.plain[index], self.values[index])

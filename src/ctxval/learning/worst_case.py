@@ -31,6 +31,8 @@ _EVALUATIONS = (512, 2048, 4096, 6000, 6000, 6000, 12000)
 """Number of tasks in the global search for 1, 2, ... task parameters; the last one holds for all higher numbers."""
 _SHOWN = 16  # largest number of these tasks
 _NEARBY = 1e-3  # largest change of each coordinate to a task that is nearly the same
+_NEARER = 64  # how many times nearer tasks are that tell kinks of a distance from jumps, a power of 2
+_BENT = 64  # rows of such tasks that are looked at more closely if the distance has kinks
 _FIRST = 8  # number of draws that show which tasks may be worst on the others
 _SCREENED = (8, 1500)  # number of draws of the hyperparameters in a screening, and of tasks in its search on the mean
 _APART = 0.15  # least distance of two tasks that are not next to each other, as a share of the cube's diagonal
@@ -157,16 +159,38 @@ class WorstCaseSearch:
         """Return by how much the mean's distance of a task differs at most from the middle of those on both sides.
 
         The tasks are those of the pool. If the distance is a smooth function of the task, this is hardly anything. It
-        is 0 for a suite, whose tasks are all searched.
+        is 0 for a suite, whose tasks are all searched. A distance whose attribute ``kinked`` is true is continuous in
+        the trajectories and has kinks, which are no jumps: they become small between tasks that are nearer.
         """
         if self.members is not None:
             return 0.0
         with single_threaded():
             tasks, planned = self._in_rows
             found = self.planner.distances(posterior.mean, planned, tasks.shape[0] * tasks.shape[1])[0]
-        first, middle, last = found.reshape(tasks.shape[:2]).T
-        jumps = np.abs(middle - 0.5 * (first + last))
+        of_rows = found.reshape(tasks.shape[:2])
+        if is_kinked(self.planner.validation.distance):
+            of_rows = self._nearer(posterior, tasks, of_rows)
+        jumps = np.abs(of_rows[:, 1] - 0.5 * (of_rows[:, 0] + of_rows[:, 2]))
         return float(jumps[np.isfinite(jumps)].max(initial=0.0))
+
+    def _nearer(self, posterior: AnyPosterior, tasks: Array, found: Array) -> Array:
+        """Return distances ``(k, 3)`` of three tasks in a row that are ``_NEARER`` times nearer, where they bend most.
+
+        Of each row, the half with the larger change is kept, which a jump is in.
+        """
+        bend = np.nan_to_num(np.abs(found[:, 1] - 0.5 * (found[:, 0] + found[:, 2])), nan=0.0, posinf=0.0)
+        rows = np.argsort(-bend, kind="stable")[:_BENT]
+        tasks, found = tasks[rows], found[rows]
+        for _ in range(int(np.log2(_NEARER))):
+            later = np.abs(found[:, 2] - found[:, 1]) > np.abs(found[:, 1] - found[:, 0])
+            ends = np.where(later[:, None], [1, 2], [0, 1])
+            tasks, found = np.take_along_axis(tasks, ends[..., None], axis=1), np.take_along_axis(found, ends, axis=1)
+            middle = tasks.mean(axis=1)
+            with single_threaded():
+                value = self.planner.distances(posterior.mean, self.planner.plan(middle), len(middle))[0]
+            tasks = np.stack([tasks[:, 0], middle, tasks[:, 1]], axis=1)
+            found = np.stack([found[:, 0], value, found[:, 1]], axis=1)
+        return found
 
     def deeper(self, posterior: AnyPosterior, rng: np.random.Generator) -> tuple[Array, Array]:
         """Return the largest distances on the mean ``(2,)`` in two separate searches, and their points ``(2, d)``.
@@ -210,7 +234,7 @@ class WorstCaseSearch:
         best = self.pool[np.argsort(-_finite(of_pool), kind="stable")[: settings.elites * 4]]
         starts = np.concatenate([known, best])
         with single_threaded():
-            if not globally:
+            if not globally and not is_kinked(self.planner.validation.distance):
                 budget = min(_SCREENED[1], settings.evaluations)
                 same = posterior.rough_mean is posterior.searched
                 rough = None if same else partial(self._distances, posterior.rough_mean)
@@ -295,10 +319,12 @@ class WorstCaseSearch:
     def _sharpness(self, mean: AnyDraws, elites: Array, rng: np.random.Generator) -> float:
         """Return the largest share that the distance of an elite loses at the median of the tasks next to it.
 
-        If controllers jump from task to task, the largest distance is a needle that a search finds by chance.
+        If controllers jump from task to task, the largest distance is a needle that a search finds by chance. Kinks are
+        no needles: they are flat between tasks that are nearer.
         """
         peaks = elites[: self.settings.peaks]
-        moves = rng.uniform(-_NEARBY, _NEARBY, (len(peaks), self.settings.nearby, self.dimension))
+        near = _NEARBY / _NEARER if is_kinked(self.planner.validation.distance) else _NEARBY
+        moves = rng.uniform(-near, near, (len(peaks), self.settings.nearby, self.dimension))
         tasks = np.concatenate([peaks[:, None], np.clip(peaks[:, None] + moves, 0, 1)], axis=1)
         found = self._distances(mean, tasks.reshape(-1, self.dimension))
         distances = np.maximum(found.reshape(tasks.shape[:2]), 0.0)
@@ -374,6 +400,15 @@ class WorstCaseSearch:
         few = (rng.random(shape) < 0.5) | (rng.random((*shape[:2], 1)) < 0.5)
         random = np.clip(around + share * few * rng.normal(size=shape), 0, 1)
         return np.concatenate([to_bounds, random], axis=1)
+
+
+def is_kinked(distance: object) -> bool:
+    """Return whether a distance, or the user's distance in it, has kinks."""
+    while distance is not None:
+        if getattr(distance, "kinked", False):
+            return True
+        distance = getattr(distance, "distance", None)
+    return False
 
 
 def _others(tasks: Array, order: Rows) -> Array:

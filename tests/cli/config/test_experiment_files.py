@@ -131,6 +131,12 @@ def test_a_described_experiment_can_be_asked_by_hand(invoke: Any) -> None:
         ("A = [[1.0, 0.05], [0.0, 1.0]]", "A = [[1.0]]", "needs A (n, n), B (n, m)"),
         ('goal = ["goal", 0.0]', 'goal = ["gaol", 0.0]', "did you mean 'goal'"),
         ('goal = ["goal", 0.0]', "goal = 3", "goal of [task] must be a list"),
+        ('goal = ["goal", 0.0]', "goal = [0.0, 0.0]\nenvironment = 3", "environment of [task] must be a table"),
+        (
+            'goal = ["goal", 0.0]',
+            "goal = [0.0, 0.0]\nenvironment = { o = 3 }",
+            "environment 'o' of [task] must be a list",
+        ),
         ('goal = ["goal", 0.0]', "goal = [1.0]", "goal or reference of a task must have 2 components"),
         ('goal = ["goal", 0.0]', 'goal = ["goal[1]", 0.0]', "[task] cannot be used"),
         ("horizon = 60            # number of time steps", "", "[task] needs horizon"),
@@ -222,6 +228,8 @@ def test_a_task_table_serves_one_task_and_a_batch() -> None:
     np.testing.assert_array_equal(batch.initial_state, np.stack([np.full(5, 0.5), -points[:, 0]], axis=1))
     np.testing.assert_array_equal(batch.goal, points[:, [0, 2]])
     np.testing.assert_array_equal(table(space.parameters(points[3])).goal, batch.goal[3])
+    placed = TaskTable((0.5,), None, 4, 0.1, {"obstacle": ["offsets[0]", 2.0]})(space.parameters(points))
+    np.testing.assert_array_equal(placed.environment["obstacle"], np.stack([points[:, 1], np.full(5, 2.0)], axis=1))
 
 
 def test_a_model_is_learned_from_recorded_files(invoke: Any) -> None:

@@ -123,6 +123,22 @@ def test_the_largest_residual_of_a_region_is_measured_in_it() -> None:
         np.testing.assert_array_equal(np.abs(given.errors[inside]).max(axis=0), one.largest)
 
 
+def test_what_is_new_to_the_model_is_separate_from_what_was_left_out_in_turn() -> None:
+    # Models that lack one of a few executions err; the model that has them all does not.
+    given = errors_by_speed(400)
+    new = np.arange(400) >= 300
+    given = replace(given, errors=np.where(new[:, None], 1e-4, 0.5) * np.sign(given.errors), new=new)
+    found = measure_residual(given, {"a": "", "b": ""}, {"c": ""})
+    assert found.left_out is not None
+    assert (found.whole.steps, found.left_out.steps) == (100, 300)
+    assert found.whole.largest.max() == pytest.approx(1e-4)
+    assert found.left_out.largest.max() == pytest.approx(0.5)
+    assert sum(one.steps for one in found.regions) == 100
+    assert "all that is new to the model" in found.text
+    assert "left out in turn" in found.text.splitlines()[-1]
+    np.testing.assert_allclose(given.rms, 1e-4)
+
+
 def test_residuals_of_zero_have_one_region() -> None:
     given = errors_by_speed()
     zero = replace(given, errors=0 * given.errors)

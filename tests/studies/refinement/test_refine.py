@@ -222,7 +222,9 @@ def test_the_model_and_its_residual_are_written(found: Refinement, tmp_path: Pat
 @pytest.mark.slow
 def test_the_residual_is_measured_on_executions_that_were_not_learned_from(found: Refinement) -> None:
     assert found.residual is not None
-    assert found.residual.whole.steps == 30 * found.executions
+    assert found.residual.left_out is not None
+    assert found.residual.whole.steps == 30 * found.last.executions  # new to the last model
+    assert found.residual.left_out.steps == 30 * (found.executions - found.last.executions)
     name = list(found.accuracy)[1]
     before, after = found.accuracy[name]
     assert after < before

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
@@ -140,12 +140,19 @@ class TaskTable:
     goal: list[float | str] | None
     horizon: int
     dt: float
+    environment: dict[str, list[float | str]] = field(default_factory=dict)
 
     def __call__(self, p: Parameters) -> Task:
         """Return the task, or the batch of tasks."""
         start = [_component(entry, p) for entry in self.initial_state]
         goal = None if self.goal is None else [_component(entry, p) for entry in self.goal]
-        return Task(start, goal=goal, horizon=self.horizon, dt=self.dt)
+        around = {name: [_component(entry, p) for entry in entries] for name, entries in self.environment.items()}
+        return Task(start, goal=goal, horizon=self.horizon, dt=self.dt, environment=around)
+
+    def describe(self) -> dict[str, Any]:
+        """Return what identifies this task function in a store."""
+        known = {name: getattr(self, name) for name in ("initial_state", "goal", "horizon", "dt")}
+        return known | ({"environment": self.environment} if self.environment else {})
 
 
 def _component(entry: float | str, p: Parameters) -> Any:
@@ -169,8 +176,11 @@ def task_function(given: str | Mapping[str, Any], space: TaskSpace, system: Any,
     missing = [key for key in ("initial_state", "horizon", "dt") if table.get(key) is None]
     if missing:
         raise InputError(f"[task] needs {', '.join(missing)}.")
-    for name in ("initial_state", "goal"):
-        entries = table[name]
+    around = table.get("environment", {})
+    if not isinstance(around, dict):
+        raise InputError(f"environment of [task] must be a table of names and lists, got {around!r}.")
+    of_environment = {f"environment {name!r}": entries for name, entries in around.items()}
+    for name, entries in {"initial_state": table["initial_state"], "goal": table["goal"], **of_environment}.items():
         plain = isinstance(entries, list) and entries and all(type(entry) in (int, float, str) for entry in entries)
         if not plain and (name, entries) != ("goal", None):
             raise InputError(f"{name} of [task] must be a list of numbers and of names of parameters, got {entries!r}.")

@@ -11,7 +11,7 @@ import tomllib
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 from pydantic_core import PydanticCustomError
@@ -41,12 +41,14 @@ from ctxval.core.space import TaskSpace
 from ctxval.core.task_suite import TaskSuite
 from ctxval.core.validation import Validation
 from ctxval.data import LogMapping
+from ctxval.distances import UnsafeMargin
 from ctxval.errors import CertificateError, InputError, UnknownNameError
 from ctxval.models import Refined, read_refined
 from ctxval.searches import DEFAULT as DEFAULT_SEARCH
 from ctxval.searches import REGISTRY as SEARCHES
 from ctxval.searches import Search, by_name
 from ctxval.studies.aspect1 import TASKS
+from ctxval.studies.safety import judged_by
 
 Part = str | dict[str, Any]
 """``module:attr``, or a table with a type and its arguments."""
@@ -135,6 +137,27 @@ class Aspect1Table(BaseModel):
     tasks: int = Field(default=TASKS, ge=2)
 
 
+class SpecTable(BaseModel):
+    """The table ``[spec]``: what a closed loop shall do, which ``ctxval safe`` judges.
+
+    Its other entries are the arguments of the specification.
+
+    Attributes:
+        type: the name of the specification.
+        margin: the robustness of M that shall suffice for a task to be safe; None to find it.
+    """
+
+    model_config = ConfigDict(extra="allow")
+
+    type: str = "ReachAvoid"
+    margin: float | None = Field(default=None, gt=0, allow_inf_nan=False, strict=True)
+
+    def on(self, experiment: Experiment) -> Experiment:
+        """Return an experiment that judges the specification in place of its distance; the threshold is the margin."""
+        distance = UnsafeMargin({"type": self.type, **(self.model_extra or {})}, margin=self.margin)
+        return judged_by(experiment, distance)
+
+
 _WHOLE = ("space", "task", "system", "model", "synthesizer")
 
 
@@ -147,6 +170,8 @@ class Settings(BaseModel):
         suite: the parameters of each task by its name, in the place of the space, if tasks are a list.
         distribution: see :func:`~ctxval.cli.config.parts.with_distribution`; a named experiment may have one too.
         longest: the largest horizon.
+        spec: what a closed loop shall do, if ``judge`` is ``spec``.
+        judge: whether the distance is judged or, as by ``ctxval safe``, the specification.
         physical: the task parameters that change the dynamics of the system; a named experiment may have some too.
         outputs: the indices of M's states that are recorded, or the function ``module:attr`` of them.
         explore, within: as the options of ``ctxval run``, so that a store knows the command that made it.
@@ -183,6 +208,8 @@ class Settings(BaseModel):
     store: Path | None = None
     search: SearchTable = Field(default_factory=SearchTable)
     aspect1: Aspect1Table = Field(default_factory=Aspect1Table)
+    spec: SpecTable | None = None
+    judge: Literal["distance", "spec"] = "distance"
     refined: Path | None = None
     recordings: dict[str, Any] | None = None
     folder: Path | None = None
@@ -204,7 +231,14 @@ class Settings(BaseModel):
             validation = validation.with_physical(self.physical)
         if self.distribution is not None:
             validation = validation.with_space(with_distribution(validation.space, self.distribution, self.folder))
-        return experiment if validation is given else replace(experiment, validation=validation)
+        experiment = experiment if validation is given else replace(experiment, validation=validation)
+        if self.judge == "distance":
+            return experiment
+        if self.spec is None:
+            raise InputError("a specification is needed: the experiment file has no table [spec].")
+        if self.threshold not in (None, self.spec.margin):
+            raise InputError(f"if a specification is judged, its margin is the threshold, got {self.threshold:g}.")
+        return self.spec.on(experiment)
 
     def _named(self, experiment: str) -> Experiment:
         for name in (*_WHOLE, "suite", "distance", "name", "outputs"):
@@ -235,13 +269,16 @@ class Settings(BaseModel):
         outputs: Any = self.outputs
         if isinstance(self.outputs, str):
             outputs = require_function("outputs", reference(self.outputs, self.folder), "x -> y")
+        default: Part = "FinalState"
+        if self.spec is not None:  # d_a, of the states that the specification looks at
+            default = {"type": "MaximumDeviation", "components": (self.spec.model_extra or {}).get("components")}
         validation = Validation(
             space=space,
             task=task_function(self.task or {}, space, system, self.folder),
             system=system,
             model=part("model", self.model or {}, self.folder),
             synthesizer=part("synthesizer", self.synthesizer or {}, self.folder),
-            distance=part("distance", self.distance or "FinalState", self.folder),
+            distance=part("distance", self.distance or default, self.folder),
             labels=Labels(labels_of(self.states), labels_of(self.inputs), self.units or ""),
             outputs=outputs,
         )

@@ -97,6 +97,8 @@ class HeldOut(ShortRepr):
         changes: the recorded changes of the states in one step, shape ``(N, n)``.
         later, later_before: errors after ten steps along held-out executions, of both models, shapes ``(K, n)``. They
             choose corrections, because noise of the records hides in one step what adds up in several.
+        new: which transitions are of executions that the model itself had not seen, shape ``(N,)``; the errors on all
+            others are of models that were learned without a part of the records. None if there are no new ones.
     """
 
     pairs: Array
@@ -105,6 +107,7 @@ class HeldOut(ShortRepr):
     changes: Array
     later: Array
     later_before: Array
+    new: Mask | None = None
 
     @property
     def better(self) -> Mask:
@@ -129,14 +132,19 @@ class HeldOut(ShortRepr):
         return (self.later, self.later_before) if len(self.later) else (self.errors, self.before)
 
     @property
+    def counted(self) -> Mask:
+        """The transitions whose errors are those of the model itself: the new ones, or all if there are none."""
+        return np.ones(len(self.errors), dtype=bool) if self.new is None else self.new
+
+    @property
     def rms(self) -> Array:
-        """The root mean square of each state's error, shape ``(n,)``."""
-        return np.asarray(np.sqrt((self.errors**2).mean(axis=0)))
+        """The root mean square of each state's error on the transitions that count, shape ``(n,)``."""
+        return np.asarray(np.sqrt((self.errors[self.counted] ** 2).mean(axis=0)))
 
     @property
     def rms_before(self) -> Array:
         """That of the first model, shape ``(n,)``."""
-        return np.asarray(np.sqrt((self.before**2).mean(axis=0)))
+        return np.asarray(np.sqrt((self.before[self.counted] ** 2).mean(axis=0)))
 
     def kept(self, chosen: Mask) -> HeldOut:
         """Return the errors if only the chosen states ``(n,)`` are corrected."""
@@ -144,7 +152,8 @@ class HeldOut(ShortRepr):
 
     def with_executions(self, model: Model, before: Model, executed: Sequence[Trajectory]) -> HeldOut:
         """Return these errors and those on executions that the model itself was not learned from."""
-        return _joined([self, *(_compared(run.transitions(), [run], model, before) for run in executed)])
+        joined = _joined([self, *(_compared(run.transitions(), [run], model, before) for run in executed)])
+        return replace(joined, new=np.arange(len(joined.pairs)) >= len(self.pairs)) if executed else self
 
 
 def held_out(learn: Callable[[Records], Model], before: Model, records: Records) -> HeldOut:
@@ -190,7 +199,8 @@ def _errors_later(model: Model, runs: Sequence[Trajectory], n: int) -> Array:
 
 
 def _joined(parts: list[HeldOut]) -> HeldOut:
-    return HeldOut(*(np.concatenate(arrays) for arrays in zip(*(vars(part).values() for part in parts), strict=True)))
+    arrays = ([value for name, value in vars(part).items() if name != "new"] for part in parts)
+    return HeldOut(*(np.concatenate(together) for together in zip(*arrays, strict=True)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -220,6 +230,8 @@ class MeasuredResidual(ShortRepr):
     Attributes:
         states, inputs: the names of states and inputs with their units.
         whole: the residual in all regions together, whose box is the range of the records.
+        left_out: the residual of models that were learned without a part of the records, on that part; it is larger if
+            the records are few. None if no execution was new to M', so that ``whole`` and the regions are of these.
         regions: disjoint regions that cover all states and inputs, those with small residuals first.
     """
 
@@ -227,13 +239,17 @@ class MeasuredResidual(ShortRepr):
     inputs: dict[str, str]
     whole: ResidualRegion
     regions: tuple[ResidualRegion, ...]
+    left_out: ResidualRegion | None = None
 
     @property
     def text(self) -> str:
         """The table as plain text."""
         units = [f"{name} [{unit}]" if unit else name for name, unit in self.states.items()]
         rows = [["region", "steps", *(f"{unit}: 95 %" for unit in units), *(f"{unit}: largest" for unit in units)]]
-        for region, where in [*((region, self._where(region)) for region in self.regions), (self.whole, "all records")]:
+        listed = [(region, self._where(region)) for region in self.regions]
+        listed.append((self.whole, "all records" if self.left_out is None else "all that is new to the model"))
+        listed += [(region, "left out in turn") for region in [self.left_out] if region is not None]
+        for region, where in listed:
             sizes = (*region.quantile.tolist(), *region.largest.tolist())
             rows.append([where, str(region.steps), *(f"{value:.3g}" for value in sizes)])
         return aligned(rows, right=True)
@@ -274,6 +290,7 @@ class MeasuredResidual(ShortRepr):
             "quantile_level": 0.95,
             "units": {**self.states, **self.inputs},
             "whole": plain(self.whole),
+            "left_out": self.left_out and plain(self.left_out),
             "regions": [plain(region) for region in self.regions],
             "guaranteed": False,
         }
@@ -282,21 +299,27 @@ class MeasuredResidual(ShortRepr):
 def measure_residual(held: HeldOut, states: dict[str, str], inputs: dict[str, str]) -> MeasuredResidual:
     """Return the residual by regions, from errors on transitions that were held out.
 
-    The regions are those of a small regression tree: each split explains most of the spread of the logarithm of the
-    error, in units of the typical change of each state. ``states`` and ``inputs`` are names with their units.
+    If executions are new to the model, the regions are of these alone. The regions are those of a small regression
+    tree: each split explains most of the spread of the logarithm of the error, in units of the typical change of each
+    state. ``states`` and ``inputs`` are names with their units.
     """
+    counted = held.counted
+    pairs, magnitudes = held.pairs[counted], np.abs(held.errors)
 
-    def region(inside: Mask, low: Array, high: Array) -> ResidualRegion:
-        chosen = np.abs(held.errors)[inside]
+    def region(of: Array, inside: Mask, low: Array, high: Array) -> ResidualRegion:
+        chosen = of[inside]
         return ResidualRegion(low, high, len(chosen), np.quantile(chosen, 0.95, axis=0), chosen.max(axis=0))
 
+    def whole(rows: Mask) -> ResidualRegion:
+        return region(magnitudes, rows, held.pairs[rows].min(axis=0), held.pairs[rows].max(axis=0))
+
     sizes = np.maximum(held.changes.std(axis=0), 1e-300)
-    error = np.sqrt(((held.errors / sizes) ** 2).mean(axis=1))
+    error = np.sqrt(((held.errors[counted] / sizes) ** 2).mean(axis=1))
     logs = np.log(np.maximum(error, 1e-12 * max(float(error.max(initial=0.0)), 1e-300)))
-    regions = [region(*box) for box in _split(held.pairs, logs)]
-    whole = region(np.ones(len(logs), dtype=bool), held.pairs.min(axis=0), held.pairs.max(axis=0))
+    regions = [region(magnitudes[counted], *box) for box in _split(pairs, logs)]
     ordered = sorted(regions, key=lambda item: float((item.quantile / sizes).max()))
-    return MeasuredResidual(states, inputs, whole, tuple(ordered))
+    left_out = None if counted.all() else whole(~counted)
+    return MeasuredResidual(states, inputs, whole(counted), tuple(ordered), left_out)
 
 
 def _split(pairs: Array, logs: Array) -> list[tuple[Mask, Array, Array]]:

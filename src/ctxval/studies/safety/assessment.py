@@ -1,0 +1,293 @@
+"""Which tasks are safe on S, from a campaign whose distance is the margin of unsafe tasks.
+
+``d_a`` is the largest deviation of the states that a specification looks at, and ``d_b`` the largest robustness rho_M
+of a task that M satisfies and S violates (Ghosh et al. 2019, arXiv 1902.10320). Every task with a larger rho_M than
+``d_b`` is safe, and ``d_b`` is at most ``d_a``.
+"""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from ctxval._util.checked import NonNegativeInt, PositiveInt, checked
+from ctxval._util.progress import stage
+from ctxval._util.progress_display import progress_shown
+from ctxval._util.representation import ShortRepr, Shown, call, lines
+from ctxval._util.texts import parted
+from ctxval.campaign.campaign import Campaign
+from ctxval.campaign.history import executed_trials
+from ctxval.certificates import Certificate, CertificateOptions, Dynamics
+from ctxval.certificates.bounds import ERRORS
+from ctxval.certificates.dynamics import draws_for
+from ctxval.certificates.verdict import Answer, usable_bound
+from ctxval.core.experiment import Experiment
+from ctxval.core.trajectory import Trajectory
+from ctxval.core.trial import Trial
+from ctxval.core.validation import Validation
+from ctxval.distances import MaximumDeviation, UnsafeMargin
+from ctxval.errors import CertificateError, InputError
+from ctxval.learning import DynamicsStudy
+from ctxval.learning.closed_loops import LoopPlanner
+from ctxval.specs import ReachAvoid
+from ctxval.studies.safety.margins import on_model, spec_distance
+
+TASKS = 4000
+"""Number of tasks on M that the shares are of; of designs that are made one by one, a tenth of it."""
+
+
+_SEARCHED = 0.01
+"""Share of a bound on d_b by which a search may end below its largest value, which lies on a ridge: in the study of
+``docs/how-to/safety.md``, it ended by up to 0.2 % below."""
+
+
+@dataclass(frozen=True)
+class UnsafeTask(ShortRepr):
+    """An executed task that M satisfies and S violates.
+
+    Attributes:
+        trial: the number of its trial.
+        parameters: the task.
+        on_model, on_system: the robustness of both trajectories.
+    """
+
+    trial: int
+    parameters: dict[str, Any]
+    on_model: float
+    on_system: float
+
+
+@dataclass(frozen=True, eq=False)
+class SafetyReport(ShortRepr):
+    """Which tasks are safe on S.
+
+    Attributes:
+        spec: the specification.
+        margin: the robustness of M that was asked for; None if it was to be found.
+        answer: whether every task with a larger one is safe, ``validated``, ``falsified`` or ``undecided``; None if no
+            margin was asked for.
+        reason: why.
+        d_a: the largest executed deviation of the states that the specification looks at.
+        d_a_bound: what the learned dynamics bound it by; no prediction of it was tested. None if it is not known.
+        d_b: the largest executed rho_M of a task that S violates; 0 if there is none.
+        d_b_bound: the certified bound; None if there is none.
+        counterexamples: the executed tasks that M satisfies and S violates, the largest rho_M first.
+        certificate: the certificate of the bound; None if there is none.
+        doubt: why there is no bound; None if there is one.
+        tasks: number of drawn tasks, on M alone, that the shares are of.
+        share_satisfied: the share of the tasks that M satisfies.
+        share_certified: the share whose rho_M exceeds the bound of d_b; None if there is none.
+        share_by_deviation: the share whose rho_M exceeds the bound of d_a; None if there is none.
+        tightened: the specification whose sets to avoid have grown, and whose set to reach has shrunk, by the bound;
+            None if there is no bound, no sets, or nothing left of the set to reach.
+        executions: the number of executions of S.
+        confidence: the confidence of the certificate.
+        units: the unit of all distances.
+    """
+
+    spec: Any
+    margin: float | None
+    answer: Answer | None
+    reason: str | None
+    d_a: float
+    d_a_bound: float | None
+    d_b: float
+    d_b_bound: float | None
+    counterexamples: tuple[UnsafeTask, ...]
+    certificate: Certificate | None
+    doubt: str | None
+    tasks: int
+    share_satisfied: float
+    share_certified: float | None
+    share_by_deviation: float | None
+    tightened: ReachAvoid | None
+    executions: int
+    confidence: float
+    units: str
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return everything as plain values."""
+        plain = {name: value for name, value in vars(self).items() if name not in ("spec", "certificate", "tightened")}
+        return {
+            **plain,
+            "spec": repr(self.spec),
+            "counterexamples": [asdict(task) for task in self.counterexamples],
+            "certificate": self.certificate and self.certificate.to_json(),
+            "avoid": None if self.tightened is None else [repr(one) for one in self.tightened.avoid],
+            "reach": None if self.tightened is None or self.tightened.reach is None else repr(self.tightened.reach),
+        }
+
+    @property
+    def statement(self) -> str:
+        """What follows for the tasks, in one sentence."""
+        unit = f" {self.units}".rstrip()
+        if self.d_b_bound is None:
+            return f"no margin is certified: {self.doubt}."
+        quantile = None if self.certificate is None else self.certificate.details.get("quantile")
+        often = "" if quantile is None else f" in {100 * quantile:g} % of its executions"
+        return (
+            f"With {100 * self.confidence:g} % confidence, every task that M satisfies with a robustness above "
+            f"{self.d_b_bound:.4g}{unit} is safe on S{often}: {100 * (self.share_certified or 0):.1f} % of the tasks, "
+            f"and M satisfies {100 * self.share_satisfied:.1f} %."
+        )
+
+    def __repr__(self) -> str:
+        head = call(self, Shown(self.answer or "no margin asked for"), d_a=self.d_a, d_b=self.d_b, bound=self.d_b_bound)
+        return lines(head, self.statement, f"counterexamples: {len(self.counterexamples)} of {self.executions}")
+
+
+def judged_by(experiment: Experiment, distance: UnsafeMargin) -> Experiment:
+    """Return an experiment whose distance is the margin of unsafe tasks, and whose threshold is that margin.
+
+    The unit is that of the states that the specification looks at, if they have one.
+    """
+    given = experiment.validation.with_distance(distance)
+    labels = [parted(label)[1] for label in experiment.states]
+    spec = given.distance.spec if isinstance(given.distance, UnsafeMargin) else distance.spec
+    components = getattr(spec, "components", None)
+    places = range(len(labels)) if components is None else [i for i in components if isinstance(i, int)]
+    found = {labels[i] for i in places if -len(labels) <= i < len(labels)}
+    units = found.pop() if len(found) == 1 else ""
+    validation = given.with_labels(replace(given.labels, units=units))
+    return replace(experiment, validation=validation, threshold=distance.margin, truth=None, units=units)
+
+
+@checked
+def require_safe_tasks(validation: Validation, tasks: PositiveInt = 512, seed: NonNegativeInt = 0) -> float:
+    """Return the share of drawn tasks that M satisfies with the margin; S is not executed.
+
+    An InputError says that there is none, so that nothing could be certified.
+    """
+    distance, planner, space = spec_distance(validation), LoopPlanner(validation), validation.space
+    plan = validation.plan(0.5 * (space.low + space.high))
+    distance.spec.robustness(plan.model_trajectory, plan.task)  # refuses sets of other dimensions
+    unit = space.members if space.members is not None else space.unit_draws(tasks, np.random.default_rng([seed, 1]))
+    least = distance.margin or 0.0
+    share = float((on_model(planner, distance.spec, unit[: tasks if planner.batched else 100]) > least).mean())
+    if not share:
+        what = f"with a margin of {least:g}" if least else "at all"
+        raise InputError(
+            f"no drawn task satisfies the specification on the model {what}, so there is nothing to certify: check "
+            "the sets, their places and the states that the specification looks at."
+        )
+    return share
+
+
+@checked
+def assess(
+    campaign: Campaign,
+    certificate: CertificateOptions | None = None,
+    *,
+    tasks: PositiveInt = TASKS,
+    progress: bool | None = None,
+) -> SafetyReport:
+    """Return which tasks are safe on S, from the trials of a campaign. S is not executed.
+
+    Args:
+        campaign: a campaign whose distance is a :class:`ctxval.distances.UnsafeMargin`.
+        certificate: the kind and options of the certificate; that of learned dynamics by default.
+        tasks: number of tasks on M that the shares are of.
+        progress: whether to show the progress on standard error; None to show it at a terminal and in a notebook.
+
+    Raises:
+        InputError: if the distance is another one, or no drawn task satisfies the specification on M.
+    """
+    validation, options = campaign.validation, certificate or CertificateOptions(Dynamics())
+    distance, space = spec_distance(validation), validation.space
+    spec, margin = distance.spec, distance.margin
+    with progress_shown(progress):
+        executed = [
+            _compared(campaign, trial, system) for trial, system in executed_trials(campaign.store, campaign.trials)
+        ]
+        unsafe = sorted(
+            (task for task, _ in executed if task.on_system <= 0 < task.on_model), key=lambda t: -t.on_model
+        )
+        verdict = None if margin is None else campaign.verdict(margin, certificate=options)
+        certified, doubt = None if verdict is None else verdict.certificate, None
+        if verdict is None:
+            try:
+                certified = campaign.certify(certificate=options)
+            except CertificateError as error:
+                doubt = str(error).removesuffix(".")
+        bound = usable_bound(certified)
+        if verdict is not None:
+            bound = margin if verdict.answer == "validated" else None
+            doubt = verdict.reason.removesuffix(".")
+        elif bound is not None and certified is not None:
+            searched = max(certified.details.get("disagreement") or 0.0, _SEARCHED)
+            bound = (1 + searched) * (bound + ERRORS * certified.error)
+        elif certified is not None:
+            doubt = certified.doubt or "the certificate leaves out a share of the tasks"
+        with stage("predicting the largest deviation"):
+            of_deviation = _deviation_bound(campaign, spec, options.confidence)
+        planner = LoopPlanner(validation)
+        count = tasks if planner.batched else max(tasks // 10, 1)
+        unit = space.members
+        if unit is None:
+            unit = space.unit_draws(count, np.random.default_rng([campaign.seed, 2]))
+        with stage("running tasks on the model", len(unit), "tasks"):
+            rho = on_model(planner, spec, unit)
+    if not (rho > 0).any():
+        raise InputError(f"none of {len(unit)} drawn tasks satisfies the specification on the model.")
+    if bound is None and not (campaign.worst is not None and campaign.worst.distance):
+        doubt = (
+            "no executed task came near a violation, so that no prediction of one was tested; ask for a margin, or "
+            "draw tasks with an audit"
+        )
+    deviation = max((moved for _, moved in executed), default=0.0)
+    tightened = None
+    if bound is not None and isinstance(spec, ReachAvoid):
+        with suppress(InputError):  # nothing is left of a set
+            tightened = spec.tightened(bound)
+    return SafetyReport(
+        spec=spec,
+        margin=margin,
+        answer=None if verdict is None else verdict.answer,
+        reason=None if verdict is None else verdict.reason,
+        d_a=deviation,
+        d_a_bound=of_deviation if of_deviation is None else max(of_deviation, deviation),
+        d_b=max((task.on_model for task in unsafe), default=0.0),
+        d_b_bound=bound,
+        counterexamples=tuple(unsafe),
+        certificate=certified,
+        doubt=None if bound is not None else doubt,
+        tasks=len(unit),
+        share_satisfied=float((rho > 0).mean()),
+        share_certified=None if bound is None else float((rho > bound).mean()),
+        share_by_deviation=None if of_deviation is None else float((rho > max(of_deviation, deviation)).mean()),
+        tightened=tightened,
+        executions=campaign.executions,
+        confidence=options.confidence,
+        units=validation.labels.units,
+    )
+
+
+def _compared(campaign: Campaign, trial: Trial, system: Trajectory) -> tuple[UnsafeTask, float]:
+    """Return the robustness of both trajectories of an executed task, and how far they deviate."""
+    validation, spec = campaign.validation, spec_distance(campaign.validation).spec
+    task = validation.task_at(validation.space.parameters(validation.space.from_unit(trial.unit_point)))
+    model, _ = campaign.trajectories(trial)
+    if model is None:
+        model = validation.plan(validation.space.from_unit(trial.unit_point)).model_trajectory
+    of_model, of_system = (float(spec.robustness(one, task)) for one in (model, system))
+    deviation = MaximumDeviation(2, getattr(spec, "components", None))(model, system, task)
+    return UnsafeTask(trial.number, trial.parameters, of_model, of_system), float(deviation)
+
+
+def _deviation_bound(campaign: Campaign, spec: Any, confidence: float) -> float | None:
+    """Return the bound that learned dynamics give on the largest deviation; None if they give none."""
+    validation = campaign.validation.with_distance(MaximumDeviation(2, getattr(spec, "components", None)))
+    pairs = [(trial.unit_point, system) for trial, system in executed_trials(campaign.store, campaign.trials)]
+    try:
+        learned = DynamicsStudy(validation, campaign.seed).learn(pairs)
+        if learned is None:
+            return None
+        maxima = learned.worst_case_of(draws_for(confidence)).maxima
+    except Exception:  # users' parts, at states that no execution has reached
+        return None
+    rank = min(int(np.ceil((len(maxima) + 1) * confidence - 1e-9)), len(maxima)) - 1
+    bound = float(np.sort(maxima)[rank])
+    return bound if np.isfinite(bound) else None

@@ -1,0 +1,128 @@
+"""Independent draws among the tasks that M satisfies with a margin: how many of them S violates at most."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ctxval._util.arrays import Array
+from ctxval._util.checked import NonNegativeFloat, PositiveInt, Probability, checked
+from ctxval._util.representation import ShortRepr
+from ctxval.campaign.campaign import Campaign
+from ctxval.campaign.history import executed_trials
+from ctxval.campaign.storage.store import Store
+from ctxval.certificates.options import CONFIDENCE
+from ctxval.certificates.scenario import volume_bound
+from ctxval.core.space import TaskSpace
+from ctxval.core.validation import Validation
+from ctxval.distances import UnsafeMargin
+from ctxval.errors import InputError
+from ctxval.learning.closed_loops import LoopPlanner
+from ctxval.searches import by_name
+from ctxval.specs import Specification
+from ctxval.studies.safety.margins import on_model, spec_distance
+
+_ATTEMPTS, _TOGETHER = 64, 512  # batches of tasks that are tried for one with the margin, and tasks in each
+
+
+@dataclass(frozen=True)
+class DrawnTasks(ShortRepr):
+    """What independent draws show of the tasks that M satisfies with a robustness above a margin.
+
+    Nothing is assumed of the dynamics, and a failed execution counts as unsafe.
+
+    Attributes:
+        margin: the margin.
+        draws: number of executed draws.
+        unsafe: number of those that S violates.
+        share: with the confidence, at most this share of these tasks is unsafe (Clopper and Pearson 1934).
+        confidence: the confidence.
+    """
+
+    margin: float
+    draws: int
+    unsafe: int
+    share: float
+    confidence: float
+
+
+@dataclass(frozen=True, eq=False)
+class TasksWithMargin:
+    """A sampler of tasks that M satisfies with a robustness above a margin; S is not executed."""
+
+    planner: LoopPlanner
+    space: TaskSpace
+    spec: Specification
+    margin: float
+
+    def __call__(self, rng: np.random.Generator, n: int) -> Array:
+        """Return n independent tasks, rows ``(n, d)`` in the units of the space."""
+        kept, count = list[Array](), 0
+        for _ in range(_ATTEMPTS):
+            unit = self.space.unit_draws(_TOGETHER if self.planner.batched else 16, rng)
+            unit = unit[on_model(self.planner, self.spec, unit) > self.margin]
+            kept.append(unit)
+            count += len(unit)
+            if count >= n:
+                return np.asarray(self.space.from_unit(np.concatenate(kept)[:n]))
+        raise InputError(
+            f"hardly any task satisfies the specification on the model with a margin of {self.margin:g}, so there is "
+            "nothing to draw from."
+        )
+
+    def describe(self) -> dict[str, Any]:
+        """Return what identifies this sampler in a store."""
+        return {"margin": self.margin, "of": self.space}
+
+
+def require_box(validation: Validation) -> None:
+    """Refuse a suite of tasks, of which draws bound no share."""
+    if validation.space.members is not None:
+        raise InputError("a suite has finitely many tasks, so no share of it is bounded by draws: execute its tasks.")
+
+
+@checked
+def draw_tasks(
+    campaign: Campaign,
+    margin: NonNegativeFloat,
+    draws: PositiveInt,
+    *,
+    store: str | Path | None = None,
+    confidence: Probability = CONFIDENCE,
+    progress: bool | None = None,
+) -> DrawnTasks:
+    """Execute independent draws among the tasks that M satisfies with a margin, and bound the share that is unsafe.
+
+    Choose the margin and the number of draws before the draws are executed. They have a store of their own.
+
+    Args:
+        campaign: a campaign whose distance is a :class:`ctxval.distances.UnsafeMargin`.
+        margin: the margin, such as the bound of :func:`assess`.
+        draws: total number of draws, with those that the store has.
+        store: the file of the store; in memory by default.
+        confidence: the confidence of the bound.
+        progress: as in :meth:`ctxval.Campaign.run`.
+    """
+    validation = campaign.validation
+    require_box(validation)
+    spec = spec_distance(validation).spec
+    sampler = TasksWithMargin(LoopPlanner(validation), validation.space, spec, float(margin))
+    sampler(np.random.default_rng(0), 1)  # refuses a margin that no task has
+    drawn = Campaign(
+        validation.with_space(validation.space.sampled(sampler)).with_distance(UnsafeMargin(spec)),
+        search=by_name("random"),
+        store=Store(store),
+        seed=campaign.seed,
+        name=campaign.name,
+    )
+    drawn.audit(draws, progress=progress)
+    trials = drawn.trials[:draws]
+    unsafe = len([trial for trial in trials if trial.state == "failed"])
+    for trial, system in executed_trials(drawn.store, trials):
+        task = validation.task_at(validation.space.parameters(validation.space.from_unit(trial.unit_point)))
+        unsafe += float(spec.robustness(system, task)) <= 0
+    share = volume_bound(len(trials), unsafe, 1 - confidence) if unsafe < len(trials) else 1.0
+    return DrawnTasks(float(margin), len(trials), unsafe, share, confidence)

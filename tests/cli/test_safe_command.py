@@ -1,0 +1,150 @@
+"""``ctxval safe``, as users call it."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from rig_cli import Invoke, calling, report
+
+FILE = """
+name = "wall"
+units = "rad"
+threshold = 7.0
+budget = 20
+
+[space]
+wall = [0.4, 2.0, "m"]
+speed = [0.5, 1.5, "m/s"]
+
+[task]
+initial_state = [0.0, 0.0]
+goal = [1.0, 0.0]
+environment = { wall = ["wall"], speed = ["speed"] }
+horizon = 10
+dt = 0.1
+
+[spec]
+components = ["position"]
+avoid = { type = "Box", center = "wall", low = [0.0], high = [inf] }
+
+[states]
+position = "m"
+clock = "s"
+
+[system]
+type = "Simulated"
+step = { ref = "safe_drive:step" }
+vectorized = true
+
+[model]
+type = "Linear"
+A = [[1.0, 0.0], [0.0, 1.0]]
+B = [[0.1], [0.0]]
+
+[synthesizer]
+type = "Policy"
+policy = { ref = "safe_drive:policy" }
+
+[distance]
+type = "FinalState"
+components = ["position"]
+"""
+
+MODULE = """
+import numpy as np
+
+
+def step(x, u):
+    return x + np.concatenate([0.1 * (u + 0.3 * u**2), 0.0 * u], axis=-1)
+
+
+def policy(t, x, task):
+    return np.broadcast_to(task.environment["speed"], (*x.shape[:-1], 1))
+"""
+
+D_B = 2.0 - (3.4**0.5 - 1) / 0.6
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    (tmp_path / "safe_drive.py").write_text(MODULE)
+    (tmp_path / "wall.toml").write_text(FILE)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "160")
+    yield tmp_path
+    sys.modules.pop("safe_drive", None)
+
+
+@pytest.fixture
+def invoke(folder: Path) -> Invoke:
+    return calling()
+
+
+@pytest.mark.slow
+@pytest.mark.in_full
+def test_it_finds_the_margin_and_other_commands_read_its_store(folder: Path, invoke: Invoke) -> None:
+    found = report(invoke("safe", "wall.toml", "--audit", "12", "--json"))
+    assert found["units"] == "m"
+    assert D_B - 1e-3 <= found["d_b_bound"] <= 1.1 * D_B
+    assert found["d_b"] <= D_B + 1e-9 <= found["d_a"] + 0.2
+    assert found["counterexamples"][0]["on_system"] <= 0 < found["counterexamples"][0]["on_model"]
+    assert found["avoid"] == [f"Box(center='wall', low=[-{found['d_b_bound']:.4g}], high=[inf])"]
+    assert (found["drawn"]["draws"], found["drawn"]["unsafe"]) == (12, 0)
+    assert found["store"] == str(Path("runs") / "wall-auto-seed0.safe.sqlite")
+    assert report(invoke("status", found["store"], "--json"))["executions"] == found["executions"]
+    assert (
+        report(invoke("certify", found["store"], "--kind", "dynamics", "--json"))["upper_bound"] <= found["d_b_bound"]
+    )
+    # Asked again for a margin, the same executions count, with their distances computed again.
+    asked = invoke("safe", "wall.toml", "--margin", "0.3")
+    assert asked.exit_code == 1
+    assert "FALSIFIED: margin 0.3 m" in asked.stdout
+    assert "the distances of its executions are computed again" in asked.output
+    assert "unsafe: wall = " in asked.stdout
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "expected"),
+    [
+        ("[spec]", "[spek]", "no setting is called 'spek'; did you mean 'spec'?"),
+        ('avoid = { type = "Box", center = "wall", low = [0.0], high = [inf] }', "", "needs at least one set"),
+        ("low = [0.0], high = [inf]", "low = [0.0, 0.0], high = [inf, 1.0]", "the Box must have 1 dimension"),
+        (
+            'center = "wall"',
+            'center = "wal"',
+            "no entry of the task's environment is called 'wal'; did you mean 'wall'",
+        ),
+        ('["position"]\navoid', '["place"]\navoid', "no state is called 'place'"),
+        ('center = "wall"', "center = [-9.0]", "no drawn task satisfies the specification on the model at all"),
+        ("avoid = { type", "margin = -1.0\navoid = { type", "margin must be a positive number"),
+        ('type = "Box"', 'type = "Bax"', "no set is called 'Bax'; did you mean 'Box'"),
+    ],
+)
+def test_bad_input_is_one_sentence(folder: Path, invoke: Invoke, old: str, new: str, expected: str) -> None:
+    (folder / "wall.toml").write_text(FILE.replace(old, new))
+    refused = invoke("safe", "wall.toml")
+    assert refused.exit_code == 2
+    assert expected in " ".join(refused.stderr.split())
+    assert refused.stderr.count("error: ") == 1
+    assert not (folder / "runs").exists()
+
+
+def test_bad_options_are_refused_before_anything_is_executed(folder: Path, invoke: Invoke) -> None:
+    for option, value, expected in (
+        ("--margin", "-0.1", "--margin must be a positive number"),
+        ("--audit", "0", "--audit must be a positive integer, got 0"),
+    ):
+        refused = invoke("safe", "wall.toml", option, value)
+        assert refused.exit_code == 2
+        assert expected in refused.stderr
+    assert not (folder / "runs").exists()
+
+
+def test_an_experiment_without_a_specification_is_refused(folder: Path, invoke: Invoke) -> None:
+    refused = invoke("safe", "pendulum")
+    assert refused.exit_code == 2
+    assert "pendulum has no table [spec] with sets to avoid or to reach" in refused.stderr
