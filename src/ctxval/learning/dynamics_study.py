@@ -135,7 +135,7 @@ class DynamicsStudy(ShortRepr):
         with contextlib.suppress(np.linalg.LinAlgError, InputError, ValueError):
             if learned is None or len(executed) < _FEWEST_AGAINST:
                 return learned
-            actuator = None if logged else self._found_actuator(executed)
+            actuator = None if logged else self._found_actuator(executed, learned)
             if actuator is not None:
                 return self._with_actuator(actuator, executed[0][1].inputs.shape[-1]).learn(executed) or learned
             if not learned.left_out_error > _WELL:
@@ -295,8 +295,11 @@ class DynamicsStudy(ShortRepr):
             self._others[name] = DynamicsStudy(given, self.seed, self.quantile, self.extended.of(given))
         return self._others[name]
 
-    def _found_actuator(self, executed: Executed) -> Actuator | None:
-        """Return a delay and a lag of inputs that explain the errors of predictions."""
+    def _found_actuator(self, executed: Executed, learned: LearnedDynamics | None = None) -> Actuator | None:
+        """Return a delay and a lag of inputs that explain the errors of predictions.
+
+        What executions teach without them is ``learned``, if it is known.
+        """
         some = scheduled(len(executed))
         if self.actuator is not None or some < _FEWEST_AGAINST:
             return None
@@ -316,9 +319,10 @@ class DynamicsStudy(ShortRepr):
 
             before, self._actuators[key] = self._found_actuator(executed[: some - 1]), None
             if before is None:
-                extended = self._executions(executed[:some])
-                plain = None if extended is None else self._learn(extended, (), with_data=True)
-                if plain is None or not plain.left_out_error > _EXACTLY:
+                if learned is None or some < len(executed):
+                    extended = self._executions(executed[:some])
+                    learned = None if extended is None else self._learn(extended, (), with_data=True)
+                if learned is None or not learned.left_out_error > _EXACTLY:
                     return None
             model = before_refinement(self.validation.model)
             with single_threaded(), np.errstate(all="ignore"):
