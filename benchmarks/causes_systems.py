@@ -62,7 +62,6 @@ class Robot:
         rates: typical rates of the joints.
         efforts: typical magnitudes of the inputs.
         weights: joints that gravity pulls at.
-        free: degrees of freedom of a MuJoCo model that are of the robot; None for other robots.
     """
 
     name: str
@@ -77,7 +76,6 @@ class Robot:
     acceleration: Acceleration | None = None
     mjcf: Path | None = None
     weights: tuple[int, ...] = ()
-    effort_unit: float = 1.0
     joint_efforts: tuple[float, ...] = ()
 
     def experiment(self, fault: Fault, noise: float, seed: int) -> Experiment:
@@ -274,11 +272,11 @@ class _OfMuJoCo:
 
 def _analytic_model(joints: int, driven: tuple[int, ...], acceleration: Acceleration, dt: float) -> Model:
     def derivative(x: Array, u: Array) -> Array:
+        # The axes of a batch stay in the opposite order until the end.
         forces = np.zeros((*np.broadcast_shapes(x.shape[:-1], u.shape[:-1]), joints))
         forces[..., list(driven)] = u
-        q, v = np.moveaxis(x[..., :joints], -1, 0), np.moveaxis(x[..., joints:], -1, 0)
-        accelerations = acceleration(q, v, np.moveaxis(forces, -1, 0), 1.0)
-        return np.concatenate([x[..., joints:], np.moveaxis(accelerations, 0, -1)], axis=-1)
+        accelerations = acceleration(x[..., :joints].T, x[..., joints:].T, forces.T, 1.0)
+        return np.concatenate([x[..., joints:], accelerations.T], axis=-1)
 
     return models.Function(systems.rk4(derivative, dt), vectorized=True)
 
@@ -419,7 +417,7 @@ DEVELOPMENT = {
             make=_tracking((6.0, 5.0), ("goal",), 1.2, (0.2, 0.5), "m", 100, 2, (0, 1), (0,)),
         ),
         Robot(
-            "double pendulum", 3, 1, (0,), 0.02, (1.0, 1.0, 1.0), (0.1,),
+            "double pendulum", 3, 1, (0,), 0.02, (1.0, 1.0, 1.0), (0.2,),
             models.MuJoCo(_of_gymnasium("inverted_double_pendulum.xml"), dt=0.02),
             _regulated(
                 ([10.0, 20.0, 20.0, 1.0, 1.0, 1.0], [400.0]),
@@ -438,7 +436,9 @@ REPORTING = {
         _analytic(
             "arm", 2, (0, 1), _arm, 0.02,
             rates=(1.0, 1.0), efforts=(8.0, 3.0), weights=(0, 1),
-            make=_tracking(([80.0, 40.0], [20.0, 8.0]), ("first", "second"), 1.0, (0.2, 0.7), "rad", 120, 2, (0, 1), (0, 1)),
+            make=_tracking(
+                ([80.0, 40.0], [20.0, 8.0]), ("first", "second"), 1.0, (0.2, 0.7), "rad", 120, 2, (0, 1), (0, 1)
+            ),
         ),
         _analytic(
             "quadrotor", 3, (1, 2), _quadrotor, 0.04,

@@ -38,7 +38,8 @@ from ctxval.studies.causes.mjcf import BodyMass, JointAttribute, MassCentre
 from ctxval.studies.causes.plant import Joint, Plant
 from ctxval.studies.causes.sensors import SensorOffset, SensorScale, SwappedJoints
 
-_MOST_BODIES = 12  # bodies whose masses are tried
+_MOST_BODIES = 8  # bodies whose masses are tried
+_NOTHING = 1e-6  # share of the changes of a rate that M misses, below which the joint has no fault
 
 
 @dataclass(frozen=True)
@@ -84,8 +85,8 @@ def _of_inputs(plant: Plant) -> Iterator[Candidate]:
         most = float(plant.commanded[k])
         yield _ratio(InputGain((1.0,), k))
         yield Candidate(InputOffset((0.0,), k), (-2 * most,), (2 * most,), (0.05 * most,), ((0.0,),))
-        limits = tuple((share * most,) for share in (0.9, 0.7, 0.5, 0.3))
-        yield Candidate(Saturation((most,), k), (0.02 * most,), (most,), (0.05 * most,), limits)
+        limits = tuple((share * most,) for share in (0.9, 0.7, 0.5, 0.3, 0.1, 0.03, 0.01))
+        yield Candidate(Saturation((most,), k), (1e-3 * most,), (most,), (0.05 * most,), limits)
         lost = tuple((share * most,) for share in (0.01, 0.05, 0.15))
         for kind in (DeadZone, Backlash):
             yield Candidate(kind((0.0,), k), (0.0,), (most,), (0.02 * most,), lost)
@@ -107,9 +108,11 @@ def _of_joints(plant: Plant, x: Array, u: Array, residuals: Array) -> Iterator[C
     for joint in plant.joints:
         yield _ratio(Inertia((1.0,), (joint,), plant.dt))
         if joint.position is not None:
-            yield _ratio(Gravity((1.0,), joint, rates, plant.dt))
+            yield _ratio(Gravity((1.0,), (joint,), rates, plant.dt))
     if len(plant.joints) > 1:
         yield _ratio(Inertia((1.0,), plant.joints, plant.dt))
+        if rates:
+            yield _ratio(Gravity((1.0,), plant.joints, rates, plant.dt))
 
 
 def _of_port(plant: Plant, joint: Joint, x: Array, u: Array, residuals: Array) -> Iterator[Candidate]:
@@ -143,7 +146,8 @@ def _typical_force(plant: Plant, joint: Joint, x: Array, u: Array, residuals: Ar
     """Return the force on a joint that has effects as large as what M misses of its rate."""
     probe = 0.1 * float(plant.commanded[joint.input]) if joint.input is not None and joint.dof is None else 1.0
     rows = slice(None, None, max(1, len(x) // 50))
-    effects = Bias((1.0,), joint, probe, plant.dt).effect(plant.model, x[rows], u[rows])[:, joint.rate]
+    free = np.asarray(plant.model.step(x[rows], u[rows]))
+    effects = Bias((1.0,), joint, probe, plant.dt).effect(plant.model, x[rows], u[rows], free)[:, joint.rate]
     effects = effects[np.isfinite(effects)]
     size = float(np.sqrt((effects**2).mean())) if len(effects) else 0.0
     return float(np.sqrt((residuals[:, joint.rate] ** 2).mean())) / size if size > 0 else 0.0
@@ -156,7 +160,7 @@ def _of_mujoco(plant: Plant, model: MuJoCo, residuals: Array) -> Iterator[Candid
         if joint.dof is None:
             continue
         missed = float(np.sqrt((residuals[:, joint.rate] ** 2).mean()))
-        if missed <= 0:
+        if missed <= _NOTHING * plant.changes[joint.rate]:
             continue
         inertia = float(inertias[joint.dof])
         force = inertia * missed / plant.dt
@@ -164,8 +168,9 @@ def _of_mujoco(plant: Plant, model: MuJoCo, residuals: Array) -> Iterator[Candid
         for attribute, size in (("damping", force / speed), ("frictionloss", force), ("armature", inertia)):
             low = -float(getattr(compiled, f"dof_{attribute}")[joint.dof])
             starts = ((0.3 * size,), (size,)) if attribute == "frictionloss" else ((0.0,),)
-            cause = JointAttribute((0.0,), attribute, joint)
-            yield Candidate(cause, (low,), (20 * size,), (0.05 * size,), starts)
+            # More damping would make the integration unstable.
+            most = min(20 * size, inertia / compiled.opt.timestep) if attribute == "damping" else 20 * size
+            yield Candidate(JointAttribute((0.0,), attribute, joint), (low,), (most,), (0.05 * size,), starts)
     bodies = [body for body in range(1, compiled.nbody) if float(compiled.body_mass[body]) > 0]
     moved = [body for body in bodies if int(compiled.body_dofnum[body]) > 0 or int(compiled.body_parentid[body]) > 0]
     for body in sorted(moved, key=lambda each: -float(compiled.body_mass[each]))[:_MOST_BODIES]:
@@ -199,6 +204,7 @@ def _of_sensors(plant: Plant, x: Array) -> Iterator[Candidate]:
         size = max(float(ranges[group[0]]), 1e-9)
         yield Candidate(SensorOffset((0.0,), group[0]), (-size,), (size,), (0.05 * size,), ((0.0,),))
         yield _ratio(SensorScale((1.0,), group))
-    pairs = [group for group in groups if len(group) == len(groups[0])]
+    moving = [group for group in groups if ranges[group[0]] > 0]
+    pairs = [group for group in moving if len(group) == len(moving[0])]
     for first, second in combinations(pairs, 2):
         yield Candidate(SwappedJoints((), first, second))

@@ -53,8 +53,8 @@ class Cause(ShortRepr):
         """
         return u, memory
 
-    def pushed(self, model: Model, x: Array, u: Array, reached: Array) -> Array:
-        """Return the next state ``(..., n)`` if that without this cause is ``reached``."""
+    def pushed(self, model: Model, x: Array, u: Array, free: Array, reached: Array) -> Array:
+        """Return the next state ``(..., n)`` for that of the model, ``free``, and that without this cause."""
         return reached
 
     def true(self, recorded: Array) -> Array:
@@ -119,9 +119,9 @@ class Repaired(ShortRepr):
         """Return the next states ``(..., n)`` for the inputs that act."""
         model: Model = vars(self)["mechanics"]
         with np.errstate(all="ignore"):
-            reached = np.asarray(model.step(x, acting))
+            reached = free = np.asarray(model.step(x, acting))
             for cause in self.causes:
-                reached = cause.pushed(model, x, acting, reached)
+                reached = cause.pushed(model, x, acting, free, reached)
         return reached
 
     def true(self, recorded: Array) -> Array:

@@ -15,8 +15,8 @@ from ctxval.core.trajectory import Trajectory
 from ctxval.studies.causes.candidates import Candidate
 from ctxval.studies.causes.cause import Repaired
 
-_SEVERAL = 8  # steps of the longer predictions
-_MOST = (1200, 240)  # predictions of one step, and of several
+_SEVERAL = 6  # steps of the longer predictions
+_MOST = (600, 120)  # predictions of one step, and of several
 _EXACT, _NEGLIGIBLE = 0.01, 1e-3  # what is smaller is no evidence: shares of the residuals of M, and of the changes
 _LARGEST = 1e3  # of a residual, as a multiple of the typical one of M
 
@@ -27,7 +27,7 @@ class Windows(ShortRepr):
 
     Attributes:
         steps: after so many steps, predictions are compared with what is recorded.
-        states, inputs: rows of the first state and of the first input, shape ``(N,)``.
+        states, inputs: rows of the first state and, in all padded runs, of the first input, shape ``(N,)``.
         floors: shape ``(n,)``.
     """
 
@@ -41,7 +41,8 @@ class Records:
     """Recorded executions, and what M misses in them.
 
     Attributes:
-        states, inputs: of all runs, one after the other, ``(N + k, n)`` and ``(N, m)``.
+        states: of all k runs, one after the other, ``(N + k, n)``.
+        inputs: of all runs, with zeros after the end of shorter ones, ``(k, H, m)``.
         windows: predictions of one step, and of several.
         sizes: of the residuals of M in these, shape ``(n,)`` each.
     """
@@ -55,7 +56,10 @@ class Records:
     ) -> None:
         self.model, self.horizons = model, [len(run.inputs) for run in runs]
         self.states = np.concatenate([run.states for run in runs])
-        self.inputs = np.concatenate([run.inputs for run in runs])
+        longest = max(self.horizons)
+        self.inputs = np.zeros((len(runs), longest, runs[0].inputs.shape[1]))
+        for padded, run in zip(self.inputs, runs, strict=True):
+            padded[: len(run.inputs)] = run.inputs
         self.windows: list[Windows] = []
         nothing, n = Repaired(model, ()), self.states.shape[1]
         for number, steps in enumerate((1, _SEVERAL)):
@@ -70,9 +74,9 @@ class Records:
         states, inputs, first = [], [], 0
         for number, horizon in enumerate(self.horizons):
             begins = np.arange(0, horizon - steps + 1, max(1, steps // 2))
-            states.append(first + number + begins)
-            inputs.append(first + begins)
-            first += horizon
+            states.append(first + begins)
+            inputs.append(number * self.inputs.shape[1] + begins)
+            first += horizon + 1
         of_states, of_inputs = np.concatenate(states), np.concatenate(inputs)
         rows = np.linspace(0, len(of_states) - 1, min(len(of_states), most)).round().astype(np.intp)
         return Windows(steps, of_states[rows], of_inputs[rows], floors)
@@ -82,12 +86,12 @@ class Records:
         """The states, inputs and residuals of M in the predictions of one step, shapes ``(N, ...)``."""
         window = self.windows[0]
         residuals = -self.left_by(Repaired(self.model, ()), window)
-        return self.states[window.states], self.inputs[window.inputs], residuals
+        inputs = self.inputs.reshape(-1, self.inputs.shape[-1])
+        return self.states[window.states], inputs[window.inputs], residuals
 
     def left_by(self, repaired: Repaired, window: Windows) -> Array:
         """Return predicted minus recorded states ``(N, n)``."""
-        ends = np.cumsum(self.horizons)[:-1]
-        acting = np.concatenate([repaired.acting(inputs) for inputs in np.split(self.inputs, ends)])
+        acting = repaired.acting(self.inputs).reshape(-1, self.inputs.shape[-1])
         x = repaired.true(self.states[window.states])
         for k in range(window.steps):
             x = repaired.reached(x, acting[window.inputs + k])
@@ -128,73 +132,115 @@ class Explanation(ShortRepr):
         return sum(len(each.scales) for each in self.candidates)
 
 
-def explained(records: Records, candidates: tuple[Candidate, ...], begun: Repaired | None = None) -> Explanation:
-    """Return causes whose sizes are fitted to records by nonlinear least squares, from one or from several starts.
+def explained(records: Records, candidates: tuple[Candidate, ...], begun: Sequence[float] | Array) -> Explanation:
+    """Return causes whose sizes are fitted to records by nonlinear least squares.
 
     The residuals of each state are first divided by those of M, and then by what is left of them.
 
     Args:
-        begun: the same causes with sizes of a former fit.
+        begun: the sizes of all causes with which the fit begins.
     """
-    low, high, scales = (
-        np.array([value for each in candidates for value in getattr(each, name)]) for name in ("low", "high", "scales")
-    )
-
-    def repaired(theta: Array) -> Repaired:
-        causes, rest = [], theta
-        for each in candidates:
-            count = len(each.scales)
-            causes.append(each.cause.with_sizes(rest[:count].tolist()))
-            rest = rest[count:]
-        return Repaired(records.model, tuple(causes))
-
-    def errors(theta: Array, sizes: Sequence[Array]) -> Array:
-        model, parts = repaired(theta), []
-        for window, size in zip(records.windows, sizes, strict=True):
-            left = np.nan_to_num(records.left_by(model, window) / size, nan=_LARGEST).clip(-_LARGEST, _LARGEST)
-            parts.append(left.ravel() / np.sqrt(len(left)))
-        return np.concatenate(parts)
-
-    def best(start: Array, sizes: Sequence[Array], steps: int) -> Array:
-        def slope(theta: Array) -> Array:
-            here, columns = errors(theta, sizes), []
-            for i, step in enumerate(1e-3 * scales):
-                moved = theta.copy()
-                moved[i] += step if moved[i] + step <= high[i] else -step
-                columns.append((errors(moved, sizes) - here) / (moved[i] - theta[i]))
-            return np.stack(columns, axis=1)
-
-        inside = np.clip(start, low + 1e-9 * scales, high - 1e-9 * scales)
-        found = least_squares(
-            lambda theta: errors(theta, sizes), inside, slope, bounds=(low, high), x_scale=scales, max_nfev=steps,
-            xtol=1e-5, ftol=1e-6,
-        )  # fmt: skip
-        return np.asarray(found.x)
-
-    theta = np.array([])
-    if len(scales):
-        if begun is not None:
-            starts = [np.array([size for cause in begun.causes for size in cause.sizes])]
-        else:
-            known = [np.array(each.cause.sizes) for each in candidates[:-1]]
-            starts = [np.concatenate([*known, start]) for start in candidates[-1].starts]
-        costs = [float((errors(start, records.sizes) ** 2).sum()) for start in starts]
-        theta = starts[int(np.argmin(costs))]
-        theta = best(theta, records.sizes, 12)
-        model = repaired(theta)
+    fit = _Fit(records, candidates)
+    theta = np.array(begun)
+    if len(theta):
+        theta = fit.best(theta, records.sizes, 8)
+        model = fit.repaired(theta)
         sizes = [
             np.clip(np.hypot(_size(records.left_by(model, window)), window.floors), window.floors, size)
             for window, size in zip(records.windows, records.sizes, strict=True)
         ]
-        theta = best(theta, sizes, 8)
-    model = repaired(theta)
-    misfit, left = records.measured(model)
-    fitted = tuple(
-        Candidate(cause, each.low, each.high, each.scales, each.starts)
-        for each, cause in zip(candidates, model.causes, strict=True)
-    )
-    count = len(theta) + len(candidates)  # which cause it is counts like a size
-    return Explanation(fitted, model, misfit + count * float(np.log(len(records.windows[0].states))), left)
+        theta = fit.best(theta, sizes, 6)
+    return fit.explanation(theta)
+
+
+def screened(records: Records, candidates: tuple[Candidate, ...]) -> tuple[float, Array]:
+    """Return how badly causes explain records at most, and sizes to begin a fit with.
+
+    The last cause is tried at each of its first guesses, and one Gauss-Newton step is made from there. The criterion is
+    that of residuals which are linear in the sizes.
+    """
+    fit = _Fit(records, candidates)
+    known = [size for each in candidates[:-1] for size in each.cause.sizes]
+    results = []
+    for start in candidates[-1].starts:
+        theta = np.array([*known, *start])
+        here = fit.errors(theta, records.sizes)
+        linear, moved = here, theta
+        if len(theta):
+            J = fit.slope(theta, records.sizes, here)
+            moved = np.clip(theta + np.linalg.lstsq(J, -here, rcond=1e-8)[0], fit.low, fit.high)
+            linear = here + J @ (moved - theta)
+        misfit, first = 0.0, 0
+        for window, size in zip(records.windows, records.sizes, strict=True):
+            count, n = len(window.states), len(size)
+            squares = (linear[first : first + count * n].reshape(count, n) ** 2).sum(axis=0)
+            misfit += count * float(np.log(squares + (window.floors / size) ** 2).sum())
+            first += count * n
+        results.append((misfit + fit.penalty, moved))
+    return min(results, key=lambda result: result[0])
+
+
+class _Fit:
+    """The residuals of records as a function of the sizes of causes."""
+
+    def __init__(self, records: Records, candidates: tuple[Candidate, ...]) -> None:
+        self.records, self.candidates = records, candidates
+        self.low, self.high, self.scales = (
+            np.array([value for each in candidates for value in getattr(each, name)])
+            for name in ("low", "high", "scales")
+        )
+        # Which cause it is counts like a size.
+        count = len(self.scales) + len(candidates)
+        self.penalty = count * float(np.log(len(records.windows[0].states)))
+
+    def repaired(self, theta: Array) -> Repaired:
+        causes, rest = [], theta
+        for each in self.candidates:
+            count = len(each.scales)
+            causes.append(each.cause.with_sizes(rest[:count].tolist()))
+            rest = rest[count:]
+        return Repaired(self.records.model, tuple(causes))
+
+    def errors(self, theta: Array, sizes: Sequence[Array]) -> Array:
+        """Return residuals in given sizes, whose squares are means over the predictions of each window."""
+        model, parts = self.repaired(theta), []
+        for window, size in zip(self.records.windows, sizes, strict=True):
+            left = np.nan_to_num(self.records.left_by(model, window) / size, nan=_LARGEST).clip(-_LARGEST, _LARGEST)
+            parts.append(left.ravel() / np.sqrt(len(left)))
+        return np.concatenate(parts)
+
+    def slope(self, theta: Array, sizes: Sequence[Array], here: Array) -> Array:
+        columns = []
+        for i, step in enumerate(1e-3 * self.scales):
+            moved = theta.copy()
+            moved[i] += step if moved[i] + step <= self.high[i] else -step
+            columns.append((self.errors(moved, sizes) - here) / (moved[i] - theta[i]))
+        return np.stack(columns, axis=1)
+
+    def best(self, start: Array, sizes: Sequence[Array], evaluations: int) -> Array:
+        inside = np.clip(start, self.low + 1e-9 * self.scales, self.high - 1e-9 * self.scales)
+        known: dict[bytes, Array] = {}
+
+        def errors(theta: Array) -> Array:
+            known.clear()
+            here = known[theta.tobytes()] = self.errors(theta, sizes)
+            return here
+
+        def slope(theta: Array) -> Array:
+            here = known.get(theta.tobytes())
+            return self.slope(theta, sizes, self.errors(theta, sizes) if here is None else here)
+
+        result = least_squares(
+            errors, inside, slope, bounds=(self.low, self.high), x_scale=self.scales, max_nfev=evaluations,
+            xtol=1e-4, ftol=1e-5,
+        )  # fmt: skip
+        return np.asarray(result.x)
+
+    def explanation(self, theta: Array) -> Explanation:
+        model = self.repaired(theta)
+        misfit, left = self.records.measured(model)
+        fitted = tuple(replace(each, cause=cause) for each, cause in zip(self.candidates, model.causes, strict=True))
+        return Explanation(fitted, model, misfit + self.penalty, left)
 
 
 def _size(errors: Array) -> Array:

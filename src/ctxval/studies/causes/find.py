@@ -20,7 +20,7 @@ from ctxval.learning.recorded import closed_loops_on_model
 from ctxval.learning.state_estimates import StateEstimates, with_states_of_model
 from ctxval.studies.causes.candidates import Candidate, candidates
 from ctxval.studies.causes.cause import Repaired
-from ctxval.studies.causes.evidence import Explanation, Records, explained
+from ctxval.studies.causes.evidence import Explanation, Records, explained, screened
 from ctxval.studies.causes.mechanics import Force
 from ctxval.studies.causes.plant import Plant, plant_of
 from ctxval.studies.causes.report import CauseReport, Explained, Separating
@@ -28,11 +28,11 @@ from ctxval.studies.causes.report import CauseReport, Explained, Separating
 _MOST = 8  # executions that are learned from, those with the largest distances
 _ALIKE = 10.0  # differences of the criterion that do not tell causes apart
 _SYSTEMATIC = 0.02  # of residuals that are left, differences by a third may be the way of integration; see `_alike`
-_NAMED = 0.9  # share of the squared closed-loop deviations of M that causes must explain, to be the cause
+_NAMED = 0.97  # share of the squared closed-loop deviations of M that causes must explain, to be the cause
 _LEFT = 0.02  # share of the residuals that must be left, for another cause to be looked for
 _BETTER = 0.5  # largest share of the deviations left by one cause that two causes may leave
-_SOME = (300, 60)  # predictions of one step, and of several, that all causes are fitted to
-_REFINED = 10  # causes that are fitted to all of them
+_SOME = (200, 40)  # predictions of one step, and of several, that all causes are screened on
+_REFINED = 8  # causes that are fitted to all of them
 _CHECKED = 4  # explanations that are tried in closed loop
 _TASKS = 24  # at which the predictions of two causes are compared
 
@@ -142,16 +142,17 @@ class _Study:
     def _ranked(self, beside: tuple[Candidate, ...]) -> list[Explanation]:
         """Return the explanations by each cause beside given ones, the most probable first.
 
-        All are fitted to a part of the records, and the best ones then to all of them.
+        All are screened on a part of the records, and the best ones are fitted to all of them.
         """
         kinds = [each.cause.with_sizes(()) for each in beside]
         results = []
         for each in self.dictionary:
             if each.cause.with_sizes(()) not in kinds:
-                results.append(explained(self.some, (*beside, each)))
+                together = (*beside, each)
+                results.append((*screened(self.some, together), together))
             advance(1)
-        results.sort(key=lambda explanation: explanation.criterion)
-        refined = [explained(self.records, each.candidates, each.repaired) for each in results[:_REFINED]]
+        results.sort(key=lambda result: result[0])
+        refined = [explained(self.records, together, begun) for _, begun, together in results[:_REFINED]]
         return sorted(refined, key=lambda explanation: explanation.criterion)
 
     def _chosen(self, ranked: list[Explanation]) -> tuple[Explained | None, list[Explained]]:
@@ -175,7 +176,8 @@ class _Study:
         """Return how well causes predict each execution if they are fitted to the others."""
         deviations, distances, sizes = [], [], []
         for execution, others in zip(self.executions, self.others, strict=True):
-            fitted = explained(others, explanation.candidates, explanation.repaired).repaired
+            begun = [size for cause in explanation.repaired.causes for size in cause.sizes]
+            fitted = explained(others, explanation.candidates, begun).repaired
             sizes.append([size for cause in fitted.causes for size in cause.sizes])
             loop = self.loop(fitted, execution.plan, execution)
             deviations.append(self._deviation(execution, loop))
@@ -198,12 +200,17 @@ class _Study:
         return loop if loop.finite.all() else None
 
     def _deviation(self, execution: _Execution, loop: Trajectory | None) -> float:
-        """Return the mean squared deviation from an execution, in shares of ranges."""
+        """Return the mean squared deviation from an execution without noise, in shares of ranges.
+
+        Noise is what second differences over time show: the deviation that a cause makes is smooth beside it.
+        """
         if loop is None:
             return np.inf
-        states = (loop.states - execution.executed.states) / self.ranges
-        inputs = (loop.inputs - execution.executed.inputs) / self.efforts
-        return float((states**2).mean() + (inputs**2).mean())
+        executed, squares = execution.executed, 0.0
+        for each in ((loop.states - executed.states) / self.ranges, (loop.inputs - executed.inputs) / self.efforts):
+            noise = (np.diff(each, 2, axis=0) ** 2).mean(axis=0) / 6 if len(each) > 2 else 0.0
+            squares += float(np.maximum((each**2).mean(axis=0) - noise, 0.0).mean())
+        return squares
 
     def _distance(self, execution: _Execution, loop: Trajectory | None) -> float:
         if loop is None:

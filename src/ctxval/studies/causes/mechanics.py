@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -28,32 +29,42 @@ class Force(Cause):
     probe: float = 1.0
     dt: float = 1.0
 
-    def effect(self, model: Model, x: Array, u: Array) -> Array:
-        """Return the change of the next state by one unit of the force, shape ``(..., n)``."""
+    def effect(self, model: Model, x: Array, u: Array, free: Array) -> Array:
+        """Return the change of the next state ``free`` of the model by one unit of the force, shape ``(..., n)``."""
         if self.joint.dof is not None:
             assert isinstance(model, MuJoCo)
             forces = np.zeros(model.compiled.nv)
             forces[self.joint.dof] = self.probe
-            return (model.changed(forces=forces).step(x, u) - model.step(x, u)) / self.probe
+            return (model.changed(forces=forces).step(x, u) - free) / self.probe
         if self.joint.input is not None:
             moved = np.array(u)
             moved[..., self.joint.input] += self.probe
-            return (np.asarray(model.step(x, moved)) - np.asarray(model.step(x, u))) / self.probe
+            return (np.asarray(model.step(x, moved)) - free) / self.probe
         effect = np.zeros_like(x)
         effect[..., self.joint.rate] = self.dt
         if self.joint.position is not None:
             effect[..., self.joint.position] = self.joint.share * self.dt**2
         return effect
 
-    def force(self, model: Model, x: Array, u: Array, reached: Array, stopping: Array) -> Array:
-        """Return the force ``(...)``, of which ``stopping`` would stop the joint within the step."""
+    def force(self, rate: Array, load: Callable[[], Array], stopping: Array) -> Array:
+        """Return the force ``(...)`` at a mean rate; the force ``stopping`` would stop the joint within the step.
+
+        Args:
+            load: returns the magnitude of the force that the gears carry.
+        """
         raise NotImplementedError
 
-    def pushed(self, model: Model, x: Array, u: Array, reached: Array) -> Array:
-        effect = self.effect(model, x, u)
-        moving = effect[..., self.joint.rate]
-        stopping = -reached[..., self.joint.rate] / np.where(np.abs(moving) > 1e-12, moving, 1e-12)
-        return reached + effect * self.force(model, x, u, reached, stopping)[..., None]
+    def pushed(self, model: Model, x: Array, u: Array, free: Array, reached: Array) -> Array:
+        effect, number = self.effect(model, x, u, free), self.joint.rate
+        moving = np.where(np.abs(effect[..., number]) > 1e-12, effect[..., number], 1e-12)
+
+        def load() -> Array:
+            # What the inputs do to the joint, against what everything else does to it, as the model has it.
+            unmoved = np.asarray(model.step(x, np.zeros_like(u)))[..., number]
+            return np.asarray(np.abs(free[..., number] - 2 * unmoved + x[..., number]) / np.abs(moving))
+
+        rate = 0.5 * (x[..., number] + reached[..., number])
+        return reached + effect * self.force(rate, load, -reached[..., number] / moving)[..., None]
 
     def amount(self, plant: Plant, size: float, per: str = "") -> str:
         return f"{size:.3g} {plant.force_unit(self.joint)}{per}"
@@ -65,7 +76,7 @@ class Bias(Force):
 
     name: ClassVar[str] = "bias"
 
-    def force(self, model: Model, x: Array, u: Array, reached: Array, stopping: Array) -> Array:
+    def force(self, rate: Array, load: Callable[[], Array], stopping: Array) -> Array:
         return np.full_like(stopping, self.sizes[0])
 
     def text(self, plant: Plant) -> str:
@@ -78,8 +89,8 @@ class Viscous(Force):
 
     name: ClassVar[str] = "viscous friction"
 
-    def force(self, model: Model, x: Array, u: Array, reached: Array, stopping: Array) -> Array:
-        return -self.sizes[0] * 0.5 * (x[..., self.joint.rate] + reached[..., self.joint.rate])
+    def force(self, rate: Array, load: Callable[[], Array], stopping: Array) -> Array:
+        return -self.sizes[0] * rate
 
     def text(self, plant: Plant) -> str:
         rate = plant.rate_unit(self.joint)
@@ -97,7 +108,7 @@ class Coulomb(Force):
 
     name: ClassVar[str] = "Coulomb friction"
 
-    def force(self, model: Model, x: Array, u: Array, reached: Array, stopping: Array) -> Array:
+    def force(self, rate: Array, load: Callable[[], Array], stopping: Array) -> Array:
         return np.clip(stopping, -self.sizes[0], self.sizes[0])
 
     def text(self, plant: Plant) -> str:
@@ -117,9 +128,8 @@ class Stribeck(Force):
 
     name: ClassVar[str] = "Stribeck friction"
 
-    def force(self, model: Model, x: Array, u: Array, reached: Array, stopping: Array) -> Array:
+    def force(self, rate: Array, load: Callable[[], Array], stopping: Array) -> Array:
         sliding, added, slow = self.sizes
-        rate = 0.5 * (x[..., self.joint.rate] + reached[..., self.joint.rate])
         most = sliding + added * np.exp(-((rate / max(slow, 1e-12)) ** 2))
         return np.clip(stopping, -most, most)
 
@@ -139,13 +149,8 @@ class LoadFriction(Force):
 
     name: ClassVar[str] = "load-dependent friction"
 
-    def force(self, model: Model, x: Array, u: Array, reached: Array, stopping: Array) -> Array:
-        rate = self.joint.rate
-        unmoved = np.asarray(model.step(x, np.zeros_like(u)))[..., rate]
-        driven = np.asarray(model.step(x, u))[..., rate] - unmoved
-        effect = self.effect(model, x, u)[..., rate]
-        load = np.abs(driven - (unmoved - x[..., rate])) / np.maximum(np.abs(effect), 1e-12)
-        most = self.sizes[0] * load + self.sizes[1]
+    def force(self, rate: Array, load: Callable[[], Array], stopping: Array) -> Array:
+        most = self.sizes[0] * load() + self.sizes[1]
         return np.clip(stopping, -most, most)
 
     def text(self, plant: Plant) -> str:
@@ -167,7 +172,7 @@ class Inertia(Cause):
     joints: tuple[Joint, ...] = ()
     dt: float = 1.0
 
-    def pushed(self, model: Model, x: Array, u: Array, reached: Array) -> Array:
+    def pushed(self, model: Model, x: Array, u: Array, free: Array, reached: Array) -> Array:
         changed = np.array(reached)
         for joint in self.joints:
             gained = (1.0 / self.sizes[0] - 1.0) * (reached[..., joint.rate] - x[..., joint.rate])
@@ -183,25 +188,32 @@ class Inertia(Cause):
 
 @dataclass(frozen=True)
 class Gravity(Cause):
-    """What pulls at a joint at rest has another size, such as the weight of a link. Size: divided by that of M."""
+    """What pulls at joints at rest has another size, such as the weight of links. Size: divided by that of M.
+
+    Attributes:
+        joints: those that it pulls at.
+        rates: indices of all states that are 0 at rest.
+        dt: seconds.
+    """
 
     name: ClassVar[str] = "gravity"
-    joint: Joint = Joint(0)  # noqa: RUF009  # it is frozen
+    joints: tuple[Joint, ...] = ()
     rates: tuple[int, ...] = ()
     dt: float = 1.0
 
-    def pushed(self, model: Model, x: Array, u: Array, reached: Array) -> Array:
+    def pushed(self, model: Model, x: Array, u: Array, free: Array, reached: Array) -> Array:
         still, changed = np.array(x), np.array(reached)
         still[..., list(self.rates)] = 0.0
-        pull = (self.sizes[0] - 1.0) * np.asarray(model.step(still, np.zeros_like(u)))[..., self.joint.rate]
-        changed[..., self.joint.rate] += pull
-        if self.joint.position is not None:
-            changed[..., self.joint.position] += self.joint.share * self.dt * pull
+        pulled = (self.sizes[0] - 1.0) * np.asarray(model.step(still, np.zeros_like(u)))
+        for joint in self.joints:
+            changed[..., joint.rate] += pulled[..., joint.rate]
+            if joint.position is not None:
+                changed[..., joint.position] += joint.share * self.dt * pulled[..., joint.rate]
         return changed
 
     def text(self, plant: Plant) -> str:
-        name = plant.joint_name(self.joint)
-        return f"the weight (or the spring) that pulls at {name} is {self.sizes[0]:.3g} times that of M"
+        names = " and ".join(plant.joint_name(joint) for joint in self.joints)
+        return f"the weights (or the springs) that pull at {names} are {self.sizes[0]:.3g} times those of M"
 
 
 @dataclass(frozen=True)
@@ -210,7 +222,7 @@ class TimeStep(Cause):
 
     name: ClassVar[str] = "time step"
 
-    def pushed(self, model: Model, x: Array, u: Array, reached: Array) -> Array:
+    def pushed(self, model: Model, x: Array, u: Array, free: Array, reached: Array) -> Array:
         return x + self.sizes[0] * (reached - x)
 
     def text(self, plant: Plant) -> str:
