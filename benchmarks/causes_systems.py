@@ -339,8 +339,8 @@ def _followed(p: Parameters, names: tuple[str, ...], horizon: int, dt: float, wi
 
 
 def _tracking(
-    gains: tuple[Any, Any], names: tuple[str, ...], reach: float, frequency: tuple[float, float], units: str, horizon: int,
-    width: int, compared: tuple[int, ...], followed: tuple[int, ...],
+    gains: tuple[Any, Any], names: tuple[str, ...], reach: float, frequency: tuple[float, float], units: str,
+    horizon: int, width: int, compared: tuple[int, ...], followed: tuple[int, ...],
 ) -> Callable[[Robot, Any], Experiment]:  # fmt: skip
     def make(robot: Robot, system: Any) -> Experiment:
         return experiment(

@@ -35,7 +35,7 @@ class InputGain(Cause):
 
     def text(self, plant: Plant) -> str:
         which = "all inputs have" if self.input is None else f"{plant.input(self.input)[0]} has"
-        return f"{which} {self.sizes[0]:.3g} times the effect that M gives to it"
+        return f"{which} {self.sizes[0]:.3g} times the effect that M has"
 
     def mjcf(self, plant: Plant) -> str | None:
         compiled = getattr(plant.model, "compiled", None)

@@ -15,8 +15,8 @@ from ctxval.core.trajectory import Trajectory
 from ctxval.studies.causes.candidates import Candidate
 from ctxval.studies.causes.cause import Repaired
 
-_SEVERAL = 6  # steps of the longer predictions
-_MOST = (600, 120)  # predictions of one step, and of several
+STEPS = (1, 6)  # of the predictions
+MOST = (600, 120)  # predictions of one step, and of several
 _EXACT, _NEGLIGIBLE = 0.01, 1e-3  # what is smaller is no evidence: shares of the residuals of M, and of the changes
 _LARGEST = 1e3  # of a residual, as a multiple of the typical one of M
 
@@ -52,7 +52,8 @@ class Records:
         model: Model,
         runs: Sequence[Trajectory],
         floors: Sequence[Array] | None = None,
-        most: tuple[int, int] = _MOST,
+        most: tuple[int, int] = MOST,
+        steps: tuple[int, int] = STEPS,
     ) -> None:
         self.model, self.horizons = model, [len(run.inputs) for run in runs]
         self.states = np.concatenate([run.states for run in runs])
@@ -62,8 +63,8 @@ class Records:
             padded[: len(run.inputs)] = run.inputs
         self.windows: list[Windows] = []
         nothing, n = Repaired(model, ()), self.states.shape[1]
-        for number, steps in enumerate((1, _SEVERAL)):
-            window = self._window(min(steps, min(self.horizons)), most[number], np.zeros(n))
+        for number, length in enumerate(steps):
+            window = self._window(min(length, min(self.horizons)), most[number], np.zeros(n))
             left = self.left_by(nothing, window)
             changes = _size(self.states[window.states + window.steps] - self.states[window.states])
             least = np.hypot(_EXACT * _size(left), _NEGLIGIBLE * changes) if floors is None else floors[number]

@@ -20,7 +20,7 @@ from ctxval.learning.recorded import closed_loops_on_model
 from ctxval.learning.state_estimates import StateEstimates, with_states_of_model
 from ctxval.studies.causes.candidates import Candidate, candidates
 from ctxval.studies.causes.cause import Repaired
-from ctxval.studies.causes.evidence import Explanation, Records, explained, screened
+from ctxval.studies.causes.evidence import STEPS, Explanation, Records, explained, screened
 from ctxval.studies.causes.mechanics import Force
 from ctxval.studies.causes.plant import Plant, plant_of
 from ctxval.studies.causes.report import CauseReport, Explained, Separating
@@ -28,9 +28,11 @@ from ctxval.studies.causes.report import CauseReport, Explained, Separating
 _MOST = 8  # executions that are learned from, those with the largest distances
 _ALIKE = 10.0  # differences of the criterion that do not tell causes apart
 _SYSTEMATIC = 0.02  # of residuals that are left, differences by a third may be the way of integration; see `_alike`
-_NAMED = 0.97  # share of the squared closed-loop deviations of M that causes must explain, to be the cause
+_NAMED = 0.95  # share of the squared closed-loop deviations of M that causes must explain, to be the cause
 _LEFT = 0.02  # share of the residuals that must be left, for another cause to be looked for
+_ENOUGH = 0.99  # share of the deviations that is explained, from which on no other cause is looked for
 _BETTER = 0.5  # largest share of the deviations left by one cause that two causes may leave
+_SHORT, _LONG = 60, 12  # predictions of estimated states take these parts of an execution
 _SOME = (200, 40)  # predictions of one step, and of several, that all causes are screened on
 _REFINED = 8  # causes that are fitted to all of them
 _CHECKED = 4  # explanations that are tried in closed loop
@@ -93,10 +95,13 @@ class _Study:
         self.validation, self.executions, self.model = validation, executions, validation.model
         self.outputs = validation.outputs is not None
         runs = [each.states for each in executions]
-        self.records = Records(self.model, runs)
+        horizon = min(len(run.inputs) for run in runs)
+        # Estimated states are worth little in one step.
+        steps = (max(1, horizon // _SHORT), max(1, horizon // _LONG)) if self.outputs else STEPS
+        self.records = Records(self.model, runs, steps=steps)
         floors = [window.floors for window in self.records.windows]
-        self.some = Records(self.model, runs, floors, _SOME)
-        self.others = [Records(self.model, runs[:k] + runs[k + 1 :], floors) for k in range(len(runs))]
+        self.some = Records(self.model, runs, floors, _SOME, steps)
+        self.others = [Records(self.model, runs[:k] + runs[k + 1 :], floors, steps=steps) for k in range(len(runs))]
         x, u, residuals = self.records.pairs
         usable = np.isfinite(residuals).all(axis=1)
         if not usable.any():
@@ -117,7 +122,7 @@ class _Study:
             ranked = self._ranked(())
             chosen, alike = self._chosen(ranked)
             while chosen is not None and len(chosen.explanation.candidates) < most:
-                if chosen.explanation.left < _LEFT:
+                if chosen.explanation.left < _LEFT or chosen.share > _ENOUGH:
                     break
                 better, others = self._chosen(self._ranked(chosen.explanation.candidates))
                 if better is None or better.explanation.criterion > chosen.explanation.criterion - _ALIKE:

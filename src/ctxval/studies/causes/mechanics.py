@@ -183,7 +183,7 @@ class Inertia(Cause):
 
     def text(self, plant: Plant) -> str:
         names = " and ".join(plant.joint_name(joint) for joint in self.joints)
-        return f"{names} has {self.sizes[0]:.3g} times the inertia of M"
+        return f"{names} {'has' if len(self.joints) == 1 else 'have'} {self.sizes[0]:.3g} times the inertia of M"
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,8 @@ from ctxval.studies.causes.cause import Cause, Repaired
 from ctxval.studies.causes.evidence import Explanation
 from ctxval.studies.causes.plant import Plant
 
+_PART = 0.5  # share of the deviations from which on a cause is called a part of the error
+
 
 @dataclass(frozen=True, eq=False)
 class Explained(ShortRepr):
@@ -104,7 +106,7 @@ class CauseReport(ShortRepr):
         """What M lacks, in one or two sentences."""
         units = f" {self.units}" if self.units else ""
         if not self.explained:
-            return f"None of these: no cause of {self.tried} predicts executions better that it was not fitted to."
+            return f"None of these {self.tried} causes: none predicts executions better that it was not fitted to."
         first = self.explained[0]
         effect = (
             f"the largest distance of {self.executions} executions falls from {self.before:.3g} to "
@@ -112,10 +114,8 @@ class CauseReport(ShortRepr):
         )
         share = f"{np.floor(1e3 * first.share) / 10:.4g} % of the squared deviations"
         if not self.named:
-            return (
-                f"None of these. What comes nearest of {self.tried} causes: {self._text(first)}. It explains {share}, "
-                f"and {effect}."
-            )
+            less = "The largest part of the error that one explains" if first.share > _PART else "What comes nearest"
+            return f"None of these {self.tried} causes. {less}: {self._text(first)}. It explains {share}, and {effect}."
         texts = [self._text(each) for each in self.explained]
         what = (
             texts[0]
