@@ -71,10 +71,10 @@ class Cause(ShortRepr):
 
     def python(self) -> str:
         """Return the Python expression that makes it."""
-        given = ", ".join(f"{name}={value!r}" for name, value in vars(self).items() if name != "sizes")
-        sizes = ", ".join(f"{size:.6g}" for size in self.sizes)
-        sizes = f"({sizes},)" if len(self.sizes) == 1 else f"({sizes})"
-        return f"causes.{type(self).__name__}({sizes}{', ' if given else ''}{given})"
+        given = [f"{name}={value!r}" for name, value in vars(self).items() if name != "sizes"]
+        sizes = f"({', '.join(f'{size:.6g}' for size in self.sizes)}{',' if len(self.sizes) == 1 else ''})"
+        text = f"causes.{type(self).__name__}({', '.join([sizes, *given])})"
+        return text.replace("Joint(rate", "causes.Joint(rate")
 
     def mjcf(self, plant: Plant) -> str | None:
         """Return the line of MJCF that puts it into a MuJoCo model; None if there is none."""

@@ -118,13 +118,15 @@ class _Study:
         self.distances = [self._distance(each, each.plan.model_trajectory) for each in executions]
 
     def report(self, most: int) -> CauseReport:
-        with stage("fitting causes", most * len(self.dictionary), "causes"):
+        with stage("fitting causes", (2 * most - 1) * len(self.dictionary), "causes"):
             ranked = self._ranked(())
             chosen, alike = self._chosen(ranked)
             while chosen is not None and len(chosen.explanation.candidates) < most:
                 if chosen.explanation.left < _LEFT or chosen.share > _ENOUGH:
                     break
                 better, others = self._chosen(self._ranked(chosen.explanation.candidates))
+                if better is not None:  # the first one was chosen without the other ones
+                    better, others = self._chosen(self._ranked(better.explanation.candidates[1:]))
                 if better is None or better.explanation.criterion > chosen.explanation.criterion - _ALIKE:
                     break
                 if 1 - better.share > _BETTER * (1 - chosen.share):

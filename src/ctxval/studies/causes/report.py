@@ -146,9 +146,8 @@ class CauseReport(ShortRepr):
         """The lines of Python that make M with the causes; None if no cause is named."""
         if not self.named:
             return None
-        made = ", ".join(cause.python() for cause in self.causes)
-        trailing = "," if len(self.causes) == 1 else ""
-        return f"from ctxval.studies import causes\n\nmodel = causes.Repaired(model, ({made}{trailing}))"
+        made = "".join(f"    {cause.python()},\n" for cause in self.causes)
+        return f"from ctxval.studies import causes\n\nmodel = causes.Repaired(model, (\n{made}))"
 
     @property
     def mjcf(self) -> tuple[str, ...]:
