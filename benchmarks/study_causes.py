@@ -16,6 +16,7 @@ from calibrate import RESULTS
 from causes_systems import DEVELOPMENT, REPORTING, Fault, Robot, faults_of, foreign_of
 from ctxval import Campaign, searches
 from ctxval._util.json_lines import JsonLines
+from ctxval.errors import InputError
 from ctxval.studies import causes
 from ctxval.studies.causes import Cause, find_causes
 
@@ -60,16 +61,19 @@ def measured(robot: Robot, fault: Fault, noise: float) -> dict[str, Any]:
     validation = robot.experiment(fault, noise, 0).validation
     campaign = Campaign(validation, search=searches.by_name("random"), seed=0).run(EXECUTIONS)
     started = time.process_time()
-    report = find_causes(campaign)
+    known = {"place": fault.place, "sizes": list(fault.sizes), "foreign": fault.foreign}
+    try:
+        report = find_causes(campaign)
+    except InputError as error:  # the robot fell in all tasks, so nothing is recorded
+        failed = {"named": False, "rank": None, "in_group": False, "size_error": None, "sentence": str(error)}
+        return {**known, "executions": len(campaign.completed), **failed, "seconds": 0.0}
     listed = [each.causes for each in report.explained]
     listed += [each.repaired.causes for each in report.ranked]
     distinct = list(dict.fromkeys(tuple(cause.with_sizes(()) for cause in each) for each in listed))
     places = [k for k, each in enumerate(distinct) if any(is_right(robot, fault, cause) for cause in each)]
     right = [cause for each in report.explained for cause in each.causes if is_right(robot, fault, cause)]
     return {
-        "place": fault.place,
-        "sizes": list(fault.sizes),
-        "foreign": fault.foreign,
+        **known,
         "executions": len(campaign.completed),
         "named": report.named,
         "causes": [[type(cause).__name__, list(cause.sizes)] for cause in report.causes],
@@ -78,6 +82,7 @@ def measured(robot: Robot, fault: Fault, noise: float) -> dict[str, Any]:
         "in_group": bool(right),
         "size_error": size_error(fault, right[0]) if right else None,
         "share": report.explained[0].share if report.explained else None,
+        "structure": report.explained[0].structure if report.explained else None,
         "before": report.before,
         "after": report.after,
         "sentence": report.sentence,
@@ -105,7 +110,7 @@ def main() -> None:
                 known = STORED[name, fault.kind, noise]
                 verdict = "right" if known["rank"] == 1 and known["named"] else ""
                 print(name, fault.kind, fault.sizes, noise, verdict, known["rank"], known["size_error"], flush=True)
-                print("    ", known["seconds"], known["sentence"], flush=True)
+                print("    ", known["seconds"], known.get("structure"), known["sentence"], flush=True)
 
 
 if __name__ == "__main__":

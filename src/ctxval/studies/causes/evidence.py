@@ -18,6 +18,7 @@ from ctxval.studies.causes.cause import Repaired
 STEPS = (1, 6)  # of the predictions
 MOST = (600, 120)  # predictions of one step, and of several
 _EXACT, _NEGLIGIBLE = 0.01, 1e-3  # what is smaller is no evidence: shares of the residuals of M, and of the changes
+_LAGS = (2, 3, 4)  # steps; see `Records.structure`
 _LARGEST = 1e3  # of a residual, as a multiple of the typical one of M
 
 
@@ -97,6 +98,23 @@ class Records:
         for k in range(window.steps):
             x = repaired.reached(x, acting[window.inputs + k])
         return np.asarray(repaired.recorded(x) - self.states[window.states + window.steps])
+
+    def structure(self, repaired: Repaired) -> float:
+        """Return the part of the squared residuals of one step that is no noise, in those of M; about 0 if all is.
+
+        It is their autocovariance over two steps to four. Noise of a step or of a measurement has none of it: a
+        measurement enters the residuals of two steps, the one after the other.
+        """
+        of_runs, first = [], 0
+        for number, horizon in enumerate(self.horizons):
+            of_states, of_inputs = first + np.arange(horizon), number * self.inputs.shape[1] + np.arange(horizon)
+            left = self.left_by(repaired, Windows(1, of_states, of_inputs, self.windows[0].floors))
+            left = np.nan_to_num(left / self.sizes[0], nan=_LARGEST).clip(-_LARGEST, _LARGEST)
+            lags = [k for k in _LAGS if k < horizon]
+            of_runs.append(np.sum([(left[k:] * left[:-k]).sum(axis=0) / (len(lags) * horizon) for k in lags], axis=0))
+            first += horizon + 1
+        matter = self.sizes[0] > 2 * self.windows[0].floors
+        return float(np.mean(of_runs, axis=0)[matter].sum())
 
     def measured(self, repaired: Repaired) -> tuple[float, float]:
         """Return minus twice the log-likelihood, and the share of the squared residuals of M that is left."""

@@ -28,12 +28,14 @@ class Explained(ShortRepr):
             without itself.
         distance: the largest distance between an execution and its prediction.
         spreads: the range of each size if one execution is left out.
+        structure: the share of what is no noise in the residuals of one step that the causes explain.
     """
 
     explanation: Explanation
     share: float
     distance: float
     spreads: tuple[float, ...]
+    structure: float
 
     @property
     def causes(self) -> tuple[Cause, ...]:
@@ -170,6 +172,7 @@ class CauseReport(ShortRepr):
                     ],
                     "spreads": list(each.spreads),
                     "share": each.share,
+                    "structure": each.structure,
                     "distance": each.distance,
                     "criterion": each.explanation.criterion,
                     "residual_left": each.explanation.left,
