@@ -22,6 +22,8 @@ from ctxval.studies.causes import Cause, find_causes
 
 EXECUTIONS, NOISES = 5, (0.0, 1e-3)
 STORED = JsonLines(RESULTS / "causes.jsonl", ("robot", "fault", "noise"))
+SERVO = JsonLines(RESULTS / "causes_servo.jsonl", ("seed",))
+SEEDS = 2
 _RATIOS = ("input gain", "sensor scale", "time step", "gravity", "mass")
 
 
@@ -83,6 +85,7 @@ def measured(robot: Robot, fault: Fault, noise: float) -> dict[str, Any]:
         "size_error": size_error(fault, right[0]) if right else None,
         "share": report.explained[0].share if report.explained else None,
         "structure": report.explained[0].structure if report.explained else None,
+        "noise_left": report.explained[0].noise if report.explained else None,
         "before": report.before,
         "after": report.after,
         "sentence": report.sentence,
@@ -90,12 +93,35 @@ def measured(robot: Robot, fault: Fault, noise: float) -> dict[str, Any]:
     }
 
 
+def on_servo(seed: int) -> dict[str, Any]:
+    """Return what is found in five recordings of the real servo with the model m1."""
+    from study_servo import validation
+
+    campaign = Campaign(validation("m1"), search=searches.by_name("random"), seed=seed).run(EXECUTIONS)
+    report = find_causes(campaign)
+    first = report.explained[0] if report.explained else None
+    return {
+        "seed": seed,
+        "first": type(report.ranked[0].repaired.causes[0]).__name__,
+        "sizes": list(report.ranked[0].repaired.causes[0].sizes),
+        "named": report.named,
+        "share": first.share if first else 0.0,
+        "sentence": report.sentence,
+    }
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("robots", choices=("development", "reporting"))
+    parser.add_argument("robots", choices=("development", "reporting", "servo"))
     parser.add_argument("--only", nargs="*", help="names of robots")
     parser.add_argument("--noise", nargs="*", type=float, default=NOISES, help="in shares of ranges")
     arguments = parser.parse_args()
+    if arguments.robots == "servo":
+        for seed in range(SEEDS):
+            if (seed,) not in SERVO:
+                SERVO.append(on_servo(seed))
+                print(SERVO[(seed,)], flush=True)
+        return
     robots = DEVELOPMENT if arguments.robots == "development" else REPORTING
     warnings.simplefilter("ignore")  # that a fault keeps the robot from its goal
     for noise in arguments.noise:

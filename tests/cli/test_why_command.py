@@ -59,7 +59,7 @@ def invoke(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Invoke:
     return calling("why", "--experiment", "offset_cart:experiment", "--most", "1")
 
 
-def test_the_cause_is_said_and_nothing_is_executed_or_stored(folder: Path, invoke: Invoke) -> None:
+def test_the_cause_is_said_and_no_trial_is_changed(folder: Path, invoke: Invoke) -> None:
     before = Store.existing(folder / "cart.sqlite").digest()
     found = report(invoke("cart.sqlite", "--json"))
     assert found["answer"] == "named"
@@ -69,6 +69,15 @@ def test_the_cause_is_said_and_nothing_is_executed_or_stored(folder: Path, invok
     assert "Force has an offset of 0.3 N." in printed.stdout
     assert "causes.InputOffset((0.3,), input=0)" in printed.stdout
     assert Store.existing(folder / "cart.sqlite").digest() == before
+
+
+def test_the_report_says_the_cause_on_its_first_screen(folder: Path, invoke: Invoke) -> None:
+    said = report(invoke("cart.sqlite", "--json"))["sentence"]
+    written = calling("report", "--experiment", "offset_cart:experiment")("cart.sqlite", "--out", "cart.html", "--json")
+    assert written.exit_code in (0, 1), written.output
+    page = (folder / "cart.html").read_text()
+    assert 0 < page.find("Why M fails") < page.find("Assumptions and diagnostics")
+    assert said in page
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,7 @@ from ctxval.campaign.campaign import Campaign
 from ctxval.campaign.dynamics import NEAR
 from ctxval.campaign.interval_search import with_next_task
 from ctxval.campaign.provenance import provenance_of_store
-from ctxval.campaign.storage.store import Store
+from ctxval.campaign.storage.store import CAUSE, Store
 from ctxval.certificates import Certificate, CertificateOptions, Provenance, Verdict, judge
 from ctxval.core.labels import Labels, labels_of
 from ctxval.core.space import TaskSpace
@@ -73,6 +73,12 @@ class ReportContext(ShortRepr):
     description: Mapping[str, Any] = field(default_factory=dict)
     changes: tuple[Change, ...] = ()
     provenance: Provenance = field(default_factory=Provenance)
+
+    @functools.cached_property
+    def cause(self) -> str:
+        """What M lacks, as ``ctxval why`` has kept it for the present trials; empty if it has not."""
+        kept = self.store.computed(CAUSE)
+        return kept if isinstance(kept, str) else ""
 
     # Trials
 

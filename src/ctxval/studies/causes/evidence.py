@@ -99,22 +99,23 @@ class Records:
             x = repaired.reached(x, acting[window.inputs + k])
         return np.asarray(repaired.recorded(x) - self.states[window.states + window.steps])
 
-    def structure(self, repaired: Repaired) -> float:
-        """Return the part of the squared residuals of one step that is no noise, in those of M; about 0 if all is.
+    def structure(self, repaired: Repaired) -> tuple[float, float]:
+        """Return the part of the squared residuals of one step that is no noise, and all of it, in those of M.
 
-        It is their autocovariance over two steps to four. Noise of a step or of a measurement has none of it: a
+        The part is their autocovariance over two steps to four. Noise of a step or of a measurement has none of it: a
         measurement enters the residuals of two steps, the one after the other.
         """
-        of_runs, first = [], 0
+        of_runs, squares, first = [], [], 0
         for number, horizon in enumerate(self.horizons):
             of_states, of_inputs = first + np.arange(horizon), number * self.inputs.shape[1] + np.arange(horizon)
             left = self.left_by(repaired, Windows(1, of_states, of_inputs, self.windows[0].floors))
             left = np.nan_to_num(left / self.sizes[0], nan=_LARGEST).clip(-_LARGEST, _LARGEST)
             lags = [k for k in _LAGS if k < horizon]
             of_runs.append(np.sum([(left[k:] * left[:-k]).sum(axis=0) / (len(lags) * horizon) for k in lags], axis=0))
+            squares.append((left**2).mean(axis=0))
             first += horizon + 1
         matter = self.sizes[0] > 2 * self.windows[0].floors
-        return float(np.mean(of_runs, axis=0)[matter].sum())
+        return float(np.mean(of_runs, axis=0)[matter].sum()), float(np.mean(squares, axis=0)[matter].sum())
 
     def measured(self, repaired: Repaired) -> tuple[float, float]:
         """Return minus twice the log-likelihood, and the share of the squared residuals of M that is left."""

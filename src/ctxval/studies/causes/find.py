@@ -102,7 +102,7 @@ class _Study:
         floors = [window.floors for window in self.records.windows]
         self.some = Records(self.model, runs, floors, _SOME, steps)
         self.others = [Records(self.model, runs[:k] + runs[k + 1 :], floors, steps=steps) for k in range(len(runs))]
-        self.structure = self.records.structure(Repaired(self.model, ()))
+        self.structure, _ = self.records.structure(Repaired(self.model, ()))
         x, u, residuals = self.records.pairs
         usable = np.isfinite(residuals).all(axis=1)
         if not usable.any():
@@ -123,7 +123,7 @@ class _Study:
             ranked = self._ranked(())
             chosen, alike = self._chosen(ranked)
             while chosen is not None and len(chosen.explanation.candidates) < most:
-                if chosen.explanation.left < _LEFT or max(chosen.share, chosen.structure) > _ENOUGH:
+                if chosen.explanation.left < _LEFT or chosen.complete > _ENOUGH:
                     break
                 better, others = self._chosen(self._ranked(chosen.explanation.candidates))
                 if better is not None:  # the first one was chosen without the other ones
@@ -133,7 +133,7 @@ class _Study:
                 if 1 - better.share > _BETTER * (1 - chosen.share):
                     break
                 chosen, alike = better, others
-        named = chosen is not None and max(chosen.share, chosen.structure) >= _NAMED
+        named = chosen is not None and chosen.complete >= _NAMED
         group = [] if chosen is None else [chosen, *alike]
         return CauseReport(
             plant=self.plant,
@@ -191,9 +191,10 @@ class _Study:
             deviations.append(self._deviation(execution, loop))
             distances.append(self._distance(execution, loop))
         share = 1 - float(np.sum(deviations) / max(np.sum(self.without), 1e-300))
-        left = self.records.structure(explanation.repaired) / max(self.structure, 1e-300)
+        left, whole = self.records.structure(explanation.repaired)
+        structure, noise = 1 - left / max(self.structure, 1e-300), 1 - left / max(whole, 1e-300)
         spreads = tuple(map(float, np.ptp(sizes, axis=0)))
-        return Explained(explanation, share, float(np.max(distances)), spreads, min(1.0, 1 - left))
+        return Explained(explanation, share, float(np.max(distances)), spreads, min(structure, 1.0), min(noise, 1.0))
 
     def loop(self, repaired: Repaired, plan: Plan, execution: _Execution | None = None) -> Trajectory | None:
         """Return the closed loop of a plan on a model with causes; None if it fails."""

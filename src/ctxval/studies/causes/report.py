@@ -15,6 +15,7 @@ from ctxval.studies.causes.cause import Cause, Repaired
 from ctxval.studies.causes.evidence import Explanation
 from ctxval.studies.causes.plant import Plant
 
+_NOISY = 0.5  # share of noise in what is left of residuals, from which on closed loops follow noise rather than causes
 _PART = 0.5  # share of the deviations from which on a cause is called a part of the error
 
 
@@ -29,6 +30,7 @@ class Explained(ShortRepr):
         distance: the largest distance between an execution and its prediction.
         spreads: the range of each size if one execution is left out.
         structure: the share of what is no noise in the residuals of one step that the causes explain.
+        noise: the share of noise in the residuals that the causes leave.
     """
 
     explanation: Explanation
@@ -36,11 +38,17 @@ class Explained(ShortRepr):
     distance: float
     spreads: tuple[float, ...]
     structure: float
+    noise: float
 
     @property
     def causes(self) -> tuple[Cause, ...]:
         """The causes with their sizes."""
         return self.explanation.repaired.causes
+
+    @property
+    def complete(self) -> float:
+        """The share that the causes explain: of deviations, or of residuals if most of what is left is noise."""
+        return max(self.share, self.structure) if self.noise > _NOISY else self.share
 
 
 @dataclass(frozen=True)
@@ -173,6 +181,7 @@ class CauseReport(ShortRepr):
                     "spreads": list(each.spreads),
                     "share": each.share,
                     "structure": each.structure,
+                    "noise": each.noise,
                     "distance": each.distance,
                     "criterion": each.explanation.criterion,
                     "residual_left": each.explanation.left,
