@@ -100,9 +100,9 @@ class Records:
         return np.asarray(repaired.recorded(x) - self.states[window.states + window.steps])
 
     def structure(self, repaired: Repaired) -> tuple[float, float]:
-        """Return the part of the squared residuals of one step that is no noise, and all of it, in those of M.
+        """Return the part of the squared residuals of one step that is no noise, and all of them, in those of M.
 
-        The part is their autocovariance over two steps to four. Noise of a step or of a measurement has none of it: a
+        The part is at most so large, up to one standard error. It is their autocovariance over two steps to four. Noise of a step or of a measurement has none of it: a
         measurement enters the residuals of two steps, the one after the other.
         """
         of_runs, squares, first = [], [], 0
@@ -115,7 +115,8 @@ class Records:
             squares.append((left**2).mean(axis=0))
             first += horizon + 1
         matter = self.sizes[0] > 2 * self.windows[0].floors
-        return float(np.mean(of_runs, axis=0)[matter].sum()), float(np.mean(squares, axis=0)[matter].sum())
+        part, whole = (float(np.mean(each, axis=0)[matter].sum()) for each in (of_runs, squares))
+        return max(part, 0.0) + whole / np.sqrt(len(_LAGS) * sum(self.horizons)), whole
 
     def measured(self, repaired: Repaired) -> tuple[float, float]:
         """Return minus twice the log-likelihood, and the share of the squared residuals of M that is left."""
