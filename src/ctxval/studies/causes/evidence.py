@@ -102,8 +102,8 @@ class Records:
     def structure(self, repaired: Repaired) -> tuple[float, float]:
         """Return the part of the squared residuals of one step that is no noise, and all of them, in those of M.
 
-        The part is at most so large, up to one standard error. It is their autocovariance over two steps to four. Noise of a step or of a measurement has none of it: a
-        measurement enters the residuals of two steps, the one after the other.
+        The part is at most so large, up to one standard error. It is their autocovariance over two steps to four. Noise
+        of a step or of a measurement has none of it: a measurement enters the residuals of two successive steps.
         """
         of_runs, squares, first = [], [], 0
         for number, horizon in enumerate(self.horizons):
@@ -116,7 +116,7 @@ class Records:
             first += horizon + 1
         matter = self.sizes[0] > 2 * self.windows[0].floors
         part, whole = (float(np.mean(each, axis=0)[matter].sum()) for each in (of_runs, squares))
-        return max(part, 0.0) + whole / np.sqrt(len(_LAGS) * sum(self.horizons)), whole
+        return max(part, 0.0) + whole / float(np.sqrt(len(_LAGS) * sum(self.horizons))), whole
 
     def measured(self, repaired: Repaired) -> tuple[float, float]:
         """Return minus twice the log-likelihood, and the share of the squared residuals of M that is left."""
