@@ -92,3 +92,13 @@ def test_bad_input_is_one_sentence(invoke: Invoke, arguments: list[str], sentenc
     assert result.exit_code == 2
     assert sentence in " ".join(result.stderr.split())
     assert "Traceback" not in result.stderr
+
+
+def test_a_refined_model_has_the_cause_and_is_in_no_file(invoke: Invoke) -> None:
+    refine = calling("refine", "cart.sqlite", "--experiment", "offset_cart:experiment", "--method", "causes")
+    refused = refine("--out", "better.npz")
+    assert refused.exit_code == 2
+    assert "--out is not for --method causes" in " ".join(refused.stderr.split())
+    found = report(refine("--threshold", "0.01", "--budget", "4", "--json"))
+    assert found["rounds"][-1]["method"] == "causes"
+    assert found["distance_after"] < 1e-3 < found["distance_before"]
