@@ -7,7 +7,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from study_causes import EXECUTIONS, SERVO, STORED
+from causes_systems import DEVELOPMENT, REPORTING
+from study_causes import EXECUTIONS, NOISES, SERVO, STORED
 
 PAGE = Path(__file__).parents[1] / "docs" / "how-to" / "causes.md"
 MARK = "<!-- written by benchmarks/causes_page.py -->\n"
@@ -37,6 +38,8 @@ are first, {sized} have all sizes within 10 %. {none} of {foreign} foreign fault
 
 The rule that takes white residuals for noise was added when four results on the arm had been seen: with noise, causes
 that were right, with the right size, were not named. Faults that are missed on the reporting robots: {missed}.
+
+{not_run}
 
 {servo}
 """
@@ -85,16 +88,30 @@ def servo() -> str:
     )
 
 
+def not_run() -> str:
+    """Return which robots and noises are missing or incomplete."""
+    robots = [*DEVELOPMENT, *REPORTING]
+    runs = {(name, noise): len(STORED.select(robot=name, noise=noise)) for name in robots for noise in NOISES}
+    few = [
+        f"{name} {'without noise' if not noise else 'with noise'} ({count} of 14 faults)"
+        for (name, noise), count in runs.items()
+        if count < 14
+    ]
+    return f"Not yet run, or in part: {'; '.join(few)}." if few else ""
+
+
 def section() -> str:
     """Return the measured part of the page."""
     records = STORED.select(of="reporting")
     misses = [each for each in records if not each["foreign"] and not (each["named"] and each["in_group"])]
     missed = ", ".join(f"{each['robot']} {each['fault']} ({100 * each['noise']:g} %)" for each in misses) or "none"
-    text = SECTION.format(executions=EXECUTIONS, missed=missed, servo=servo(), **counts(records))
+    text = SECTION.strip().format(
+        executions=EXECUTIONS, missed=missed, servo=servo(), not_run=not_run(), **counts(records)
+    )
     paragraphs = [
         textwrap.fill(part, 120, break_long_words=False, break_on_hyphens=False) for part in text.split("\n\n")
     ]
-    whole = "\n\n".join(paragraphs)
+    whole = "\n\n".join(filter(None, paragraphs))
     return whole.replace("{reporting}", table("reporting")).replace("{development}", table("development"))
 
 
