@@ -37,7 +37,9 @@ are first, {sized} have all sizes within 10 %. {none} of {foreign} foreign fault
 {{development}}
 
 The rule that takes white residuals for noise was added when four results on the arm had been seen: with noise, causes
-that were right, with the right size, were not named. Faults that are missed on the reporting robots: {missed}.
+that were right, with the right size, were not named. When these runs were made, no second cause was looked for as soon
+as one was named; this is so no more, because a first cause may explain 95 % and be wrong. Faults that
+are missed on the reporting robots: {missed}.
 
 {not_run}
 

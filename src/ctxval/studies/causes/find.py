@@ -30,6 +30,7 @@ _ALIKE = 10.0  # differences of the criterion that do not tell causes apart
 _SYSTEMATIC = 0.02  # of residuals that are left, differences by a third may be the way of integration; see `_alike`
 _NAMED = 0.95  # share of the squared closed-loop deviations of M that causes must explain, to be the cause
 _LEFT = 0.02  # share of the residuals that must be left, for another cause to be looked for
+_ENOUGH = 0.99  # share of the deviations that is explained, from which on no other cause is looked for
 _BETTER = 0.5  # largest share of the deviations left by one cause that two causes may leave
 _SHORT, _LONG = 60, 12  # predictions of estimated states take these parts of an execution
 _SOME = (200, 40)  # predictions of one step, and of several, that all causes are screened on
@@ -122,7 +123,7 @@ class _Study:
             ranked = self._ranked(())
             chosen, alike = self._chosen(ranked)
             while chosen is not None and len(chosen.explanation.candidates) < most:
-                if chosen.explanation.left < _LEFT or chosen.complete >= _NAMED:
+                if chosen.explanation.left < _LEFT or chosen.share > _ENOUGH:
                     break
                 better, others = self._chosen(self._ranked(chosen.explanation.candidates))
                 if better is not None:  # the first one was chosen without the other ones

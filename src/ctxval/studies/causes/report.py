@@ -48,7 +48,12 @@ class Explained(ShortRepr):
     @property
     def complete(self) -> float:
         """The share that the causes explain: of deviations, or of residuals if most of what is left is noise."""
-        return max(self.share, self.structure) if self.noise > _NOISY else self.share
+        return max(self.share, self.structure) if self.is_noisy else self.share
+
+    @property
+    def is_noisy(self) -> bool:
+        """Whether most of what is left of the residuals is noise."""
+        return self.noise > _NOISY
 
 
 @dataclass(frozen=True)
