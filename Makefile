@@ -8,7 +8,7 @@ CAMPAIGNS ?= 120
 # Small dense algebra is faster on one thread.
 export OMP_NUM_THREADS = 1
 
-.PHONY: demo test quick thorough check docs reliability interleavings crash-states attack lowest bench bench-peers study study-refine reproduce search global-search calibrate drawn-tests parts pictures posterior-ranks servo watch envelope safety clean
+.PHONY: demo test quick thorough check docs reliability interleavings crash-states attack lowest bench bench-peers study study-refine reproduce search global-search calibrate drawn-tests parts pictures posterior-ranks servo watch envelope safety causes clean
 
 demo: .venv/.installed
 	$(BIN)/ctxval run pendulum
@@ -107,6 +107,12 @@ watch: .venv/.test  ## does a watch notice that a system has changed? Writes doc
 
 envelope: .venv/.test  ## which part of the true set envelopes find; writes docs/envelope.md, and resumes
 	$(BIN)/python benchmarks/study_envelope.py
+
+causes: .venv/.test  ## does `ctxval why` name the fault of a robot? Writes docs/how-to/causes.md, and resumes
+	$(BIN)/python benchmarks/study_causes.py development
+	$(BIN)/python benchmarks/study_causes.py reporting
+	$(BIN)/python benchmarks/study_causes.py servo
+	$(BIN)/python benchmarks/causes_page.py
 
 posterior-ranks: .venv/.test  ## are draws of the learned dynamics as uncertain as they should be? Resumes
 	$(BIN)/python benchmarks/study_posterior_ranks.py

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from conftest import Predicted, make_validation
-from ctxval import Campaign, refine
+from ctxval import Campaign, refine, searches, systems
 from ctxval.campaign.dynamics import PREDICTION
 from ctxval.certificates import (
     KINDS,
@@ -35,6 +35,7 @@ from ctxval.core.trial import Origin, State
 from ctxval.data import Break, LogMapping, MemoryTable, recordings_of
 from ctxval.learning import ExecutionPrediction
 from ctxval.models import Linear
+from ctxval.studies.causes import find_causes
 from ctxval.studies.fitting import FittedParameter, fit
 from ctxval.studies.refinement import HeldOut, measure_residual
 from ctxval.studies.replay import PredictedTask, PredictedTasks, Suggestion, replay
@@ -169,6 +170,14 @@ def test_the_glossary_explains_what_is_said_of_safety() -> None:
     said = {field.name for of in (SafetyReport, UnsafeTask, DrawnTasks, Disturbance) for field in fields(of)}
     explained = re.findall(r"`([^`]+)`", (ROOT / "docs" / "glossary.md").read_text())
     assert (said | {"avoid", "reach", "drawn", "store"}) - {"tightened"} <= set(explained)
+
+
+def test_the_glossary_explains_what_why_says() -> None:
+    model = make_validation().model
+    shifted = make_validation(systems.Simulated(lambda x, u: model.step(x, u + 0.3), vectorized=True), model)
+    said = keys(find_causes(Campaign(shifted, search=searches.by_name("random")).run(2), most=1).to_dict())
+    explained = re.findall(r"`([^`]+)`", (ROOT / "docs" / "glossary.md").read_text())
+    assert said - {"goal"} | {"store", "task", "gap", "other"} <= set(explained)
 
 
 def test_the_glossary_is_in_alphabetical_order() -> None:

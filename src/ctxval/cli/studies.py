@@ -27,7 +27,7 @@ from ctxval.studies.comparison.candidates import require_comparable
 from ctxval.studies.comparison.compare import BUDGET, store_name
 from ctxval.studies.comparison.result import CANDIDATES, PAIRS, WORDS, Comparison
 from ctxval.studies.fitting.model_file import require_file_of
-from ctxval.studies.refinement import Method, ParameterFit, Refinement, refine
+from ctxval.studies.refinement import CauseRepair, Method, ParameterFit, Refinement, refine
 from ctxval.studies.refinement.methods import NAMES, UserFit, method_of
 from ctxval.studies.refinement.rounds import write_refined
 
@@ -133,9 +133,12 @@ def refine_model(
     timeout: float | None = None,
     option: list[str] | None = None,
 ) -> Any:
-    chosen = _method(method, fit, function)
+    known = _method(method, fit, function)
+    if known is None and out_ is not None:
+        raise InputError("--out is not for --method causes: `ctxval why` prints the lines that make its model.")
     require_model_file(out_, [target, allowed.experiment], force=force)
     opened = open_target(target, {"seed": seed, "options": named_values(option) or None}, allowed)
+    chosen = CauseRepair(opened.campaign) if known is None else known
     settings = opened.settings.certified_as({"stochastic": stochastic})
     if confidence is not None:
         settings = settings.model_copy(update={"confidence": confidence})
@@ -176,13 +179,16 @@ def refine_model(
     return {**refinement.to_dict(), "files": files}, FALSIFIED if refinement.answer == "falsified" else 0
 
 
-def _method(name: str, fit: str | None, function: StepFunction) -> Method:
+def _method(name: str, fit: str | None, function: StepFunction) -> Method | None:
+    """Return a method; None for one that needs the campaign."""
     if (fit is not None) != (name == "fit"):
         raise InputError("--method fit and --fit MODULE:ATTR must be given together.")
     if bool(function.parameter) != (name == "parameters"):
         raise InputError("--method parameters and --parameter must be given together.")
     if function.step is not None and name != "parameters":
         raise InputError("--step is for --method parameters.")
+    if name == "causes":
+        return None
     if fit is not None:
         return UserFit(require_function(f"--fit {fit}", reference(fit), "(data) -> model"))
     if name != "parameters":

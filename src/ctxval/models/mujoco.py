@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import copy
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -34,6 +37,8 @@ class MuJoCo(ShortRepr):
         data: the transitions that the model was identified from, if they are known.
     """
 
+    _forces: Array | None = None  # of every step; see `changed`
+
     def __init__(self, mjcf: str | Path, *, dt: Seconds | None = None, data: Transitions | None = None) -> None:
         _, self._model = compile_mjcf(mjcf if is_mjcf_text(mjcf) else identified_in(Path(mjcf)))
         timestep = float(self._model.opt.timestep)
@@ -52,6 +57,28 @@ class MuJoCo(ShortRepr):
         """Length of a step, seconds."""
         return float(self._model.opt.timestep) * self.substeps
 
+    @property
+    def compiled(self) -> Any:
+        """The compiled ``mujoco.MjModel``, which must not be changed: :meth:`changed` changes a copy."""
+        return self._model
+
+    def changed(self, change: Callable[[Any], None] | None = None, *, forces: Array | None = None) -> MuJoCo:
+        """Return the model after a function has changed its compiled ``mujoco.MjModel``.
+
+        Args:
+            change: sets attributes of a copy; constants that follow from them are computed again.
+            forces: forces on the degrees of freedom in every step, shape ``(nv,)``.
+        """
+        another = copy.copy(self)
+        if change is not None:
+            mujoco = require_extra("mujoco", "mujoco", "models of MuJoCo")
+            another._model = copy.copy(self._model)
+            change(another._model)
+            mujoco.mj_setConst(another._model, mujoco.MjData(another._model))
+        if forces is not None:
+            another._forces = forces
+        return another
+
     def step(self, x: Array, u: Array) -> Array:
         model, nq = self._model, self._model.nq
         if (x.shape[-1], u.shape[-1]) != (nq + model.nv, model.nu):
@@ -65,6 +92,8 @@ class MuJoCo(ShortRepr):
         for k in np.flatnonzero(np.isfinite(states).all(axis=1) & np.isfinite(inputs).all(axis=1)).tolist():
             mujoco.mj_resetData(model, data)
             data.qpos, data.qvel, data.ctrl = states[k, :nq], states[k, nq:], inputs[k]
+            if self._forces is not None:
+                data.qfrc_applied = self._forces
             mujoco.mj_step(model, data, self.substeps)
             if not data.warning.number.any():
                 reached[k] = np.concatenate([data.qpos, data.qvel])

@@ -17,7 +17,7 @@ from ctxval.campaign.dynamics import NEAR, CampaignDynamics
 from ctxval.campaign.envelope import has_tests
 from ctxval.campaign.interval_search import with_next_task
 from ctxval.campaign.provenance import provenance_of_store
-from ctxval.campaign.storage.store import Store
+from ctxval.campaign.storage.store import CAUSE, Store
 from ctxval.certificates import Certificate, CertificateOptions, Provenance, Verdict, judge
 from ctxval.certificates.envelope import Envelope
 from ctxval.core.labels import Labels, labels_of
@@ -79,6 +79,12 @@ class ReportContext(ShortRepr):
     changes: tuple[Change, ...] = ()
     provenance: Provenance = field(default_factory=Provenance)
     envelope: Envelope | None = None
+
+    @functools.cached_property
+    def cause(self) -> str:
+        """What M lacks, as ``ctxval why`` has kept it for the present trials; empty if it has not."""
+        kept = self.store.computed(CAUSE)
+        return kept if isinstance(kept, str) else ""
 
     # Trials
 

@@ -271,6 +271,12 @@ def goals(context: ReportContext) -> Answer | None:
     return "attention", text, values
 
 
+@asks("Why M fails")
+def cause(context: ReportContext) -> Answer | None:
+    """What M lacks, if ``ctxval why`` has found it in the present trials."""
+    return ("note", context.cause, {}) if context.cause else None
+
+
 INSIGHTS = (
-    weak_region, weak_states, components, flips, saturation, converged, unusual_motion, goals, bias, explained,
+    cause, weak_region, weak_states, components, flips, saturation, converged, unusual_motion, goals, bias, explained,
 )  # fmt: skip

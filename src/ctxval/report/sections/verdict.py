@@ -112,7 +112,7 @@ def _facts(context: ReportContext) -> Markup:
 
 def _remarks(context: ReportContext) -> list[Markup]:
     """Return what must not be overlooked in what is folded below, and around the store."""
-    remarks = []
+    remarks = [paragraph(element("strong", "Why M fails. "), context.cause)] if context.cause else []
     # The sentence of the verdict says why a certificate is refused or withdrawn.
     findings = [finding for finding in [*context.diagnostics, *context.insights] if finding.name != "Certificate"]
     for light in ("bad", "attention"):

@@ -1,5 +1,6 @@
 """Better models from executions: a model is learned again from what falsified it, and validated again."""
 
+from ctxval.studies.refinement.cause_repair import CauseRepair
 from ctxval.studies.refinement.held_out import (
     HeldOut,
     MeasuredResidual,
@@ -13,6 +14,7 @@ from ctxval.studies.refinement.refine import refine
 from ctxval.studies.refinement.rounds import Refinement, Round
 
 __all__ = [
+    "CauseRepair",
     "HeldOut",
     "Learned",
     "MeasuredResidual",

@@ -27,7 +27,7 @@ _CENTRES = 300  # largest number of transitions that a correction is conditioned
 _MUCH = 0.1  # share of the error that a correction leaves on held-out executions, from which on another one is tried
 
 RefitKind = Literal["linear", "network", "gaussian-process"]
-NAMES = ("residual", *get_args(RefitKind), "parameters", "fit")
+NAMES = ("residual", "causes", *get_args(RefitKind), "parameters", "fit")
 """The names of the methods on the command line."""
 
 
@@ -219,6 +219,8 @@ def method_of(method: str | Method | Callable[[Transitions], Any], *, seed: int 
         return Refit(method, seed)  # type: ignore[arg-type]
     if method == "parameters":
         raise InputError("the method 'parameters' needs bounds: give refinement.ParameterFit({'mass': (0.5, 2.0)}).")
+    if method == "causes":
+        raise InputError("the method 'causes' needs the campaign: give refinement.CauseRepair(campaign).")
     if method == "fit":
         raise InputError("the method 'fit' needs a function: give the function fit(data) -> model itself.")
     raise UnknownNameError.among("method of refinement", method, NAMES)

@@ -1,0 +1,190 @@
+"""Causes in the actuators: what acts is not what is commanded."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from ctxval._util.arrays import Array
+from ctxval.learning.actuators import Actuator
+from ctxval.studies.causes.cause import Cause
+from ctxval.studies.causes.plant import Plant
+
+
+def _with_unit(value: float, unit: str) -> str:
+    return f"{value:.3g} {unit}".strip()
+
+
+@dataclass(frozen=True)
+class InputGain(Cause):
+    """An input has more or less effect: a weak motor, or a wrong constant. Size: the share of its effect in M.
+
+    Attributes:
+        input: index of the input; None for all of them together.
+    """
+
+    name: ClassVar[str] = "input gain"
+    input: int | None = 0
+
+    def follow(self, u: Array, memory: Any) -> tuple[Array, Any]:
+        gains = np.ones(u.shape[-1])
+        gains[slice(None) if self.input is None else self.input] = self.sizes[0]
+        return u * gains, None
+
+    def text(self, plant: Plant) -> str:
+        which = "all inputs have" if self.input is None else f"{plant.input(self.input)[0]} has"
+        return f"{which} {self.sizes[0]:.3g} times the effect that M has"
+
+    def mjcf(self, plant: Plant) -> str | None:
+        compiled = getattr(plant.model, "compiled", None)
+        if compiled is None or self.input is None:
+            return None
+        gear = self.sizes[0] * float(compiled.actuator_gear[self.input, 0])
+        return f'<motor name="{compiled.actuator(self.input).name}" gear="{gear:.5g}"/>'
+
+
+@dataclass(frozen=True)
+class InputOffset(Cause):
+    """An input has an offset. Size: the offset, in units of the input."""
+
+    name: ClassVar[str] = "input offset"
+    input: int = 0
+
+    def follow(self, u: Array, memory: Any) -> tuple[Array, Any]:
+        shift = np.zeros(u.shape[-1])
+        shift[self.input] = self.sizes[0]
+        return u + shift, None
+
+    def text(self, plant: Plant) -> str:
+        name, unit = plant.input(self.input)
+        return f"{name} has an offset of {_with_unit(self.sizes[0], unit)}"
+
+
+@dataclass(frozen=True)
+class Saturation(Cause):
+    """An input is limited. Size: the limit of its magnitude."""
+
+    name: ClassVar[str] = "saturation"
+    input: int = 0
+
+    def follow(self, u: Array, memory: Any) -> tuple[Array, Any]:
+        most = np.full(u.shape[-1], np.inf)
+        most[self.input] = self.sizes[0]
+        return np.clip(u, -most, most), None
+
+    def text(self, plant: Plant) -> str:
+        name, unit = plant.input(self.input)
+        return f"{name} saturates at {_with_unit(self.sizes[0], unit)}"
+
+    def mjcf(self, plant: Plant) -> str | None:
+        compiled = getattr(plant.model, "compiled", None)
+        if compiled is None:
+            return None
+        limit = f'ctrllimited="true" ctrlrange="{-self.sizes[0]:.5g} {self.sizes[0]:.5g}"'
+        return f'<motor name="{compiled.actuator(self.input).name}" {limit}/>'
+
+
+@dataclass(frozen=True)
+class DeadZone(Cause):
+    """An input has no effect near 0. Size: the magnitude below which it has none, and which is lost above."""
+
+    name: ClassVar[str] = "dead zone"
+    input: int = 0
+
+    def follow(self, u: Array, memory: Any) -> tuple[Array, Any]:
+        lost = np.zeros(u.shape[-1])
+        lost[self.input] = self.sizes[0]
+        return u - np.clip(u, -lost, lost), None
+
+    def text(self, plant: Plant) -> str:
+        name, unit = plant.input(self.input)
+        return f"{name} has a dead zone of {_with_unit(self.sizes[0], unit)}"
+
+
+@dataclass(frozen=True)
+class Backlash(Cause):
+    """An input follows with play. Size: half of the play, in units of the input."""
+
+    name: ClassVar[str] = "backlash"
+    remembers: ClassVar[bool] = True
+    input: int = 0
+
+    def follow(self, u: Array, memory: Any) -> tuple[Array, Any]:
+        play = np.zeros(u.shape[-1])
+        play[self.input] = self.sizes[0]
+        acting = np.clip(np.zeros_like(u) if memory is None else memory, u - play, u + play)
+        return acting, acting
+
+    def text(self, plant: Plant) -> str:
+        name, unit = plant.input(self.input)
+        return f"{name} has backlash of {_with_unit(2 * self.sizes[0], unit)}"
+
+
+@dataclass(frozen=True)
+class Delay(Cause):
+    """All inputs act late. Size: the delay in steps, which need not be an integer. Before the first input, 0 acts."""
+
+    name: ClassVar[str] = "delay"
+    remembers: ClassVar[bool] = True
+
+    def follow(self, u: Array, memory: Any) -> tuple[Array, Any]:
+        actuator = Actuator(delay=max(self.sizes[0], 0.0))
+        commanded = (u, *(memory or ()))[: actuator.remembered]
+        return actuator.follow(np.zeros_like(u), commanded), commanded
+
+    def text(self, plant: Plant) -> str:
+        return f"commands arrive {1e3 * plant.dt * self.sizes[0]:.3g} ms late ({self.sizes[0]:.3g} steps)"
+
+
+@dataclass(frozen=True)
+class Lag(Cause):
+    """All inputs are followed by a first-order lag. Size: the time constant in steps."""
+
+    name: ClassVar[str] = "lag"
+    remembers: ClassVar[bool] = True
+
+    def follow(self, u: Array, memory: Any) -> tuple[Array, Any]:
+        lag = max(self.sizes[0], 1e-3)
+        left = (np.zeros_like(u) if memory is None else memory) - u
+        # What acts is the mean over the step of an input that approaches the command.
+        return u + left * lag * (1 - np.exp(-1 / lag)), u + left * np.exp(-1 / lag)
+
+    def text(self, plant: Plant) -> str:
+        return f"the actuators follow with a time constant of {1e3 * plant.dt * self.sizes[0]:.3g} ms"
+
+
+@dataclass(frozen=True)
+class SwappedInputs(Cause):
+    """Two inputs are exchanged."""
+
+    sizes: tuple[float, ...] = ()
+    name: ClassVar[str] = "swapped inputs"
+    first: int = 0
+    second: int = 1
+
+    def follow(self, u: Array, memory: Any) -> tuple[Array, Any]:
+        order = np.arange(u.shape[-1])
+        order[[self.first, self.second]] = self.second, self.first
+        return u[..., order], None
+
+    def text(self, plant: Plant) -> str:
+        return f"the inputs {plant.input(self.first)[0]} and {plant.input(self.second)[0]} are exchanged"
+
+
+@dataclass(frozen=True)
+class ReversedInput(Cause):
+    """An input acts with the opposite sign."""
+
+    sizes: tuple[float, ...] = ()
+    name: ClassVar[str] = "reversed input"
+    input: int = 0
+
+    def follow(self, u: Array, memory: Any) -> tuple[Array, Any]:
+        signs = np.ones(u.shape[-1])
+        signs[self.input] = -1.0
+        return u * signs, None
+
+    def text(self, plant: Plant) -> str:
+        return f"{plant.input(self.input)[0]} acts with the opposite sign"

@@ -1,0 +1,210 @@
+"""What a search for causes says: sentences, numbers, and lines to paste."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from ctxval._util.describe import describe
+from ctxval._util.representation import ShortRepr, call, line, lines, task_text
+from ctxval.studies.causes.cause import Cause, Repaired
+from ctxval.studies.causes.evidence import Explanation
+from ctxval.studies.causes.plant import Plant
+
+_NOISY = 0.5  # share of noise in what is left of residuals, from which on closed loops follow noise rather than causes
+_PART = 0.5  # share of the deviations from which on a cause is called a part of the error
+
+
+@dataclass(frozen=True, eq=False)
+class Explained(ShortRepr):
+    """Causes that were tried in closed loop.
+
+    Attributes:
+        explanation: the causes with their sizes.
+        share: the share of the squared closed-loop deviations of M that the causes explain, each execution predicted
+            without itself.
+        distance: the largest distance between an execution and its prediction.
+        spreads: the range of each size if one execution is left out.
+        structure: the share of what is no noise in the residuals of one step that the causes explain.
+        noise: the share of noise in the residuals that the causes leave.
+    """
+
+    explanation: Explanation
+    share: float
+    distance: float
+    spreads: tuple[float, ...]
+    structure: float
+    noise: float
+
+    @property
+    def causes(self) -> tuple[Cause, ...]:
+        """The causes with their sizes."""
+        return self.explanation.repaired.causes
+
+    @property
+    def complete(self) -> float:
+        """The share that the causes explain: of deviations, or of residuals if most of what is left is noise."""
+        return max(self.share, self.structure) if self.is_noisy else self.share
+
+    @property
+    def is_noisy(self) -> bool:
+        """Whether most of what is left of the residuals is noise."""
+        return self.noise > _NOISY
+
+
+@dataclass(frozen=True)
+class Separating(ShortRepr):
+    """The task that tells two causes apart.
+
+    Attributes:
+        task: its parameters.
+        distance: the distance between what the two causes predict of it.
+        other: the number of the second cause among those that were explained; the first one is 0.
+        gap: the largest difference of a state, in shares of its range.
+    """
+
+    task: Mapping[str, Any]
+    distance: float
+    other: int
+    gap: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class CauseReport(ShortRepr):
+    """Why a model fails.
+
+    Attributes:
+        plant: the parts of the model that causes act on.
+        explained: the most probable causes, and others that the executions do not tell from them; empty if no cause
+            predicts held-out executions better than M.
+        named: whether the first of these is the cause. Otherwise the answer is none of these, and ``explained`` is what
+            comes nearest.
+        tried: the number of causes in the dictionary.
+        executions: the number of executions that were learned from.
+        before: the largest distance of these executions from M.
+        units: of the distance.
+        separating: the task that tells causes apart which these executions do not.
+        ranked: the most probable causes alone, the best one first.
+    """
+
+    plant: Plant
+    explained: tuple[Explained, ...]
+    named: bool
+    tried: int
+    executions: int
+    before: float
+    units: str = ""
+    separating: Separating | None = None
+    ranked: tuple[Explanation, ...] = ()
+
+    @property
+    def causes(self) -> tuple[Cause, ...]:
+        """The causes that are named; empty if there are none."""
+        return self.explained[0].causes if self.named else ()
+
+    @property
+    def repaired(self) -> Repaired | None:
+        """M with the named causes in it; None if no cause is named."""
+        return self.explained[0].explanation.repaired if self.named else None
+
+    @property
+    def after(self) -> float | None:
+        """The largest distance of the same executions from M with the causes, each predicted without itself."""
+        return self.explained[0].distance if self.explained else None
+
+    @property
+    def sentence(self) -> str:
+        """What M lacks, in one or two sentences."""
+        units = f" {self.units}" if self.units else ""
+        if not self.explained:
+            return f"None of these {self.tried} causes: none predicts executions better that it was not fitted to."
+        first = self.explained[0]
+        effect = (
+            f"the largest distance of {self.executions} executions falls from {self.before:.3g} to "
+            f"{first.distance:.3g}{units}"
+        )
+        share = f"{np.floor(1e3 * first.share) / 10:.4g} % of the squared deviations"
+        if not self.named:
+            less = "The largest part of the error that one explains" if first.share > _PART else "What comes nearest"
+            return f"None of these {self.tried} causes. {less}: {self._text(first)}. It explains {share}, and {effect}."
+        texts = [self._text(each) for each in self.explained]
+        what = (
+            texts[0]
+            if len(texts) == 1
+            else f"One of these, which the executions do not tell apart: {'; or '.join(texts)}"
+        )
+        together = "both" if len(first.causes) == 2 else "this"
+        return f"{what[0].upper()}{what[1:]}. With {together} in M, {effect}. This explains {share}."
+
+    def _text(self, each: Explained) -> str:
+        return " and ".join(cause.text(self.plant) for cause in each.causes)
+
+    @property
+    def separating_sentence(self) -> str | None:
+        """Which task tells causes apart; None if the executions do, or if no task does."""
+        if self.separating is None:
+            return None
+        if self.separating.gap < 1e-3:
+            return "No task tells them apart: they are the same to this model."
+        units = f" {self.units}" if self.units else ""
+        return (
+            f"Execute the task {task_text(self.separating.task)} to tell them apart: there, the first and number "
+            f"{self.separating.other + 1} differ by {self.separating.distance:.3g}{units}."
+        )
+
+    @property
+    def python(self) -> str | None:
+        """The lines of Python that make M with the causes; None if no cause is named."""
+        if not self.named:
+            return None
+        made = "".join(f"    {cause.python()},\n" for cause in self.causes)
+        return f"from ctxval.studies import causes\n\nmodel = causes.Repaired(model, (\n{made}))"
+
+    @property
+    def mjcf(self) -> tuple[str, ...]:
+        """The lines of MJCF that put the causes into a MuJoCo model; empty if there are none."""
+        found = [cause.mjcf(self.plant) for cause in self.causes]
+        return tuple(each for each in found if each is not None)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return everything as plain values."""
+        return {
+            "answer": "named" if self.named else "none of these",
+            "sentence": self.sentence,
+            "separating": self.separating and {**asdict(self.separating), "sentence": self.separating_sentence},
+            "explained": [
+                {
+                    "text": self._text(each),
+                    "causes": [
+                        {"name": cause.name, "sizes": list(cause.sizes), "python": cause.python()}
+                        for cause in each.causes
+                    ],
+                    "spreads": list(each.spreads),
+                    "share": each.share,
+                    "structure": each.structure,
+                    "noise": each.noise,
+                    "distance": each.distance,
+                    "criterion": each.explanation.criterion,
+                    "residual_left": each.explanation.left,
+                }
+                for each in self.explained
+            ],
+            "tried": self.tried,
+            "executions": self.executions,
+            "distance_before": self.before,
+            "distance_after": self.after,
+            "units": self.units,
+            "python": self.python,
+            "mjcf": list(self.mjcf),
+        }
+
+    def to_json(self) -> str:
+        """Return :meth:`to_dict` as a text in JSON."""
+        return json.dumps(describe(self.to_dict(), depth=12), indent=1)
+
+    def __repr__(self) -> str:
+        return lines(call(self, executions=self.executions, tried=self.tried), line(self.sentence))

@@ -1,0 +1,130 @@
+"""Causes that are found in executions."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ctxval import (
+    Array,
+    Campaign,
+    Labels,
+    Task,
+    TaskSpace,
+    Validation,
+    controllers,
+    distances,
+    models,
+    searches,
+    systems,
+)
+from ctxval.core.model import Step
+from ctxval.errors import InputError
+from ctxval.studies import causes
+from ctxval.studies.causes import CauseReport, find_causes
+
+DT, PARTS = 0.05, 6
+
+
+def slide(force: Callable[[Array, Array, Array], Array]) -> Step:
+    """Return the step of a carriage of 1 kg with a force of position, rate, and what stops it."""
+
+    def step(x: Array, u: Array) -> Array:
+        position, speed, h = x[..., 0], x[..., 1], DT / PARTS
+        for _ in range(PARTS):
+            push = u[..., 0]
+            speed = speed + h * (push + force(position, speed, -(speed / h + push)))
+            position = position + h * speed
+        return np.stack([position, speed], axis=-1)
+
+    return step
+
+
+def campaign(step: Step, **imperfect: Any) -> Campaign:
+    validation = Validation(
+        space=TaskSpace(goal=(-1.5, 1.5, "m"), start=(-0.5, 0.5, "m")),
+        task=lambda p: Task(np.stack([p.start, 0 * p.start], axis=-1), goal=[p.goal, 0.0], horizon=40, dt=DT),
+        system=systems.Imperfect(step, vectorized=True, seed=0, **imperfect),
+        model=models.Linear([[1.0, DT], [0.0, 1.0]], [[0.5 * DT**2], [DT]]),
+        synthesizer=controllers.LQR([10.0, 1.0], [0.5]),
+        distance=distances.MaximumDeviation(components=(0,)),
+        start_tolerance=1.0,
+        labels=Labels(("position [m]", "speed [m/s]"), ("force [N]",), "m"),
+    )
+    return Campaign(validation, search=searches.by_name("random"), seed=0).run(3)
+
+
+def no_force(position: Array, speed: Array, stopping: Array) -> Array:
+    return 0.0 * position
+
+
+def friction(position: Array, speed: Array, stopping: Array) -> Array:
+    return np.clip(stopping, -0.4, 0.4)
+
+
+def found(step: Step, **imperfect: Any) -> CauseReport:
+    return find_causes(campaign(step, **imperfect))
+
+
+@pytest.mark.slow
+def test_dry_friction_and_a_delay_are_found_together() -> None:
+    report = found(slide(friction), delay=0.7)
+    sizes = {cause.name: cause.sizes for cause in report.causes}
+    assert sizes == {"delay": pytest.approx([0.7], rel=0.02), "Coulomb friction": pytest.approx([0.4], rel=0.02)}
+    assert "position sticks (0.4 n)" in report.sentence.lower()
+    assert "arrive 35 ms late" in report.sentence
+    assert report.after is not None
+    assert report.after < 0.1 * report.before
+
+
+@pytest.mark.slow
+def test_noise_does_not_hide_a_weak_motor() -> None:
+    weak = slide(no_force)
+    report = found(lambda x, u: weak(x, 0.8 * u), measurement=[1e-3, 2e-3])
+    assert any(isinstance(cause, causes.InputGain) for each in report.explained for cause in each.causes)
+    (cause,) = report.causes
+    inverse = cause.sizes[0] if isinstance(cause, causes.InputGain) else 1 / cause.sizes[0]
+    assert inverse == pytest.approx(0.8, rel=0.02)
+
+
+@pytest.mark.slow
+def test_causes_that_are_the_same_to_a_model_are_said_together() -> None:
+    weak = slide(no_force)
+    report = found(lambda x, u: weak(x, 0.8 * u))
+    names = {each.causes[0].name for each in report.explained}
+    assert {"input gain", "inertia"} <= names
+    assert "One of these" in report.sentence
+    assert report.separating_sentence is not None
+    assert "the same to this model" in report.separating_sentence
+
+
+@pytest.mark.slow
+def test_a_fault_outside_of_the_dictionary_is_none_of_these() -> None:
+    report = found(slide(lambda position, speed, stopping: 0.5 * np.sin(11 * position)))
+    assert not report.named
+    assert report.causes == ()
+    assert report.sentence.startswith("None of these")
+    assert report.python is None
+
+
+def test_a_report_is_plain_values_and_its_python_makes_the_model() -> None:
+    weak = slide(no_force)
+    report = find_causes(campaign(lambda x, u: weak(x, u + 0.3)), most=1)
+    stored = json.loads(report.to_json())
+    assert (stored["answer"], stored["sentence"]) == ("named", report.sentence)
+    assert report.python is not None
+    made: dict[str, Any] = {"model": models.Linear([[1.0, DT], [0.0, 1.0]], [[0.5 * DT**2], [DT]])}
+    exec(report.python, made)
+    x, u = np.array([0.3, -0.2]), np.array([0.5])
+    np.testing.assert_allclose(made["model"].step(x, u), weak(x, u + 0.3), atol=2e-3)
+
+
+def test_one_execution_is_too_few() -> None:
+    few = campaign(slide(no_force))
+    alone = Campaign(few.validation, search=searches.by_name("random"), seed=0).run(1)
+    with pytest.raises(InputError, match="at least 2 executions with trajectories in the store, got 1"):
+        find_causes(alone)

@@ -1,0 +1,75 @@
+"""Causes in MuJoCo models, with the lines of MJCF that repair them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from ctxval import Campaign, Parameters, Task, TaskSpace, Validation, controllers, distances, models, searches, systems
+from ctxval.studies import causes
+from ctxval.studies.causes import CauseReport, Joint, find_causes
+from ctxval.studies.causes.plant import plant_of
+
+pytest.importorskip("mujoco")
+
+DT = 0.02
+
+
+def mjcf(joint: str = "", mass: float = 0.5, gear: float = 1.0) -> str:
+    return f"""<mujoco><option timestep="0.005"/><worldbody><body name="link">
+      <joint name="hinge" type="hinge" axis="0 1 0" damping="0.05" {joint}/>
+      <geom type="capsule" fromto="0 0 0 0 0 -0.5" size="0.02" mass="{mass}"/>
+    </body></worldbody><actuator><motor name="motor" joint="hinge" gear="{gear}"/></actuator></mujoco>"""
+
+
+def reach(p: Parameters) -> Task:
+    return Task(np.stack([p.start, 0 * p.start], axis=-1), goal=[p.goal, 0.0], horizon=50, dt=DT)
+
+
+def report(true: str) -> CauseReport:
+    validation = Validation(
+        space=TaskSpace(goal=(-1.0, 1.0, "rad"), start=(-0.5, 0.5, "rad")),
+        task=reach,
+        system=systems.Simulated(models.MuJoCo(true, dt=DT)),
+        model=models.MuJoCo(mjcf(), dt=DT),
+        synthesizer=controllers.PID(4.0, 0.0, 0.4),
+        distance=distances.MaximumDeviation(components=(0,)),
+    )
+    return find_causes(Campaign(validation, search=searches.by_name("random"), seed=0).run(3), most=1)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("true", "line", "says"),
+    [
+        (mjcf('frictionloss="0.2"'), '<joint name="hinge" frictionloss="0.2"/>', "Hinge sticks (0.2 N m)"),
+        (mjcf('armature="0.03"'), '<joint name="hinge" armature="0.03"/>', "more inertia of the rotor"),
+        (mjcf(mass=0.7), "<inertial ", "Link has a mass of 0.7 kg and not of 0.5 kg"),
+    ],
+)
+def test_the_attribute_that_differs_is_found(true: str, line: str, says: str) -> None:
+    found = report(true)
+    assert found.named
+    assert says.lower() in found.sentence.lower()
+    assert any(each.startswith(line) for each in found.mjcf)
+
+
+def test_a_changed_copy_leaves_the_model_as_it_is() -> None:
+    model = models.MuJoCo(mjcf(), dt=DT)
+    x, u = np.array([0.3, 1.0]), np.array([0.5])
+    before = model.step(x, u)
+    sticking = causes.JointAttribute((0.2,), "frictionloss", Joint(1, 0, 1.0, 0, 0)).model(model)
+    np.testing.assert_array_equal(model.step(x, u), before)
+    expected = models.MuJoCo(mjcf('frictionloss="0.2"'), dt=DT).step(x, u)
+    np.testing.assert_allclose(sticking.step(x, u), expected, atol=1e-9)
+    pushed = model.changed(forces=np.array([0.1])).step(x, u)
+    np.testing.assert_allclose(pushed, model.step(x, np.array([0.6])), atol=1e-12)
+
+
+def test_joints_and_units_are_those_of_the_model() -> None:
+    rng, model = np.random.default_rng(0), models.MuJoCo(mjcf(), dt=DT)
+    plant = plant_of(model, DT, {"x0": "", "x1": ""}, {"u0": ""}, rng.normal(size=(9, 2)), rng.normal(size=(9, 1)))
+    (joint,) = plant.joints
+    assert (joint.position, joint.rate, joint.input, joint.dof) == (0, 1, 0, 0)
+    assert (plant.joint_name(joint), plant.force_unit(joint), plant.rate_unit(joint)) == ("hinge", "N m", "rad/s")
+    assert causes.InputGain((0.5,), 0).mjcf(plant) == '<motor name="motor" gear="0.5"/>'
