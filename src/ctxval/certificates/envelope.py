@@ -31,21 +31,10 @@ from ctxval._util.files import write_text
 from ctxval._util.representation import ShortRepr
 from ctxval._util.texts import enumerated
 from ctxval.certificates.bounds import at_most, percent
-from ctxval.certificates.drawn_distances import FLOOR, LARGEST, DrawnDistances
-from ctxval.certificates.dynamics_diagnostics import (
-    ACCURATE,
-    BEYOND,
-    GAP,
-    NOISY_BEYOND,
-    PREDICTIONS,
-    agrees,
-    counted,
-    missing_tests,
-    tested,
-    unlearned,
-    untried_parameter,
-)
-from ctxval.certificates.dynamics_evidence import CheckedPrediction, DynamicsEvidence
+from ctxval.certificates.drawn_distances import LARGEST, DrawnDistances
+from ctxval.certificates.dynamics_evidence import DynamicsEvidence
+from ctxval.certificates.envelope_diagnostics import most_beyond, rises_of
+from ctxval.certificates.envelope_onnx import write_onnx
 from ctxval.certificates.envelope_surface import Surfaces, exported
 from ctxval.certificates.envelope_words import Region, regions_inside
 from ctxval.certificates.prediction_tests import DRAWN
@@ -58,68 +47,6 @@ COUNTED = 4096  # tasks of which the share in the envelope is counted
 _EXCEEDED = 1.02  # an executed distance above the threshold counts as at least this multiple of it
 _SAME = 1e-9
 _WORTH = 0.8  # share of the tasks predicted below the threshold that tests may leave in the envelope
-
-
-def rises_of(evidence: DynamicsEvidence, threshold: float) -> list[tuple[float, CheckedPrediction]]:
-    """Return the standardised excesses of predictions that count over what was predicted, with the predictions.
-
-    These are the tests that count and the last other predictions. A prediction counts only if the task or its
-    prediction is below the threshold: nothing is claimed of the others.
-    """
-    drawn = [test for test in tested(evidence.predictions, evidence.tests) if test.origin in DRAWN]
-    last = {each.trial: each for each in [*drawn, *counted(evidence, threshold)[-PREDICTIONS:]]}.values()
-    return [(_standardised(each, threshold), each) for each in last if _matters(each, threshold)]
-
-
-def _matters(prediction: CheckedPrediction, threshold: float) -> bool:
-    return min(prediction.distance, prediction.median) <= threshold
-
-
-def _standardised(prediction: CheckedPrediction, threshold: float) -> float:
-    if not np.isfinite(prediction.upper):
-        return 0.0  # it said nothing
-    spread = (prediction.upper - prediction.median) / 1.645  # the 0.95 quantile of a normal distribution
-    return prediction.excess / max(spread, 2 * FLOOR * threshold)
-
-
-def most_beyond(evidence: DynamicsEvidence) -> float:
-    """Return by how much the closed loop of a trusted task may leave the records, as a share of the visited range."""
-    if evidence.coverage.pair is None:
-        return GAP
-    return BEYOND if evidence.quantile is None else NOISY_BEYOND
-
-
-def unexplained(evidence: DynamicsEvidence, threshold: float) -> CheckedPrediction | None:
-    """Return a test whose distance what is learned by now does not have, by more than a share of the threshold."""
-    for test in evidence.predictions:
-        known = test.explained
-        if known is None or test.is_noisy or min(test.distance, known) > threshold:
-            continue
-        if not agrees(test.distance, known, threshold):
-            return test
-    return None
-
-
-def doubt_of_envelope(evidence: DynamicsEvidence, threshold: float) -> str | None:
-    """Return why no envelope can be stated, and what would help; None if one can."""
-    # Tasks that cannot be planned are no part of the envelope.
-    if (doubt := unlearned(replace(evidence, unplanned=0.0), threshold)) is not None:
-        return doubt
-    if (doubt := untried_parameter(evidence)) is not None:
-        return doubt
-    if (test := unexplained(evidence, threshold)) is not None:
-        return (
-            f"trial {test.trial} has the distance {test.distance:.4g}, and {test.explained:.4g} on the learned "
-            f"dynamics, a difference of more than {100 * ACCURATE:g} % of the threshold: the next state is no function "
-            "of what is recorded, or the dynamics depend on the task; record more states"
-        )
-    missing = missing_tests(evidence.predictions, evidence.tests)
-    if missing:
-        return (
-            f"{missing} more {'execution' if missing == 1 else 'executions'} must be predicted beforehand, at tasks "
-            "drawn over the whole task space (`ctxval run --envelope` executes them)"
-        )
-    return None
 
 
 @dataclass(frozen=True, eq=False)
@@ -227,20 +154,20 @@ class Envelope(ShortRepr):
         }
 
     def save(self, path: str | Path) -> Path:
-        """Write a Python file with a function ``trusted(task) -> (bool, bound)`` that needs NumPy alone.
+        """Write the function ``trusted(task) -> bool, bound`` to a file, which needs nothing of this package.
 
-        It is the same function as :meth:`trusted` and :meth:`bound`.
+        It is the same function as :meth:`trusted` and :meth:`bound`. A Python file needs NumPy alone. A file that ends
+        with ``.onnx`` is written by :meth:`to_onnx`.
 
         Raises:
-            InputError: if the path does not end with ``.py``, nothing is trusted, or the task space is a suite.
+            InputError: if the path has another suffix, nothing is trusted, or the task space is a suite.
         """
+        if Path(path).suffix == ".onnx":
+            return self.to_onnx(path)
         if Path(path).suffix != ".py":
-            raise InputError(f"the envelope is written to a Python file, such as envelope.py, got {str(path)!r}.")
-        if self._surfaces is None:
-            reason = "the tasks of a suite are a list" if self.tasks is not None else "no task is trusted"
-            raise InputError(f"there is no function to write: {reason}.")
+            raise InputError(f"the envelope is written to a file such as envelope.py or .onnx, got {str(path)!r}.")
         text = exported(
-            self._surfaces,
+            self._written,
             title=self.statement,
             labels=list(self.space.labels),
             names=list(self.space.names),
@@ -250,6 +177,24 @@ class Envelope(ShortRepr):
             confidence=self.confidence,
         )
         return write_text(path, text)
+
+    def to_onnx(self, path: str | Path) -> Path:
+        """Write an ONNX file with the input ``task`` ``(N, d)`` and the outputs ``trusted`` and ``bound`` ``(N,)``.
+
+        It is the same function as :meth:`trusted` and :meth:`bound`, up to rounding. The package onnx is needed to
+        write it (extra ``fit``).
+
+        Raises:
+            InputError: if onnx is not installed, nothing is trusted, or the task space is a suite.
+        """
+        return write_onnx(path, self._written, self.space, self.threshold)
+
+    @property
+    def _written(self) -> Surfaces:
+        if self._surfaces is None:
+            reason = "the tasks of a suite are a list" if self.tasks is not None else "no task is trusted"
+            raise InputError(f"there is no function to write: {reason}.")
+        return self._surfaces
 
 
 def withdrawn(space: TaskSpace, threshold: float, confidence: float, doubt: str) -> Envelope:
