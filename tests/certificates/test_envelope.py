@@ -100,6 +100,9 @@ def test_tasks_that_leave_the_records_or_cannot_be_planned_are_not_trusted() -> 
     assert trusted.any()
     assert (low[trusted, 0] < 0.52).all()
     assert (low[trusted, 0] > 0.2).all()
+    assert 0.25 < found.uncovered < 0.33
+    assert "of the tasks are predicted to stay below it, but their runs leave what was recorded" in found.statement
+    assert envelope().uncovered == 0
 
 
 def test_a_test_that_exceeds_its_prediction_raises_the_factor() -> None:
@@ -198,6 +201,11 @@ def test_of_a_suite_it_is_a_list_and_executed_tasks_are_facts() -> None:
     assert found.trusted({"task": "b"})
     assert not found.trusted({"task": "a"})
     assert found.bound({"task": "d"}) == 0.55
+    far = DrawnDistances(points, draws, np.ones(5))
+    known = envelope_of(suite, far, evidence_of(), executed, 0.6, 0.95)
+    assert known.tasks == ("d",)
+    assert known.uncovered == pytest.approx(0.4)  # b and c: a was executed
+    assert "no further task" not in known.statement
 
 
 @pytest.mark.slow
@@ -211,6 +219,8 @@ def test_further_tasks_check_what_is_interpolated() -> None:
     for evaluate in (None, waves):
         known = envelope_of(SPACE, waves(POINTS), evidence_of(), [], 0.6, 0.95, evaluate, 200, "m")
         assert "stays below 0.6 m on all tasks" in known.statement
+        assert ("no further task checks this" in known.statement) == (evaluate is None)
+        assert (known.checks > 0) == (evaluate is not None)
         false.append((np.isfinite(known.bound_at(others)) & (waves(others).mean > 0.6)).mean())
     assert false[0] > 0.01
     assert false[1] < 0.5 * false[0]

@@ -64,6 +64,8 @@ class Envelope(ShortRepr):
         raised_by: the trial whose excess over its prediction raised k; None if there is none.
         margin: the median of what the interpolation adds next to evaluated tasks, as a share of the threshold.
         evaluated: the number of tasks at which closed loops were run.
+        checks: the number of further tasks that checked the interpolation between these.
+        uncovered: the share of the tasks that are not trusted only because predicted runs leave the records.
         executions, tests: numbers of executions, and of those that were predicted beforehand at drawn tasks.
         quantile: the share of the executions of a task whose distances are below tau; None if the system is not noisy.
         assumptions: what it assumes.
@@ -82,6 +84,8 @@ class Envelope(ShortRepr):
     raised_by: int | None = None
     margin: float = 0.0
     evaluated: int = 0
+    checks: int = 0
+    uncovered: float = 0.0
     executions: int = 0
     tests: int = 0
     quantile: float | None = None
@@ -146,6 +150,8 @@ class Envelope(ShortRepr):
             "raised_by_trial": self.raised_by,
             "margin": self.margin,
             "evaluated": self.evaluated,
+            "checks": self.checks,
+            "uncovered": self.uncovered,
             "executions": self.executions,
             "tests": self.tests,
             "quantile": self.quantile,
@@ -297,11 +303,13 @@ def envelope_of(
             checked = evaluate(tasks)
             outside = (checked.upper(factor, threshold) > 1) | (checked.beyond > most_beyond(evidence))
             surfaces = surfaces.without(tasks[outside], len(tasks))
+            envelope = replace(envelope, checks=len(tasks))
         envelope = replace(envelope, margin=float(np.median(surfaces.errors[:, 0])), _surfaces=surfaces)
         tasks = space.unit_draws(COUNTED, np.random.default_rng(0))
         inside = np.isfinite(envelope.bound_at(tasks))
         regions = regions_inside(space, tasks, inside, lambda unit: np.isfinite(envelope.bound_at(unit)))
-        envelope = replace(envelope, share=float(inside.mean()), regions=regions)
+        uncovered = float(((surfaces(tasks)[:, 0] <= 1) & ~inside).mean())
+        envelope = replace(envelope, share=float(inside.mean()), regions=regions, uncovered=uncovered)
     return replace(envelope, statement=_statement(envelope))
 
 
@@ -314,23 +322,38 @@ def _of_suite(
 ) -> Envelope:
     """Return the envelope of the members of a suite, of which executed ones are known."""
     threshold, bounds = envelope.threshold, np.full(len(suite), np.inf)
+    uncovered = np.zeros(len(suite), dtype=np.bool_)
     upper = threshold * drawn.upper(envelope.factor or 0.0, threshold)
     rows = suite.rows_at(drawn.points)
     bounds[rows] = np.where((upper <= threshold) & (drawn.beyond <= most), upper, np.inf)
+    uncovered[rows] = (upper <= threshold) & (drawn.beyond > most)
     if envelope.quantile is None:
         for point, distance in executed:
-            bounds[int(suite.rows_at(point))] = distance if distance <= threshold else np.inf
+            row = int(suite.rows_at(point))
+            bounds[row], uncovered[row] = distance if distance <= threshold else np.inf, False
     names = tuple(name for name, bound in zip(suite.task_names, bounds, strict=True) if np.isfinite(bound))
-    return replace(envelope, tasks=names, share=len(names) / len(suite), _bounds=bounds)
+    share = len(names) / len(suite)
+    return replace(envelope, tasks=names, share=share, uncovered=float(uncovered.mean()), _bounds=bounds)
 
 
 def _statement(envelope: Envelope) -> str:
-    """Return what an envelope says."""
+    """Return what an envelope says, why it is not larger, and what nothing has checked."""
     limit, share = f"{at_most(envelope.threshold)} {envelope.units}".rstrip(), 100 * envelope.share
-    if not envelope.share:
-        return f"With {percent(envelope.confidence)} confidence, d stays below {limit} on no task that can be named."
     what = "d" if envelope.quantile is None else f"the {envelope.quantile:g} quantile of d"
-    tasks = f"{share:.3g} % of the tasks" if envelope.tasks is None else f"{len(envelope.tasks)} tasks"
-    return (
-        f"With {percent(envelope.confidence)} confidence, {what} stays below {limit} on all tasks of a set of {tasks}."
-    )
+    tasks = f"all tasks of a set of {share:.3g} % of the tasks"
+    if envelope.tasks is not None:
+        tasks = f"all tasks of a set of {len(envelope.tasks)} tasks"
+    if not envelope.share:
+        tasks = "no task that can be named"
+    sentences = [f"With {percent(envelope.confidence)} confidence, {what} stays below {limit} on {tasks}."]
+    if envelope.uncovered >= 0.005:
+        sentences.append(
+            f"Another {100 * envelope.uncovered:.2g} % of the tasks are predicted to stay below it, but their runs "
+            "leave what was recorded, so they are not trusted, however accurate the model is there."
+        )
+    if envelope.share and envelope.tasks is None and not envelope.checks:
+        sentences.append(
+            f"Between the {envelope.evaluated} tasks whose closed loops were run, it is interpolated, and no further "
+            "task checks this, because the planner designs one task at a time."
+        )
+    return " ".join(sentences)
