@@ -122,6 +122,24 @@ def test_a_test_that_exceeds_its_prediction_raises_the_factor() -> None:
     assert envelope(replace(evidence, predictions=(*predictions[:3], far, *predictions[4:]))).raised_by is None
 
 
+@pytest.mark.parametrize("sign", [-1, 1])
+def test_distances_that_the_draws_do_not_have_raise_the_factor(sign: int) -> None:
+    drawn, evidence = drawn_from(POINTS), evidence_of()
+    row = int(np.abs(drawn.mean - 0.3).argmin())
+    distance = drawn.mean[row] + sign * 7 * drawn.spread(0.6)[row]
+    test = CheckedPrediction(11, 0.5, distance, 2.0, distance, origin="spread", point=tuple(POINTS[row]), explained=0.3)
+    missed = replace(evidence, predictions=(*evidence.predictions, test))
+    raised = envelope_of(SPACE, drawn, missed, EXECUTED, 0.6, 0.95)
+    assert raised.factor == pytest.approx(7)
+    assert raised.raised_by == 11
+    assert raised.share < envelope().share
+    above = replace(test, point=tuple(POINTS[int(drawn.mean.argmax())]))  # nothing is claimed of this task
+    known = envelope_of(SPACE, drawn, replace(evidence, predictions=(above,)), EXECUTED, 0.6, 0.95)
+    assert known.raised_by is None
+    noisy = replace(missed, quantile=0.9)  # noise explains it
+    assert envelope_of(SPACE, drawn, noisy, EXECUTED, 0.6, 0.95).raised_by is None
+
+
 def test_what_withdraws_it() -> None:
     evidence = evidence_of()
     assert doubt_of_envelope(evidence, 0.6) is None
@@ -129,7 +147,12 @@ def test_what_withdraws_it() -> None:
     assert "2 more executions must be predicted beforehand" in str(doubt_of_envelope(few, 0.6))
     moved = replace(evidence.predictions[0], explained=0.5)
     other = replace(evidence, predictions=(moved, *evidence.predictions[1:]))
-    assert "trial 2 has the distance 0.4, and 0.5 on the learned dynamics" in str(doubt_of_envelope(other, 0.6))
+    assert doubt_of_envelope(other, 0.6) is None
+    above = replace(evidence.predictions[0], distance=0.62, explained=0.5)
+    other = replace(evidence, predictions=(above, *evidence.predictions[1:]))
+    assert "trial 2 has the distance 0.62, and 0.5 on the learned dynamics, which is below" in str(
+        doubt_of_envelope(other, 0.6)
+    )
     assert "at least 3" in str(doubt_of_envelope(replace(evidence, executions=2), 0.6))
     assert doubt_of_envelope(replace(evidence, unplanned=0.3), 0.6) is None
     none = withdrawn(SPACE, 0.6, 0.95, "too little is known.")

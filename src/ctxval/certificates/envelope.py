@@ -32,7 +32,7 @@ from ctxval._util.representation import ShortRepr
 from ctxval._util.texts import enumerated
 from ctxval.certificates.bounds import at_most, percent
 from ctxval.certificates.drawn_distances import LARGEST, DrawnDistances
-from ctxval.certificates.dynamics_evidence import DynamicsEvidence
+from ctxval.certificates.dynamics_evidence import CheckedPrediction, DynamicsEvidence
 from ctxval.certificates.envelope_diagnostics import most_beyond, rises_of
 from ctxval.certificates.envelope_onnx import write_onnx
 from ctxval.certificates.envelope_surface import Surfaces, exported
@@ -46,6 +46,7 @@ from ctxval.errors import InputError
 COUNTED = 4096  # tasks of which the share in the envelope is counted
 _EXCEEDED = 1.02  # an executed distance above the threshold counts as at least this multiple of it
 _SAME = 1e-9
+_SAME_TASK = 1e-6
 _WORTH = 0.8  # share of the tasks predicted below the threshold that tests may leave in the envelope
 
 
@@ -221,10 +222,35 @@ def boundary_tasks(
 def _raised(
     drawn: DrawnDistances, evidence: DynamicsEvidence, threshold: float, confidence: float
 ) -> tuple[float, int | None]:
-    """Return k, at least the largest standardised excess of the predictions that count, and whose it is."""
+    """Return k, and the trial that raised it; None if it is that of the draws.
+
+    It is at least the largest standardised excess of the predictions that count, and the largest standardised error of
+    the draws at the tasks that they were learned from.
+    """
     factor = drawn.factor(threshold, confidence)
-    largest, which = max(rises_of(evidence, threshold), key=lambda rise: rise[0], default=(0.0, None))
+    rises = [*rises_of(evidence, threshold), *_unexplained(drawn, evidence, threshold)]
+    largest, which = max(rises, key=lambda rise: rise[0], default=(0.0, None))
     return (factor, None) if which is None or largest <= factor else (largest, which.trial)
+
+
+def _unexplained(
+    drawn: DrawnDistances, evidence: DynamicsEvidence, threshold: float
+) -> list[tuple[float, CheckedPrediction]]:
+    """Return by how many spreads the draws miss the distances of executed tasks, with the predictions of these tasks.
+
+    They hardly miss any if the next state is a function of what is recorded. Stiff contacts and hidden states are
+    missed in both directions, so a distance that is too small counts as well: it is too large elsewhere. Nothing is
+    claimed of tasks that the draws have above the threshold.
+    """
+    if evidence.quantile is not None:
+        return []  # noise explains the differences
+    mean, spread, missed = drawn.mean, drawn.spread(threshold), []
+    for each in (each for each in evidence.predictions if each.point):
+        apart = np.abs(drawn.points - np.array(each.point)).max(axis=1)
+        row = int(apart.argmin())
+        if apart[row] <= _SAME_TASK and mean[row] <= threshold:
+            missed.append((abs(each.distance - mean[row]) / spread[row], each))
+    return missed
 
 
 def must_outlive_a_test(drawn: DrawnDistances, evidence: DynamicsEvidence, threshold: float) -> bool:
@@ -248,7 +274,7 @@ def _interpolated(
     points, values = drawn.points, np.stack([bounds, beyond], axis=1)
     excesses = [(point, d / threshold) for point, d in executed if d > threshold and evidence.quantile is None]
     for point, ratio in excesses:
-        near = np.abs(points - point).max(axis=1) <= 1e-6
+        near = np.abs(points - point).max(axis=1) <= _SAME_TASK
         points, values = points[~near], values[~near]
         points = np.concatenate([points, point[None]])
         values = np.concatenate([values, [[float(np.clip(ratio, _EXCEEDED, LARGEST)), 0.0]]])

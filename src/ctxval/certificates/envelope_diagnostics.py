@@ -8,7 +8,6 @@ import numpy as np
 
 from ctxval.certificates.drawn_distances import FLOOR
 from ctxval.certificates.dynamics_diagnostics import (
-    ACCURATE,
     BEYOND,
     GAP,
     NOISY_BEYOND,
@@ -53,13 +52,16 @@ def most_beyond(evidence: DynamicsEvidence) -> float:
     return BEYOND if evidence.quantile is None else NOISY_BEYOND
 
 
-def unexplained(evidence: DynamicsEvidence, threshold: float) -> CheckedPrediction | None:
-    """Return a test whose distance what is learned by now does not have, by more than a share of the threshold."""
+def falsely_kept(evidence: DynamicsEvidence, threshold: float) -> CheckedPrediction | None:
+    """Return a test whose distance exceeds the threshold, and is below it on what is learned by now.
+
+    A smaller difference of the two raises the factor of the envelope.
+    """
     for test in evidence.predictions:
         known = test.explained
-        if known is None or test.is_noisy or min(test.distance, known) > threshold:
+        if known is None or test.is_noisy or agrees(test.distance, known, threshold):
             continue
-        if not agrees(test.distance, known, threshold):
+        if known <= threshold < test.distance:
             return test
     return None
 
@@ -71,11 +73,11 @@ def doubt_of_envelope(evidence: DynamicsEvidence, threshold: float) -> str | Non
         return doubt
     if (doubt := untried_parameter(evidence)) is not None:
         return doubt
-    if (test := unexplained(evidence, threshold)) is not None:
+    if (test := falsely_kept(evidence, threshold)) is not None:
         return (
             f"trial {test.trial} has the distance {test.distance:.4g}, and {test.explained:.4g} on the learned "
-            f"dynamics, a difference of more than {100 * ACCURATE:g} % of the threshold: the next state is no function "
-            "of what is recorded, or the dynamics depend on the task; record more states"
+            "dynamics, which is below the threshold: the next state is no function of what is recorded, or the "
+            "dynamics depend on the task; record more states"
         )
     missing = missing_tests(evidence.predictions, evidence.tests)
     if missing:
