@@ -7,9 +7,10 @@ envelope is ``{p : mean(p) + k spread(p) <= tau}``. It is the simultaneous band 
 Hoeting 2016; compare the excursion sets of Bolin and Lindgren 2015), with draws in closed loop in the place of values.
 
 Draws that are learned from few executions are overconfident. So k is at least the largest standardised excess of the
-executions that were predicted beforehand at drawn tasks. A task is no part of the envelope if its closed loop leaves
-the records, or if it was executed with a larger distance. Without tests the envelope is withdrawn, as the bound on d*
-is, and if the learned dynamics do not explain the executions.
+executions that were predicted beforehand at drawn tasks, and the largest standardised error of the draws at tasks that
+they were learned from. A task is no part of the envelope if its closed loop leaves the records, or if it was executed
+with a larger distance. Without tests the envelope is withdrawn, as the bound on d* is, and if a test exceeds the
+threshold although the learned dynamics have it below.
 
 Between these tasks, ``mean + k spread`` is interpolated (:mod:`ctxval.certificates.envelope_surface`). The largest
 error of the nearest tasks, if each of them is interpolated from all others, is added. Further tasks of the set check
@@ -62,7 +63,8 @@ class Envelope(ShortRepr):
         regions: the largest boxes and half-spaces inside it, the largest first; empty for a suite.
         tasks: the names of the trusted tasks of a suite; None if the task space is no suite.
         factor: k, by how many spreads the mean must stay below the threshold.
-        raised_by: the trial whose excess over its prediction raised k; None if there is none.
+        raised_by: the trial that raised k, by its excess over its prediction or because the draws miss its distance;
+            None if there is none.
         margin: the median of what the interpolation adds next to evaluated tasks, as a share of the threshold.
         evaluated: the number of tasks at which closed loops were run.
         checks: the number of further tasks that checked the interpolation between these.
