@@ -33,6 +33,7 @@ PAGE = Path(__file__).parents[1] / "docs" / "envelope.md"
 RULE = 4
 """The version of the method: 1 had one margin for all tasks, 2 did not check its interpolation, 3 stated no envelope if
 learned dynamics missed the distance of a test, on whichever side of the threshold."""
+COMPARABLE = 3  # the next version differs in what it does if learned dynamics miss a distance, and when it tests
 BUDGET, KEPT, CONFIDENCE = 15, 0.7, 0.95
 TASKS, NOISY_TASKS, REPEATS = 4000, 1000, 60
 
@@ -94,9 +95,12 @@ TEXT = """# The envelope, measured
 systems that are reported and were not tuned on. (Four campaigns of an earlier version, on reactor, heated-rooms,
 boat-in-current and ball-on-beam, showed that its interpolation lost much in five parameters. It was replaced by one
 that was chosen on development systems, and which further tasks check since a system with short waves was made to
-mislead it.) Of each system, 70 % of the tasks keep the threshold. "Found" is the
-share of these tasks that the envelope trusts; "false" is the share of all tasks that it trusts although their true
-distance is larger. True sets are known at {tasks} random tasks, of noisy systems at {noisy_tasks} tasks by {repeats}
+mislead it. Version 3 stated no envelope for the three systems with contacts, because the learned dynamics missed the
+distance of a test. In version {rule}, such a distance raises the factor; it withdraws the envelope only if it exceeds
+the threshold and the learned dynamics have it below. The rest is the same, except that executions are kept for tests.)
+Of each system, 70 % of the tasks keep the threshold. "Found" is the share of these tasks that the envelope trusts;
+"false" is the share of all tasks that it trusts although their true distance is larger. True sets are known at {tasks}
+random tasks, of noisy systems at {noisy_tasks} tasks by {repeats}
 executions each. [How to use an envelope](how-to/envelope.md) says what it is.
 
 **The median share found is {found:.0f} %; it is at least 80 % on {enough} of {systems} systems (the goal is 80 % on 8,
@@ -113,14 +117,21 @@ which are the largest.
 """
 
 
+def newest() -> list[dict[str, Any]]:
+    """Return the result of each campaign by the newest version of the method, from ``COMPARABLE`` on."""
+    lines = sorted(STORED.values(), key=lambda line: int(line["rule"]))
+    last = {(line["system"], line["seed"]): line for line in lines if line["rule"] >= COMPARABLE}
+    return [line for (system, _), line in sorted(last.items()) if system in SYSTEMS]
+
+
 def write_page(page: Path = PAGE) -> None:
     """Write the page of the stored results."""
-    results = [line for line in STORED.select(rule=RULE) if line["system"] in SYSTEMS]
+    results = newest()
     if not results:
         return
     rows = [
-        "| system | parameters | campaigns | executions | found | false | false, at most | words | CPU s |",
-        "|---" * 9 + "|",
+        "| system | parameters | campaigns | version | executions | found | false | false, at most | words | CPU s |",
+        "|---" * 10 + "|",
     ]
     medians = []
     for system in SYSTEMS:
@@ -133,12 +144,21 @@ def write_page(page: Path = PAGE) -> None:
         executions = ", ".join(str(line["executions"]) for line in lines)
         worst = max(lines, key=lambda line: line["false"])
         at_most = f"{worst['worst_false']:.2f}" if worst["false"] else "-"
-        cells = [f"{system}{kind}", lines[0]["dimension"], len(lines), executions, f"{100 * middle['found']:.0f} %"]
+        rules = ", ".join(str(line["rule"]) for line in lines)
+        cells = [
+            f"{system}{kind}",
+            lines[0]["dimension"],
+            len(lines),
+            rules,
+            executions,
+            f"{100 * middle['found']:.0f} %",
+        ]
         cells += [f"{100 * worst['false']:.1f} %", at_most, f"{100 * middle['in_words']:.0f} %"]
         rows.append(f"| {' | '.join(map(str, [*cells, round(middle['seconds'])]))} |")
     false = np.array([line["false"] for line in results])
     reasons = [f"* {line['system']}, seed {line['seed']}: {line['doubt']}." for line in results if line["doubt"]]
     text = TEXT.format(
+        rule=RULE,
         count=len(results),
         budget=BUDGET,
         systems=len({line["system"] for line in results}),
