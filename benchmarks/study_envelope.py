@@ -30,10 +30,11 @@ from study_auto import RESULTS
 
 STORED = JsonLines(RESULTS / "envelope.jsonl", ("system", "seed", "rule"))
 PAGE = Path(__file__).parents[1] / "docs" / "envelope.md"
-RULE = 4
+RULE = 5
 """The version of the method: 1 had one margin for all tasks, 2 did not check its interpolation, 3 stated no envelope if
-learned dynamics missed the distance of a test, on whichever side of the threshold."""
-COMPARABLE = 3  # the next version differs in what it does if learned dynamics miss a distance, and when it tests
+learned dynamics missed the distance of a test, on whichever side of the threshold, and 4 executed the tests before the
+model was falsified, which cost the verdict of oblique-wall."""
+COMPARABLE = 3  # later versions differ in what they do if learned dynamics miss a distance, and 4 in when it tests
 BUDGET, KEPT, CONFIDENCE = 15, 0.7, 0.95
 TASKS, NOISY_TASKS, REPEATS = 4000, 1000, 60
 
@@ -96,8 +97,9 @@ systems that are reported and were not tuned on. (Four campaigns of an earlier v
 boat-in-current and ball-on-beam, showed that its interpolation lost much in five parameters. It was replaced by one
 that was chosen on development systems, and which further tasks check since a system with short waves was made to
 mislead it. Version 3 stated no envelope for the three systems with contacts, because the learned dynamics missed the
-distance of a test. In version {rule}, such a distance raises the factor; it withdraws the envelope only if it exceeds
-the threshold and the learned dynamics have it below. The rest is the same, except that executions are kept for tests.)
+distance of a test. Since version 4, such a distance raises the factor; it withdraws the envelope only if it exceeds the
+threshold and the learned dynamics have it below. Version 4 also executed the tests before the model was falsified, which
+left oblique-wall undecided. The rest is the same.)
 Of each system, 70 % of the tasks keep the threshold. "Found" is the share of these tasks that the envelope trusts;
 "false" is the share of all tasks that it trusts although their true distance is larger. True sets are known at {tasks}
 random tasks, of noisy systems at {noisy_tasks} tasks by {repeats}
@@ -158,7 +160,6 @@ def write_page(page: Path = PAGE) -> None:
     false = np.array([line["false"] for line in results])
     reasons = [f"* {line['system']}, seed {line['seed']}: {line['doubt']}." for line in results if line["doubt"]]
     text = TEXT.format(
-        rule=RULE,
         count=len(results),
         budget=BUDGET,
         systems=len({line["system"] for line in results}),

@@ -91,10 +91,3 @@ def test_initial_states_that_scatter_are_noise_too() -> None:
     assert "in at least 90 % of its executions" in verdict.reason
     falsified = Campaign(validation, seed=0).run(20, 0.8 * largest, certificate=FEW_TESTS)
     assert falsified.verdict(0.8 * largest, certificate=FEW_TESTS).answer == "falsified"
-
-
-@pytest.mark.slow
-def test_executions_are_kept_for_the_tests_of_an_envelope() -> None:
-    largest = largest_quantile(cart(0.05))
-    campaign = Campaign(cart(0.05), seed=0).run(12, 0.5 * largest, envelope=True)
-    assert sum(trial.origin == "spread" for trial in campaign.trials) == 8

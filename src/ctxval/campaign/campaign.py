@@ -226,7 +226,8 @@ class Campaign:
                 return None
             if decides is None:
                 return by_search
-            return decides.choose() if enlarges is None else enlarges.choose()
+            choice = decides.choose()
+            return enlarges.choose() if choice is None and enlarges is not None and decides.is_falsified else choice
 
         pool = worker_pool(self.validation.system, workers=workers, executor=executor, timeout=timeout)
         if retry_failures and pool is None:

@@ -132,33 +132,24 @@ class EnvelopeSearch:
         return DrawnDistances(points, *learned.drawn_distances(points, draws, settled=settled))
 
     def choose(self) -> Choice | None:
-        """Return the next task of the verdict or, after a falsification, of the envelope; None if neither needs one.
-
-        As soon as a distance exceeds the threshold, so many executions are kept for tests as are missing: a contact may
-        look like noise, and what tells them apart would use them up.
-        """
-        interval, recorder, trials = self.interval, self.interval.recorder, self._trials
-        learns = interval.predicts and recorder.has_tasks and all(trial.distance is not None for trial in trials)
-        if learns and interval.best > self._threshold and recorder.dynamics.learned(trials) is not None:
-            missing = missing_tests(recorder.dynamics.checked(trials), interval.tests)
-            waiting = sum(trial.state == "open" for trial in recorder.trials)
-            if missing and interval.budget - recorder.executions - waiting <= missing:
-                return interval.test()
-        choice = interval.choose()
-        return self._enlarging() if choice is None and learns and interval.is_falsified else choice
-
-    def _enlarging(self) -> Choice | None:
         """Return the next task that enlarges the envelope, or a test of it; None if it would hardly grow.
 
         The set grows where the mean is below the threshold and mean + k spread is not, and where closed loops leave the
-        records. The larger of these two parts is worked on. Tests come last: those that are predicted by better
-        dynamics raise k less.
+        records. The larger of these two parts is worked on. Tests come last, when hardly anything is uncertain or the
+        budget is just enough for them: those that are predicted by better dynamics raise k less.
         """
-        interval, recorder = self.interval, self.interval.recorder
-        known = self._known(self._trials)
+        interval = self.interval
+        recorder, trials = interval.recorder, self._trials
+        if not interval.predicts or not recorder.has_tasks or any(trial.distance is None for trial in trials):
+            return None
+        known = self._known(trials)
         if known is None:
             return None
         learned, evidence = known
+        missing = missing_tests(evidence.predictions, interval.tests)
+        waiting = sum(trial.state == "open" for trial in recorder.trials)
+        if missing and interval.budget - recorder.executions - waiting <= missing:
+            return interval.test()
         pool = learned.study.search.pool
         some = pool[:_SCREENED] if recorder.validation.space.members is None else pool
         drawn = self._at(learned, some, settled=False)
@@ -176,7 +167,6 @@ class EnvelopeSearch:
             new = self._is_new(drawn.points)
             if (np.isfinite(score) & new).any():
                 return _choice(drawn.points[int(np.where(new, score, -np.inf).argmax())])
-        missing = missing_tests(evidence.predictions, interval.tests)
         return interval.test() if missing or must_outlive_a_test(drawn, evidence, self._threshold) else None
 
     def _is_new(self, points: Array) -> Mask:

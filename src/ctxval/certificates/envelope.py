@@ -251,7 +251,7 @@ def _unexplained(
         apart = np.abs(drawn.points - np.array(each.point)).max(axis=1)
         row = int(apart.argmin())
         if apart[row] <= _SAME_TASK and mean[row] <= threshold:
-            missed.append((abs(each.distance - mean[row]) / spread[row], each))
+            missed.append((float(abs(each.distance - mean[row]) / spread[row]), each))
     return missed
 
 
