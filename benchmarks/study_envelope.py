@@ -98,11 +98,11 @@ boat-in-current and ball-on-beam, showed that its interpolation lost much in fiv
 that was chosen on development systems, and which further tasks check since a system with short waves was made to
 mislead it. Version 3 stated no envelope for the three systems with contacts, because the learned dynamics missed the
 distance of a test. Since version 4, such a distance raises the factor; it withdraws the envelope only if it exceeds the
-threshold and the learned dynamics have it below. Version 4 also executed the tests before the model was falsified, which
-left oblique-wall undecided. The rest is the same.)
-Of each system, 70 % of the tasks keep the threshold. "Found" is the share of these tasks that the envelope trusts;
-"false" is the share of all tasks that it trusts although their true distance is larger. True sets are known at {tasks}
-random tasks, of noisy systems at {noisy_tasks} tasks by {repeats}
+threshold and the learned dynamics have it below. Version 4 also executed the tests before the model was falsified,
+which left oblique-wall undecided. The rest is the same.) Of each system, 70 % of the tasks keep the threshold. "Found"
+is the share of these tasks that the envelope trusts; "false" is the share of all tasks that it trusts although their
+true distance is larger. True sets are known at {tasks} random tasks, of noisy systems at {noisy_tasks} tasks by
+{repeats}
 executions each. [How to use an envelope](how-to/envelope.md) says what it is.
 
 **The median share found is {found:.0f} %; it is at least 80 % on {enough} of {systems} systems (the goal is 80 % on 8,
