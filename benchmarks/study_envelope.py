@@ -104,9 +104,10 @@ is the share of these tasks that the envelope trusts; "false" is the share of al
 true distance is larger. True sets are known at {tasks} random tasks, of noisy systems at {noisy_tasks} tasks by
 {repeats} executions each. [How to use an envelope](how-to/envelope.md) says what it is.
 
-**The median share found is {found:.0f} %; it is at least 80 % on {enough} of {systems} systems, of which {contacts} have
-contacts and {noisy} noise (the goal is 8, of which 2 have contacts and 2 noise). In {above} of {count} campaigns, the falsely included volume is above 1 % (the
-goal is at most 5 % of 200 campaigns); the largest is {largest:.1f} %. {withdrawn} of the campaigns stated no envelope.**
+**The median share found is {found:.0f} %. It is at least 80 % on {enough} of {systems} systems, of which {contacts}
+have contacts and {noisy} noise (the goal is 8, of which 2 have contacts and 2 noise). In {above} of {count} campaigns,
+the falsely included volume is above 1 % (the goal is at most 5 % of 200 campaigns); the largest is {largest:.1f} %. In
+{withdrawn} campaigns, no envelope was stated.**
 
 {table}
 
