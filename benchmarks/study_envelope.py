@@ -3,7 +3,8 @@
 The threshold is the 0.7 quantile of the true distance over the tasks, so it is below d* and 70 % of the tasks keep it.
 The true set is known at 4,000 random tasks, by executions of the true system that count as none; a noisy system is
 executed 60 times at each of 1,000 tasks, and its distance is the 0.9 quantile. The method was tuned on systems of the
-development lists alone (hanging-pendulum, two-tanks, docking-magnet, and the carts and pendulums with noise).
+development lists alone (hanging-pendulum, two-tanks, docking-magnet, corner-stop, hidden-load, and the
+carts and pendulums with noise).
 
 ``python benchmarks/study_envelope.py --seeds 4`` runs the campaigns that are not stored yet, and writes
 ``docs/envelope.md``. With ``--seeds 0``, it only writes the page.
@@ -29,7 +30,11 @@ from study_auto import RESULTS
 
 STORED = JsonLines(RESULTS / "envelope.jsonl", ("system", "seed", "rule"))
 PAGE = Path(__file__).parents[1] / "docs" / "envelope.md"
-RULE = 3  # the version of the method; 1 had one margin for all tasks, and 2 did not check its interpolation
+RULE = 5
+"""The version of the method: 1 had one margin for all tasks, 2 did not check its interpolation, 3 stated no envelope if
+learned dynamics missed the distance of a test, on whichever side of the threshold, and 4 executed the tests before the
+model was falsified, which cost the verdict of oblique-wall."""
+COMPARABLE = 3  # later versions differ in what they do if learned dynamics miss a distance, and 4 in when it tests
 BUDGET, KEPT, CONFIDENCE = 15, 0.7, 0.95
 TASKS, NOISY_TASKS, REPEATS = 4000, 1000, 60
 
@@ -78,6 +83,7 @@ def study(system: str, seed: int) -> dict[str, Any]:
         "factor": envelope.factor,
         "raised_by": envelope.raised_by,
         "margin": envelope.margin,
+        "uncovered": envelope.uncovered,
         "doubt": envelope.doubt,
         "words": envelope.words,
         "seconds": round(time.process_time() - begun, 1),
@@ -90,14 +96,18 @@ TEXT = """# The envelope, measured
 systems that are reported and were not tuned on. (Four campaigns of an earlier version, on reactor, heated-rooms,
 boat-in-current and ball-on-beam, showed that its interpolation lost much in five parameters. It was replaced by one
 that was chosen on development systems, and which further tasks check since a system with short waves was made to
-mislead it.) Of each system, 70 % of the tasks keep the threshold. "Found" is the
-share of these tasks that the envelope trusts; "false" is the share of all tasks that it trusts although their true
-distance is larger. True sets are known at {tasks} random tasks, of noisy systems at {noisy_tasks} tasks by {repeats}
-executions each. [How to use an envelope](how-to/envelope.md) says what it is.
+mislead it. Version 3 stated no envelope for the three systems with contacts, because the learned dynamics missed the
+distance of a test. Since version 4, such a distance raises the factor; it withdraws the envelope only if it exceeds the
+threshold and the learned dynamics have it below. Version 4 also executed the tests before the model was falsified,
+which left oblique-wall undecided. The rest is the same.) Of each system, 70 % of the tasks keep the threshold. "Found"
+is the share of these tasks that the envelope trusts; "false" is the share of all tasks that it trusts although their
+true distance is larger. True sets are known at {tasks} random tasks, of noisy systems at {noisy_tasks} tasks by
+{repeats} executions each. [How to use an envelope](how-to/envelope.md) says what it is.
 
-**The median share found is {found:.0f} %; it is at least 80 % on {enough} of {systems} systems (the goal is 80 % on 8,
-of which 2 have contacts and 2 noise). In {above} of {count} campaigns, the falsely included volume is above 1 % (the
-goal is at most 5 % of 200 campaigns); the largest is {largest:.1f} %. {withdrawn} campaigns stated no envelope.**
+**The median share found is {found:.0f} %. It is at least 80 % on {enough} of {systems} systems, of which {contacts}
+have contacts and {noisy} noise (the goal is 8, of which 2 have contacts and 2 noise). In {above} of {count} campaigns,
+the falsely included volume is above 1 % (the goal is at most 5 % of 200 campaigns); the largest is {largest:.1f} %. In
+{withdrawn} campaigns, no envelope was stated.**
 
 {table}
 
@@ -109,27 +119,42 @@ which are the largest.
 """
 
 
+def newest() -> list[dict[str, Any]]:
+    """Return the result of each campaign by the newest version of the method, from ``COMPARABLE`` on."""
+    lines = sorted(STORED.values(), key=lambda line: int(line["rule"]))
+    last = {(line["system"], line["seed"]): line for line in lines if line["rule"] >= COMPARABLE}
+    return [line for (system, _), line in sorted(last.items()) if system in SYSTEMS]
+
+
 def write_page(page: Path = PAGE) -> None:
     """Write the page of the stored results."""
-    results = [line for line in STORED.select(rule=RULE) if line["system"] in SYSTEMS]
+    results = newest()
     if not results:
         return
     rows = [
-        "| system | parameters | campaigns | executions | found | false | false, at most | words | CPU s |",
-        "|---" * 9 + "|",
+        "| system | parameters | campaigns | version | executions | found | false | false, at most | words | CPU s |",
+        "|---" * 10 + "|",
     ]
-    medians = []
+    medians = {}
     for system in SYSTEMS:
         lines = [line for line in results if line["system"] == system]
         if not lines:
             continue
         kind = " (contact)" if system in CONTACTS else ""
         middle = {name: float(np.median([line[name] for line in lines])) for name in ("found", "in_words", "seconds")}
-        medians.append(middle["found"])
+        medians[system] = middle["found"]
         executions = ", ".join(str(line["executions"]) for line in lines)
         worst = max(lines, key=lambda line: line["false"])
         at_most = f"{worst['worst_false']:.2f}" if worst["false"] else "-"
-        cells = [f"{system}{kind}", lines[0]["dimension"], len(lines), executions, f"{100 * middle['found']:.0f} %"]
+        rules = ", ".join(str(line["rule"]) for line in lines)
+        cells = [
+            f"{system}{kind}",
+            lines[0]["dimension"],
+            len(lines),
+            rules,
+            executions,
+            f"{100 * middle['found']:.0f} %",
+        ]
         cells += [f"{100 * worst['false']:.1f} %", at_most, f"{100 * middle['in_words']:.0f} %"]
         rows.append(f"| {' | '.join(map(str, [*cells, round(middle['seconds'])]))} |")
     false = np.array([line["false"] for line in results])
@@ -143,7 +168,9 @@ def write_page(page: Path = PAGE) -> None:
         repeats=REPEATS,
         found=100 * np.median([line["found"] for line in results]),
         above=int((false > 0.01).sum()),
-        enough=sum(median >= 0.8 for median in medians),
+        enough=sum(median >= 0.8 for median in medians.values()),
+        contacts=sum(medians.get(system, 0) >= 0.8 for system in CONTACTS),
+        noisy=sum(medians.get(system, 0) >= 0.8 for system in NOISY),
         largest=100 * false.max(),
         withdrawn=len(reasons),
         table="\n".join(rows),

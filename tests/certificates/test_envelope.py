@@ -15,11 +15,11 @@ from ctxval.certificates.drawn_distances import DrawnDistances
 from ctxval.certificates.envelope import (
     Envelope,
     boundary_tasks,
-    doubt_of_envelope,
     envelope_of,
     must_outlive_a_test,
     withdrawn,
 )
+from ctxval.certificates.envelope_diagnostics import doubt_of_envelope
 from ctxval.errors import CertificateError, InputError
 from rig_evidence import GOOD
 
@@ -100,6 +100,9 @@ def test_tasks_that_leave_the_records_or_cannot_be_planned_are_not_trusted() -> 
     assert trusted.any()
     assert (low[trusted, 0] < 0.52).all()
     assert (low[trusted, 0] > 0.2).all()
+    assert 0.25 < found.uncovered < 0.33
+    assert "of the tasks are predicted to stay below it, but their runs leave what was recorded" in found.statement
+    assert envelope().uncovered == 0
 
 
 def test_a_test_that_exceeds_its_prediction_raises_the_factor() -> None:
@@ -119,6 +122,24 @@ def test_a_test_that_exceeds_its_prediction_raises_the_factor() -> None:
     assert envelope(replace(evidence, predictions=(*predictions[:3], far, *predictions[4:]))).raised_by is None
 
 
+@pytest.mark.parametrize("sign", [-1, 1])
+def test_distances_that_the_draws_do_not_have_raise_the_factor(sign: int) -> None:
+    drawn, evidence = drawn_from(POINTS), evidence_of()
+    row = int(np.abs(drawn.mean - 0.3).argmin())
+    distance = drawn.mean[row] + sign * 7 * drawn.spread(0.6)[row]
+    test = CheckedPrediction(11, 0.5, distance, 2.0, distance, origin="spread", point=tuple(POINTS[row]), explained=0.3)
+    missed = replace(evidence, predictions=(*evidence.predictions, test))
+    raised = envelope_of(SPACE, drawn, missed, EXECUTED, 0.6, 0.95)
+    assert raised.factor == pytest.approx(7)
+    assert raised.raised_by == 11
+    assert raised.share < envelope().share
+    above = replace(test, point=tuple(POINTS[int(drawn.mean.argmax())]))  # nothing is claimed of this task
+    known = envelope_of(SPACE, drawn, replace(evidence, predictions=(above,)), EXECUTED, 0.6, 0.95)
+    assert known.raised_by is None
+    noisy = replace(missed, quantile=0.9)  # noise explains it
+    assert envelope_of(SPACE, drawn, noisy, EXECUTED, 0.6, 0.95).raised_by is None
+
+
 def test_what_withdraws_it() -> None:
     evidence = evidence_of()
     assert doubt_of_envelope(evidence, 0.6) is None
@@ -126,7 +147,12 @@ def test_what_withdraws_it() -> None:
     assert "2 more executions must be predicted beforehand" in str(doubt_of_envelope(few, 0.6))
     moved = replace(evidence.predictions[0], explained=0.5)
     other = replace(evidence, predictions=(moved, *evidence.predictions[1:]))
-    assert "trial 2 has the distance 0.4, and 0.5 on the learned dynamics" in str(doubt_of_envelope(other, 0.6))
+    assert doubt_of_envelope(other, 0.6) is None
+    above = replace(evidence.predictions[0], distance=0.62, explained=0.5)
+    other = replace(evidence, predictions=(above, *evidence.predictions[1:]))
+    assert "trial 2 has the distance 0.62, and 0.5 on the learned dynamics, which is below" in str(
+        doubt_of_envelope(other, 0.6)
+    )
     assert "at least 3" in str(doubt_of_envelope(replace(evidence, executions=2), 0.6))
     assert doubt_of_envelope(replace(evidence, unplanned=0.3), 0.6) is None
     none = withdrawn(SPACE, 0.6, 0.95, "too little is known.")
@@ -159,8 +185,24 @@ def test_the_exported_function_is_the_same_and_needs_numpy_alone(tmp_path: Path)
     assert names["trusted"]([-2.5, 1.0]) == (False, np.inf)
     with pytest.raises(ValueError, match="a task has the parameters goal, load"):
         names["trusted"]([1.0])
-    with pytest.raises(InputError, match=r"written to a Python file, such as envelope\.py, got 'e\.onnx'"):
-        found.save("e.onnx")
+    with pytest.raises(InputError, match=r"written to a file such as envelope\.py or \.onnx, got 'e\.txt'"):
+        found.save("e.txt")
+
+
+def test_the_onnx_file_computes_the_same(tmp_path: Path) -> None:
+    pytest.importorskip("onnx")
+    onnxruntime = pytest.importorskip("onnxruntime")
+    rng = np.random.default_rng(4)
+    for known in (envelope(beyond=np.where(POINTS[:, 0] > 0.9, 0.1, 0.0)), envelope()):
+        path = known.save(tmp_path / "folder" / "envelope.onnx")
+        session = onnxruntime.InferenceSession(str(path))
+        tasks = np.concatenate([SPACE.from_unit(rng.uniform(-0.1, 1.1, (500, 2))), SPACE.from_unit(np.eye(2))])
+        trusted, bounds = session.run(["trusted", "bound"], {"task": tasks})
+        assert 50 < trusted.sum() < 400
+        np.testing.assert_array_equal(trusted, known.trusted(tasks))
+        np.testing.assert_allclose(bounds, known.bound(tasks), rtol=1e-9)
+    with pytest.raises(InputError, match=r"there is no function to write: no task is trusted\."):
+        withdrawn(SPACE, 0.6, 0.95, "why").to_onnx(tmp_path / "e.onnx")
 
 
 def test_boundary_tasks_lie_next_to_the_boundary() -> None:
@@ -182,6 +224,11 @@ def test_of_a_suite_it_is_a_list_and_executed_tasks_are_facts() -> None:
     assert found.trusted({"task": "b"})
     assert not found.trusted({"task": "a"})
     assert found.bound({"task": "d"}) == 0.55
+    far = DrawnDistances(points, draws, np.ones(5))
+    known = envelope_of(suite, far, evidence_of(), executed, 0.6, 0.95)
+    assert known.tasks == ("d",)
+    assert known.uncovered == pytest.approx(0.4)  # b and c: a was executed
+    assert "no further task" not in known.statement
 
 
 @pytest.mark.slow
@@ -195,6 +242,8 @@ def test_further_tasks_check_what_is_interpolated() -> None:
     for evaluate in (None, waves):
         known = envelope_of(SPACE, waves(POINTS), evidence_of(), [], 0.6, 0.95, evaluate, 200, "m")
         assert "stays below 0.6 m on all tasks" in known.statement
+        assert ("no further task checks this" in known.statement) == (evaluate is None)
+        assert (known.checks > 0) == (evaluate is not None)
         false.append((np.isfinite(known.bound_at(others)) & (waves(others).mean > 0.6)).mean())
     assert false[0] > 0.01
     assert false[1] < 0.5 * false[0]

@@ -25,7 +25,8 @@ def state_envelope(
     force: bool = False,
 ) -> Any:
     """``ctxval envelope``."""
-    require_outputs({"--out .py": out_}, [store, allowed.experiment], force=force)
+    suffix = ".onnx" if out_ is not None and out_.suffix == ".onnx" else ".py"
+    require_outputs({f"--out {suffix}": out_}, [store, allowed.experiment], force=force)
     loaded = open_store(store, allowed)
     limit = limit_of(loaded.experiment, loaded.settings, threshold)
     if limit is None:

@@ -5,15 +5,12 @@ An ONNX file has double precision, for robots and other programs; it needs onnx 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from ctxval._util.arrays import Array
-from ctxval._util.extras import require_extra
-from ctxval._util.files import MADE_BY, write_text, written_whole
+from ctxval._util.files import MADE_BY, write_text
+from ctxval._util.onnx_graph import GraphValue, require_onnx
 from ctxval.core.model import Model
 from ctxval.errors import InputError
 from ctxval.models import Corrected, Correction, FeedforwardReLU, GaussianProcessModel, Linear, Parametric
@@ -91,23 +88,15 @@ def write_model_file(path: Path, model: Model, step: str | None = None) -> list[
 
 def write_onnx(path: str | Path, model: Model) -> None:
     """Write a model as an ONNX file with one input ``(x, u)`` and the output ``x_next``."""
-    onnx = _require_onnx(model)
-    nodes, tensors = list[Any](), list[Any]()
-    _, n, m = _next_state(_Value("z", onnx, nodes, tensors), model)
-    nodes[-1].output[0] = "x_next"
-    value, kind = onnx.helper.make_tensor_value_info, onnx.TensorProto.DOUBLE
-    ends = [value("z", kind, ["N", n + m])], [value("x_next", kind, ["N", n])]
-    made = onnx.helper.make_graph(nodes, "step", *ends, tensors)
-    # Versions that onnxruntime has read since 2022.
-    opset = [onnx.helper.make_opsetid("", 17)]
-    content = onnx.helper.make_model(made, opset_imports=opset, ir_version=8, producer_name=MADE_BY)
-    with written_whole(path) as file:
-        file.write(content.SerializeToString())
+    _require_onnx(model)
+    z = GraphValue.first("z")
+    following, n, m = _next_state(z, model)
+    z.write(path, "step", n + m, {"x_next": (following, "DOUBLE", ["N", n])})
 
 
-def _require_onnx(model: Model | None) -> Any:
-    """Return the module onnx, if it is installed and a model can be written."""
-    onnx = require_extra("onnx", "fit", "ONNX files")
+def _require_onnx(model: Model | None) -> None:
+    """Check that onnx is installed and that a model can be written."""
+    require_onnx()
     while isinstance(model, Corrected):
         model = model.model
     if model is not None and not isinstance(model, Linear | FeedforwardReLU | GaussianProcessModel):
@@ -115,10 +104,9 @@ def _require_onnx(model: Model | None) -> Any:
             f"only linear models, networks, Gaussian processes and corrections of these can be written as ONNX, got "
             f"{model!r}."
         )
-    return onnx
 
 
-def _next_state(z: _Value, model: Model) -> tuple[_Value, int, int]:
+def _next_state(z: GraphValue, model: Model) -> tuple[GraphValue, int, int]:
     """Return the next state of a model at ``z = (x, u)``, and the numbers of states and inputs."""
     if isinstance(model, Linear):
         n, m = model.B.shape
@@ -136,16 +124,16 @@ def _next_state(z: _Value, model: Model) -> tuple[_Value, int, int]:
             h = h.affine(weight, bias).node("Relu")
         change = h.affine(*layers[-1]).affine(np.diag(scaling.scale_out), scaling.shift_out)
     else:
-        half = _squared_distance(h, model.centres, model.covariance.length_scales, 0.5)
+        half = h.squared_distances(model.centres, model.covariance.length_scales, 0.5)
         weights = model.covariance.variance * model.weights * scaling.scale_out
         change = half.node("Neg").node("Exp").affine(weights, scaling.shift_out)
     return z.affine(np.eye(width)[:, :n], np.zeros(n)) + change, n, width - n
 
 
-def _correction(z: _Value, given: Correction) -> _Value:
+def _correction(z: GraphValue, given: Correction) -> GraphValue:
     """Return ``clip(k(z) W + linear) * exp(-1/2 |beyond / fade|^2)``, as :class:`ctxval.models.Correction` does."""
     pair = z.affine(np.diag(1 / given.scale), -given.shift / given.scale)
-    r2 = _squared_distance(pair, given.centres, given.length_scales, 5.0)
+    r2 = pair.squared_distances(given.centres, given.length_scales, 5.0)
     r = r2.node("Sqrt")
     covariances = (r + r2 * np.array([1 / 3]) + np.array([1.0])) * r.node("Neg").node("Exp")
     unlimited = covariances.affine(given.weights, np.zeros(given.states)) + pair.affine(
@@ -153,44 +141,5 @@ def _correction(z: _Value, given: Correction) -> _Value:
     )
     limited = unlimited.node("Min", given.limit).node("Max", -given.limit)
     beyond = pair.node("Sub", pair.node("Min", given.high).node("Max", given.low))
-    far = _squared_distance(beyond, np.zeros((1, len(given.fade))), given.fade, 0.5)
+    far = beyond.squared_distances(np.zeros((1, len(given.fade))), given.fade, 0.5)
     return limited * far.node("Neg").node("Exp")
-
-
-def _squared_distance(z: _Value, centres: Array, scales: Array, factor: float) -> _Value:
-    """Return ``factor |(z - c) / l|^2`` for each centre c, which rounding must not make negative."""
-    inverse = factor / scales**2
-    mixed = z.affine((-2 * inverse * centres).T, (inverse * centres**2).sum(axis=1))
-    squares = (z * z).affine(np.repeat(inverse[:, None], len(centres), axis=1), np.zeros(len(centres)))
-    return (mixed + squares).node("Relu")
-
-
-@dataclass(frozen=True, eq=False)
-class _Value:
-    """A value in a graph, with the operations that add a node to it; all values share the nodes and the constants."""
-
-    name: str
-    onnx: Any
-    nodes: list[Any]
-    tensors: list[Any]
-
-    def node(self, kind: str, *others: _Value | Array) -> _Value:
-        """Return the result of an operation on this value and others; constants are broadcast."""
-        names = [self.name]
-        for other in others:
-            if not isinstance(other, _Value):
-                array, name = np.asarray(other, dtype=np.float64), f"constant_{len(self.tensors)}"
-                self.tensors.append(self.onnx.numpy_helper.from_array(array, name))
-            names.append(other.name if isinstance(other, _Value) else self.tensors[-1].name)
-        result = f"value_{len(self.nodes)}"
-        self.nodes.append(self.onnx.helper.make_node(kind, names, [result]))
-        return replace(self, name=result)
-
-    def affine(self, weight: Array, bias: Array) -> _Value:
-        return self.node("Gemm", weight, bias)
-
-    def __add__(self, other: _Value | Array) -> _Value:
-        return self.node("Add", other)
-
-    def __mul__(self, other: _Value | Array) -> _Value:
-        return self.node("Mul", other)
