@@ -25,7 +25,7 @@ def test_a_robot_without_a_fault_does_what_its_model_does(name: str) -> None:
     validation = ROBOTS[name].experiment(Fault("none"), 0.0, 0).validation
     plan = validation.plan(0.3 * validation.space.low + 0.7 * validation.space.high)
     assert validation.measure(plan, validation.execute(plan)) < 2e-3
-    faulty = ROBOTS[name].experiment(Fault("input gain", 0, (0.8,)), 0.0, 0).validation
+    faulty = ROBOTS[name].experiment(Fault("input gain", 0, (0.5,)), 0.0, 0).validation
     assert faulty.measure(plan, faulty.execute(plan)) > 3e-3
 
 

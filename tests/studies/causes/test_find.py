@@ -96,7 +96,7 @@ def test_causes_that_are_the_same_to_a_model_are_said_together() -> None:
     weak = slide(no_force)
     report = found(lambda x, u: weak(x, 0.8 * u))
     names = {each.causes[0].name for each in report.explained}
-    assert {"input gain", "inertia"} <= names
+    assert {"input gain", "sensor scale"} <= names  # and the inertia, if its fit comes as near
     assert "One of these" in report.sentence
     assert report.separating_sentence is not None
     assert "the same to this model" in report.separating_sentence

@@ -156,7 +156,7 @@ class Explanation(ShortRepr):
 def explained(records: Records, candidates: tuple[Candidate, ...], begun: Sequence[float] | Array) -> Explanation:
     """Return causes whose sizes are fitted to records by nonlinear least squares.
 
-    The residuals of each state are first divided by those of M, and then by what is left of them.
+    The residuals of each state are first divided by those of M, and then twice by what is left of them.
 
     Args:
         begun: the sizes of all causes with which the fit begins.
@@ -164,13 +164,14 @@ def explained(records: Records, candidates: tuple[Candidate, ...], begun: Sequen
     fit = _Fit(records, candidates)
     theta = np.array(begun)
     if len(theta):
-        theta = fit.best(theta, records.sizes, 8)
-        model = fit.repaired(theta)
-        sizes = [
-            np.clip(np.hypot(_size(records.left_by(model, window)), window.floors), window.floors, size)
-            for window, size in zip(records.windows, records.sizes, strict=True)
-        ]
-        theta = fit.best(theta, sizes, 6)
+        theta = fit.most_likely_of_states(fit.best(theta, records.sizes, 8))
+        for _ in range(2):
+            model = fit.repaired(theta)
+            sizes = [
+                np.clip(np.hypot(_size(records.left_by(model, window)), window.floors), window.floors, size)
+                for window, size in zip(records.windows, records.sizes, strict=True)
+            ]
+            theta = fit.best(theta, sizes, 6)
     return fit.explanation(theta)
 
 
@@ -237,6 +238,20 @@ class _Fit:
             moved[i] += step if moved[i] + step <= self.high[i] else -step
             columns.append((self.errors(moved, sizes) - here) / (moved[i] - theta[i]))
         return np.stack(columns, axis=1)
+
+    def most_likely_of_states(self, theta: Array) -> Array:
+        """Return the most likely of these sizes and of those that explain one state alone, by a Gauss-Newton step.
+
+        Where M integrates a position otherwise than the system does, a cause explains the rate alone.
+        """
+        here = self.errors(theta, self.records.sizes)
+        J = self.slope(theta, self.records.sizes, here)
+        n = len(self.records.sizes[0])
+        tried = [theta]
+        for i in range(n):  # rows of errors are predictions after predictions, each with all states
+            step = np.linalg.lstsq(J[i::n], -here[i::n], rcond=1e-8)[0]
+            tried.append(np.clip(theta + step, self.low, self.high))
+        return min(tried, key=lambda each: self.records.measured(self.repaired(each))[0])
 
     def best(self, start: Array, sizes: Sequence[Array], evaluations: int) -> Array:
         inside = np.clip(start, self.low + 1e-9 * self.scales, self.high - 1e-9 * self.scales)
