@@ -15,8 +15,7 @@ import numpy as np
 from ctxval._util.arrays import Array, Mask
 from ctxval._util.representation import ShortRepr
 from ctxval.certificates import Certificate, CertificateKind, Sample
-from ctxval.core.controller import Controller, ControllerWithMemory, Synthesizer, converged_of
-from ctxval.core.controller import started as run_of
+from ctxval.core.controller import Controller, ControllerWithMemory, Synthesizer, converged_of, each_alone
 from ctxval.core.distance import Distance
 from ctxval.core.model import Model, central_differences, linearize
 from ctxval.core.outputs import OutputsLike, as_outputs
@@ -90,15 +89,10 @@ def check_system(
     _require_close("the first execution", first.states, "the second", second.states, tolerance)
     if getattr(system, "batched", False):
         exact = getattr(system, "exact_batches", False)
-        batch = system.execute(_alone(controller, task) if exact else controller, Task.stacked([task, task]))
+        both = each_alone([controller, controller], [task, task]) if exact else controller
+        batch = system.execute(both, Task.stacked([task, task]))
         allowed = 0.0 if exact else tolerance
         _require_close("an execution in a batch", batch.states[1], "the same alone", first.states, allowed)
-
-
-def _alone(controller: Controller, task: Task) -> Controller:
-    """Return the controller of a batch of two that rounds in no other way than for one task."""
-    runs = [run_of(controller, task) for _ in range(2)]
-    return lambda t, x: np.stack([np.asarray(run(t, state)) for run, state in zip(runs, x, strict=True)])
 
 
 def check_synthesizer(synthesizer: Synthesizer, task: Task, model: Model) -> None:

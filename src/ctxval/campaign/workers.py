@@ -25,8 +25,7 @@ from ctxval._util.interrupts import allow_exits, exits_as_exceptions, raised_by_
 from ctxval._util.progress import mute
 from ctxval._util.texts import reason_of
 from ctxval.campaign.choices import Execution
-from ctxval.core.controller import Controller
-from ctxval.core.controller import started as run_of
+from ctxval.core.controller import Controller, each_alone
 from ctxval.core.plan import Plan
 from ctxval.core.system import System
 from ctxval.core.task import Task
@@ -64,7 +63,8 @@ def _executed_batch(system: System, plans: Sequence[Plan]) -> Trajectory | None:
     if len(plans) == 1 or len(kinds) > 1:
         return None
     try:
-        trajectory = system.execute(_each_alone(plans), Task.stacked([plan.task for plan in plans]))
+        tasks = [plan.task for plan in plans]
+        trajectory = system.execute(each_alone([plan.controller for plan in plans], tasks), Task.stacked(tasks))
     except BaseException as error:
         if raised_by_signal(error):
             raise
@@ -72,12 +72,6 @@ def _executed_batch(system: System, plans: Sequence[Plan]) -> Trajectory | None:
     if not isinstance(trajectory, Trajectory) or trajectory.batch_shape != (len(plans),):
         return None
     return trajectory if trajectory.ended == COMPLETE or not trajectory.finite.all() else None
-
-
-def _each_alone(plans: Sequence[Plan]) -> Controller:
-    """Return the controllers of plans as one of their batch, whose inputs are to the last digit those of each alone."""
-    runs = [run_of(plan.controller, plan.task) for plan in plans]
-    return lambda t, x: np.stack([np.asarray(run(t, state)) for run, state in zip(runs, x, strict=True)])
 
 
 def timed_out(timeout: float, seconds: float) -> Execution:

@@ -10,7 +10,7 @@ import numpy as np
 from ctxval._util.arrays import Array, ArrayLike, as_finite
 from ctxval._util.registry import part
 from ctxval._util.representation import ShortRepr
-from ctxval.core.controller import Controller, ControllerWithMemory, Limits, Synthesizer
+from ctxval.core.controller import Controller, Limits, Synthesizer, memory_of, stepped
 from ctxval.core.kalman import Estimate, corrected, predicted
 from ctxval.core.model import Model
 from ctxval.core.outputs import Outputs, OutputsLike
@@ -97,17 +97,12 @@ class EstimatedFeedback(ShortRepr):
 
     def start(self, task: Task) -> FilterMemory:
         known = np.broadcast_to(self.process, (*task.batch_shape, *self.process.shape))
-        of_feedback = self.feedback.start(task) if isinstance(self.feedback, ControllerWithMemory) else None
-        return FilterMemory(Estimate(np.array(task.initial_state), known), of_feedback)
+        return FilterMemory(Estimate(np.array(task.initial_state), known), memory_of(self.feedback, task))
 
     def step(self, t: int, y: Array, memory: FilterMemory) -> tuple[Array, FilterMemory]:
         """Return the inputs ``(..., m)`` for the outputs ``(..., p)`` of step t, and the new memory."""
         known, _ = corrected(self.outputs, memory.prior, np.asarray(y, dtype=np.float64), self.measurement)
-        of_feedback = memory.of_feedback
-        if isinstance(self.feedback, ControllerWithMemory):
-            u, of_feedback = self.feedback.step(t, known.mean, of_feedback)
-        else:
-            u = self.feedback(t, known.mean)
+        u, of_feedback = stepped(self.feedback, t, known.mean, memory.of_feedback)
         u = np.asarray(u, dtype=np.float64)
         prior, _ = predicted(self.model, known, u, self.process)
         return u, FilterMemory(prior, of_feedback)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
@@ -85,6 +85,24 @@ def started(controller: Controller, task: Task) -> Feedback:
         wanted = "a function (t, x) -> u, or have the methods start(task) and step(t, x, memory)"
         raise InputError(f"a controller must be {wanted}, got {shown(controller)}.")
     return controller
+
+
+def memory_of(controller: Controller, task: Task) -> Any:
+    """Return the memory of a controller before the first step of a task; None if it has none."""
+    return controller.start(task) if isinstance(controller, ControllerWithMemory) else None
+
+
+def stepped(controller: Controller, t: int, x: Array, memory: Any) -> tuple[Any, Any]:
+    """Return the inputs of a controller with memory or without at step t, and its new memory."""
+    if isinstance(controller, ControllerWithMemory):
+        return controller.step(t, x, memory)
+    return controller(t, x), memory
+
+
+def each_alone(controllers: Sequence[Controller], tasks: Sequence[Task]) -> Feedback:
+    """Return controllers of tasks as one of their batch, whose inputs are to the last digit those of each alone."""
+    runs = [started(controller, task) for controller, task in zip(controllers, tasks, strict=True)]
+    return lambda t, x: np.stack([np.asarray(run(t, state)) for run, state in zip(runs, x, strict=True)])
 
 
 @runtime_checkable

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 from ctxval._util.arrays import Array, Mask, Rows
-from ctxval.core.controller import Controller, ControllerWithMemory, Synthesizer
+from ctxval.core.controller import Controller, Synthesizer, memory_of, stepped
 from ctxval.core.distance import Distance
 from ctxval.core.model import Model
 from ctxval.core.task import Task
@@ -48,10 +48,9 @@ class Actuator:
 
     def follow(self, acting: Array, commanded: Sequence[Array]) -> Array:
         """Return the acting input ``(..., m)`` from the one before and all that were commanded, the latest first."""
-        whole, share = int(self.delay), self.delay % 1.0
         due = np.zeros_like(acting)
-        for weight, back in ((1.0 - share, whole), (share, whole + 1)):
-            if weight and back < len(commanded):
+        for weight, back in self._parts:
+            if back < len(commanded):
                 due = due + weight * commanded[back]
         return self._followed(acting, due)
 
@@ -62,13 +61,18 @@ class Actuator:
 
     def acting(self, inputs: Array) -> Array:
         """Return the inputs that act in each step, for commanded ones ``(..., H, m)``."""
-        H, (whole, share) = inputs.shape[-2], (int(self.delay), self.delay % 1.0)
-        due = np.zeros_like(inputs)
-        for weight, back in ((1.0 - share, whole), (share, whole + 1)):
+        H, due = inputs.shape[-2], np.zeros_like(inputs)
+        for weight, back in self._parts:
             due[..., back:, :] += weight * inputs[..., : max(H - back, 0), :]
         for t in range(H) if self.lag else ():
             due[..., t, :] = self._followed(due[..., t - 1, :] if t else np.zeros_like(due[..., 0, :]), due[..., t, :])
         return due
+
+    @property
+    def _parts(self) -> list[tuple[float, int]]:
+        """The weights of the commanded inputs that are due, and how many steps ago they were commanded."""
+        whole, share = int(self.delay), self.delay % 1.0
+        return [(weight, back) for weight, back in ((1.0 - share, whole), (share, whole + 1)) if weight]
 
     def _followed(self, acting: Array, due: Array) -> Array:
         return np.asarray(acting + (due - acting) * (1 - np.exp(-1 / self.lag)) if self.lag else due)
@@ -98,13 +102,14 @@ def found_actuator(
         return None
     without = evidence.mode(Actuator()).height
     tried = [before] if before else [Actuator(*each) for each in _TRIED]
-    height, best = max(((evidence.mode(each).height, each) for each in tried), key=lambda pair: pair[0])
+    mode, best = max(((evidence.mode(each), each) for each in tried), key=lambda pair: pair[0].height)
     values = len(evidence.rows) * int(evidence.live.sum())
-    if height < without - _NEAR * values:
+    if mode.height < without - _NEAR * values:
         return None
     for _ in range(2):  # the noise that a wrong actuator seems to add is less the second time
-        best = evidence.refined(best, evaluations)
-    return best if evidence.mode(best).height > without + _BETTER * values else None
+        best = evidence.refined(best, mode, evaluations)
+        mode = evidence.mode(best)
+    return best if mode.height > without + _BETTER * values else None
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,10 +153,10 @@ class _Evidence:
         inputs = Z.shape[1] - len(self.live)
         return HyperparameterPosterior.given((Z - shift) / scale, E, inputs, FAMILIES[:1]).highest
 
-    def refined(self, start: Actuator, evaluations: int) -> Actuator:
+    def refined(self, start: Actuator, mode: Mode, evaluations: int) -> Actuator:
         """Return the most likely actuator near one, with the hyperparameters that are most probable for that one."""
         Z, _ = self.data(start)
-        shift, scale, mode = Z.mean(axis=0), standard_deviations(Z), self.mode(start)
+        shift, scale = Z.mean(axis=0), standard_deviations(Z)
 
         def unlikely(each: Array) -> float:
             Z, E = self.data(Actuator(*np.clip(each, 0.0, _LONGEST).tolist()))
@@ -226,19 +231,15 @@ class _ActuatedController:
     actuator: Actuator
 
     def start(self, task: Task) -> Any:
-        own = self.controller.start(task) if isinstance(self.controller, ControllerWithMemory) else None
-        return own, (), None
+        return memory_of(self.controller, task), (), None
 
     def step(self, t: int, x: Array, memory: Any) -> tuple[Array, Any]:
-        own, commanded, acting = memory
-        if isinstance(self.controller, ControllerWithMemory):
-            u, own = self.controller.step(t, x, own)
-        else:
-            u = self.controller(t, x)
+        of_controller, commanded, acting = memory
+        u, of_controller = stepped(self.controller, t, x, of_controller)
         u = np.array(u, dtype=np.float64)
         commanded = (u, *commanded)[: self.actuator.remembered]
         acting = self.actuator.follow(np.zeros_like(u) if acting is None else acting, commanded)
-        return np.concatenate([acting, u], axis=-1), (own, commanded, acting)
+        return np.concatenate([acting, u], axis=-1), (of_controller, commanded, acting)
 
 
 @dataclass(frozen=True)

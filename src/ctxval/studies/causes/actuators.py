@@ -13,6 +13,13 @@ from ctxval.studies.causes.cause import Cause
 from ctxval.studies.causes.plant import Plant
 
 
+def _at(u: Array, index: int | None, size: float, elsewhere: float = 0.0) -> Array:
+    """Return an array ``(m,)`` with a size at one input of ``u``, or at all of them if it is None."""
+    sizes = np.full(u.shape[-1], elsewhere)
+    sizes[slice(None) if index is None else index] = size
+    return sizes
+
+
 def _with_unit(value: float, unit: str) -> str:
     return f"{value:.3g} {unit}".strip()
 
@@ -29,9 +36,7 @@ class InputGain(Cause):
     input: int | None = 0
 
     def follow(self, u: Array, memory: Any) -> tuple[Array, Any]:
-        gains = np.ones(u.shape[-1])
-        gains[slice(None) if self.input is None else self.input] = self.sizes[0]
-        return u * gains, None
+        return u * _at(u, self.input, self.sizes[0], 1.0), None
 
     def text(self, plant: Plant) -> str:
         which = "all inputs have" if self.input is None else f"{plant.input(self.input)[0]} has"
@@ -53,9 +58,7 @@ class InputOffset(Cause):
     input: int = 0
 
     def follow(self, u: Array, memory: Any) -> tuple[Array, Any]:
-        shift = np.zeros(u.shape[-1])
-        shift[self.input] = self.sizes[0]
-        return u + shift, None
+        return u + _at(u, self.input, self.sizes[0]), None
 
     def text(self, plant: Plant) -> str:
         name, unit = plant.input(self.input)
@@ -70,8 +73,7 @@ class Saturation(Cause):
     input: int = 0
 
     def follow(self, u: Array, memory: Any) -> tuple[Array, Any]:
-        most = np.full(u.shape[-1], np.inf)
-        most[self.input] = self.sizes[0]
+        most = _at(u, self.input, self.sizes[0], np.inf)
         return np.clip(u, -most, most), None
 
     def text(self, plant: Plant) -> str:
@@ -94,8 +96,7 @@ class DeadZone(Cause):
     input: int = 0
 
     def follow(self, u: Array, memory: Any) -> tuple[Array, Any]:
-        lost = np.zeros(u.shape[-1])
-        lost[self.input] = self.sizes[0]
+        lost = _at(u, self.input, self.sizes[0])
         return u - np.clip(u, -lost, lost), None
 
     def text(self, plant: Plant) -> str:
@@ -112,8 +113,7 @@ class Backlash(Cause):
     input: int = 0
 
     def follow(self, u: Array, memory: Any) -> tuple[Array, Any]:
-        play = np.zeros(u.shape[-1])
-        play[self.input] = self.sizes[0]
+        play = _at(u, self.input, self.sizes[0])
         acting = np.clip(np.zeros_like(u) if memory is None else memory, u - play, u + play)
         return acting, acting
 
@@ -182,9 +182,7 @@ class ReversedInput(Cause):
     input: int = 0
 
     def follow(self, u: Array, memory: Any) -> tuple[Array, Any]:
-        signs = np.ones(u.shape[-1])
-        signs[self.input] = -1.0
-        return u * signs, None
+        return u * _at(u, self.input, -1.0, 1.0), None
 
     def text(self, plant: Plant) -> str:
         return f"{plant.input(self.input)[0]} acts with the opposite sign"

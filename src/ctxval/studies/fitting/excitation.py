@@ -12,7 +12,7 @@ import numpy as np
 from ctxval._util.arrays import Array, ArrayLike, as_finite
 from ctxval._util.representation import ShortRepr
 from ctxval.campaign.workers import SerialPool
-from ctxval.core.controller import Controller, ControllerWithMemory, Limits
+from ctxval.core.controller import Controller, Limits, memory_of, stepped
 from ctxval.core.plan import Plan
 from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory
@@ -66,14 +66,11 @@ class Excited(ShortRepr):
 
     def start(self, task: Task) -> Any:
         """Return the memory of the controller before its first step."""
-        return self.controller.start(task) if isinstance(self.controller, ControllerWithMemory) else None
+        return memory_of(self.controller, task)
 
     def step(self, t: int, x: Array, memory: Any) -> tuple[Array, Any]:
         """Return the input at step t, shape ``(..., m)``, and the new memory."""
-        if isinstance(self.controller, ControllerWithMemory):
-            u, memory = self.controller.step(t, x, memory)
-        else:
-            u = self.controller(t, x)
+        u, memory = stepped(self.controller, t, x, memory)
         return self.limits.clip(np.asarray(u) + self.signal[t]), memory
 
 
