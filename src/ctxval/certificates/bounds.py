@@ -37,6 +37,14 @@ def at_most(value: float, digits: int = 4) -> str:
     return f"{value + 10.0 ** (np.floor(np.log10(abs(value))) - digits + 1):.{digits}g}"
 
 
+def rank_of(confidence: float, draws: int) -> int:
+    """Return the rank, from 1, of the order statistic that a further draw stays below with this probability.
+
+    It is larger than the number of draws if the confidence needs more of them.
+    """
+    return max(1, int(np.ceil((draws + 1) * confidence - 1e-9)))
+
+
 def percent(probability: float) -> str:
     """Return a probability such as 0.95 as ``95 %``."""
     return f"{100 * probability:.9g} %"

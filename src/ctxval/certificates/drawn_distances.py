@@ -8,6 +8,7 @@ import numpy as np
 
 from ctxval._util.arrays import Array, Mask
 from ctxval._util.representation import ShortRepr
+from ctxval.certificates.bounds import rank_of
 from ctxval.errors import CertificateError
 
 FLOOR = 0.005  # least spread, as a share of the threshold
@@ -57,7 +58,7 @@ class DrawnDistances(ShortRepr):
         """
         known, spread = self.known, self.spread(threshold)
         excess = ((self.draws - self.mean)[:, known] / spread[known]).max(axis=1, initial=0.0)
-        rank = int(np.ceil((len(excess) + 1) * confidence - 1e-9))
+        rank = rank_of(confidence, len(excess))
         if rank > len(excess):
             raise CertificateError(
                 f"a confidence of {confidence:g} needs more than {len(excess)} posterior samples of the dynamics."

@@ -22,6 +22,7 @@ import numpy as np
 from ctxval._util.checked import NonNegativeInt, Probability, checked
 from ctxval._util.registry import part
 from ctxval.certificates.base import Certificate, CertificateKind
+from ctxval.certificates.bounds import rank_of
 from ctxval.certificates.dynamics_diagnostics import (
     ACCURATE,
     PREDICTIONS,
@@ -227,7 +228,7 @@ def _undeclared_noise(sample: Sample, bound: float) -> str | None:
 
 
 def _require_draws(draws: int, confidence: float) -> None:
-    if np.ceil((draws + 1) * confidence - 1e-9) > draws:
+    if rank_of(confidence, draws) > draws:
         raise CertificateError(
             f"a confidence of {confidence:g} needs more than {draws} posterior samples of the dynamics."
         )

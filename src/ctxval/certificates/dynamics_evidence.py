@@ -10,6 +10,7 @@ import numpy as np
 
 from ctxval._util.arrays import Array
 from ctxval._util.representation import ShortRepr
+from ctxval.certificates.bounds import rank_of
 from ctxval.certificates.prediction_tests import TESTS
 from ctxval.core.quantiles import LEVELS, QUANTILE, chance_of_more
 from ctxval.core.trial import Origin
@@ -289,7 +290,7 @@ class DynamicsEvidence(ShortRepr):
 
     def rank(self, confidence: float) -> int:
         """Return the row, in ascending order, of the maximum that d* stays below with this probability."""
-        return min(int(np.ceil((len(self.maxima) + 1) * confidence - 1e-9)), len(self.maxima)) - 1
+        return min(rank_of(confidence, len(self.maxima)), len(self.maxima)) - 1
 
     def upper(self, confidence: float) -> float:
         """Return the maximum that d* stays below with this probability."""

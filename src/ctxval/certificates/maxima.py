@@ -15,7 +15,7 @@ from ctxval._util.arrays import Array, Rows, single_threaded
 from ctxval._util.checked import Probability, checked
 from ctxval._util.progress import advance, stage
 from ctxval._util.representation import ShortRepr
-from ctxval.certificates.bounds import ERRORS
+from ctxval.certificates.bounds import ERRORS, rank_of
 from ctxval.certificates.sample import Sample, advice_to_remeasure, listed
 from ctxval.certificates.sentences import two_distances
 from ctxval.errors import CertificateError
@@ -49,7 +49,7 @@ class Maxima(ShortRepr):
     @checked
     def upper(self, confidence: Probability) -> float:
         """Return the bound on d* that holds with this probability; a CertificateError if that needs more draws."""
-        rank = max(1, int(np.ceil((len(self.draws) + 1) * confidence - 1e-9)))
+        rank = rank_of(confidence, len(self.draws))
         if rank > len(self.draws):
             raise CertificateError(
                 f"a confidence of {confidence:g} needs more than the {len(self.draws)} draws of d* that were made."

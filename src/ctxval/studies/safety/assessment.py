@@ -21,7 +21,7 @@ from ctxval._util.texts import parted
 from ctxval.campaign.campaign import Campaign
 from ctxval.campaign.history import executed_trials
 from ctxval.certificates import Certificate, CertificateOptions, Dynamics
-from ctxval.certificates.bounds import ERRORS
+from ctxval.certificates.bounds import ERRORS, rank_of
 from ctxval.certificates.dynamics import draws_for
 from ctxval.certificates.verdict import Answer, usable_bound
 from ctxval.core.experiment import Experiment
@@ -288,6 +288,5 @@ def _deviation_bound(campaign: Campaign, spec: Any, confidence: float) -> float 
         maxima = learned.worst_case_of(draws_for(confidence)).maxima
     except Exception:  # users' parts, at states that no execution has reached
         return None
-    rank = min(int(np.ceil((len(maxima) + 1) * confidence - 1e-9)), len(maxima)) - 1
-    bound = float(np.sort(maxima)[rank])
+    bound = float(np.sort(maxima)[min(rank_of(confidence, len(maxima)), len(maxima)) - 1])
     return bound if np.isfinite(bound) else None
