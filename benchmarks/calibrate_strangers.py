@@ -23,7 +23,7 @@ from strangers_diagnostics import JudgedRun
 from strangers_reporting import REPORTING
 from strangers_truths import TRUTHS
 
-RULE = 5
+RULE = 6
 """Version of the rule by which campaigns are run: 5 tests again after a test that failed, if what is learned explains
 it by now; 4 finds task parameters that change the dynamics, and leaves out data of M that contradict the
 executions; 3 learns histories and noise, and tests are points of a hypercube."""

@@ -15,6 +15,7 @@ from ctxval.models.parametric import Parametric
 from ctxval.models.saved import read_model, read_refined, write_model, write_transitions
 from ctxval.models.scaling import IncrementScaling
 from ctxval.models.scikit_learn import ScikitLearn
+from ctxval.models.torch import Torch
 
 __all__ = [
     "REGISTRY",
@@ -33,6 +34,7 @@ __all__ = [
     "Refined",
     "ScikitLearn",
     "SquaredExponential",
+    "Torch",
     "by_name",
     "linearize",
     "read_model",
