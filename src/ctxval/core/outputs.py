@@ -86,17 +86,7 @@ class Outputs(ShortRepr):
         if not callable(self.function):
             C = np.eye(n)[self.function]
             return np.broadcast_to(C, (*x.shape[:-1], *C.shape))
-        p = self(x).shape[-1]
-
-        def padded(states: Array, _: Array) -> Array:
-            """H as a step, which returns as many numbers as it takes."""
-            y = self(states[..., :n])
-            return np.concatenate([y, np.zeros((*y.shape[:-1], width - p))], axis=-1)
-
-        width = max(n, p)
-        wide = np.concatenate([x, np.zeros((*x.shape[:-1], width - n))], axis=-1)
-        A, _ = central_differences(padded, wide, np.zeros((*x.shape[:-1], 0)))
-        return A[..., :p, :n]
+        return central_differences(lambda states, _: self(states), x, np.zeros((*x.shape[:-1], 0)))[0]
 
     def of(self, trajectory: Trajectory) -> Trajectory:
         """Return a trajectory with its outputs in the place of states."""

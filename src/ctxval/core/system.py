@@ -11,7 +11,7 @@ from ctxval._util.arrays import Array
 from ctxval._util.registry import part
 from ctxval._util.representation import ShortRepr
 from ctxval.core.controller import Controller
-from ctxval.core.model import Function, Model, Step
+from ctxval.core.model import Model, Step, as_model
 from ctxval.core.outputs import Outputs, OutputsLike
 from ctxval.core.rollout import rollout
 from ctxval.core.task import Task
@@ -45,7 +45,7 @@ class Simulated(ShortRepr):
     batched = True
 
     def __init__(self, step: Step | Model, *, vectorized: bool = False) -> None:
-        self.model = step if isinstance(step, Model) else Function(step, vectorized=vectorized)
+        self.model = as_model(step, vectorized=vectorized)
 
     def execute(self, controller: Controller, task: Task) -> Trajectory:
         """Run the closed loop from the initial state of the task over its horizon."""

@@ -160,8 +160,7 @@ class Trajectory:
         if self.batch_shape:
             raise ShapeError(f"a CSV file must hold one trajectory, got a batch of shape {self.batch_shape}.")
         header = ["t"]
-        for letter, names, array in (("x", states, self.states), ("u", inputs, self.inputs)):
-            count = array.shape[-1]
+        for letter, names, count in (("x", states, self.states.shape[-1]), ("u", inputs, self.inputs.shape[-1])):
             columns = [f"{letter}{i}" for i in range(count)] if names is None else list(names)
             if len(columns) != count:
                 raise ShapeError(f"there must be {count} names of columns, got {', '.join(columns) or 'none'}.")
@@ -197,7 +196,7 @@ class Trajectory:
         x, u = _chosen(table, "x", states), _chosen(table, "u", inputs)
         if any(table.names) and (time is None or not x):
             wanted = ", ".join(["t", *(states or ("x0", "...")), *(inputs or ("u0", "..."))])
-            raise InputError(f"{path} must have the columns {wanted}; it has {_listed(table.names)}.")
+            raise InputError(f"{path} must have the columns {wanted}; it has {enumerated((name[:60] for name in table.names), 20)}.")
         column, unit = time or ("", "s")
         read = table.columns([column, *x, *u], last=list(u), most=most_rows)
         if len(times := read[column]) < 2:
@@ -218,11 +217,12 @@ class Trajectory:
         if self.batch_shape or not (np.diff(recorded) > 0).all():
             raise InputError("only a single trajectory with increasing times can be resampled.")
         dt, period = float(wanted[1] - wanted[0]), float(np.median(np.diff(recorded)))
+        advice = f"; {text}" if (text := unit_advice(period, dt)) else ""
         if period > FAR * dt:
-            raise InputError(f"the recording has steps of {period:g} s instead of {dt:g} s{_advice(period, dt)}.")
+            raise InputError(f"the recording has steps of {period:g} s instead of {dt:g} s{advice}.")
         if not recorded[-1] >= wanted[-1] - _TIMES * dt:
             ends = f"the recording ends after {recorded[-1]:g} s, and {wanted[-1]:g} s are needed"
-            raise InputError(f"{ends}{_advice(period, dt)}.")
+            raise InputError(f"{ends}{advice}.")
         states = np.stack([np.interp(wanted, recorded, column) for column in self.states.T], axis=-1)
         # A sample that belongs to a time may have been recorded just after it.
         inputs = held_means(recorded[:-1], self.inputs, wanted, 1e-6 * dt)
@@ -240,7 +240,7 @@ def require_times(trajectory: Trajectory, times: Array) -> None:
     """Check that a trajectory has these times ``(H + 1,)``, counted from its first time."""
     dt, recorded = times[1] - times[0], trajectory.times - trajectory.times[0]
     period = float(np.median(np.diff(recorded)))
-    advice = _advice(period, dt) or "; --resample interpolates a recording to these times"
+    advice = f"; {unit_advice(period, dt) or '--resample interpolates a recording to these times'}"
     if len(recorded) != len(times):
         got = f"{len(recorded)} with steps of {period:g} s{advice}"
         raise InputError(f"the trajectory must have {len(times)} times, {len(times) - 1} steps of {dt:g} s, got {got}.")
@@ -252,20 +252,11 @@ def require_times(trajectory: Trajectory, times: Array) -> None:
         raise InputError(f"the trajectory must have steps of {dt:g} s: {first}. {largest}.")
 
 
-def _advice(period: float, dt: float) -> str:
-    advice = unit_advice(period, dt)
-    return f"; {advice}" if advice else ""
-
-
 def _require_fitting(times: tuple[int, ...], states: tuple[int, ...], inputs: tuple[int, ...]) -> None:
     axes = len(times) == 1 and len(states) >= 2 and len(inputs) == len(states) and states[:-2] == inputs[:-2]
     if not axes or states[-2] != times[0] or inputs[-2] != times[0] - 1:
         got = f"{times}, {states} and {inputs}"
         raise ShapeError(f"a trajectory needs times (H+1,), states (..., H+1, n) and inputs (..., H, m), got {got}.")
-
-
-def _listed(names: Sequence[str]) -> str:
-    return enumerated((name[:60] for name in names), 20)
 
 
 def _chosen(table: CsvTable, letter: str, names: Sequence[str] | None) -> dict[str, float]:
@@ -279,7 +270,7 @@ def _chosen(table: CsvTable, letter: str, names: Sequence[str] | None) -> dict[s
     factors = dict[str, float]()
     for name, column in columns.items():
         if column is None:
-            raise InputError(f"{path} has no column {name}; there are {_listed(table.names)}.")
+            raise InputError(f"{path} has no column {name}; there are {enumerated((name[:60] for name in table.names), 20)}.")
         try:
             factors[column[0]] = conversion(column[1], wanted.get(name) or column[1]) if column[1] else 1.0
         except InputError:

@@ -151,7 +151,7 @@ def judged_by(experiment: Experiment, distance: UnsafeMargin) -> Experiment:
     places = range(len(labels)) if components is None else [i for i in components if isinstance(i, int)]
     found = {labels[i] for i in places if -len(labels) <= i < len(labels)}
     units = found.pop() if len(found) == 1 else ""
-    validation = given.with_labels(replace(given.labels, units=units))
+    validation = given.with_parts(labels=replace(given.labels, units=units))
     return replace(experiment, validation=validation, threshold=distance.margin, truth=None, units=units)
 
 
