@@ -9,7 +9,7 @@ import pytest
 from conftest import make_validation
 from ctxval import Campaign, Task, Validation, distances, searches
 from ctxval.core.labels import Labels
-from ctxval.core.preflight import DistanceWarning, start_offset
+from ctxval.core.plan import DistanceWarning, start_offset
 from ctxval.core.validation import CostWarning
 from ctxval.distances import AtCrossing, AtTimes, CrossingTime, FinalState, GoalError, RelativeDeviation, TrackingError
 from ctxval.errors import DistanceError, InputError, UnknownNameError

@@ -19,7 +19,7 @@ from ctxval.core.labels import labels_of
 from ctxval.core.trajectory import COMPLETE, Trajectory
 from ctxval.data import LogMapping, is_log, read_recordings
 from ctxval.errors import ExecutionError, InputError
-from ctxval.systems.supervised import run_supervised
+from ctxval.systems.subprocess import run_supervised
 
 _PROGRAM = Path(__file__).absolute().with_name("recording_process.py")
 

@@ -11,8 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from ctxval._util.arrays import Array, Mask, Rows, as_floats, held_means, rows_of
-from ctxval._util.columns import EPISODES, FAR, column_of, in_seconds, time_column, unit_advice
-from ctxval._util.csv_table import CsvTable
+from ctxval._util.columns import EPISODES, FAR, CsvTable, column_of, in_seconds, time_column, unit_advice
 from ctxval._util.files import MOST_BYTES, read_bytes, written_whole
 from ctxval._util.npz import Archive
 from ctxval._util.representation import ShortRepr, Shown, call, counted, number
@@ -196,7 +195,7 @@ class Trajectory:
         x, u = _chosen(table, "x", states), _chosen(table, "u", inputs)
         if any(table.names) and (time is None or not x):
             wanted = ", ".join(["t", *(states or ("x0", "...")), *(inputs or ("u0", "..."))])
-            raise InputError(f"{path} must have the columns {wanted}; it has {enumerated((name[:60] for name in table.names), 20)}.")
+            raise InputError(f"{path} must have the columns {wanted}; it has {_listed(table.names)}.")
         column, unit = time or ("", "s")
         read = table.columns([column, *x, *u], last=list(u), most=most_rows)
         if len(times := read[column]) < 2:
@@ -252,6 +251,10 @@ def require_times(trajectory: Trajectory, times: Array) -> None:
         raise InputError(f"the trajectory must have steps of {dt:g} s: {first}. {largest}.")
 
 
+def _listed(names: Sequence[str]) -> str:
+    return enumerated((name[:60] for name in names), 20)
+
+
 def _require_fitting(times: tuple[int, ...], states: tuple[int, ...], inputs: tuple[int, ...]) -> None:
     axes = len(times) == 1 and len(states) >= 2 and len(inputs) == len(states) and states[:-2] == inputs[:-2]
     if not axes or states[-2] != times[0] or inputs[-2] != times[0] - 1:
@@ -270,7 +273,7 @@ def _chosen(table: CsvTable, letter: str, names: Sequence[str] | None) -> dict[s
     factors = dict[str, float]()
     for name, column in columns.items():
         if column is None:
-            raise InputError(f"{path} has no column {name}; there are {enumerated((name[:60] for name in table.names), 20)}.")
+            raise InputError(f"{path} has no column {name}; there are {_listed(table.names)}.")
         try:
             factors[column[0]] = conversion(column[1], wanted.get(name) or column[1]) if column[1] else 1.0
         except InputError:

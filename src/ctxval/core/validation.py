@@ -15,8 +15,8 @@ import numpy as np
 
 from ctxval._util.arrays import Array, ArrayLike, as_floats, require_shape
 from ctxval._util.checked import NonNegativeFloat, PositiveInt, checked
+from ctxval._util.cores import raised_by_signal
 from ctxval._util.describe import describe, without_numbers
-from ctxval._util.interrupts import raised_by_signal
 from ctxval._util.progress import advance
 from ctxval._util.representation import call, lines, shown
 from ctxval._util.texts import parted, reason_of, text_of
@@ -24,11 +24,10 @@ from ctxval.core.controller import Controller, Synthesizer, is_controller
 from ctxval.core.distance import Distance
 from ctxval.core.labels import Labels, names_of, require_names
 from ctxval.core.model import Model, Step, as_model, require_time_step
-from ctxval.core.outputs import OutputsLike, as_outputs
 from ctxval.core.plan import Measurement, Outcome, Plan, require_execution
 from ctxval.core.rollout import rollout
 from ctxval.core.space import Parameters, TaskSpace
-from ctxval.core.system import Simulated, System, WithOutputs
+from ctxval.core.system import OutputsLike, Simulated, System, WithOutputs, as_outputs
 from ctxval.core.task import Task
 from ctxval.core.trajectory import COMPLETE, Trajectory
 from ctxval.errors import CtxvalError, DesignError, DistanceError, ExecutionError, InputError, ModelError, ShapeError

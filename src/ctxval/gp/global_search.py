@@ -16,7 +16,7 @@ from scipy.spatial import KDTree
 
 from ctxval._util.arrays import Array, Rows
 from ctxval._util.boxes import separated_rows
-from ctxval.gp.evaluations import Evaluations, Values
+from ctxval.gp.ascent import Evaluations, Values
 
 _SAMPLED, _EVOLVED, _CLIMBED = 0.35, 0.7, 0.88
 """Shares of the evaluations after which sampling, evolution and climbs end."""

@@ -14,8 +14,7 @@ from typing import Any
 import numpy as np
 
 from ctxval._util.checked import NonNegativeInt, PositiveInt, checked
-from ctxval._util.progress import stage
-from ctxval._util.progress_display import progress_shown
+from ctxval._util.progress import progress_shown, stage
 from ctxval._util.representation import ShortRepr, Shown, call, lines
 from ctxval._util.texts import parted
 from ctxval.campaign.campaign import Campaign
