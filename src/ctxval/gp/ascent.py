@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ctxval._util.arrays import Array
-from ctxval._util.boxes import climb, moves_to_bounds, separated_rows
+from ctxval._util.boxes import Box, climb, moves_to_bounds, separated_rows
 
 Values = Callable[[Array], Array]
 """Points ``(m, d)`` -> values ``(m,)``."""
@@ -72,7 +72,7 @@ class Evaluations:
         """Return all points ``(m, d)`` and their values ``(m,)`` as they were evaluated."""
         return np.concatenate(self._points), np.concatenate(self._values)
 
-    def found(self) -> tuple[Array, Array]:
+    def best_first(self) -> tuple[Array, Array]:
         """Return all points ``(m, d)`` and their values ``(m,)``, the largest first."""
         points, values = self.in_order()
         order = np.argsort(-values, kind="stable")
@@ -89,7 +89,7 @@ class Evaluations:
         """Climb from starts ``(s, d)`` along finite differences, with about so many evaluations."""
         if not len(starts):
             return
-        scale = max(float(np.abs(self.found()[1][0])), 1e-300)
+        scale = max(float(np.abs(self.best_first()[1][0])), 1e-300)
         calls = max(2, budget // (len(starts) * (self.dimension + 1)))
 
         def sloped(points: Array) -> tuple[Array, Array]:
@@ -139,7 +139,7 @@ class Evaluations:
 
     def move_to_bounds(self, rng: np.random.Generator) -> bool:
         """Move coordinates of the best points to bounds, singly and several at a time; return whether that helped."""
-        points, values = self.found()
+        points, values = self.best_first()
         d = self.dimension
         best = points[:3]
         ends = np.stack([self.low, self.high])
@@ -171,8 +171,10 @@ _MOVED = 3  # number of best points of which single coordinates are moved to bou
 _REFINED = 16  # number of points at which the function itself is evaluated after its approximation
 
 
-class Ascent:
-    """One search for the maximum of a function over a box within the unit cube.
+def ascend(
+    function: Values, box: Box, budget: int, starts: Array, rng: np.random.Generator, rough: Values | None = None
+) -> tuple[Array, Array]:
+    """Search a box within the unit cube for the maximum; return all points ``(m, d)`` and values, the largest first.
 
     In few dimensions, the points of a fixed pool are evaluated, and then samples ever closer to the best ones. In more
     dimensions the function is sampled, and line searches start from the best samples, all at once, along slopes and
@@ -183,62 +185,54 @@ class Ascent:
     Args:
         function: points ``(m, d)`` -> values ``(m,)``; values that are not finite are never a maximum.
         budget: number of points at which the function may be evaluated; the last climb may exceed it.
+        starts: points to evaluate first, ``(s, d)``.
         rough: a cheap approximation of the function; the function itself if None.
     """
+    exact, inside = Evaluations(function, *box, budget, strict=False), np.clip(starts, *box)
+    if exact.dimension <= _FEW:
+        _search_few(exact, inside, rng)
+    else:
+        _search_many(exact, exact if rough is None else Evaluations(rough, *box, budget, strict=False), inside, rng)
+    return exact.best_first()
 
-    def __init__(self, function: Values, low: Array, high: Array, budget: int, rough: Values | None = None) -> None:
-        self._exact = Evaluations(function, low, high, budget, strict=False)
-        self._rough = self._exact if rough is None else Evaluations(rough, low, high, budget, strict=False)
 
-    def run(self, starts: Array, rng: np.random.Generator) -> tuple[Array, Array]:
-        """Evaluate starts first, and return all points ``(m, d)`` and their values ``(m,)``, the largest first."""
-        inside = np.clip(starts, self._exact.low, self._exact.high)
-        if self._exact.dimension <= _FEW:
-            self._search_few(inside, rng)
-        else:
-            self._search_many(inside, rng)
-        return self._exact.found()
+def _search_few(exact: Evaluations, starts: Array, rng: np.random.Generator) -> None:
+    """Sample ever closer to the best points: cheaper than slopes in few dimensions, and insensitive to kinks."""
+    d, low, high = exact.dimension, exact.low, exact.high
+    pool = _pool(d, min(_POOL * d, exact.budget // 3))
+    exact.evaluate(starts)
+    exact.evaluate_inside(pool)
+    best, gap = _best(exact, _ZOOMED), len(pool) ** (-1 / d)
+    for _ in range(2 * d - 1):
+        corners = moves_to_bounds(best[:_MOVED], low, high).reshape(-1, d)
+        count = min(_SAMPLES * d, exact.left - len(best) - len(corners))
+        if not len(best) or count < 1:
+            return
+        steps = np.resize((1.0, 0.3, 0.1), count)[:, None] * np.minimum(gap, 0.3 * (high - low))
+        near = np.resize(best, (count, d)) + steps * rng.normal(size=(count, d))
+        exact.evaluate(np.concatenate([best, np.clip(near, low, high), corners]))
+        best, gap = _best(exact, _ZOOMED), 0.5 * gap
 
-    @property
-    def _left(self) -> int:
-        used = 0 if self._rough is self._exact else self._rough.budget - self._rough.left
-        return self._exact.left - used
 
-    def _search_few(self, starts: Array, rng: np.random.Generator) -> None:
-        """Sample ever closer to the best points: cheaper than slopes in few dimensions, and insensitive to kinks."""
-        exact = self._exact
-        pool = _pool(exact.dimension, min(_POOL * exact.dimension, exact.budget // 3))
-        exact.evaluate(starts)
-        exact.evaluate_inside(pool)
-        best = _best(exact, _ZOOMED)
-        gap = len(pool) ** (-1 / exact.dimension)
-        for _ in range(2 * exact.dimension - 1):
-            corners = moves_to_bounds(best[:_MOVED], exact.low, exact.high).reshape(-1, exact.dimension)
-            count = min(_SAMPLES * exact.dimension, self._left - len(best) - len(corners))
-            if not len(best) or count < 1:
-                return
-            widths = np.minimum(gap, 0.3 * (exact.high - exact.low))
-            steps = np.resize((1.0, 0.3, 0.1), count)[:, None] * widths
-            near = np.resize(best, (count, exact.dimension)) + steps * rng.normal(size=(count, exact.dimension))
-            exact.evaluate(np.concatenate([best, np.clip(near, exact.low, exact.high), corners]))
-            best = _best(exact, _ZOOMED)
-            gap *= 0.5
+def _search_many(exact: Evaluations, rough: Evaluations, starts: Array, rng: np.random.Generator) -> None:
+    """Climb from the best samples, on the approximation first; both share the budget."""
 
-    def _search_many(self, starts: Array, rng: np.random.Generator) -> None:
-        rough, exact = self._rough, self._exact
-        rough.evaluate(np.concatenate([starts, rough.samples(max(8, rough.budget // 6), rng)]))
-        self._climb(rough, _STARTS, _ROUNDS)
-        if rough is not exact:
-            exact.evaluate(np.concatenate([starts, _best(rough, _REFINED, 0.02)]))
-        self._climb(exact, *_FINALISTS)
-        for _ in range(4):
-            if self._left < 1 or not exact.move_to_bounds(rng):
-                return
+    def left() -> int:
+        return exact.left - (0 if rough is exact else rough.budget - rough.left)
 
-    def _climb(self, done: Evaluations, starts: int, rounds: int) -> None:
-        allowed = self._left // (rounds * line_search_cost(done.dimension))
+    def climb(on: Evaluations, starts: int, rounds: int) -> None:
+        allowed = left() // (rounds * line_search_cost(on.dimension))
         if allowed:
-            done.search_lines(_best(done, min(starts, allowed)), rounds)
+            on.search_lines(_best(on, min(starts, allowed)), rounds)
+
+    rough.evaluate(np.concatenate([starts, rough.samples(max(8, rough.budget // 6), rng)]))
+    climb(rough, _STARTS, _ROUNDS)
+    if rough is not exact:
+        exact.evaluate(np.concatenate([starts, _best(rough, _REFINED, 0.02)]))
+    climb(exact, *_FINALISTS)
+    for _ in range(4):
+        if left() < 1 or not exact.move_to_bounds(rng):
+            return
 
 
 @dataclass(frozen=True)
@@ -273,7 +267,7 @@ def usual_effort(dimension: int, budget: int) -> Effort:
 
 
 def _best(done: Evaluations, count: int, share: float = 0.1) -> Array:
-    points, values = done.found()
+    points, values = done.best_first()
     finite = points[np.isfinite(values)]
     reach = share * float(np.linalg.norm(done.high - done.low))
     return finite[separated_rows(finite, reach, count)]

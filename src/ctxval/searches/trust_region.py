@@ -24,9 +24,8 @@ from ctxval._util.arrays import Array, Mask, single_threaded
 from ctxval._util.boxes import Box
 from ctxval._util.checked import NonNegativeFloat, PositiveInt
 from ctxval._util.registry import part
-from ctxval.gp.ascent import Ascent
-from ctxval.gp.subset import kept_rows
-from ctxval.gp.surrogate import fit_surrogate
+from ctxval.gp.ascent import ascend
+from ctxval.gp.surrogate import fit_surrogate, kept_rows
 from ctxval.searches.base import Note, Prediction, SequentialSearch, best_first
 from ctxval.searches.bayesian_optimisation import BayesianOptimisation
 
@@ -52,27 +51,14 @@ class _Candidate:
         return self.expected * (1 + optimism * self.doubt)
 
 
-@dataclass(frozen=True, eq=False)
-class _OptimisticValue:
-    """The optimistic value of points: the prediction d_hat, raised by kappa (``optimism``) times its doubt w."""
+def _optimistic(predicted: Callable[[Array], tuple[Array, Array]], optimism: float) -> Callable[[Array], Array]:
+    """Return the optimistic value: the prediction d_hat, raised by kappa (``optimism``) times its doubt w."""
 
-    prediction: Prediction
-    optimism: float
+    def value(points: Array) -> Array:
+        expected, doubt = predicted(points)
+        return np.asarray(expected * (1 + optimism * doubt))
 
-    @property
-    def rough(self) -> _OptimisticValue | None:
-        """The same with the rough prediction; None if there is none."""
-        rough = self.prediction.rough
-        return None if rough is None else replace(self, prediction=replace(self.prediction, expected=rough))
-
-    def __call__(self, points: Array) -> Array:
-        """Return the optimistic values ``(m,)`` of points ``(m, d)``."""
-        expected, doubt = self.prediction.expected(points)
-        return np.asarray(expected * (1 + self.optimism * doubt))
-
-    def at(self, point: Array) -> _Candidate:
-        expected, doubt = self.prediction.expected(point[None])
-        return _Candidate(point, float(expected[0]), float(doubt[0]))
+    return value
 
 
 @dataclass(frozen=True, eq=False)
@@ -233,41 +219,42 @@ class TrustRegion(SequentialSearch):
         self, prediction: Prediction, history: _History, rng: np.random.Generator
     ) -> tuple[_Candidate | None, _Region]:
         """Return the next candidate after a history, None if no point can be predicted, and its region."""
-        value = _OptimisticValue(prediction, self.optimism)
         if not self.restrict:
-            return self._best(value, _Region(), history, rng), _Region()
+            return self._best(prediction, self.optimism, _Region(), history, rng), _Region()
         region = self._state(history)
         if region.misses < self.misses and region.radius >= 0.02:
-            found = self._best(value, region, history, rng)
-            if found is not None:
+            best = self._best(prediction, self.optimism, region, history, rng)
+            if best is not None:
                 # It may exceed the region's best value and, with ten times the optimism, the largest value of all.
                 least, largest = 1 + _IMPROVEMENT, float(np.nanmax(history.values, initial=0.0))
-                patient = found.optimistic(10.0 * self.optimism)
-                if found.optimistic(self.optimism) > region.best * least and patient > largest * least:
-                    return found, region
+                patient = best.optimistic(10.0 * self.optimism)
+                if best.optimistic(self.optimism) > region.best * least and patient > largest * least:
+                    return best, region
         # The optimism grows with every region that finds nothing larger, so the search explores more.
-        bold = replace(value, optimism=self.optimism * self.boldness ** (1 + region.stale))
-        return self._best(bold, _Region(), history, rng), _Region(region.number + 1, radius=0.4)
+        bold = self.optimism * self.boldness ** (1 + region.stale)
+        return self._best(prediction, bold, _Region(), history, rng), _Region(region.number + 1, radius=0.4)
 
     def _best(
-        self, value: _OptimisticValue, region: _Region, history: _History, rng: np.random.Generator
+        self, prediction: Prediction, optimism: float, region: _Region, history: _History, rng: np.random.Generator
     ) -> _Candidate | None:
         """Return the new point of largest optimistic value in a region; None if no point there can be predicted."""
-        points, few = np.empty((0, self.dimension)), value.prediction.candidates
+        value, few, box = _optimistic(prediction.expected, optimism), prediction.candidates, region.box(self.dimension)
         if few is not None:
-            low, high = region.box(self.dimension)
-            points = few[((few >= low) & (few <= high)).all(axis=1)]
+            points = few[((few >= box[0]) & (few <= box[1])).all(axis=1)]
             promised = value(points) if len(points) else np.empty(0)
             order = np.argsort(-np.nan_to_num(promised, nan=-np.inf), kind="stable")
             points, promised = points[order], promised[order]
         else:
-            budget = min(value.prediction.budget, POINTS * self.dimension)
-            ascent = Ascent(value, *region.box(self.dimension), budget, value.rough)
-            points, promised = ascent.run(best_first(history.points, history.values)[:8], rng)
+            budget = min(prediction.budget, POINTS * self.dimension)
+            rough = None if prediction.rough is None else _optimistic(prediction.rough, optimism)
+            starts = best_first(history.points, history.values)[:8]
+            points, promised = ascend(value, box, budget, starts, rng, rough)
         points = points[self._is_new(points, history) & np.isfinite(promised)]
-        steady = value.prediction.steady or (lambda point: True)
-        best = next(filter(steady, points), points[0]) if len(points) else None
-        return None if best is None else value.at(best)
+        if not len(points):
+            return None
+        point = next(filter(prediction.steady or (lambda point: True), points), points[0])
+        expected, doubt = prediction.expected(point[None])
+        return _Candidate(point, float(expected[0]), float(doubt[0]))
 
     def _is_new(self, points: Array, history: _History) -> Mask:
         known, reach = np.isfinite(history.values), 0.05 * np.sqrt(self.dimension)
