@@ -13,7 +13,7 @@ import numpy as np
 
 from ctxval._util.arrays import Array
 from ctxval._util.columns import sentinels
-from ctxval._util.confinement import MOST_MEMORY
+from ctxval._util.cores import MOST_MEMORY
 from ctxval._util.files import temporary_folder
 from ctxval.core.labels import labels_of
 from ctxval.core.trajectory import COMPLETE, Trajectory
@@ -93,7 +93,7 @@ class RecordingFile:
                     )
 
     def read_confined(self) -> Trajectory:
-        """Return the recording as a process without rights reads it; see :mod:`ctxval._util.confinement`."""
+        """Return the recording as a process without rights reads it; see :mod:`ctxval._util.cores`."""
         seconds = 60 if self.uploaded else 3600
         with temporary_folder() as folder:
             (folder / "request").write_bytes(pickle.dumps((self, seconds)))
