@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ctxval._util.confinement import may_confine
+from ctxval._util.cores import may_confine
 from ctxval.campaign.recording_file import RecordingFile
 from ctxval.data import LogMapping
 from ctxval.errors import InputError

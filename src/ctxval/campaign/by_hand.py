@@ -10,8 +10,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from ctxval._util.columns import column_of
-from ctxval._util.csv_table import CsvTable
+from ctxval._util.columns import CsvTable, column_of
 from ctxval._util.texts import shortened, unguarded
 from ctxval._util.units import conversion
 from ctxval.campaign.choices import Execution, OpenTrial

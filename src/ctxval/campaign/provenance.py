@@ -10,7 +10,7 @@ from ctxval.campaign.history import executed_trials
 from ctxval.campaign.storage.other_stores import other_stores
 from ctxval.campaign.storage.store import Store
 from ctxval.certificates import Provenance
-from ctxval.core.preflight import start_offset
+from ctxval.core.plan import start_offset
 from ctxval.core.trial import Trial
 from ctxval.core.validation import Validation
 

@@ -11,8 +11,7 @@ from ctxval.campaign.campaign import Campaign
 from ctxval.campaign.choices import OpenTrial
 from ctxval.campaign.recording_file import RecordingFile
 from ctxval.core.experiment import Experiment
-from ctxval.core.plan import Plan
-from ctxval.core.preflight import StartOffset
+from ctxval.core.plan import Plan, StartOffset
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import Trial
 from ctxval.data import LogMapping, is_log
