@@ -18,9 +18,8 @@ from ctxval._util.describe import describe
 from ctxval._util.files import MADE_BY, temporary_folder, write_text, written_whole
 from ctxval._util.texts import guarded, shortened, visible
 from ctxval.campaign.storage import schema
-from ctxval.campaign.storage.rows import COLUMNS, checksum_of, read_json, read_trajectory, read_trial
+from ctxval.campaign.storage.rows import COLUMNS, Side, checksum_of, read_json, read_trajectory, read_trial
 from ctxval.campaign.storage.store import Store
-from ctxval.campaign.storage.trajectories import Side
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import Trial
 from ctxval.errors import CtxvalError, InputError, StoreAccessError
