@@ -172,7 +172,7 @@ def import_runs(
             except InputError as error:
                 raise InputError(f"{run.where}: {error}") from error
             advance(1)
-    ended = campaign.add_known(checked, _WAIT)
+    ended = campaign.recorder.add(checked, _WAIT)
     new = [trial for trial in ended if trial is not None]
     known = len(ended) - len(new)
     for trial in new[:10]:

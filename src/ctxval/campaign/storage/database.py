@@ -154,8 +154,8 @@ class Database:
             hint = "; `ctxval export` saves what is readable" if "malformed" in str(error) else ""
             raise ForeignStoreError(f"{self.name} cannot be read as a store: {error}{hint}.") from error
         except (OSError, ValueError, OverflowError) as error:
-            where = f"{error.filename}: " if getattr(error, "filename", None) is not None else ""
-            reason = getattr(error, "strerror", None) or error
+            file, reason = getattr(error, "filename", None), getattr(error, "strerror", None) or error
+            where = "" if file is None else f"{file}: "
             raise StoreAccessError(f"{self.name} cannot be used as a store: {where}{reason}.") from error
 
     def _damaged(self, what: str) -> ForeignStoreError:

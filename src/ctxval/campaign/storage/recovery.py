@@ -195,12 +195,7 @@ def _cell(value: Any) -> Any:
 
 
 def _flat(trial: Trial) -> dict[str, Any]:
-    parameters: dict[str, Any] = {}
+    flat: dict[str, Any] = {name: getattr(trial, name) for name in ("number", "origin", "state")}
     for name, value in trial.parameters.items():
-        parameters |= {f"{name}[{i}]": v for i, v in enumerate(value)} if isinstance(value, list) else {name: value}
-    last = ("distance", "failure", "executed", "attempts", "seconds")
-    return {
-        **{name: getattr(trial, name) for name in ("number", "origin", "state")},
-        **parameters,
-        **{name: getattr(trial, name) for name in last},
-    }
+        flat |= {f"{name}[{i}]": v for i, v in enumerate(value)} if isinstance(value, list) else {name: value}
+    return flat | {name: getattr(trial, name) for name in ("distance", "failure", "executed", "attempts", "seconds")}
