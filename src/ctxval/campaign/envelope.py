@@ -159,14 +159,14 @@ class EnvelopeSearch:
         uncovered = below & (drawn.beyond > most_beyond(evidence))
         few = evidence.executions < fewest_executions(evidence)
         if evidence.untried is not None and untried_parameter(evidence) is not None:
-            return _choice(evidence.untried.task)
+            return Choice.tested(evidence.untried.task)
         if few or (uncertain | uncovered).sum() > _SETTLED * below.sum():
             score = np.where(uncovered, drawn.beyond, -np.inf)
             if uncertain.sum() >= uncovered.sum():
                 score = straddle
             new = self._is_new(drawn.points)
             if (np.isfinite(score) & new).any():
-                return _choice(drawn.points[int(np.where(new, score, -np.inf).argmax())])
+                return Choice.tested(drawn.points[int(np.where(new, score, -np.inf).argmax())])
         return interval.test() if missing or must_outlive_a_test(drawn, evidence, self._threshold) else None
 
     def _is_new(self, points: Array) -> Mask:
@@ -174,10 +174,6 @@ class EnvelopeSearch:
         known = np.array([trial.unit_point for trial in self.interval.recorder.trials])
         near = 0.0 if self.interval.recorder.validation.space.members is not None else NEAR
         return np.asarray((np.abs(points[:, None] - known).max(axis=2) > near).all(axis=1))
-
-
-def _choice(point: Array) -> Choice:
-    return Choice(point, "covering", planned_draws=0, rejected=0)
 
 
 def has_tests(recorder: TrialRecorder, options: CertificateOptions) -> bool:

@@ -117,7 +117,7 @@ class ExecutionLoop:
                 if chosen is None:
                     return
                 if isinstance(chosen, Choice) and self.independent and most > 1:
-                    opened = self.recorder.start_together(self._choices(chosen, most))
+                    opened = self.recorder.open_all(self._choices(chosen, most), attempts=1)
                 else:
                     opened = [self.recorder.start(chosen)]
                 for each in opened:
