@@ -73,10 +73,13 @@ class KnownRun(NamedTuple):
 
     def checked(self, validation: Validation, experiment: Experiment) -> tuple[Plan, Execution]:
         """Return the plan of the task and the measured execution; nothing is stored."""
-        plan = validation.plan(validation.space.point(self.parameters))
-        recording = self.told.read(experiment, plan)
-        execution = Execution.reported(recording, self.told.distance, self.told.failed)
-        return plan, execution.measured(validation, plan, self.told.start_tolerance)
+        try:
+            plan = validation.plan(validation.space.point(self.parameters))
+            recording = self.told.read(experiment, plan)
+            execution = Execution.reported(recording, self.told.distance, self.told.failed)
+            return plan, execution.measured(validation, plan, self.told.start_tolerance)
+        except InputError as error:
+            raise InputError(f"{self.where}: {error}") from error
 
 
 def read_runs(
@@ -136,7 +139,7 @@ def _table(path: Path, space: TaskSpace, reading: Mapping[str, Any]) -> list[Kno
     return runs
 
 
-_NUMBER = re.compile(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)(.*)", re.DOTALL)
+_QUANTITY = re.compile(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)(.*)", re.DOTALL)
 
 
 def parameters_from(settings: Sequence[str], space: TaskSpace) -> dict[str, Any]:
@@ -159,37 +162,6 @@ def parameters_from(settings: Sequence[str], space: TaskSpace) -> dict[str, Any]
             if not equals or not name or name in given:
                 raise InputError(f"each task parameter must be given once, as name=value, got {text!r}.")
             given[name] = _value(name, value.strip(), space)
-    return _whole(given, space)
-
-
-def _value(name: str, text: str, space: TaskSpace) -> float | list[float]:
-    """Return the number or the list of numbers in a text, which may have the unit of the parameter."""
-    unit = space.units.get(name if name in space.units else name.partition("[")[0], "")
-    inside, given_unit, is_list = text, "", text.startswith("[")
-    if is_list:
-        inside, bracket, given_unit = text[1:].partition("]")
-        if not bracket:
-            raise InputError(f"{name} must be a list such as [1.5, 0.5], got {text!r}.")
-    numbers = [_quantity(name, f"{number} {given_unit}", unit) for number in inside.split(",")]
-    return numbers if is_list or len(numbers) > 1 else numbers[0]
-
-
-def _quantity(name: str, text: str, unit: str) -> float:
-    matched = _NUMBER.fullmatch(text)
-    if matched is None:
-        try:
-            return float(text)  # NaN and infinity are refused elsewhere
-        except ValueError:
-            raise InputError(f"--set: {name} must be a number, got {text.strip()!r}.") from None
-    given = matched[2].strip().removeprefix("[").removesuffix("]").strip()
-    if given and given != unit:
-        declared = f"in {unit}" if unit else "a number without a unit"
-        raise InputError(f"--set: {name} must be {declared}, got {text.strip()!r}.")
-    return float(matched[1])
-
-
-def _whole(given: Mapping[str, Any], space: TaskSpace) -> dict[str, Any]:
-    """Return values by parameter, with the single components of a vector put together."""
     whole = {name: value for name, value in given.items() if name in space.units or name not in space.names}
     for name in {name.partition("[")[0]: None for name in given if name not in whole}:
         columns = space.columns(name)
@@ -201,3 +173,26 @@ def _whole(given: Mapping[str, Any], space: TaskSpace) -> dict[str, Any]:
             raise InputError(f"--set: {name} must be given completely: {', '.join(missing)} is missing.")
         whole[name] = [given[component] for component in components]
     return whole
+
+
+def _value(name: str, text: str, space: TaskSpace) -> float | list[float]:
+    """Return the number or the list of numbers in a text, which may have the unit of the parameter."""
+    unit = space.units.get(name if name in space.units else name.partition("[")[0], "")
+    inside, given_unit, is_list = text, "", text.startswith("[")
+    if is_list:
+        inside, bracket, given_unit = text[1:].partition("]")
+        if not bracket:
+            raise InputError(f"{name} must be a list such as [1.5, 0.5], got {text!r}.")
+    numbers = []
+    for number in inside.split(","):
+        quantity = f"{number} {given_unit}"
+        matched = _QUANTITY.fullmatch(quantity)
+        try:
+            numbers.append(float(quantity if matched is None else matched[1]))  # NaN and infinity are refused elsewhere
+        except ValueError:
+            raise InputError(f"--set: {name} must be a number, got {quantity.strip()!r}.") from None
+        given = "" if matched is None else matched[2].strip().removeprefix("[").removesuffix("]").strip()
+        if given and given != unit:
+            declared = f"in {unit}" if unit else "a number without a unit"
+            raise InputError(f"--set: {name} must be {declared}, got {quantity.strip()!r}.")
+    return numbers if is_list or len(numbers) > 1 else numbers[0]

@@ -23,7 +23,7 @@ from ctxval.campaign.history import executed_trials
 from ctxval.campaign.identity import description_of, identify, search_of
 from ctxval.campaign.interval_search import IntervalSearch, with_next_task
 from ctxval.campaign.plot import overview
-from ctxval.campaign.provenance import provenance_of_store
+from ctxval.campaign.storage.other_stores import provenance_of_store
 from ctxval.campaign.storage.store import Store
 from ctxval.campaign.trials import TrialRecorder
 from ctxval.campaign.watching import FALSE_ALARMS, Watch

@@ -42,9 +42,9 @@ class Choice:
     parameters: Mapping[str, Any] | None = None
 
     @classmethod
-    def tested(cls, unit_point: Array, origin: Origin = "covering", rejected: int = 0) -> Choice:
+    def tested(cls, unit_point: Array, origin: Origin = "covering") -> Choice:
         """Return the choice of a task that needs no test whether it is steady, for a number that results decide."""
-        return cls(unit_point, origin, planned_draws=0, rejected=rejected)
+        return cls(unit_point, origin, planned_draws=0, rejected=0)
 
 
 @dataclass(frozen=True, eq=False)

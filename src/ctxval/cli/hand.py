@@ -167,10 +167,7 @@ def import_runs(
     checked = list[tuple[Plan, Execution]]()
     with stage("checking", len(runs), "runs"):
         for run in runs:  # all of them before any is stored
-            try:
-                checked.append(run.checked(campaign.validation, experiment))
-            except InputError as error:
-                raise InputError(f"{run.where}: {error}") from error
+            checked.append(run.checked(campaign.validation, experiment))
             advance(1)
     ended = campaign.recorder.add(checked, _WAIT)
     new = [trial for trial in ended if trial is not None]
