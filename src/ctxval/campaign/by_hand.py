@@ -1,4 +1,4 @@
-"""Trials that people execute: the files of the task and controller, and the recordings of the results."""
+"""Trials that people execute: the files of the task and controller, and the results that they report."""
 
 from __future__ import annotations
 
@@ -14,15 +14,17 @@ from ctxval._util.columns import column_of
 from ctxval._util.csv_table import CsvTable
 from ctxval._util.texts import shortened, unguarded
 from ctxval._util.units import conversion
+from ctxval.campaign.campaign import Campaign
 from ctxval.campaign.choices import Execution, OpenTrial
-from ctxval.campaign.recording_file import require_file
-from ctxval.campaign.telling import ToldResult
+from ctxval.campaign.telling import ToldResult, require_file
 from ctxval.core.controller import AffineFeedback
 from ctxval.core.exchange import write_controller, write_task
 from ctxval.core.experiment import Experiment
 from ctxval.core.plan import Plan
+from ctxval.core.preflight import StartOffset
 from ctxval.core.space import TaskSpace
 from ctxval.core.task_suite import TASK
+from ctxval.core.trial import Trial
 from ctxval.core.validation import Validation
 from ctxval.errors import InputError
 
@@ -196,3 +198,37 @@ def _value(name: str, text: str, space: TaskSpace) -> float | list[float]:
             declared = f"in {unit}" if unit else "a number without a unit"
             raise InputError(f"--set: {name} must be {declared}, got {quantity.strip()!r}.")
     return numbers if is_list or len(numbers) > 1 else numbers[0]
+
+
+def tell_result(campaign: Campaign, experiment: Experiment, trial: OpenTrial | int, told: ToldResult) -> Trial:
+    """Check and store the result of an open trial."""
+    recording = None
+    if told.recording is not None:
+        trial = trial if isinstance(trial, OpenTrial) else campaign.reopen(trial, ended=told.replace is not None)
+        recording = told.read(experiment, trial.plan)
+    return campaign.tell(
+        trial,
+        recording,
+        distance=told.distance,
+        failed=told.failed,
+        start_tolerance=told.start_tolerance,
+        replace=told.replace,
+    )
+
+
+def result_sentence(trial: Trial, units: str = "", start: StartOffset | None = None) -> str:
+    """Return the result of a trial that has ended, in one sentence without its full stop."""
+    if trial.state == "unmeasured":
+        return f"trial {trial.number} is stored without a distance: {trial.failure}"
+    if trial.distance is None:
+        return f"trial {trial.number} failed: {trial.failure}"
+    sentence = f"trial {trial.number} has the distance {trial.distance:.4g} {units}".rstrip()
+    return sentence if start is None or not start.size else f"{sentence}; its start was off by {start.text}"
+
+
+def parameters_of_trial(campaign: Campaign, number: int) -> Mapping[str, Any]:
+    """Return the parameters of the task of a trial."""
+    known = {trial.number: trial.parameters for trial in campaign.trials}
+    if number not in known:
+        raise InputError(f"there is no trial {number}; there are {len(known)}, numbered from 0.")
+    return known[number]

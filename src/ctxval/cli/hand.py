@@ -11,11 +11,19 @@ from typing import Any
 from ctxval._util.checked import NonNegativeFloat, require
 from ctxval._util.progress import advance, stage
 from ctxval._util.texts import enumerated
-from ctxval.campaign.by_hand import TRIAL_FILES, parameters_from, read_runs, write_files
+from ctxval.campaign.by_hand import (
+    TRIAL_FILES,
+    parameters_from,
+    parameters_of_trial,
+    read_runs,
+    result_sentence,
+    tell_result,
+    write_files,
+)
 from ctxval.campaign.choices import Execution
 from ctxval.campaign.storage.other_stores import STORE_SUFFIXES
 from ctxval.campaign.storage.store import Store
-from ctxval.campaign.telling import ToldResult, parameters_of_trial, result_sentence, tell_result
+from ctxval.campaign.telling import ToldResult
 from ctxval.cli.base import command, out, print_verdict, status_of
 from ctxval.cli.config.settings import Settings
 from ctxval.cli.config.stored_settings import Opened, budget_of, limit_of, open_store, open_target, trusted_settings
