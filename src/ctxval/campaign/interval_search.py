@@ -173,10 +173,7 @@ class IntervalSearch:
     # The choices, in the order in which they are tried
 
     def _against_noise(self) -> Choice | None:
-        """Return a task whose execution tells whether noise explains a distance above the limit.
-
-        It is None if the system is not noisy, if the limit is falsified, or if no task is predicted to exceed it.
-        """
+        """Return a task whose execution tells whether noise explains a distance above the limit, if there is one."""
         trials, quantile = self.recorder.trials, quantile_of(self.options.kind)
         bets = bets_against(trials, self.limit, quantile)
         if self._suite is not None or not self.predicts or (bets is not None and bets.falsify(self.options.confidence)):
@@ -274,10 +271,7 @@ class IntervalSearch:
     # What is known
 
     def _evidence(self) -> DynamicsEvidence | None:
-        """Return what the store keeps, or else what a few draws of the learned dynamics say.
-
-        It is None if the certificate does not use them.
-        """
+        """Return what the store keeps, or what a few posterior samples say; None if the certificate uses neither."""
         trials, dynamics = self.recorder.trials, self.recorder.dynamics
         if not self.predicts or any(trial.state == "failed" for trial in trials):
             return None
@@ -308,12 +302,10 @@ class IntervalSearch:
 
     @property
     def _near(self) -> float:
-        """The largest change of each coordinate to a task that is no new one.
-
-        A distance with kinks may be large in a few tasks only, which are next to others where it is 0.
-        """
+        """The largest change of each coordinate to a task that is no new one."""
         if self._suite is not None:
             return SAME
+        # A distance with kinks may be large in a few tasks only, which are next to others where it is 0.
         return 0.1 * NEAR if is_kinked(self.recorder.validation.distance) else NEAR
 
 
