@@ -11,7 +11,7 @@ from ctxval import report as reports
 from ctxval._util.checked import PositiveFloat, require
 from ctxval._util.files import write_text
 from ctxval._util.progress import stage
-from ctxval.campaign.provenance import provenance_of_store
+from ctxval.campaign.storage.other_stores import provenance_of_store
 from ctxval.campaign.storage.store import Store
 from ctxval.certificates import KINDS, CertificateOptions, assess
 from ctxval.cli.base import command, out, print_other_stores, print_verdict, status_of

@@ -11,11 +11,19 @@ from typing import Any
 from ctxval._util.checked import NonNegativeFloat, require
 from ctxval._util.progress import advance, stage
 from ctxval._util.texts import enumerated
-from ctxval.campaign.by_hand import TRIAL_FILES, parameters_from, read_runs, write_files
+from ctxval.campaign.by_hand import (
+    TRIAL_FILES,
+    parameters_from,
+    parameters_of_trial,
+    read_runs,
+    result_sentence,
+    tell_result,
+    write_files,
+)
 from ctxval.campaign.choices import Execution
 from ctxval.campaign.storage.other_stores import STORE_SUFFIXES
 from ctxval.campaign.storage.store import Store
-from ctxval.campaign.telling import ToldResult, parameters_of_trial, result_sentence, tell_result
+from ctxval.campaign.telling import ToldResult
 from ctxval.cli.base import command, out, print_verdict, status_of
 from ctxval.cli.config.settings import Settings
 from ctxval.cli.config.stored_settings import Opened, budget_of, limit_of, open_store, open_target, trusted_settings
@@ -167,12 +175,9 @@ def import_runs(
     checked = list[tuple[Plan, Execution]]()
     with stage("checking", len(runs), "runs"):
         for run in runs:  # all of them before any is stored
-            try:
-                checked.append(run.checked(campaign.validation, experiment))
-            except InputError as error:
-                raise InputError(f"{run.where}: {error}") from error
+            checked.append(run.checked(campaign.validation, experiment))
             advance(1)
-    ended = campaign.add_known(checked, _WAIT)
+    ended = campaign.recorder.add(checked, _WAIT)
     new = [trial for trial in ended if trial is not None]
     known = len(ended) - len(new)
     for trial in new[:10]:

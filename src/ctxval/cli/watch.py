@@ -114,8 +114,6 @@ def _runs(
         for run in read_runs([path], given, space, mapping=mapping, **how):
             try:
                 _, execution = run.checked(validation, experiment)
-            except InputError as error:
-                raise InputError(f"{run.where}: {error}") from error
             except ExecutionError as error:
                 execution = Execution(failed=str(error))
             yield _Run(run.where, execution, run.parameters)

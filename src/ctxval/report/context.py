@@ -16,7 +16,7 @@ from ctxval.campaign.campaign import Campaign
 from ctxval.campaign.dynamics import NEAR, CampaignDynamics
 from ctxval.campaign.envelope import has_tests
 from ctxval.campaign.interval_search import with_next_task
-from ctxval.campaign.provenance import provenance_of_store
+from ctxval.campaign.storage.other_stores import provenance_of_store
 from ctxval.campaign.storage.store import CAUSE, Store
 from ctxval.certificates import Certificate, CertificateOptions, Provenance, Verdict, judge
 from ctxval.certificates.envelope import Envelope
