@@ -282,6 +282,13 @@ class DynamicsPosterior(ShortRepr):
         return found
 
     @property
+    def deviations(self) -> Array:
+        """The most probable standard deviations of the noise of each state in a step, shape ``(n,)``."""
+        data, deviations = self.data, np.zeros(len(self.data.sizes))
+        deviations[data.learned] = self.most_probable.noise * data.sizes[data.learned]
+        return deviations
+
+    @property
     def noise(self) -> float:
         """The learned variance of noise, as a share of the mean square of a state's residual.
 
