@@ -16,8 +16,9 @@ from ctxval.core.system import System, WithOutputs
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.validation import Validation
 from ctxval.errors import CtxvalError, InputError
+from ctxval.learning.extended import with_states_of_model
 from ctxval.learning.recorded import closed_loops_on_model
-from ctxval.learning.state_estimates import StateEstimates, with_states_of_model
+from ctxval.learning.state_estimates import StateEstimates
 from ctxval.studies.causes.candidates import Candidate, candidates
 from ctxval.studies.causes.cause import Repaired
 from ctxval.studies.causes.evidence import STEPS, Explanation, Records, explained, screened

@@ -20,8 +20,9 @@ from ctxval.core.trajectory import Trajectory, Transitions
 from ctxval.core.trial import Trial
 from ctxval.core.validation import Validation
 from ctxval.errors import CtxvalError, InputError
+from ctxval.learning.extended import with_states_of_model
 from ctxval.learning.recorded import closed_loops_on_model
-from ctxval.learning.state_estimates import StateEstimates, with_states_of_model
+from ctxval.learning.state_estimates import StateEstimates
 from ctxval.models import Refined, read_refined, write_model
 from ctxval.models.corrected import before_refinement
 from ctxval.models.saved import is_savable, read_note
