@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from ctxval.data import LogMapping, read_recordings
-from ctxval.data.json_records import read_json_records
+from ctxval.data.readers import read_json_records
 from ctxval.data.log import Clock
 from ctxval.errors import InputError
 

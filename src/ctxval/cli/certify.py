@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -117,9 +117,8 @@ def write_report(
         settings = planned_settings(opened, asked.kind)
         labels = Labels(labels_of(settings.states), labels_of(settings.inputs), settings.units or "")
         limit = settings.threshold if asked.threshold is None else asked.threshold
-        certificate = asked.options(settings, asked.kind)
-        context = reports.context_of_store(opened, limit, certificate=certificate, missing=str(error), labels=labels)
-        context = replace(context, budget=settings.budget)
+        known: dict[str, Any] = {"missing": str(error), "labels": labels, "budget": settings.budget}
+        context = reports.context_of_store(opened, limit, certificate=asked.options(settings, asked.kind), **known)
     else:
         settings, experiment = loaded.settings, loaded.experiment
         context = reports.context_of_campaign(
