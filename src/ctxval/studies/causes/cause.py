@@ -6,6 +6,7 @@ for those that are commanded, the next state, or what is recorded of a state.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
@@ -98,11 +99,13 @@ class Repaired(ShortRepr):
 
     batched: ClassVar[bool] = True
 
-    def __post_init__(self) -> None:
+    @functools.cached_property
+    def mechanics(self) -> Model:
+        """M with what causes change in it."""
         model = self.given
         for cause in self.causes:
             model = cause.model(model)
-        object.__setattr__(self, "mechanics", model)
+        return model
 
     @property
     def complete(self) -> bool:
@@ -117,11 +120,10 @@ class Repaired(ShortRepr):
 
     def reached(self, x: Array, acting: Array) -> Array:
         """Return the next states ``(..., n)`` for the inputs that act."""
-        model: Model = vars(self)["mechanics"]
         with np.errstate(all="ignore"):
-            reached = free = np.asarray(model.step(x, acting))
+            reached = free = np.asarray(self.mechanics.step(x, acting))
             for cause in self.causes:
-                reached = cause.pushed(model, x, acting, free, reached)
+                reached = cause.pushed(self.mechanics, x, acting, free, reached)
         return reached
 
     def true(self, recorded: Array) -> Array:
@@ -140,10 +142,9 @@ class Repaired(ShortRepr):
         """Return the inputs that act in each step, for commanded ones ``(..., H, m)``."""
         for cause in self.causes:
             if cause.remembers:
-                memory, followed = None, np.empty_like(inputs)
+                memory, commanded, inputs = None, inputs, np.empty_like(inputs)
                 for t in range(inputs.shape[-2]):
-                    followed[..., t, :], memory = cause.follow(inputs[..., t, :], memory)
-                inputs = followed
+                    inputs[..., t, :], memory = cause.follow(commanded[..., t, :], memory)
             else:
                 inputs, _ = cause.follow(inputs, None)
         return inputs

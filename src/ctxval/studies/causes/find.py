@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
-from ctxval._util.arrays import Array, single_threaded
+from ctxval._util.arrays import single_threaded
 from ctxval._util.progress import advance, stage
 from ctxval.campaign.campaign import Campaign
 from ctxval.campaign.history import executed_trials
@@ -36,14 +36,12 @@ _SHORT, _LONG = 60, 12  # predictions of estimated states take these parts of an
 _SOME = (200, 40)  # predictions of one step, and of several, that all causes are screened on
 _REFINED = 8  # causes that are fitted to all of them
 _CHECKED = 4  # explanations that are tried in closed loop
-_TASKS = 24  # at which the predictions of two causes are compared
 
 
 @dataclass(frozen=True, eq=False)
 class _Execution:
     """An executed task: its plan, what the system did, and the same with states of M if only outputs are recorded."""
 
-    point: Array
     plan: Plan
     executed: Trajectory
     states: Trajectory
@@ -67,25 +65,19 @@ def find_causes(campaign: Campaign, *, most: int = 2) -> CauseReport:
     trials.sort(key=lambda pair: -(pair[0].distance or 0.0))
     if len(trials) < 2:
         raise InputError(f"causes need at least 2 executions with trajectories in the store, got {len(trials)}.")
+    executed = [(trial.unit_point, run) for trial, run in trials[:_MOST]]
     with single_threaded():
-        executions = _executions(validation, [(trial.unit_point, run) for trial, run in trials[:_MOST]])
+        states = [run for _, run in executed]
+        if validation.outputs is not None:
+            loops = closed_loops_on_model(with_states_of_model(validation))
+            estimates = None if loops is None else StateEstimates(validation, validation.outputs, loops.states)
+            estimated = None if estimates is None else estimates.of(executed, len(executed))
+            if estimated is None:
+                raise InputError("the states of the model cannot be estimated from the recorded outputs.")
+            states = estimated
+        plans = [validation.plan(validation.space.from_unit(point)) for point, _ in executed]
+        executions = list(map(_Execution, plans, (run for _, run in executed), states))
         return _Study(validation, executions).report(most)
-
-
-def _executions(validation: Validation, executed: Sequence[tuple[Array, Trajectory]]) -> list[_Execution]:
-    states = [run for _, run in executed]
-    if validation.outputs is not None:
-        loops = closed_loops_on_model(with_states_of_model(validation))
-        estimates = None if loops is None else StateEstimates(validation, validation.outputs, loops.states)
-        estimated = None if estimates is None else estimates.of(executed, len(executed))
-        if estimated is None:
-            raise InputError("the states of the model cannot be estimated from the recorded outputs.")
-        states = estimated
-    space = validation.space
-    return [
-        _Execution(point, validation.plan(space.from_unit(point)), run, of_model)
-        for (point, run), of_model in zip(executed, states, strict=True)
-    ]
 
 
 class _Study:
@@ -177,17 +169,16 @@ class _Study:
         others = [each for each in ranked if each is not best.explanation and _alike(best.explanation, each)]
         group = [best, *(self._in_closed_loop(each) for each in others[:_CHECKED])]
         group = [each for each in group if 1 - each.share <= 2 * (1 - best.share) + 1e-3]
-        first = min(group, key=lambda each: each.explanation.count)
+        first = min(group, key=lambda each: len(each.explanation.sizes))
         return first, [each for each in group if each is not first and not _contains(each, first)]
 
     def _in_closed_loop(self, explanation: Explanation) -> Explained:
         """Return how well causes predict each execution if they are fitted to the others."""
         deviations, distances, sizes = [], [], []
         for execution, others in zip(self.executions, self.others, strict=True):
-            begun = [size for cause in explanation.repaired.causes for size in cause.sizes]
-            fitted = explained(others, explanation.candidates, begun).repaired
-            sizes.append([size for cause in fitted.causes for size in cause.sizes])
-            loop = self.loop(fitted, execution.plan, execution)
+            fitted = explained(others, explanation.candidates, explanation.sizes)
+            sizes.append(fitted.sizes)
+            loop = self._loop(fitted.repaired, execution.plan, execution)
             deviations.append(self._deviation(execution, loop))
             distances.append(self._distance(execution, loop))
         share = 1 - float(np.sum(deviations) / max(np.sum(self.without), 1e-300))
@@ -196,7 +187,7 @@ class _Study:
         spreads = tuple(map(float, np.ptp(sizes, axis=0)))
         return Explained(explanation, share, float(np.max(distances)), spreads, min(structure, 1.0), min(noise, 1.0))
 
-    def loop(self, repaired: Repaired, plan: Plan, execution: _Execution | None = None) -> Trajectory | None:
+    def _loop(self, repaired: Repaired, plan: Plan, execution: _Execution | None = None) -> Trajectory | None:
         """Return the closed loop of a plan on a model with causes; None if it fails."""
         system: System = repaired
         task = plan.task
@@ -234,25 +225,25 @@ class _Study:
 
     def _separating(self, group: Sequence[Explained]) -> Separating | None:
         """Return the task at which the predictions of causes that the executions do not tell apart differ most."""
-        first, space, best = group[0], self.validation.space, None
-        points = space.from_unit(np.random.default_rng(0).random((_TASKS, space.dimension)))
-        for point in points:
+        first, space = group[0], self.validation.space
+        best: Separating | None = None
+        for point in space.from_unit(np.random.default_rng(0).random((24, space.dimension))):
             try:
                 plan = self.validation.plan(point)
             except CtxvalError:
                 continue
-            promised = self.loop(first.explanation.repaired, plan)
+            promised = self._loop(first.explanation.repaired, plan)
             if promised is None:
                 continue
             for number, other in enumerate(group[1:], start=1):
-                loop = self.loop(other.explanation.repaired, plan)
+                loop = self._loop(other.explanation.repaired, plan)
                 if loop is None:
                     continue
                 gap = float(np.max(np.abs(loop.states - promised.states) / self.ranges))
-                apart = float(self.validation.distance(promised.copy(), loop.copy(), plan.task))
-                if best is None or gap > best[0]:
-                    best = gap, Separating(space.describe_point(point), apart, number)
-        return None if best is None else replace(best[1], gap=best[0])
+                if best is None or gap > best.gap:
+                    apart = float(self.validation.distance(promised.copy(), loop.copy(), plan.task))
+                    best = Separating(space.describe_point(point), apart, number, gap)
+        return best
 
 
 def _alike(best: Explanation, other: Explanation) -> bool:
@@ -265,5 +256,5 @@ def _contains(general: Explained, special: Explained) -> bool:
     """Return whether an explanation has another one as a special case, as Stribeck friction has Coulomb friction."""
     ends = general.causes[-1], special.causes[-1]
     forces = [cause for cause in ends if isinstance(cause, Force)]
-    more = general.explanation.count > special.explanation.count
+    more = len(general.explanation.sizes) > len(special.explanation.sizes)
     return more and len(forces) == 2 and forces[0].joint.rate == forces[1].joint.rate

@@ -15,9 +15,6 @@ from ctxval.studies.causes.cause import Cause, Repaired
 from ctxval.studies.causes.evidence import Explanation
 from ctxval.studies.causes.plant import Plant
 
-_NOISY = 0.5  # share of noise in what is left of residuals, from which on closed loops follow noise rather than causes
-_PART = 0.5  # share of the deviations from which on a cause is called a part of the error
-
 
 @dataclass(frozen=True, eq=False)
 class Explained(ShortRepr):
@@ -48,12 +45,8 @@ class Explained(ShortRepr):
     @property
     def complete(self) -> float:
         """The share that the causes explain: of deviations, or of residuals if most of what is left is noise."""
-        return max(self.share, self.structure) if self.is_noisy else self.share
-
-    @property
-    def is_noisy(self) -> bool:
-        """Whether most of what is left of the residuals is noise."""
-        return self.noise > _NOISY
+        # Closed loops then follow noise rather than causes.
+        return max(self.share, self.structure) if self.noise > 0.5 else self.share
 
 
 @dataclass(frozen=True)
@@ -129,14 +122,11 @@ class CauseReport(ShortRepr):
         )
         share = f"{np.floor(1e3 * first.share) / 10:.4g} % of the squared deviations"
         if not self.named:
-            less = "The largest part of the error that one explains" if first.share > _PART else "What comes nearest"
+            less = "The largest part of the error that one explains" if first.share > 0.5 else "What comes nearest"
             return f"None of these {self.tried} causes. {less}: {self._text(first)}. It explains {share}, and {effect}."
-        texts = [self._text(each) for each in self.explained]
-        what = (
-            texts[0]
-            if len(texts) == 1
-            else f"One of these, which the executions do not tell apart: {'; or '.join(texts)}"
-        )
+        what = "; or ".join(map(self._text, self.explained))
+        if len(self.explained) > 1:
+            what = f"One of these, which the executions do not tell apart: {what}"
         together = "both" if len(first.causes) == 2 else "this"
         return f"{what[0].upper()}{what[1:]}. With {together} in M, {effect}. This explains {share}."
 

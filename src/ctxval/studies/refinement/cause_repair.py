@@ -49,14 +49,13 @@ class CauseRepair(ShortRepr, Method):
         """Return the model with its causes."""
         if self.campaign.validation.outputs is not None:
             raise InputError("the method 'causes' needs recorded states of M, and only outputs are recorded.")
-        best = self.report.explained[0]
-        begun = [size for cause in best.causes for size in cause.sizes]
+        best = self.report.explained[0].explanation
 
         def repaired(some: Records) -> Repaired:
             if not some.executed:
                 raise InputError("the method 'causes' needs executions with trajectories.")
             with single_threaded():
-                return explained(Executions(model, some.executed), best.explanation.candidates, begun).repaired
+                return explained(Executions(model, some.executed), best.candidates, best.sizes).repaired
 
         learned = repaired(records)
         note = " and ".join(cause.text(self.report.plant) for cause in learned.causes)
