@@ -23,6 +23,7 @@ from ctxval.core.outputs import Outputs
 from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.validation import Validation
+from ctxval.learning.recorded import closed_loops_on_model
 from ctxval.learning.vector import Executed
 from ctxval.models.corrected import before_refinement
 from ctxval.models.scaling import standard_deviations
@@ -99,6 +100,14 @@ class StateEstimates:
         steps = standard_deviations(changes[np.isfinite(changes).all(axis=1)])
         self.steps = np.maximum(steps, 1e-9 * max(float(steps.max(initial=0.0)), 1e-300))
         self._known: WeakKeyDictionary[Trajectory, tuple[Array, Array]] = WeakKeyDictionary()
+
+    @classmethod
+    def by_loops_on_model(cls, validation: Validation) -> StateEstimates | None:
+        """Return the estimates for a validation; None if no task can be planned, or if it has no outputs."""
+        if validation.outputs is None:
+            return None
+        loops = closed_loops_on_model(with_states_of_model(validation))
+        return None if loops is None else cls(validation, validation.outputs, loops.states)
 
     def of(self, executed: Executed, judged: int) -> list[Trajectory] | None:
         """Return the executions, points of the unit cube with recorded outputs, with states ``(H + 1, n)``.

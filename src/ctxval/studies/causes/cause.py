@@ -30,7 +30,6 @@ class Cause(ShortRepr):
     A subclass changes one of the hooks below. All of them take batches.
 
     Attributes:
-        sizes: the parameters of the cause.
         name: what it is in two or three words.
         remembers: whether the inputs that act depend on earlier ones, so that it cannot be a part of a step.
     """
@@ -89,9 +88,7 @@ class Repaired(ShortRepr):
     It is a model and a system. As a system, it has all causes. A step of the model is a function of state and input, so
     it lacks causes that remember inputs, such as a delay; ``complete`` is False then.
 
-    Attributes:
-        given: M.
-        causes: those of the inputs act in this order, after the controller.
+    Causes of the inputs act in the given order, after the controller.
     """
 
     given: Model

@@ -23,12 +23,9 @@ _LARGEST = 1e3  # of a residual, as a multiple of the typical one of M
 
 @dataclass(frozen=True, eq=False)
 class Windows(ShortRepr):
-    """Predictions over some steps: where they begin, and residuals that are too small to be evidence.
+    """Predictions over some steps: where they begin, and residuals ``(n,)`` that are too small to be evidence.
 
-    Attributes:
-        steps: after so many steps, predictions are compared with what is recorded.
-        states, inputs: rows of the first state and, in all padded runs, of the first input, shape ``(N,)``.
-        floors: shape ``(n,)``.
+    ``states`` and ``inputs`` are rows of the first state and, in all padded runs, of the first input, shape ``(N,)``.
     """
 
     steps: int
@@ -43,8 +40,7 @@ class Records:
     Attributes:
         states: of all k runs, one after the other, ``(N + k, n)``.
         inputs: of all runs, with zeros after the end of shorter ones, ``(k, H, m)``.
-        windows: predictions of one step, and of several.
-        sizes: of the residuals of M in these, shape ``(n,)`` each.
+        windows, sizes: predictions of one step and of several, and the sizes ``(n,)`` of the residuals of M in these.
     """
 
     def __init__(

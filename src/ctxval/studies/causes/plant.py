@@ -41,7 +41,6 @@ class Plant(ShortRepr):
     """What sentences, sizes and forces need to know of a model.
 
     Attributes:
-        dt: seconds.
         states, inputs: names with units.
         joints: one for each rate of a position; if no state is a position, one for each state.
         ports: where forces on joints may enter; a joint may have several.

@@ -18,12 +18,10 @@ from ctxval.studies.causes.plant import Plant
 
 @dataclass(frozen=True, eq=False)
 class Explained(ShortRepr):
-    """Causes that were tried in closed loop.
+    """Causes that were tried in closed loop, each execution predicted without itself.
 
     Attributes:
-        explanation: the causes with their sizes.
-        share: the share of the squared closed-loop deviations of M that the causes explain, each execution predicted
-            without itself.
+        share: the share of the squared closed-loop deviations of M that the causes explain.
         distance: the largest distance between an execution and its prediction.
         spreads: the range of each size if one execution is left out.
         structure: the share of what is no noise in the residuals of one step that the causes explain.
@@ -54,10 +52,9 @@ class Separating(ShortRepr):
     """The task that tells two causes apart.
 
     Attributes:
-        task: its parameters.
-        distance: the distance between what the two causes predict of it.
+        distance, gap: between what the two causes predict of it: the distance, and the largest difference of a state in
+            shares of its range.
         other: the number of the second cause among those that were explained; the first one is 0.
-        gap: the largest difference of a state, in shares of its range.
     """
 
     task: Mapping[str, Any]
@@ -71,15 +68,12 @@ class CauseReport(ShortRepr):
     """Why a model fails.
 
     Attributes:
-        plant: the parts of the model that causes act on.
         explained: the most probable causes, and others that the executions do not tell from them; empty if no cause
             predicts held-out executions better than M.
         named: whether the first of these is the cause. Otherwise the answer is none of these, and ``explained`` is what
             comes nearest.
         tried: the number of causes in the dictionary.
-        executions: the number of executions that were learned from.
-        before: the largest distance of these executions from M.
-        units: of the distance.
+        executions, before: the number of executions that were learned from, and their largest distance from M.
         separating: the task that tells causes apart which these executions do not.
         ranked: the most probable causes alone, the best one first.
     """

@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -24,7 +25,6 @@ from ctxval.studies.refinement.held_out import HeldOut, Records, held_out
 from ctxval.studies.replay.accuracy import stepped
 
 _CENTRES = 300  # largest number of transitions that a correction is conditioned on
-_MUCH = 0.1  # share of the error that a correction leaves on held-out executions, from which on another one is tried
 
 RefitKind = Literal["linear", "network", "gaussian-process"]
 NAMES = ("residual", "causes", *get_args(RefitKind), "parameters", "fit")
@@ -80,26 +80,21 @@ class ResidualCorrection(ShortRepr, Method):
     def learn(self, model: Model, records: Records) -> Learned:
         """Return the corrected model."""
 
-        def left_by(correction: Callable[[Records], Correction | None]) -> HeldOut:
+        def left_by(correction: Callable[[Model, Records], Correction | None]) -> HeldOut:
             def corrected(some: Records) -> Model:
-                learned = correction(some)
+                learned = correction(model, some)
                 return model if learned is None else Corrected(model, learned)
 
             return held_out(corrected, model, records)
 
-        def exact(some: Records) -> Correction | None:
-            return exact_correction(model, some, self.centres)
-
-        def averaged(some: Records) -> Correction | None:
-            return averaged_correction(model, some)
-
-        correction, errors = exact, left_by(exact)
-        if errors.left > _MUCH:
-            other = left_by(averaged)
-            if other.left < errors.left:
-                correction, errors = averaged, other
+        correction: Callable[[Model, Records], Correction | None] = partial(exact_correction, centres=self.centres)
+        errors = left_by(correction)
+        if errors.left > 0.1:  # much of the error
+            averaged = left_by(averaged_correction)
+            if averaged.left < errors.left:
+                correction, errors = averaged_correction, averaged
         better = errors.better
-        whole = correction(records)
+        whole = correction(model, records)
         if whole is None or not better.any():
             raise InputError(
                 "no state can be corrected: on executions that were held out, the residual of the model is not "
@@ -217,10 +212,11 @@ def method_of(method: str | Method | Callable[[Transitions], Any], *, seed: int 
         return ResidualCorrection()
     if method in get_args(RefitKind):
         return Refit(method, seed)  # type: ignore[arg-type]
-    if method == "parameters":
-        raise InputError("the method 'parameters' needs bounds: give refinement.ParameterFit({'mass': (0.5, 2.0)}).")
-    if method == "causes":
-        raise InputError("the method 'causes' needs the campaign: give refinement.CauseRepair(campaign).")
-    if method == "fit":
-        raise InputError("the method 'fit' needs a function: give the function fit(data) -> model itself.")
+    needs = {
+        "parameters": "bounds: give refinement.ParameterFit({'mass': (0.5, 2.0)})",
+        "causes": "the campaign: give refinement.CauseRepair(campaign)",
+        "fit": "a function: give the function fit(data) -> model itself",
+    }
+    if method in needs:
+        raise InputError(f"the method {method!r} needs {needs[method]}.")
     raise UnknownNameError.among("method of refinement", method, NAMES)
