@@ -187,7 +187,6 @@ def survey(
 
 
 def _summary(logs: Sequence[Log], path: str, clock: Clock) -> FieldSummary:
-    """Return what a field of some logs holds."""
     try:
         signals = [log.signals([path], clock)[path] for log in logs]
     except InputError as error:

@@ -34,12 +34,10 @@ class Candidate(ShortRepr):
 
 
 def _of_size(cause: Cause, low: float, high: float, scale: float, *starts: float) -> Candidate:
-    """Return a candidate with a single size."""
     return Candidate(cause, (low,), (high,), (scale,), tuple((start,) for start in starts))
 
 
 def _ratio(cause: Cause) -> Candidate:
-    """Return a candidate whose size is a factor of what M has."""
     return _of_size(cause, 0.1, 10.0, 0.1, 0.95, 1.1)
 
 

@@ -79,8 +79,6 @@ def find_causes(campaign: Campaign, *, most: int = 2) -> CauseReport:
 
 
 class _Study:
-    """The search for the causes of a model's error in some executions."""
-
     def __init__(self, validation: Validation, executions: Sequence[_Execution]) -> None:
         self.validation, self.executions, self.model = validation, executions, validation.model
         self.outputs = validation.outputs is not None

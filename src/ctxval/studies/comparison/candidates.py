@@ -305,7 +305,6 @@ class Executions:
             self._hidden = before
 
     def _elsewhere(self, candidate: Candidate) -> list[Trajectory]:
-        """Return the executions that are in no trial of a candidate."""
         copied = {note.shared for _, note in candidate.noted}
         return [
             trajectory

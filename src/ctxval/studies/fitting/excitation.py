@@ -139,7 +139,6 @@ class Excitation(ShortRepr):
             raise stopped
 
     def _excited(self, number: int) -> Plan:
-        """Return the plan of a run, whose controller adds the signal."""
         plan = self.plan(number)
         signal = excitation(self.kind, plan.task.horizon, self.amplitude, np.random.default_rng([self.seed, number, 1]))
         excited = Excited(plan.controller, signal, self.limits)

@@ -109,8 +109,6 @@ class ResidualCorrection(ShortRepr, Method):
 
 
 class _Replacement(Method):
-    """A method whose model takes the place of the first one."""
-
     @abstractmethod
     def _fit(self, model: Model, data: Transitions) -> tuple[Model, tuple[FittedParameter, ...]]: ...
 

@@ -171,7 +171,14 @@ class _Loop:
         options = replace(self.options, confidence=confidence)
         file = self._beside(number, ".npz")
         if file is not None and file.exists():
-            model, notes = self._stored(number, file)
+            note = read_note(file)
+            if note.get("method") != self.method.name:
+                raise InputError(
+                    f"{file} was learned by the method {note.get('method')!r}: give this method, or move the files of "
+                    "the rounds away."
+                )
+            stored, notes = read_refined(file, self._base), tuple(map(str, note.get("notes", [])))
+            model = Refined(stored, stored.data or self._records(number).transitions, self._base)
         else:
             try:
                 model, notes, file = self._learned_model(number, file)
@@ -192,18 +199,6 @@ class _Loop:
         verdict, name = self._judged(campaign, options), self.method.name
         self.rounds.append(Round(number, name, campaign, verdict, confidence, len(model.data), file, notes, same))
         return None
-
-    def _stored(self, number: int, file: Path) -> tuple[Refined, tuple[str, ...]]:
-        """Return the model of a round from its file, with its notes."""
-        note = read_note(file)
-        if note.get("method") != self.method.name:
-            raise InputError(
-                f"{file} was learned by the method {note.get('method')!r}: give this method, or move the files of the "
-                "rounds away."
-            )
-        model = read_refined(file, self._base)
-        data = model.data or self._records(number).transitions
-        return Refined(model, data, self._base), tuple(map(str, note.get("notes", [])))
 
     def _learned_model(self, number: int, file: Path | None) -> tuple[Refined, tuple[str, ...], Path | None]:
         """Return the model of a round, learned from the executions before, with its notes; write its file."""
@@ -229,7 +224,6 @@ class _Loop:
         return self._last[1]
 
     def _records(self, before: int) -> Records:
-        """Return what the rounds before a number have recorded."""
         return Records.of(self.first.validation.model, self._with_states(self.rounds[:before]))
 
     def _with_states(self, rounds: list[Round], judged: int | None = None) -> list[Trajectory]:
@@ -254,7 +248,6 @@ class _Loop:
         return StateEstimates.by_loops_on_model(self.first.validation)
 
     def _beside(self, number: int, suffix: str) -> Path | None:
-        """Return the path of a file of a round, next to the store of the first model."""
         store = self.first.store.path
         return None if store is None else store.with_name(f"{store.stem}.round-{number}{suffix}")
 

@@ -57,7 +57,6 @@ def residual_shares(model: Model, recorded: RecordedSteps, seed: int) -> tuple[R
         return ()
 
     def left_by(predict: Callable[[Mask], Array], targets: Array) -> Array:
-        """Return what is left of targets if those of each fold are predicted from the other folds."""
         left = np.zeros_like(targets)
         for fold in np.unique(folds):
             held = folds == fold
@@ -71,7 +70,6 @@ def residual_shares(model: Model, recorded: RecordedSteps, seed: int) -> tuple[R
     history = left_by(lambda held: _affine(past, rest, held), rest)
 
     def share(errors: Array, size: float) -> float:
-        """Return which share of a mean square is explained if these errors are left."""
         return max(0.0, 1.0 - float((errors**2).mean()) / size) if size > 0 else 0.0
 
     sizes, left = (residuals**2).mean(axis=0).tolist(), (rest**2).mean(axis=0).tolist()
@@ -94,7 +92,6 @@ def _affine(features: Array, targets: Array, held: Mask) -> Array:
 
 
 def _learned(model: Model, where: Windows, folds: Rows, held: Mask, seed: int) -> Array:
-    """Return the residual that a Gaussian process predicts for held-out steps."""
     transitions = Transitions(where.states(), where.inputs(), where.states(1))
     rows = np.flatnonzero(~held)
     if len(rows) > 1500:
@@ -183,7 +180,6 @@ def _delay(model: Model, recorded: RecordedSteps) -> Suggestion | None:
 
 
 def _time_step(model: Model, recorded: RecordedSteps) -> Suggestion | None:
-    """Suggest another time step of the model if it then predicts better."""
     multiples = (2, 3, 4, 5, 10)
     where = recorded.windows(0, max(multiples), 8000)
     if not len(where):
