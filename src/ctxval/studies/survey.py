@@ -245,7 +245,10 @@ def _guessed(log: Log, fields: Sequence[FieldSummary], clock: Clock, guesses: li
             f"{log.source} has no field that looks like a state; name the states and inputs with --state and --input. "
             f"Its fields are {enumerated((each.path for each in fields), 24)}."
         )
-    names = dict(zip(states + inputs, _short(states + inputs), strict=True))
+    # Short names: the last part of each path, or the whole path if that is not unique.
+    plain = {path: named_unit(path)[0] for path in states + inputs}
+    last = {path: re.split(r"[/.]", name)[-1].strip() or name for path, name in plain.items()}
+    names = {path: name if [*last.values()].count(name) == 1 else plain[path] for path, name in last.items()}
     taken = f"states: {enumerated(states, 12)}; inputs: {enumerated(inputs, 12) or 'none'}"
     guesses.append(f"the names of the fields tell what they are taken as; {taken}")
     if unused := [*others, *still, *(path for path in left if path not in states)]:
@@ -256,13 +259,6 @@ def _guessed(log: Log, fields: Sequence[FieldSummary], clock: Clock, guesses: li
         of_states |= {f"{names[path]} rate": Field(derivative_of=names[path]) for path in single}
         guesses.append("no rate is recorded, so the derivatives of the states are states too")
     return LogMapping(of_states, {names[path]: Field(path) for path in inputs}, dt=log.period)
-
-
-def _short(paths: Sequence[str]) -> list[str]:
-    """Return short names of fields: the last part of each path, or the whole path if that is not unique."""
-    plain = [named_unit(path)[0] for path in paths]
-    last = [re.split(r"[/.]", name)[-1].strip() or name for name in plain]
-    return [name if last.count(name) == 1 else path for name, path in zip(last, plain, strict=True)]
 
 
 def _clock(log: Log, dt: float | None, guesses: list[str]) -> Clock:

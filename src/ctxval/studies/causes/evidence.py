@@ -16,8 +16,6 @@ from ctxval.studies.causes.candidates import Candidate
 from ctxval.studies.causes.cause import Repaired
 
 STEPS = (1, 6)  # of the predictions
-MOST = (600, 120)  # predictions of one step, and of several
-_EXACT, _NEGLIGIBLE = 0.01, 1e-3  # what is smaller is no evidence: shares of the residuals of M, and of the changes
 _LARGEST = 1e3  # of a residual, as a multiple of the typical one of M
 
 
@@ -48,7 +46,7 @@ class Records:
         model: Model,
         runs: Sequence[Trajectory],
         floors: Sequence[Array] | None = None,
-        most: tuple[int, int] = MOST,
+        most: tuple[int, int] = (600, 120),
         steps: tuple[int, int] = STEPS,
     ) -> None:
         self.model, self.horizons = model, [len(run.inputs) for run in runs]
@@ -62,7 +60,8 @@ class Records:
             window = self._window(min(length, min(self.horizons)), most[number])
             left = self.left_by(Repaired(model, ()), window)
             changes = _size(self.states[window.states + window.steps] - self.states[window.states])
-            least = np.hypot(_EXACT * _size(left), _NEGLIGIBLE * changes) if floors is None else floors[number]
+            # Smaller residuals are no evidence.
+            least = np.hypot(0.01 * _size(left), 1e-3 * changes) if floors is None else floors[number]
             self.windows.append(replace(window, floors=np.maximum(least, 1e-15)))
             self.sizes.append(np.maximum(_size(left), self.windows[-1].floors))
 

@@ -24,16 +24,8 @@ from ctxval.studies.causes.mechanics import Force
 from ctxval.studies.causes.plant import Plant, plant_of
 from ctxval.studies.causes.report import CauseReport, Explained, Separating
 
-_MOST = 8  # executions that are learned from, those with the largest distances
 _ALIKE = 10.0  # differences of the criterion that do not tell causes apart
-_SYSTEMATIC = 0.02  # of residuals that are left, differences by a third may be the way of integration; see `_alike`
 _NAMED = 0.95  # share of the squared closed-loop deviations of M that causes must explain, to be the cause
-_LEFT = 0.02  # share of the residuals that must be left, for another cause to be looked for
-_ENOUGH = 0.99  # share of the deviations that is explained, from which on no other cause is looked for
-_BETTER = 0.5  # largest share of the deviations left by one cause that two causes may leave
-_SHORT, _LONG = 60, 12  # predictions of estimated states take these parts of an execution
-_SOME = (200, 40)  # predictions of one step, and of several, that all causes are screened on
-_REFINED = 8  # causes that are fitted to all of them
 _CHECKED = 4  # explanations that are tried in closed loop
 
 
@@ -64,7 +56,7 @@ def find_causes(campaign: Campaign, *, most: int = 2) -> CauseReport:
     trials.sort(key=lambda pair: -(pair[0].distance or 0.0))
     if len(trials) < 2:
         raise InputError(f"causes need at least 2 executions with trajectories in the store, got {len(trials)}.")
-    executed = [(trial.unit_point, run) for trial, run in trials[:_MOST]]
+    executed = [(trial.unit_point, run) for trial, run in trials[:8]]  # those with the largest distances
     with single_threaded():
         states = [run for _, run in executed]
         if validation.outputs is not None:
@@ -85,10 +77,10 @@ class _Study:
         runs = [each.states for each in executions]
         horizon = min(len(run.inputs) for run in runs)
         # Estimated states are worth little in one step.
-        steps = (max(1, horizon // _SHORT), max(1, horizon // _LONG)) if self.outputs else STEPS
+        steps = (max(1, horizon // 60), max(1, horizon // 12)) if self.outputs else STEPS
         self.records = Records(self.model, runs, steps=steps)
         floors = [window.floors for window in self.records.windows]
-        self.some = Records(self.model, runs, floors, _SOME, steps)
+        self.some = Records(self.model, runs, floors, (200, 40), steps)  # all causes are screened on these
         self.others = [Records(self.model, runs[:k] + runs[k + 1 :], floors, steps=steps) for k in range(len(runs))]
         self.structure, _ = self.records.structure(Repaired(self.model, ()))
         x, u, residuals = self.records.pairs
@@ -111,14 +103,14 @@ class _Study:
             ranked = self._ranked(())
             chosen, alike = self._chosen(ranked)
             while chosen is not None and len(chosen.explanation.candidates) < most:
-                if chosen.explanation.left < _LEFT or chosen.share > _ENOUGH:
+                if chosen.explanation.left < 0.02 or chosen.share > 0.99:  # nothing is left for another cause
                     break
                 better, others = self._chosen(self._ranked(chosen.explanation.candidates))
                 if better is not None:  # the first one was chosen without the other ones
                     better, others = self._chosen(self._ranked(better.explanation.candidates[1:]))
                 if better is None or better.explanation.criterion > chosen.explanation.criterion - _ALIKE:
                     break
-                if 1 - better.share > _BETTER * (1 - chosen.share):
+                if 1 - better.share > 0.5 * (1 - chosen.share):
                     break
                 chosen, alike = better, others
         named = chosen is not None and chosen.complete >= _NAMED
@@ -148,7 +140,7 @@ class _Study:
                 results.append((*screened(self.some, together), together))
             advance(1)
         results.sort(key=lambda result: result[0])
-        refined = [explained(self.records, together, begun) for _, begun, together in results[:_REFINED]]
+        refined = [explained(self.records, together, begun) for _, begun, together in results[:8]]
         return sorted(refined, key=lambda explanation: explanation.criterion)
 
     def _chosen(self, ranked: list[Explanation]) -> tuple[Explained | None, list[Explained]]:
@@ -244,7 +236,8 @@ class _Study:
 
 def _alike(best: Explanation, other: Explanation) -> bool:
     """Return whether another explanation is as good as the best one, except for what is no evidence."""
-    systematic = best.left < _SYSTEMATIC and other.left < 1.3 * best.left + 2e-4
+    # Of residuals that are nearly explained, differences by a third may be the way of integration.
+    systematic = best.left < 0.02 and other.left < 1.3 * best.left + 2e-4
     return other.criterion < best.criterion + _ALIKE or systematic
 
 

@@ -13,9 +13,6 @@ from ctxval._util.representation import ShortRepr
 from ctxval.core.model import Model
 from ctxval.models import MuJoCo
 
-_MOVED = 0.2  # least effect of an input on a rate that it may be the force of, as a share of its largest effect
-_SAME = 0.05  # largest error of a position's change as the integral of a rate, as a share of that change
-
 
 @dataclass(frozen=True)
 class Joint(ShortRepr):
@@ -138,7 +135,7 @@ def _joints(dt: float, x: Array, reached: Array) -> tuple[Joint, ...]:
             share = float(np.clip(left @ gained / max(float(gained @ gained), 1e-300), 0.0, 1.0))
             errors.append((float(((left - share * gained) ** 2).mean()), rate, share))
         error, rate, share = min(errors)
-        if rate != position and size > 0 and error < _SAME**2 * size:
+        if rate != position and size > 0 and error < 0.05**2 * size:
             pairs[rate] = position, share
     positions = {position for position, _ in pairs.values()}
     rates = [i for i in range(n) if i not in positions]
@@ -162,7 +159,7 @@ def _ports(
         sizes = np.sqrt((effects**2).mean(axis=0))
         largest = float(sizes.max(initial=0.0))
         for j, joint in enumerate(joints):
-            if largest > 0 and sizes[j] > _MOVED * largest:
+            if largest > 0 and sizes[j] > 0.2 * largest:
                 ports.append(replace(joint, input=k))
                 if np.delete(sizes, j).max(initial=0.0) < 0.01 * sizes[j] and effects[:, j].std() < 0.01 * sizes[j]:
                     alone.add(joint.rate)

@@ -30,8 +30,7 @@ from ctxval.core.trial import Trial
 from ctxval.studies.comparison.candidates import Candidate, Decision, Executions, TrialNote
 from ctxval.studies.comparison.result import PairResult
 
-# So many more executions than the better candidate the worse one may have to come near its predicted largest one.
-_INSIST = 3
+_INSIST = 3  # executions that the worse candidate may have beyond the better one, to come near its prediction
 
 
 @dataclass(eq=False)

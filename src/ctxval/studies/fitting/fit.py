@@ -34,8 +34,7 @@ class FittedParameter(ShortRepr):
     """One parameter of a model.
 
     Attributes:
-        value: the estimate.
-        low, high: the confidence interval; infinite if the recordings do not determine the parameter.
+        value, low, high: the estimate and the confidence interval, which is infinite if the recordings determine none.
         note: what is unusual: the value is at a bound, or depends on others; empty otherwise.
     """
 

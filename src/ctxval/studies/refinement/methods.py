@@ -2,22 +2,24 @@
 
 from __future__ import annotations
 
+import functools
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from functools import partial
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import numpy as np
 
 from ctxval._util.arrays import Mask, single_threaded
 from ctxval._util.representation import ShortRepr
 from ctxval._util.texts import reason_of
+from ctxval.campaign.campaign import Campaign
 from ctxval.core.model import Model, Step, as_model
 from ctxval.core.trajectory import Transitions
 from ctxval.errors import CtxvalError, InputError, ModelError, UnknownNameError
 from ctxval.models import Corrected, Correction, FeedforwardReLU, GaussianProcessModel, Linear, Parametric
 from ctxval.models.parametric import ParametricStep
+from ctxval.studies.causes import CauseReport, Repaired, evidence, find_causes
 from ctxval.studies.fitting import FittedParameter, fit_parameters
 from ctxval.studies.fitting.fit import as_bounds, learned_model
 from ctxval.studies.refinement.corrections import averaged_correction, exact_correction
@@ -27,7 +29,10 @@ from ctxval.studies.replay.accuracy import stepped
 _CENTRES = 300  # largest number of transitions that a correction is conditioned on
 
 RefitKind = Literal["linear", "network", "gaussian-process"]
-NAMES = ("residual", "causes", *get_args(RefitKind), "parameters", "fit")
+_KINDS: dict[str, type[Model]] = {
+    "linear": Linear, "network": FeedforwardReLU, "gaussian-process": GaussianProcessModel
+}  # fmt: skip
+NAMES = ("residual", "causes", *_KINDS, "parameters", "fit")
 """The names of the methods on the command line."""
 
 
@@ -78,8 +83,6 @@ class ResidualCorrection(ShortRepr, Method):
     makes = Corrected
 
     def learn(self, model: Model, records: Records) -> Learned:
-        """Return the corrected model."""
-
         def left_by(correction: Callable[[Model, Records], Correction | None]) -> HeldOut:
             def corrected(some: Records) -> Model:
                 learned = correction(model, some)
@@ -87,7 +90,8 @@ class ResidualCorrection(ShortRepr, Method):
 
             return held_out(corrected, model, records)
 
-        correction: Callable[[Model, Records], Correction | None] = partial(exact_correction, centres=self.centres)
+        exact = functools.partial(exact_correction, centres=self.centres)
+        correction: Callable[[Model, Records], Correction | None] = exact
         errors = left_by(correction)
         if errors.left > 0.1:  # much of the error
             averaged = left_by(averaged_correction)
@@ -106,6 +110,42 @@ class ResidualCorrection(ShortRepr, Method):
         note = f"not corrected, because the error on held-out executions would not fall: state {rows}"
         learned = Corrected(model, whole.of_states(better), data=records.transitions)
         return Learned(learned, errors.kept(better), (note,) if rows else ())
+
+
+@dataclass(frozen=True, eq=False)
+class CauseRepair(ShortRepr, Method):
+    """The first model with the causes that executions of its campaign name, with sizes fitted to all executions."""
+
+    campaign: Campaign
+    name: str = field(default="causes", init=False)
+    makes = Repaired
+
+    @functools.cached_property
+    def report(self) -> CauseReport:
+        """The causes, which a model can have."""
+        report = find_causes(self.campaign)
+        if report.repaired is None:
+            raise InputError(f"no cause is known that a model could have. {report.sentence}")
+        if not report.repaired.complete:
+            raise InputError(
+                f"a step of a model depends on state and input alone, so it cannot have this cause. {report.sentence}"
+            )
+        return report
+
+    def learn(self, model: Model, records: Records) -> Learned:
+        if self.campaign.validation.outputs is not None:
+            raise InputError("the method 'causes' needs recorded states of M, and only outputs are recorded.")
+        best = self.report.explained[0].explanation
+
+        def repaired(some: Records) -> Repaired:
+            if not some.executed:
+                raise InputError("the method 'causes' needs executions with trajectories.")
+            with single_threaded():
+                return evidence.explained(evidence.Records(model, some.executed), best.candidates, best.sizes).repaired
+
+        learned = repaired(records)
+        note = " and ".join(cause.text(self.report.plant) for cause in learned.causes)
+        return Learned(learned, held_out(repaired, model, records), (note,))
 
 
 class _Replacement(Method):
@@ -129,20 +169,13 @@ class Refit(ShortRepr, _Replacement):
 
     kind: RefitKind
     seed: int = 0
+    name: str = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        if self.kind not in get_args(RefitKind):
-            raise UnknownNameError.among("kind of model", str(self.kind), get_args(RefitKind))
-
-    @property
-    def name(self) -> str:  # type: ignore[override]
-        """Its kind."""
-        return self.kind
-
-    @property
-    def makes(self) -> type[Model]:  # type: ignore[override]
-        """The type of the models of its kind."""
-        return {"linear": Linear, "network": FeedforwardReLU, "gaussian-process": GaussianProcessModel}[self.kind]
+        if self.kind not in _KINDS:
+            raise UnknownNameError.among("kind of model", str(self.kind), _KINDS)
+        object.__setattr__(self, "name", self.kind)
+        object.__setattr__(self, "makes", _KINDS[self.kind])
 
     def _fit(self, model: Model, data: Transitions) -> tuple[Model, tuple[FittedParameter, ...]]:
         with single_threaded():
@@ -208,7 +241,7 @@ def method_of(method: str | Method | Callable[[Transitions], Any], *, seed: int 
         return UserFit(method)
     if method == "residual":
         return ResidualCorrection()
-    if method in get_args(RefitKind):
+    if method in _KINDS:
         return Refit(method, seed)  # type: ignore[arg-type]
     needs = {
         "parameters": "bounds: give refinement.ParameterFit({'mass': (0.5, 2.0)})",

@@ -25,14 +25,12 @@ class ResidualShare(ShortRepr):
     """How much of the one-step residual of a state can be explained, measured on held-out recordings.
 
     Attributes:
-        state, unit: the state and its unit.
-        rms: root mean square of the residual.
+        rms, rest: root mean square of the residual, and of what state and input do not explain.
         linear: share of its mean square that an affine function of state and input explains; at least 0.
         explained: share that a Gaussian process of state and input explains, or the affine function if that is more;
             at least 0.
         history: share of the rest that the previous state, input and residual explain; at least 0. If it is large, the
             system has a state that is not recorded, or a delay.
-        rest: root mean square of what state and input do not explain.
     """
 
     state: str
@@ -111,10 +109,8 @@ class Suggestion(ShortRepr):
     """A change of timing with which the model predicts held-out recordings clearly better.
 
     Attributes:
-        kind: ``delay`` or ``time step``.
-        value: the delay in seconds, or the time step of the model in seconds.
+        value: the delay, or the time step of the model, in seconds.
         ratio: the held-out one-step error with the change, divided by that without it.
-        sentence: what it means.
     """
 
     kind: Literal["delay", "time step"]
