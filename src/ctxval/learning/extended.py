@@ -44,6 +44,14 @@ def with_states_of_model(validation: Validation) -> Validation:
     )
 
 
+def estimates_by_loops_on_model(validation: Validation) -> StateEstimates | None:
+    """Return the estimates of states for a validation; None if no task can be planned, or if it has no outputs."""
+    if validation.outputs is None:
+        return None
+    loops = closed_loops_on_model(with_states_of_model(validation))
+    return None if loops is None else StateEstimates(validation, validation.outputs, loops.states)
+
+
 class ExtendedValidation:
     """A user's validation, and the one whose trajectories what S does in a step is a function of.
 

@@ -137,6 +137,10 @@ class SpecTable(BaseModel):
     type: str = "ReachAvoid"
     margin: float | None = Field(default=None, gt=0, allow_inf_nan=False, strict=True)
 
+    def on(self, experiment: Experiment) -> Experiment:
+        """Return an experiment that judges the specification in place of its distance; the threshold is the margin."""
+        return judged_by(experiment, UnsafeMargin({"type": self.type, **(self.model_extra or {})}, margin=self.margin))
+
 
 _WHOLE = ("space", "task", "system", "model", "synthesizer")
 
@@ -228,8 +232,7 @@ class Settings(BaseModel):
             raise InputError("a specification is needed: the experiment file has no table [spec].")
         if self.threshold not in (None, self.spec.margin):
             raise InputError(f"if a specification is judged, its margin is the threshold, got {self.threshold:g}.")
-        spec = {"type": self.spec.type, **(self.spec.model_extra or {})}
-        return judged_by(experiment, UnsafeMargin(spec, margin=self.spec.margin))
+        return self.spec.on(experiment)
 
     def _described(self) -> Experiment:
         if self.space is not None and self.suite is not None:
