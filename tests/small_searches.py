@@ -21,6 +21,7 @@ def take_few_draws(replace: Callable[[str, Any], None]) -> None:
     for module in ("stopping", "posterior", "maxima"):
         replace(f"ctxval.certificates.{module}.draw_maxima", fewer)
     replace("ctxval.certificates.maxima._MOST", 1)  # the draws are not doubled where a bound is near the threshold
+    replace("ctxval.gp.sample_paths.WAVES", 128)
 
 
 def run_few_loops(replace: Callable[[str, Any], None]) -> None:
@@ -32,3 +33,6 @@ def run_few_loops(replace: Callable[[str, Any], None]) -> None:
     replace("ctxval.learning.worst_case.WorstCaseSettings.for_dimension", lambda *_: loops)
     replace("ctxval.learning.dynamics_posterior.PosteriorSettings.for_horizon", lambda *_: draws)
     replace("ctxval.searches.auto._SHARES", (FAST,))
+    # Delays and lags of inputs are looked for in each campaign whose model errs: half of its time.
+    replace("ctxval.learning.actuators._LEARNED_FROM", 40)
+    replace("ctxval.learning.actuators._TRIED", [(1.0, 0.0), (3.0, 0.0), (0.0, 1.5)])
