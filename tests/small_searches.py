@@ -21,7 +21,6 @@ def take_few_draws(replace: Callable[[str, Any], None]) -> None:
     for module in ("stopping", "posterior", "maxima"):
         replace(f"ctxval.certificates.{module}.draw_maxima", fewer)
     replace("ctxval.certificates.maxima._MOST", 1)  # the draws are not doubled where a bound is near the threshold
-    replace("ctxval.gp.sample_paths.WAVES", 128)
 
 
 def run_few_loops(replace: Callable[[str, Any], None]) -> None:

@@ -25,7 +25,6 @@ def threshold_of(validation) -> float:  # type: ignore[no-untyped-def]
 
 
 @pytest.mark.slow
-@pytest.mark.in_full
 def test_it_finds_the_true_set_after_a_falsification_and_includes_nothing_else() -> None:
     campaign = campaign_of()
     validation = campaign.validation
