@@ -118,6 +118,7 @@ def test_states_keep_their_names_and_a_parameter_of_the_same_name_gets_another()
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("few_loops")
 def test_dynamics_that_depend_on_a_stated_parameter_are_validated_by_a_bound_that_is_true(tmp_path: Path) -> None:
     validation = loaded_cart()
     largest = float(validation.distances(validation.space.grid(21)).max())
@@ -138,6 +139,7 @@ def test_dynamics_that_depend_on_a_stated_parameter_are_validated_by_a_bound_tha
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("few_loops")
 def test_a_statement_that_leaves_out_the_parameter_is_not_validated_below_the_largest_distance() -> None:
     validation = loaded_cart(("goal",))
     largest = float(validation.distances(validation.space.grid(21)).max())
