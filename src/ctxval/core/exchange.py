@@ -16,8 +16,7 @@ import numpy as np
 
 from ctxval._util.arrays import Array, as_finite, as_floats
 from ctxval._util.checked import Seconds, require
-from ctxval._util.files import read_bytes, read_json, written_whole
-from ctxval._util.npz import Archive
+from ctxval._util.files import Archive, read_bytes, read_json, written_whole
 from ctxval._util.representation import ShortRepr, shown
 from ctxval.core.controller import AffineFeedback, ControllerWithMemory, Limits
 from ctxval.core.task import Task

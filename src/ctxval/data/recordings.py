@@ -11,9 +11,8 @@ from typing import Any
 import numpy as np
 
 from ctxval._util.arrays import Array, Rows
-from ctxval._util.columns import FAR, sentinels, time_column, unit_advice
+from ctxval._util.columns import FAR, conversion, sentinels, time_column, unit_advice
 from ctxval._util.representation import ShortRepr, counted
-from ctxval._util.units import conversion
 from ctxval.core.trajectory import Trajectory, Transitions
 from ctxval.data.derived import with_derived
 from ctxval.data.log import Log, Signal, Table

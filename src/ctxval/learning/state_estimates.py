@@ -14,9 +14,9 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from ctxval._util.arrays import Array
+from ctxval.controllers.output_feedback import Estimate, corrected, predicted, smoothed
 from ctxval.core.controller import Controller, Synthesizer
 from ctxval.core.distance import Distance
-from ctxval.core.kalman import Estimate, corrected, predicted, smoothed
 from ctxval.core.labels import labels_of
 from ctxval.core.model import Model
 from ctxval.core.system import Outputs

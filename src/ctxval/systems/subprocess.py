@@ -1,4 +1,8 @@
-"""A command as the true system: a rig's own program, a simulator, any language."""
+"""A command as the true system: a rig's own program, a simulator, any language.
+
+Its child processes all end: with the command, at a timeout, and with the process that started it. If a command went on
+after ``kill -9`` of its campaign, it would move a rig at the same time as its own repetition.
+"""
 
 from __future__ import annotations
 
