@@ -51,7 +51,7 @@ class StateNorm(NamedStates):
     @property
     def factors(self) -> Array | None:
         """The factor of the difference of each compared state, shape ``(k,)``; None if all are 1."""
-        weights, scales = (np.asarray(1.0 if given is None else given) for given in (self.weights, self.scales))
+        weights, scales = (1.0 if given is None else np.asarray(given) for given in (self.weights, self.scales))
         factors = np.asarray(weights / scales, dtype=np.float64)
         return None if (factors == 1).all() else factors
 
@@ -63,6 +63,10 @@ class StateNorm(NamedStates):
             raise ShapeError(f"there must be a weight or a scale for each of {gap.shape[-1]} states, got {counts[0]}.")
         factors = self.factors
         return gap if factors is None else gap * factors
+
+    def norms(self, states: Array, others: Array) -> Array:
+        """Return the norms of the weighted differences of states ``(..., n)``, shape ``(...)``."""
+        return np.asarray(np.linalg.norm(self.difference(states, others), self.norm, axis=-1))
 
     def unwrapped(self, gap: Array) -> Array:
         """Return differences of states ``(..., n)``; those of angles are moved to at most pi in magnitude."""
@@ -85,8 +89,7 @@ class StateNorm(NamedStates):
     def describe(self) -> dict[str, Any]:
         names = [field.name for field in dataclasses.fields(self)]
         described = {name: getattr(self, name) for name in names if name not in ("weights", "scales", "angles")}
-        factors = self.factors
-        if factors is not None:
+        if (factors := self.factors) is not None:
             described["factors"] = factors
         return described | ({"angles": self.angles} if self.angles else {})
 
@@ -179,8 +182,7 @@ class MaximumDeviation(StateNorm):
     norm: Norm = 2
 
     def __call__(self, model_trajectory: Trajectory, system_trajectory: Trajectory, task: Task) -> Array:
-        gap = self.difference(system_trajectory.states, model_trajectory.states)
-        return np.asarray(np.linalg.norm(gap, self.norm, axis=-1).max(axis=-1))
+        return np.asarray(self.norms(system_trajectory.states, model_trajectory.states).max(axis=-1))
 
 
 @part()
@@ -194,8 +196,7 @@ class MeanDeviation(StateNorm):
     norm: Norm = 2
 
     def __call__(self, model_trajectory: Trajectory, system_trajectory: Trajectory, task: Task) -> Array:
-        gap = self.difference(system_trajectory.states, model_trajectory.states)
-        return np.asarray(np.linalg.norm(gap[..., 1:, :], self.norm, axis=-1).mean(axis=-1))
+        return np.asarray(self.norms(system_trajectory.states, model_trajectory.states)[..., 1:].mean(axis=-1))
 
 
 @part()
@@ -285,8 +286,7 @@ class TrackingError(StateNorm):
     over: Literal["maximum", "mean"] = "maximum"
 
     def __call__(self, model_trajectory: Trajectory, system_trajectory: Trajectory, task: Task) -> Array:
-        gap = self.difference(system_trajectory.states, task.reference)[..., 1:, :]
-        norms = np.linalg.norm(gap, self.norm, axis=-1)
+        norms = self.norms(system_trajectory.states, task.reference)[..., 1:]
         return np.asarray(norms.max(axis=-1) if self.over == "maximum" else norms.mean(axis=-1))
 
 

@@ -27,8 +27,6 @@ class Function(ShortRepr):
     """
 
     def __init__(self, execute: Callable[[Feedback, Task], Any], *, batched: bool = False) -> None:
-        if not callable(execute):
-            raise InputError(f"a system must be a function (controller, task) -> trajectory, got {execute!r}.")
         self.function = execute
         self.batched = batched
 
