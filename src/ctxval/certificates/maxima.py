@@ -19,8 +19,7 @@ from ctxval.certificates.bounds import ERRORS, rank_of
 from ctxval.certificates.sample import Sample, advice_to_remeasure, listed
 from ctxval.certificates.sentences import two_distances
 from ctxval.errors import CertificateError
-from ctxval.gp.hyperposterior import EXACT, Conditioned, Prior, draw_hyperparameters
-from ctxval.gp.sample_paths import draw_paths, maxima
+from ctxval.gp.hyperposterior import EXACT, Conditioned, Prior, draw_hyperparameters, draw_paths, maxima
 from ctxval.gp.surrogate import kept_rows
 
 FEWEST = 4  # trials for a bound
