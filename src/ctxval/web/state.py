@@ -165,7 +165,7 @@ class LiveCampaign(PageState):
     live = True
 
     def __init__(self, served: ServedCampaign, search: IntervalSearch | None) -> None:
-        super().__init__(served, served.snapshot())
+        super().__init__(served, Snapshot(served.campaign.trials))
         self._search = search
         self.hear = Innermost(self._follow_progress("choosing"))
         self._drawn = self._cost = 0.0
@@ -221,7 +221,7 @@ class LiveCampaign(PageState):
 
     async def _watch(self) -> None:
         while True:
-            fresh = self.served.snapshot()
+            fresh = Snapshot(self.served.campaign.trials)
             if (fresh.signature, fresh.executions) != (self.snapshot.signature, self.snapshot.executions):
                 self.snapshot = fresh
                 self.update()
