@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ctxval._util.confinement import may_confine
+from ctxval._util.cores import may_confine
 from ctxval.campaign.telling import ToldResult
 from ctxval.core.trajectory import Trajectory
 from ctxval.data import LogMapping

@@ -10,8 +10,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from ctxval._util.columns import column_of
-from ctxval._util.csv_table import CsvTable
+from ctxval._util.columns import CsvTable, column_of
 from ctxval._util.texts import shortened, unguarded
 from ctxval._util.units import conversion
 from ctxval.campaign.campaign import Campaign
@@ -20,8 +19,7 @@ from ctxval.campaign.telling import ToldResult, require_file
 from ctxval.core.controller import AffineFeedback
 from ctxval.core.exchange import write_controller, write_task
 from ctxval.core.experiment import Experiment
-from ctxval.core.plan import Plan
-from ctxval.core.preflight import StartOffset
+from ctxval.core.plan import Plan, StartOffset
 from ctxval.core.space import TaskSpace
 from ctxval.core.task_suite import TASK
 from ctxval.core.trial import Trial

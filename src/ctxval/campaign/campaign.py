@@ -11,8 +11,7 @@ import numpy as np
 
 from ctxval._util.arrays import Array
 from ctxval._util.checked import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, Seconds, checked
-from ctxval._util.progress import stage
-from ctxval._util.progress_display import progress_shown
+from ctxval._util.progress import progress_shown, stage
 from ctxval.campaign import display
 from ctxval.campaign.choices import Choice, Execution, OpenTrial
 from ctxval.campaign.dynamics import LearnedFromTrials
@@ -32,7 +31,7 @@ from ctxval.certificates.envelope import Envelope
 from ctxval.certificates.expiry import WatchState
 from ctxval.certificates.options import CONFIDENCE, WITHIN
 from ctxval.core.distance import Distance
-from ctxval.core.preflight import StartOffset, start_offset
+from ctxval.core.plan import StartOffset, start_offset
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import Trial
 from ctxval.core.validation import Validation

@@ -18,7 +18,7 @@ from ctxval.campaign.trials import TrialRecorder
 from ctxval.certificates.automatic import Automatic
 from ctxval.certificates.drawn_distances import DrawnDistances
 from ctxval.certificates.dynamics import Dynamics, draws_for
-from ctxval.certificates.dynamics_diagnostics import fewest_executions, missing_tests, untried_parameter
+from ctxval.certificates.dynamics_diagnostics import fewest_executions, missing_tests, most_beyond, untried_parameter
 from ctxval.certificates.dynamics_evidence import DynamicsEvidence
 from ctxval.certificates.envelope import (
     Envelope,
@@ -27,7 +27,7 @@ from ctxval.certificates.envelope import (
     must_outlive_a_test,
     withdrawn,
 )
-from ctxval.certificates.envelope_diagnostics import doubt_of_envelope, most_beyond
+from ctxval.certificates.envelope_diagnostics import doubt_of_envelope
 from ctxval.certificates.options import CertificateOptions
 from ctxval.certificates.prediction_tests import DRAWN
 from ctxval.core.trial import Trial

@@ -7,13 +7,13 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 
-from ctxval._util.interrupts import Interrupts, exits_as_exceptions
+from ctxval._util.cores import Interrupts, exits_as_exceptions
 from ctxval._util.progress import advance, is_heard, stage
 from ctxval._util.representation import named
 from ctxval.campaign.choices import Choice, Execution, OpenTrial
 from ctxval.campaign.trials import TrialRecorder
 from ctxval.campaign.workers import AHEAD, SerialPool, WorkerPool
-from ctxval.core.preflight import start_offset
+from ctxval.core.plan import start_offset
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import CONVERGED, Trial
 from ctxval.errors import CtxvalError, ExecutionError, InputError, StoreError

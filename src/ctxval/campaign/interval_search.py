@@ -24,7 +24,7 @@ from ctxval.certificates import CertificateOptions, DynamicsEvidence, Sample, St
 from ctxval.certificates.anytime import AnytimeAudit
 from ctxval.certificates.automatic import Automatic
 from ctxval.certificates.bets import bets_against
-from ctxval.certificates.bounds import with_units
+from ctxval.certificates.bounds import Quantities, with_units
 from ctxval.certificates.covering import RESOLUTION, covering
 from ctxval.certificates.dynamics import Dynamics, bound_of, certify_dynamics
 from ctxval.certificates.dynamics_diagnostics import (
@@ -45,7 +45,6 @@ from ctxval.certificates.prediction_tests import DRAWN, MANY, TESTS
 from ctxval.certificates.sample import SAME
 from ctxval.certificates.suite import WholeSuite
 from ctxval.certificates.verdict import counterexample, quantile_of, require_suite
-from ctxval.certificates.verdict_sentences import Quantities
 from ctxval.core.trial import Trial
 from ctxval.errors import CertificateError, InputError
 from ctxval.learning.worst_case import is_kinked
@@ -374,11 +373,11 @@ def next_task(
         candidates = [largest, highest, farthest]
     elif exceeds:
         candidates = [highest, farthest]
-    elif uncovered(evidence) is not None:
+    elif uncovered(evidence):
         candidates = [farthest, highest, largest]
         if evidence.untried is not None and evidence.untried.gap > GAP:
             candidates = [evidence.untried.task[None], *candidates]
-    elif evidence.missed > 1 or untested(evidence, best, limit) is not None:
+    elif evidence.missed > 1 or untested(evidence, best, limit):
         candidates = [largest, highest, farthest]
     else:
         candidates = [highest, farthest] if len(known) % 2 else [farthest, highest]

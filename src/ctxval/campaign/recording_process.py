@@ -19,7 +19,7 @@ def main() -> None:
     os.environ.clear()
     os.environ |= home | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "ARROW_DEFAULT_MEMORY_POOL": "system"}
     sys.path.append(str(Path(__file__).resolve().parents[2]))
-    from ctxval._util.confinement import limit, read_only
+    from ctxval._util.cores import limit, read_only
     from ctxval.campaign.telling import REFUSED
     from ctxval.errors import CtxvalError
 

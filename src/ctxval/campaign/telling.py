@@ -14,7 +14,7 @@ import numpy as np
 
 from ctxval._util.arrays import Array
 from ctxval._util.columns import sentinels
-from ctxval._util.confinement import MOST_MEMORY
+from ctxval._util.cores import MOST_MEMORY
 from ctxval._util.files import temporary_folder
 from ctxval.core.experiment import Experiment
 from ctxval.core.labels import labels_of
@@ -22,7 +22,7 @@ from ctxval.core.plan import Plan
 from ctxval.core.trajectory import COMPLETE, Trajectory
 from ctxval.data import LogMapping, is_log, read_recordings
 from ctxval.errors import ExecutionError, InputError
-from ctxval.systems.supervised import run_supervised
+from ctxval.systems.subprocess import run_supervised
 
 _PROGRAM = Path(__file__).absolute().with_name("recording_process.py")
 
@@ -96,7 +96,7 @@ class ToldResult:
         return recording.resampled(times) if self.resample else recording
 
     def read_confined(self, path: Path, states: Names, inputs: Names, times: Array) -> Trajectory:
-        """Return the recording as a process without rights reads it; see :mod:`ctxval._util.confinement`."""
+        """Return the recording as a process without rights reads it; see :mod:`ctxval._util.cores`."""
         seconds = 60 if self.uploaded else 3600
         with temporary_folder() as folder:
             (folder / "request").write_bytes(pickle.dumps((self, (path, dict(states), dict(inputs), times), seconds)))

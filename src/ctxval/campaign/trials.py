@@ -24,8 +24,7 @@ from ctxval.campaign.storage.store import Store
 from ctxval.certificates import PLANNED
 from ctxval.core.controller import converged_of
 from ctxval.core.distance import Distance
-from ctxval.core.plan import Plan
-from ctxval.core.preflight import StartOffset, start_offset, try_distance
+from ctxval.core.plan import Plan, StartOffset, start_offset, try_distance
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import CONVERGED, Origin, Trial
 from ctxval.core.validation import Validation

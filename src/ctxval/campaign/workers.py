@@ -20,8 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from ctxval._util.cores import can_fork, forking
-from ctxval._util.interrupts import allow_exits, exits_as_exceptions, raised_by_signal
+from ctxval._util.cores import allow_exits, can_fork, exits_as_exceptions, forking, raised_by_signal
 from ctxval._util.progress import mute
 from ctxval._util.texts import reason_of
 from ctxval.campaign.choices import Execution

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from ctxval._util.checked import NonNegativeFloat, require
-from ctxval._util.csv_table import CsvTable
+from ctxval._util.columns import CsvTable
 from ctxval._util.progress import advance, stage
 from ctxval._util.representation import task_text
 from ctxval.campaign.by_hand import parameters_from, read_runs

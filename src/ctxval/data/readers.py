@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from ctxval._util.arrays import Array
-from ctxval._util.csv_table import CsvTable
+from ctxval._util.columns import CsvTable
 from ctxval._util.extras import require_extra
 from ctxval._util.files import MOST_BYTES, read_bytes, read_json, require_regular_file
 from ctxval._util.npz import Archive

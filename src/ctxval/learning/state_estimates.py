@@ -19,7 +19,7 @@ from ctxval.core.distance import Distance
 from ctxval.core.kalman import Estimate, corrected, predicted, smoothed
 from ctxval.core.labels import labels_of
 from ctxval.core.model import Model
-from ctxval.core.outputs import Outputs
+from ctxval.core.system import Outputs
 from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.validation import Validation

@@ -226,9 +226,9 @@ class Settings(BaseModel):
             validation = validation.with_model(Refined(refined, refined.data, given.model))
             experiment = replace(experiment, truth=None)
         if self.longest is not None:
-            validation = validation.with_longest(self.longest)
+            validation = validation.with_parts(longest=self.longest)
         if self.physical is not None:
-            validation = validation.with_physical(self.physical)
+            validation = validation.with_parts(physical=self.physical)
         if self.distribution is not None:
             validation = validation.with_space(with_distribution(validation.space, self.distribution, self.folder))
         experiment = experiment if validation is given else replace(experiment, validation=validation)

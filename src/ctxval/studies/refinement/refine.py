@@ -10,8 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from ctxval._util.checked import PositiveFloat, PositiveInt, checked
-from ctxval._util.progress import stage
-from ctxval._util.progress_display import progress_shown
+from ctxval._util.progress import progress_shown, stage
 from ctxval.campaign.campaign import Campaign
 from ctxval.campaign.history import executed_trials
 from ctxval.certificates import CertificateOptions
