@@ -379,6 +379,7 @@ def test_a_thread_that_hangs_is_given_up() -> None:
 @pytest.mark.slow
 @pytest.mark.skipif(importlib.util.find_spec("distributed") is None, reason="needs dask.distributed")
 @pytest.mark.filterwarnings("ignore")
+@pytest.mark.thorough  # test_clusters.py kills a worker of Dask, too
 def test_a_campaign_on_dask_survives_the_death_of_a_worker(tmp_path: Path) -> None:
     script = tmp_path / "cluster.py"
     script.write_text(DASK)

@@ -102,7 +102,7 @@ class Dynamics(CertificateKind):
 
     def _evidence(self, sample: Sample, confidence: float) -> DynamicsEvidence:
         learned = require_learned(sample, self.name)
-        unknown = [sample.numbers[row] for row in np.flatnonzero(np.isnan(sample.distances))]
+        unknown = [sample.numbers[row] for row in np.flatnonzero(np.isnan(sample.distances)).tolist()]
         if unknown:
             raise CertificateError(
                 f"{listed(unknown)} failed or has no distance, so d* is not bounded there; execute the task again, or "

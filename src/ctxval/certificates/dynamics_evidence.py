@@ -190,7 +190,7 @@ class PushedDistances(ShortRepr):
             [[d if np.isfinite(d) else None for d in row] for row in distances.tolist()]
             for distances in (self.everywhere, self.away)
         )
-        return dict(residuals=self.residuals, levels=self.levels.tolist(), everywhere=everywhere, away=away)
+        return {"residuals": self.residuals, "levels": self.levels.tolist(), "everywhere": everywhere, "away": away}
 
     @classmethod
     def from_json(cls, values: dict[str, Any]) -> Self:
@@ -318,7 +318,9 @@ class DynamicsEvidence(ShortRepr):
                 **{name: np.array(values[name], dtype=np.float64) for name in ("maxima", "points", "elites")},
                 **{name: values[name] and tuple(values[name]) for name in ("actuator", "suspect")},
                 "predictions": tuple(
-                    CheckedPrediction(**{name: tuple(v) if isinstance(v, list) else v for name, v in each.items()})
+                    CheckedPrediction(
+                        **dict[str, Any]((k, tuple(v) if isinstance(v, list) else v) for k, v in each.items())
+                    )
                     for each in values["predictions"]
                 ),
                 "coverage": StateInputCoverage(**{**coverage, **gaps, "task": np.array(coverage["task"])}),

@@ -268,7 +268,7 @@ class DynamicsStudy(ShortRepr):
             return None
         # The data that M was made from tell no earlier inputs.
         data = self._data if with_data and self.actuator is None else None
-        loops = [self.extended.with_acting(one) for _, one in executed]
+        loops = [replace(loop, inputs=self.extended.acting(loop)) for _, loop in executed]
         return recorded_transitions(data, loops, self._loops, logged)
 
     @functools.cached_property

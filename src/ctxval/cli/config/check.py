@@ -24,7 +24,7 @@ from ctxval.core.task_suite import TaskSuite
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.validation import Validation
 from ctxval.errors import ConformanceError, CtxvalError
-from ctxval.learning.state_estimates import with_states_of_model
+from ctxval.learning.extended import with_states_of_model
 from ctxval.specs import Specification
 from ctxval.studies.aspect1 import Aspect1Report
 from ctxval.testing import check_distance, check_model, check_synthesizer
