@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from ctxval.data import LogMapping, read_recordings
-from ctxval.data.json_records import read_json_records
 from ctxval.data.log import Clock
+from ctxval.data.readers import read_json_records
 from ctxval.errors import InputError
 
 RECORDS: list[dict[str, Any]] = [

@@ -24,7 +24,7 @@ from ctxval.core.trial import Trial
 from ctxval.core.validation import Validation
 from ctxval.learning import DynamicsStudy
 from ctxval.searches import Auto, Costs, Prediction
-from ctxval.searches.auto import FAST
+from ctxval.searches.trust_region import FAST
 
 
 @dataclass(frozen=True)

@@ -33,8 +33,9 @@ from ctxval._util.representation import ShortRepr
 from ctxval._util.texts import enumerated
 from ctxval.certificates.bounds import at_most, percent
 from ctxval.certificates.drawn_distances import LARGEST, DrawnDistances
+from ctxval.certificates.dynamics_diagnostics import most_beyond
 from ctxval.certificates.dynamics_evidence import CheckedPrediction, DynamicsEvidence
-from ctxval.certificates.envelope_diagnostics import most_beyond, rises_of
+from ctxval.certificates.envelope_diagnostics import rises_of
 from ctxval.certificates.envelope_onnx import write_onnx
 from ctxval.certificates.envelope_surface import Surfaces, exported
 from ctxval.certificates.envelope_words import Region, regions_inside

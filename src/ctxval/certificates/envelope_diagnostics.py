@@ -8,9 +8,6 @@ import numpy as np
 
 from ctxval.certificates.drawn_distances import FLOOR
 from ctxval.certificates.dynamics_diagnostics import (
-    BEYOND,
-    GAP,
-    NOISY_BEYOND,
     PREDICTIONS,
     agrees,
     counted,
@@ -31,54 +28,31 @@ def rises_of(evidence: DynamicsEvidence, threshold: float) -> list[tuple[float, 
     """
     drawn = [test for test in tested(evidence.predictions, evidence.tests) if test.origin in DRAWN]
     last = {each.trial: each for each in [*drawn, *counted(evidence, threshold)[-PREDICTIONS:]]}.values()
-    return [(_standardised(each, threshold), each) for each in last if _matters(each, threshold)]
-
-
-def _matters(prediction: CheckedPrediction, threshold: float) -> bool:
-    return min(prediction.distance, prediction.median) <= threshold
-
-
-def _standardised(prediction: CheckedPrediction, threshold: float) -> float:
-    if not np.isfinite(prediction.upper):
-        return 0.0  # it said nothing
-    spread = (prediction.upper - prediction.median) / 1.645  # the 0.95 quantile of a normal distribution
-    return prediction.excess / max(spread, 2 * FLOOR * threshold)
-
-
-def most_beyond(evidence: DynamicsEvidence) -> float:
-    """Return by how much the closed loop of a trusted task may leave the records, as a share of the visited range."""
-    if evidence.coverage.pair is None:
-        return GAP
-    return BEYOND if evidence.quantile is None else NOISY_BEYOND
-
-
-def falsely_kept(evidence: DynamicsEvidence, threshold: float) -> CheckedPrediction | None:
-    """Return a test whose distance exceeds the threshold, and is below it on what is learned by now.
-
-    A smaller difference of the two raises the factor of the envelope.
-    """
-    for test in evidence.predictions:
-        known = test.explained
-        if known is None or test.is_noisy or agrees(test.distance, known, threshold):
-            continue
-        if known <= threshold < test.distance:
-            return test
-    return None
+    rises = []
+    for each in last:
+        if min(each.distance, each.median) <= threshold:
+            spread = (each.upper - each.median) / 1.645  # the 0.95 quantile of a normal distribution
+            rise = each.excess / max(spread, 2 * FLOOR * threshold) if np.isfinite(each.upper) else 0.0
+            rises.append((rise, each))
+    return rises
 
 
 def doubt_of_envelope(evidence: DynamicsEvidence, threshold: float) -> str | None:
     """Return why no envelope can be stated, and what would help; None if one can."""
     # Tasks that cannot be planned are no part of the envelope.
-    if (doubt := unlearned(replace(evidence, unplanned=0.0), threshold)) is not None:
-        return doubt
-    if (doubt := untried_parameter(evidence)) is not None:
-        return doubt
-    if (test := falsely_kept(evidence, threshold)) is not None:
-        return (
-            f"trial {test.trial} has the distance {test.distance:.4g}, and {test.explained:.4g} on the learned "
-            "dynamics, which is below the threshold: the next state is no function of what is recorded, or the "
-            "dynamics depend on the task; record more states"
-        )
+    for doubt in (*unlearned(replace(evidence, unplanned=0.0), threshold), untried_parameter(evidence)):
+        if doubt is not None:
+            return doubt
+    for test in evidence.predictions:
+        known = test.explained  # smaller differences raise the factor of the envelope
+        if known is None or test.is_noisy or agrees(test.distance, known, threshold):
+            continue
+        if known <= threshold < test.distance:
+            return (
+                f"trial {test.trial} has the distance {test.distance:.4g}, and {known:.4g} on the learned dynamics, "
+                "which is below the threshold: the next state is no function of what is recorded, or the dynamics "
+                "depend on the task; record more states"
+            )
     missing = missing_tests(evidence.predictions, evidence.tests)
     if missing:
         return (

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ctxval._util.onnx_graph import GraphValue
+from ctxval._util.onnx_network import GraphValue
 from ctxval.certificates.envelope_surface import Surfaces
 from ctxval.core.space import TaskSpace
 

@@ -10,9 +10,9 @@ from typing import Any
 from ctxval._util.representation import ShortRepr
 from ctxval.certificates import verdict_sentences as sentences
 from ctxval.certificates.base import Certificate
+from ctxval.certificates.bounds import Quantities
 from ctxval.certificates.dynamics_evidence import LearnedDistance
 from ctxval.certificates.sample import Sample
-from ctxval.certificates.verdict_sentences import Quantities
 from ctxval.core.space import DISTRIBUTION, TaskSpace
 from ctxval.core.task_distribution import distribution_text
 from ctxval.core.task_suite import SUITE, TaskSuite

@@ -11,12 +11,12 @@ import numpy as np
 from ctxval._util.checked import PositiveFloat, checked
 from ctxval._util.representation import ShortRepr, call, line, lines, shown, table
 from ctxval.certificates import verdict_sentences as sentences
-from ctxval.certificates.base import KINDS, Certificate, CertificateKind
+from ctxval.certificates.base import KINDS, Certificate, CertificateKind, certified
 from ctxval.certificates.bets import bets_against
+from ctxval.certificates.bounds import NO_UNITS, Quantities
 from ctxval.certificates.forecast import Forecast
 from ctxval.certificates.options import CONFIDENCE, CertificateOptions, require_confidence, require_volume
 from ctxval.certificates.provenance import Provenance
-from ctxval.certificates.verdict_sentences import Quantities
 from ctxval.core.quantiles import QUANTILE
 from ctxval.core.trial import Trial, designs_sentence
 from ctxval.errors import CertificateError
@@ -100,7 +100,7 @@ def usable_bound(certificate: Certificate | None) -> float | None:
 def counterexample(
     trials: Sequence[Trial],
     threshold: PositiveFloat,
-    quantities: Quantities = sentences.NO_UNITS,
+    quantities: Quantities = NO_UNITS,
     confidence: float = CONFIDENCE,
     quantile: float = QUANTILE,
 ) -> Verdict | None:
@@ -199,11 +199,8 @@ def _certified(
     if sample.suite is not None:
         require_suite(kind)
     sample = sample if kind.sorts_draws else sample.with_countable_draws()
-    if threshold is None:
-        certificate, expected = kind.certify(sample, options.confidence), None
-    else:
-        certificate, expected = kind.certify_against(sample, threshold, options.confidence)
-    return certificate.with_remarks(known.remarks), expected
+    certificate, expected = certified(kind, sample, threshold, options.confidence)
+    return replace(certificate, assumptions=(*certificate.assumptions, *known.remarks)), expected
 
 
 def require_suite(kind: CertificateKind) -> None:

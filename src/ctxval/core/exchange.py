@@ -15,6 +15,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from ctxval._util.arrays import Array, as_finite, as_floats
+from ctxval._util.checked import Seconds, require
 from ctxval._util.files import read_bytes, read_json, written_whole
 from ctxval._util.npz import Archive
 from ctxval._util.representation import ShortRepr, shown
@@ -56,7 +57,13 @@ def write_controller(
     if controller.gains.ndim != 3 or controller.inputs.ndim != 2:
         raise ShapeError(f"the controller must be for one task, with gains (H, m, n), got {controller.gains.shape}.")
     horizon, m, n = controller.gains.shape
-    about = {"format": CONTROLLER_FORMAT, "version": VERSION, "law": LAW, "dt": _seconds(dt), "horizon": horizon}
+    about = {
+        "format": CONTROLLER_FORMAT,
+        "version": VERSION,
+        "law": LAW,
+        "dt": require("dt", Seconds, dt),
+        "horizon": horizon,
+    }
     about |= _named("state", states, n) | _named("input", inputs, m)
     known = {"gains": controller.gains, "inputs": controller.inputs, "states": controller.states[:horizon]}
     arrays = {name: as_finite(f"the controller's {name}", array) for name, array in known.items()}
@@ -145,13 +152,9 @@ def _controller(content: Mapping[str, Any]) -> ControllerFile:
         high = [np.inf if value is None else value for value in content["high"]]
         limits = Limits.of(Limits(as_floats("limits", low), as_floats("limits", high)), m)
     feedback = AffineFeedback(gains, inputs, states, limits)
-    return ControllerFile(feedback, _seconds(content["dt"]), _names("state", content, n), _names("input", content, m))
-
-
-def _seconds(dt: Any) -> float:
-    if not isinstance(dt, int | float | np.number) or isinstance(dt, bool) or not (np.isfinite(dt) and dt > 0):
-        raise InputError(f"dt must be a positive number of seconds, got {str(dt)[:40]}.")
-    return float(dt)
+    return ControllerFile(
+        feedback, float(require("dt", Seconds, content["dt"])), _names("state", content, n), _names("input", content, m)
+    )
 
 
 def _named(kind: str, names: Names | None, count: int) -> dict[str, list[str]]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from ctxval._util.registry import Registry
 from ctxval.core.distance import ComposedDistance, Distance
-from ctxval.distances.base import StateNorm
 from ctxval.distances.crossing import AtCrossing, CrossingTime
 from ctxval.distances.deviations import (
     AtTimes,
@@ -13,6 +12,7 @@ from ctxval.distances.deviations import (
     MaximumDeviation,
     MeanDeviation,
     RelativeDeviation,
+    StateNorm,
     TrackingError,
     WholeTrajectory,
 )

@@ -10,10 +10,10 @@ import numpy as np
 from ctxval._util.arrays import Array
 from ctxval._util.checked import FiniteFloat, Norm, PositiveInt
 from ctxval._util.registry import part
-from ctxval.core.components import NamedStates, require_indices
+from ctxval.core.distance import NamedStates, require_indices
 from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory
-from ctxval.distances.base import ErrorNorm, turned
+from ctxval.distances.deviations import ErrorNorm, turned
 
 Direction = Literal["up", "down", "either"]
 

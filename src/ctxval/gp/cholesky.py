@@ -7,7 +7,7 @@ without the checks of :mod:`scipy.linalg`, which cost more than a small solve.
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,6 +16,7 @@ from scipy.linalg.lapack import dpotrf, dpotri, dpotrs, dtrtrs
 
 from ctxval._util.arrays import Array, Rows
 from ctxval.errors import InputError
+from ctxval.gp.kernels import Covariance
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,3 +87,49 @@ def tenfold(noise: float) -> Iterator[float]:
     for _ in range(31):
         yield noise
         noise *= 10
+
+
+# Parts of matrices
+
+
+def pivoted_rows(kernel: Covariance, theta: Array, X: Array, count: int, least: float) -> Rows:
+    """Return at most ``count`` rows by pivoted Cholesky: each has the largest variance given the rows before it.
+
+    The choice ends if no remaining variance is larger than ``least``.
+    """
+    towards = kernel.towards(theta, X)
+    return pivoted_cholesky(kernel.diagonal(theta, X), lambda row: towards(X[row : row + 1])[0], count, least).rows
+
+
+@dataclass(frozen=True, eq=False)
+class PivotedCholesky:
+    """A part of a positive semidefinite matrix of which each row has the largest variance given the rows before it."""
+
+    rows: Rows  # (k,)
+    L: Array  # the Cholesky factor of the matrix of these rows (k, k)
+    left: Array  # the variances of all n rows given these (n,)
+
+
+def pivoted_cholesky(
+    variances: Array, covariances: Callable[[int], Array], count: int, least: float
+) -> PivotedCholesky:
+    """Return the Cholesky factor of those rows of a covariance matrix that represent all of it.
+
+    The matrix has the diagonal ``variances`` ``(n,)``, and ``covariances`` returns one of its rows in an array that may
+    be overwritten; count and least are as in :func:`pivoted_rows`.
+    """
+    left = np.array(variances)
+    columns = np.empty((min(count, len(left)), len(left)))
+    chosen: list[int] = []
+    for k, column in enumerate(columns):
+        pivot = int(left.argmax())
+        if left[pivot] <= least:
+            break
+        row = covariances(pivot)
+        row -= columns[:k, pivot] @ columns[:k]
+        np.divide(row, np.sqrt(left[pivot]), out=column)
+        left -= np.square(column, out=row)
+        left[pivot] = 0.0
+        chosen.append(pivot)
+    rows = np.array(chosen, dtype=np.intp)
+    return PivotedCholesky(rows, np.tril(columns[: len(rows)][:, rows].T), np.maximum(left, 0.0))

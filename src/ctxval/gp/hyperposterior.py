@@ -9,6 +9,7 @@ to tune: the scale of the values, the smoothness, the length-scales and the nois
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -160,7 +161,7 @@ def draw_hyperparameters(
     if len(y) < 3 or not np.isfinite(y).all() or np.ptp(y) == 0:
         raise InputError(f"hyperparameters need at least three finite values that differ, got {y.tolist()}.")
     prior = prior or Prior()
-    drawn = _Sampler(X, y, prior, rng).draw(count)
+    drawn = _chain(X, y, prior, count, rng)
     apart = max(6, int(np.ceil(prior.spread_share * len(y))))
     if apart < len(y):
         # The row of the largest value, and those of points chosen farthest-first from it, in the data's order.
@@ -168,58 +169,43 @@ def draw_hyperparameters(
         gaps = np.linalg.norm(X - X[first], axis=1)
         gaps[first] = -np.inf
         rows = np.sort([first, *farthest_rows(X, gaps, apart - 1)])
-        rougher = _Sampler(X[rows], y[rows], prior, rng).draw(count)
-        drawn = [(own.as_rough_as(other), warp) for (own, warp), (other, _) in zip(drawn, rougher, strict=True)]
-    return [condition(own, X, y, warp) for own, warp in drawn]
+        rougher = _chain(X[rows], y[rows], prior, count, rng)
+        drawn = [(draw.as_rough_as(other), warp) for (draw, warp), (other, _) in zip(drawn, rougher, strict=True)]
+    return [condition(draw, X, y, warp) for draw, warp in drawn]
 
 
-class _Sampler:
-    """A Markov chain over (nu, log length-scales, log noise)."""
+def _chain(
+    X: Array, y: Array, prior: Prior, count: int, rng: np.random.Generator
+) -> list[tuple[Hyperparameters, Warp]]:
+    """Return draws of a Markov chain over (nu, log length-scales, log noise), two sweeps apart."""
+    d, warps, (low, high) = X.shape[1], prior.warps(y), np.log(prior.noise)
+    choices = [(nu, warp) for nu in prior.smoothness for warp in warps]
+    choice, state = choices[0], np.append(np.full(d, prior.centre(d)), 0.5 * (low + high))
+    # All length-scales together, each length-scale, and the noise.
+    axes = np.eye(d + 1)
+    directions = [np.append(np.ones(d), 0.0), *(axes[:d] if d > 1 else ()), *(axes[d:] if high > low else ())]
 
-    def __init__(self, X: Array, y: Array, prior: Prior, rng: np.random.Generator) -> None:
-        self.X, self.y, self.prior, self.rng, self.d = X, y, prior, rng, X.shape[1]
-        self.low, self.high = np.log(prior.noise)
-        self.warps = prior.warps(y)
-        self.choice = (prior.smoothness[0], self.warps[0])
-        self.state = np.append(np.full(self.d, prior.centre(self.d)), 0.5 * (self.low + self.high))
-
-    def draw(self, count: int) -> list[tuple[Hyperparameters, Warp]]:
-        """Return draws two sweeps apart."""
-        for _ in range(20):  # the burn-in
-            self._sweep()
-        draws = []
-        for _ in range(count):
-            self._sweep()
-            self._sweep()
-            nu, warp = self.choice
-            draws.append((Hyperparameters(nu, self.state[:-1], float(self.state[-1])), warp))
-        return draws
-
-    def _log_density(self, choice: tuple[float, Warp], state: Array) -> float:
-        nu, warp = choice
-        if not self.low <= state[-1] <= self.high or np.abs(state[:-1]).max() > 12.0:
+    def log_density(choice: tuple[float, Warp], state: Array) -> float:
+        if not low <= state[-1] <= high or np.abs(state[:-1]).max() > 12.0:
             return -np.inf
         try:
-            conditioned = condition(Hyperparameters(nu, state[:-1], float(state[-1])), self.X, self.y, warp)
+            conditioned = condition(Hyperparameters(choice[0], state[:-1], float(state[-1])), X, y, choice[1])
         except InputError:
             return -np.inf
-        away = (state[:-1] - self.prior.centre(self.d)) / self.prior.deviation
+        away = (state[:-1] - prior.centre(d)) / prior.deviation
         return conditioned.log_likelihood + float(-0.5 * (away**2).sum())
 
-    def _sweep(self) -> None:
-        """Move along all length-scales together, each length-scale and the noise; then draw smoothness and scale."""
-        directions = [np.append(np.ones(self.d), 0.0)]
-        if self.d > 1:
-            directions += list(np.eye(self.d + 1)[: self.d])
-        if self.high > self.low:
-            directions.append(np.eye(self.d + 1)[self.d])
+    draws = []
+    for sweep in range(20 + 2 * count):  # the first 20 are the burn-in
         for direction in directions:
-            self.state = _slice(lambda state: self._log_density(self.choice, state), self.state, direction, self.rng)
-        choices = [(nu, warp) for nu in self.prior.smoothness for warp in self.warps]
+            state = _slice(functools.partial(log_density, choice), state, direction, rng)
         if len(choices) > 1:
-            densities = np.array([self._log_density(choice, self.state) for choice in choices])
+            densities = np.array([log_density(each, state) for each in choices])
             shares = np.exp(densities - densities.max())
-            self.choice = choices[int(self.rng.choice(len(choices), p=shares / shares.sum()))]
+            choice = choices[int(rng.choice(len(choices), p=shares / shares.sum()))]
+        if sweep >= 20 and sweep % 2:
+            draws.append((Hyperparameters(choice[0], state[:-1], float(state[-1])), choice[1]))
+    return draws
 
 
 def _slice(log_density: Callable[[Array], float], state: Array, direction: Array, rng: np.random.Generator) -> Array:

@@ -1,27 +1,22 @@
 """Inputs that act late: a delay and a lag of the actuators, found in executions, as a part of the controller.
 
 What S does in a step then depends on earlier inputs. Recorded inputs tell which input acts in each step, so the
-residual is a function of the state and of that input, and everything that is learned, covered and tested of state and
-input holds. A closed loop has the acting inputs and those that were commanded, in this order; M, the user's controllers
-and the distance see what was commanded.
+residual is a function of the state and of that input.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from scipy.optimize import minimize
 
 from ctxval._util.arrays import Array, Mask, Rows
-from ctxval.core.controller import Controller, Synthesizer, memory_of, stepped
-from ctxval.core.distance import Distance
+from ctxval.core.controller import Controller, memory_of, stepped
 from ctxval.core.model import Model
 from ctxval.core.task import Task
-from ctxval.core.trajectory import Trajectory
-from ctxval.core.validation import Validation
 from ctxval.learning.histories import History, Record, Structure
 from ctxval.learning.hyperparameters import FAMILIES, HyperparameterPosterior, Mode, learning_rows, log_posterior
 from ctxval.learning.residual_data import NEGLIGIBLE
@@ -173,88 +168,25 @@ class _Evidence:
         return Actuator(*chosen.tolist())
 
 
-# A closed loop whose inputs are those that act, followed by those that were commanded
+@dataclass(frozen=True)
+class ActuatedController:
+    """A controller with an actuator, which returns the input that acts and the one that is commanded, ``(..., 2 m)``.
 
-
-def with_actuator(validation: Validation, actuator: Actuator | None, inputs: int) -> Validation:
-    """Return a validation whose controllers have an actuator and return both inputs ``(..., 2 m)``; itself if None.
-
-    Its system is that of the given one, and cannot be executed.
+    Its memory has the latest commands, the latest first, and the input that acts.
     """
-    if actuator is None:
-        return validation
-    return validation.with_parts(
-        model=_OfCommands(validation.model, inputs),
-        synthesizer=_ActuatedSynthesizer(validation.synthesizer, validation.model, actuator),
-        distance=_DistanceOfCommands(validation.distance, inputs),
-    )
-
-
-def with_commands(trajectory: Trajectory, commanded: Array) -> Trajectory:
-    """Return a trajectory whose inputs act, with those that were commanded in its steps beside them."""
-    steps = trajectory.inputs.shape[-2]
-    return replace(trajectory, inputs=np.concatenate([trajectory.inputs, commanded[..., :steps, :]], axis=-1))
-
-
-@dataclass(frozen=True)
-class _OfCommands:
-    """M under the last m inputs, which are commanded, or under what acts if nothing else is given."""
-
-    model: Model
-    inputs: int
-
-    def step(self, x: Array, u: Array) -> Array:
-        return np.asarray(self.model.step(x, u[..., -self.inputs :]))
-
-
-@dataclass(frozen=True)
-class _ActuatedSynthesizer:
-    """Designs the user's controllers on the user's model."""
-
-    synthesizer: Synthesizer
-    model: Model
-    actuator: Actuator
-
-    @property
-    def batched(self) -> bool:
-        return bool(getattr(self.synthesizer, "batched", False))
-
-    def design(self, task: Task, model: Model) -> Controller:
-        return _ActuatedController(self.synthesizer.design(task, self.model), self.actuator)
-
-
-@dataclass(frozen=True)
-class _ActuatedController:
-    """A controller whose memory has the latest commands, the latest first, and the input that acts."""
 
     controller: Controller
     actuator: Actuator
 
     def start(self, task: Task) -> Any:
+        """Return the memory before the first step."""
         return memory_of(self.controller, task), (), None
 
     def step(self, t: int, x: Array, memory: Any) -> tuple[Array, Any]:
+        """Return both inputs and the memory after the step."""
         of_controller, commanded, acting = memory
         u, of_controller = stepped(self.controller, t, x, of_controller)
         u = np.array(u, dtype=np.float64)
         commanded = (u, *commanded)[: self.actuator.remembered]
         acting = self.actuator.follow(np.zeros_like(u) if acting is None else acting, commanded)
         return np.concatenate([acting, u], axis=-1), (of_controller, commanded, acting)
-
-
-@dataclass(frozen=True)
-class _DistanceOfCommands:
-    """The user's distance of trajectories with the inputs that were commanded."""
-
-    distance: Distance
-    inputs: int
-
-    def __call__(self, model_trajectory: Trajectory, system_trajectory: Trajectory, task: Task) -> Array:
-        return self.distance(
-            commands_of(model_trajectory, self.inputs), commands_of(system_trajectory, self.inputs), task
-        )
-
-
-def commands_of(trajectory: Trajectory, inputs: int) -> Trajectory:
-    """Return a closed loop with the m inputs that were commanded alone."""
-    return replace(trajectory, inputs=trajectory.inputs[..., -inputs:])

@@ -268,7 +268,7 @@ class DynamicsStudy(ShortRepr):
             return None
         # The data that M was made from tell no earlier inputs.
         data = self._data if with_data and self.actuator is None else None
-        loops = [self.extended.with_acting(one) for _, one in executed]
+        loops = [replace(loop, inputs=self.extended.acting(loop)) for _, loop in executed]
         return recorded_transitions(data, loops, self._loops, logged)
 
     @functools.cached_property
@@ -291,7 +291,7 @@ class DynamicsStudy(ShortRepr):
     def _with_parameter(self, name: str) -> DynamicsStudy:
         """Return the study with another task parameter as a state; it is kept."""
         if name not in self._others:
-            given = self.given.with_physical([*self.given.physical, name])
+            given = self.given.with_parts(physical=[*self.given.physical, name])
             self._others[name] = DynamicsStudy(given, self.seed, self.quantile, self.extended.of(given))
         return self._others[name]
 

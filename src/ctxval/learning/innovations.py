@@ -120,11 +120,6 @@ class InnovationsFit(ABC):
         """The variance of the innovations as a share of the mean square of the error of M, where it is largest."""
         return float(((self.noise[self.live] / self.scaled.sizes[self.live]) ** 2).max(initial=0.0))
 
-    @property
-    def most_probable(self) -> list[DrawnWeights]:
-        """The most probable weights, as one draw."""
-        return [(self.features, self.weights[None], self.noise[None])]
-
     def residual(self, z: Array) -> Array:
         """Return the most probable residual ``(..., n)`` of regressors ``(..., D)``."""
         flat = (z.reshape(-1, z.shape[-1]) - self.scaled.shift) / self.scaled.scale

@@ -18,7 +18,7 @@ from ctxval.core.trajectory import Trajectory
 from ctxval.learning.dynamics_study import DynamicsStudy
 from ctxval.learning.histories import Record
 from ctxval.learning.learned_dynamics import LearnedDynamics
-from ctxval.learning.tolerance import PushedDynamics
+from ctxval.learning.tolerance import pushed
 
 NEGLIGIBLE = 0.01
 """Share of the threshold: what moves no distance by so much is no change."""
@@ -138,15 +138,12 @@ def names(study: DynamicsStudy, states: int) -> Sequence[str]:
 def influences(learned: LearnedDynamics) -> Array:
     """Return what a unit of a constant residual of each state moves the distance of executed tasks by, ``(n, q)``."""
     posterior, planner = learned.posterior, learned.study.planner
-    data, mean, n = posterior.data, posterior.mean, len(posterior.data.sizes)
+    data, n = posterior.data, len(posterior.data.sizes)
     sizes = np.maximum(_PUSH * data.sizes, 1e-3 * data.steps)
     pushes = np.concatenate([np.zeros((1, n)), np.diag(sizes), -np.diag(sizes)])
-    pushed = PushedDynamics(
-        model=posterior.model, data=data, expansions=mean.expansions, limit=mean.limit, pushes=pushes,
-        widths=np.ones(n),
-    )  # fmt: skip
     with single_threaded():
-        distances = planner.distances(pushed, planner.plan(learned.executed), len(learned.executed))
+        planned = planner.plan(learned.executed)
+        distances = planner.distances(pushed(posterior.mean, pushes), planned, len(learned.executed))
     moved = np.abs(distances[1:] - distances[0]).reshape(2, n, -1).max(axis=0)
     return np.asarray(np.where(np.isfinite(moved), moved, 0.0) / sizes[:, None])
 
@@ -161,11 +158,9 @@ def _residuals(learned: LearnedDynamics, record: Record) -> tuple[Array, Array, 
         data, most = posterior.data, posterior.most_probable
         residuals = record.states[1:] - posterior.mean.alone(record.states[:-1], record.inputs)
         Z = data.standardised(record.states[:-1], record.inputs)
-        doubt, noise = np.zeros(len(data.sizes)), np.zeros(len(data.sizes))
-        sizes = data.sizes[data.learned]
-        doubt[data.learned] = most.variance(Z).mean() * most.squares / len(most.centres) * sizes**2
-        noise[data.learned] = (most.noise * sizes) ** 2
-        return residuals, doubt, noise, Z
+        doubt = np.zeros(len(data.sizes))
+        doubt[data.learned] = most.variance(Z).mean() * most.squares / len(most.centres) * data.sizes[data.learned] ** 2
+        return residuals, doubt, posterior.deviations**2, Z
     fit = noisy.fit
     Z, _, residuals = fit.history.along([record], fit.residual)
     z = (Z - fit.scaled.shift) / fit.scaled.scale

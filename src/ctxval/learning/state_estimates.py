@@ -7,23 +7,17 @@ recorded, beside what it misses in the other states, is chosen by how well the f
 
 from __future__ import annotations
 
-import contextlib
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from weakref import WeakKeyDictionary
 
 import numpy as np
 
 from ctxval._util.arrays import Array
-from ctxval.core.controller import Controller, Synthesizer
-from ctxval.core.distance import Distance
 from ctxval.core.kalman import Estimate, corrected, predicted, smoothed
-from ctxval.core.labels import labels_of
 from ctxval.core.model import Model
-from ctxval.core.outputs import Outputs
-from ctxval.core.task import Task
+from ctxval.core.system import Outputs
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.validation import Validation
-from ctxval.learning.recorded import closed_loops_on_model
 from ctxval.learning.vector import Executed
 from ctxval.models.corrected import before_refinement
 from ctxval.models.scaling import standard_deviations
@@ -32,56 +26,6 @@ _SHARES = np.array([1.0, 1e-1, 1e-2, 1e-3, 1e-4])
 """What M misses in recorded directions, beside what it misses in all others, as shares of their steps."""
 
 _EXACT = 1e-6  # error of the recorded outputs, as a share of their smallest step: they are reproduced
-
-
-def with_states_of_model(validation: Validation) -> Validation:
-    """Return a validation whose trajectories have the states of M; itself if the states are recorded.
-
-    Its system is that of the given one, and cannot be executed.
-    """
-    outputs = validation.outputs
-    if outputs is None:
-        return validation
-    labels, space = replace(validation.labels, states=()), validation.space
-    with contextlib.suppress(Exception):  # the user's task, which is planned with its own errors elsewhere
-        n = validation.task(space.parameters(0.5 * (space.low + space.high))).initial_state.shape[-1]
-        names = [f"x{i}" for i in range(n)]
-        recorded = outputs.indices or []
-        for i, label in zip(recorded, labels_of(validation.names(len(recorded), 0)[0]), strict=True):
-            names[i] = label
-        labels = replace(labels, states=tuple(names))
-    return validation.with_parts(
-        synthesizer=_OutputSynthesizer(validation.synthesizer, outputs),
-        distance=_OutputDistance(validation.distance, outputs),
-        labels=labels,
-        outputs=None,
-    )
-
-
-@dataclass(frozen=True)
-class _OutputSynthesizer:
-    """Designs the user's controllers, which see the outputs alone."""
-
-    synthesizer: Synthesizer
-    outputs: Outputs
-
-    @property
-    def batched(self) -> bool:
-        return bool(getattr(self.synthesizer, "batched", False))
-
-    def design(self, task: Task, model: Model) -> Controller:
-        return self.outputs.seen_by(self.synthesizer.design(task, model))
-
-
-@dataclass(frozen=True)
-class _OutputDistance:
-    """The user's distance, which is about the outputs alone."""
-
-    distance: Distance
-    outputs: Outputs
-
-    def __call__(self, model_trajectory: Trajectory, system_trajectory: Trajectory, task: Task) -> Array:
-        return self.distance(self.outputs.of(model_trajectory), self.outputs.of(system_trajectory), task)
 
 
 class StateEstimates:
@@ -100,14 +44,6 @@ class StateEstimates:
         steps = standard_deviations(changes[np.isfinite(changes).all(axis=1)])
         self.steps = np.maximum(steps, 1e-9 * max(float(steps.max(initial=0.0)), 1e-300))
         self._known: WeakKeyDictionary[Trajectory, tuple[Array, Array]] = WeakKeyDictionary()
-
-    @classmethod
-    def by_loops_on_model(cls, validation: Validation) -> StateEstimates | None:
-        """Return the estimates for a validation; None if no task can be planned, or if it has no outputs."""
-        if validation.outputs is None:
-            return None
-        loops = closed_loops_on_model(with_states_of_model(validation))
-        return None if loops is None else cls(validation, validation.outputs, loops.states)
 
     def of(self, executed: Executed, judged: int) -> list[Trajectory] | None:
         """Return the executions, points of the unit cube with recorded outputs, with states ``(H + 1, n)``.

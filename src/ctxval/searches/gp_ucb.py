@@ -10,8 +10,7 @@ from ctxval._util.registry import part
 from ctxval.gp.acquisition import Uncertainty, UpperConfidenceBound, maximise
 from ctxval.gp.kernels import Kernel, Matern
 from ctxval.gp.regression import NOISE, Mean
-from ctxval.gp.subset import kept_rows
-from ctxval.gp.surrogate import Surrogate, fit_surrogate
+from ctxval.gp.surrogate import Surrogate, fit_surrogate, kept_rows
 from ctxval.searches.base import SequentialSearch, best_first
 
 

@@ -21,10 +21,10 @@ from ctxval.web.jobs import OpenCampaign, ServedCampaign
 
 
 class BackgroundProcess:
-    """A process that opens the campaign once and then does one job at a time.
+    """A process that opens the campaign once and then does one job at a time; after a crash, the next job restarts it.
 
-    A process keeps the server responsive while Python computes, keeps users' code of two campaigns apart, and may crash
-    without harm. The next job starts it again. The listener is called in another thread.
+    It keeps the server responsive while Python computes, and users' code of two campaigns apart. The listener is called
+    in another thread.
     """
 
     def __init__(self, open_campaign: OpenCampaign, on_progress: Listener) -> None:

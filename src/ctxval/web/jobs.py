@@ -13,12 +13,11 @@ import numpy as np
 
 from ctxval._util.progress import stage
 from ctxval._util.texts import reason_of
-from ctxval.campaign.by_hand import write_files
+from ctxval.campaign.by_hand import parameters_of_trial, write_files
 from ctxval.campaign.campaign import Campaign
 from ctxval.campaign.choices import OpenTrial
 from ctxval.campaign.interval_search import require_decisive
 from ctxval.campaign.plot import overview, worst_trajectories
-from ctxval.campaign.telling import parameters_of_trial
 from ctxval.certificates import CertificateOptions, Verdict
 from ctxval.certificates import judge as judge_trials
 from ctxval.core.experiment import Experiment

@@ -9,7 +9,8 @@ from collections.abc import Callable
 from typing import Any, TypeVar
 
 from ctxval._util.texts import reason_of
-from ctxval.campaign.telling import ToldResult, tell_result
+from ctxval.campaign.by_hand import tell_result
+from ctxval.campaign.telling import ToldResult
 from ctxval.core.trial import Trial
 from ctxval.errors import CampaignError, CtxvalError, DistanceError, InputError
 from ctxval.web import jobs

@@ -14,8 +14,7 @@ from collections.abc import AsyncIterator
 from dataclasses import dataclass, replace
 from typing import Any
 
-from ctxval._util.progress import Listener, Progress
-from ctxval._util.progress_display import amount
+from ctxval._util.progress import Listener, Progress, amount
 from ctxval.campaign.interval_search import IntervalSearch
 from ctxval.certificates import Certificate, Verdict
 from ctxval.core.trial import Trial

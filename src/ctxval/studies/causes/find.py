@@ -16,7 +16,7 @@ from ctxval.core.system import System, WithOutputs
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.validation import Validation
 from ctxval.errors import CtxvalError, InputError
-from ctxval.learning.state_estimates import StateEstimates
+from ctxval.learning.extended import estimates_by_loops_on_model
 from ctxval.studies.causes.candidates import Candidate, candidates
 from ctxval.studies.causes.cause import Repaired
 from ctxval.studies.causes.evidence import STEPS, Explanation, Records, explained, screened
@@ -60,7 +60,7 @@ def find_causes(campaign: Campaign, *, most: int = 2) -> CauseReport:
     with single_threaded():
         states = [run for _, run in executed]
         if validation.outputs is not None:
-            estimates = StateEstimates.by_loops_on_model(validation)
+            estimates = estimates_by_loops_on_model(validation)
             estimated = None if estimates is None else estimates.of(executed, len(executed))
             if estimated is None:
                 raise InputError("the states of the model cannot be estimated from the recorded outputs.")

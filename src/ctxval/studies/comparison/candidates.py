@@ -16,7 +16,7 @@ from ctxval._util.describe import describe, differences
 from ctxval._util.progress import stage
 from ctxval.campaign.campaign import Campaign
 from ctxval.campaign.choices import Choice, Execution
-from ctxval.campaign.execution import RetryPolicy, Schedule, execute_schedule
+from ctxval.campaign.execution import ExecutionLoop
 from ctxval.campaign.history import executed_trials, largest_distance
 from ctxval.core.plan import gives_inputs
 from ctxval.core.trajectory import Trajectory
@@ -249,9 +249,12 @@ class Executions:
 
     def _run(self, candidate: Candidate, choice: Choice | None, predicts: bool) -> None:
         waiting = [] if choice is None else [choice]
-        schedule = Schedule(candidate.recorder, lambda: waiting.pop() if waiting else None, expected=None)
         with candidate.recorder.predicting(predicts), self._hiding(None if choice is None else choice.unit_point):
-            execute_schedule(schedule, None, partial(self.on_trial, candidate.name), RetryPolicy())
+            ExecutionLoop(
+                candidate.recorder,
+                lambda: waiting.pop() if waiting else None,
+                on_trial=partial(self.on_trial, candidate.name),
+            ).run()
 
     def _share_all(self) -> None:
         """Record executions for the candidates that would have given the system the same inputs."""

@@ -11,8 +11,7 @@ from typing import Literal
 import numpy as np
 
 from ctxval._util.checked import NonNegativeInt, PositiveFloat, PositiveInt, Probability, checked
-from ctxval._util.progress import advance, stage
-from ctxval._util.progress_display import progress_shown
+from ctxval._util.progress import advance, progress_shown, stage
 from ctxval.campaign.campaign import Campaign
 from ctxval.certificates.options import CONFIDENCE, require_confidence
 from ctxval.core.experiment import Experiment

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from ctxval._util.files import MADE_BY, write_text
-from ctxval._util.onnx_graph import GraphValue, require_onnx
+from ctxval._util.onnx_network import GraphValue, require_onnx
 from ctxval.core.model import Model
 from ctxval.errors import InputError
 from ctxval.models import Corrected, Correction, FeedforwardReLU, GaussianProcessModel, Linear, Parametric

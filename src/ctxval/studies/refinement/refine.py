@@ -10,8 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from ctxval._util.checked import PositiveFloat, PositiveInt, checked
-from ctxval._util.progress import stage
-from ctxval._util.progress_display import progress_shown
+from ctxval._util.progress import progress_shown, stage
 from ctxval.campaign.campaign import Campaign
 from ctxval.campaign.history import executed_trials
 from ctxval.certificates import CertificateOptions
@@ -21,7 +20,8 @@ from ctxval.core.trajectory import Trajectory, Transitions
 from ctxval.core.trial import Trial
 from ctxval.core.validation import Validation
 from ctxval.errors import CtxvalError, InputError
-from ctxval.learning.state_estimates import StateEstimates, with_states_of_model
+from ctxval.learning.extended import estimates_by_loops_on_model, with_states_of_model
+from ctxval.learning.state_estimates import StateEstimates
 from ctxval.models import Refined, read_refined, write_model
 from ctxval.models.corrected import before_refinement
 from ctxval.models.saved import is_savable, read_note
@@ -245,7 +245,7 @@ class _Loop:
 
     @functools.cached_property
     def _estimates(self) -> StateEstimates | None:
-        return StateEstimates.by_loops_on_model(self.first.validation)
+        return estimates_by_loops_on_model(self.first.validation)
 
     def _beside(self, number: int, suffix: str) -> Path | None:
         store = self.first.store.path
