@@ -31,9 +31,9 @@ _Outcome = tuple[Certificate, Forecast | None]
 class Automatic(CertificateKind):
     """The bound from learned dynamics if it keeps the threshold, otherwise the posterior bound of the distance.
 
-    For a suite of tasks, it is the bound from learned dynamics until all tasks were executed. The dynamics bound is tried
-    only if the experiment is loaded and the resolution is the usual one. If neither keeps the threshold, the certificate
-    is the one that is nearer to a decision.
+    For a suite of tasks, it is the bound from learned dynamics until all tasks were executed. The dynamics bound is
+    tried only if the experiment is loaded and the resolution is the usual one. If neither keeps the threshold, the
+    certificate is the one that is nearer to a decision.
 
     Attributes:
         resolution: as for the posterior bound.
