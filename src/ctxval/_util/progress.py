@@ -9,7 +9,7 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -76,16 +76,14 @@ def listening(listener: Listener | None) -> Iterator[None]:
         _innermost.reset(tokens[1])
 
 
-@contextmanager
-def also_listening(listener: Listener) -> Iterator[None]:
+def also_listening(listener: Listener) -> AbstractContextManager[None]:
     outer = _listener.get() or ignore
 
     def both(progress: Progress) -> None:
         outer(progress)
         listener(progress)
 
-    with listening(both):
-        yield
+    return listening(both)
 
 
 def ignore(_: Progress) -> None:

@@ -25,23 +25,15 @@ class Declaration:
     """Declares a class, or a function that makes an object, as a part that is found by name; checks its arguments.
 
     A part of this package is found once its package exports it in ``__all__``.
-
-    Attributes:
-        name: the name of the class by default.
-        runs_code: whether plain arguments, such as a text, can make the part run code: a program, a library, a module.
-        files: arguments that are paths of files.
-        folder: the argument that is a folder, which is the experiment's by default.
-        functions: arguments that are functions, each with its form, such as ``(x, u) -> x_next``.
-        parts: arguments that are parts themselves, each with its kind, such as ``synthesizer``.
     """
 
-    name: str = ""
+    name: str = ""  # the name of the class by default
     _: KW_ONLY
-    runs_code: bool = False
-    files: tuple[str, ...] = ()
-    folder: str | None = None
-    functions: Mapping[str, str] = field(default_factory=dict)
-    parts: Mapping[str, str] = field(default_factory=dict)
+    runs_code: bool = False  # whether plain arguments, such as a text, can make it run a program, a library, a module
+    files: tuple[str, ...] = ()  # arguments that are paths of files
+    folder: str | None = None  # the argument that is a folder, which is the experiment's by default
+    functions: Mapping[str, str] = field(default_factory=dict)  # arguments that are functions: (x, u) -> x_next
+    parts: Mapping[str, str] = field(default_factory=dict)  # arguments that are parts, each with its kind: synthesizer
 
     def __call__(self, made: Part) -> Part:
         made = checked(made)

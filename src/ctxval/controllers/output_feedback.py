@@ -120,16 +120,12 @@ class FilterMemory(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class EstimatedFeedback(ShortRepr):
-    """The state feedback of one task or a batch on the filter's estimates, a controller with memory.
-
-    Attributes:
-        process, measurement: covariances ``(n, n)`` and ``(p, p)``.
-    """
+    """The state feedback of one task or a batch on the filter's estimates, a controller with memory."""
 
     feedback: Controller
     model: Model
     outputs: Outputs
-    process: Array
+    process: Array  # covariances (n, n) and (p, p)
     measurement: Array
 
     @property

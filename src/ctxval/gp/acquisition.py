@@ -31,14 +31,10 @@ _LOG_ROOT_2PI = 0.5 * float(np.log(2 * np.pi))
 
 @dataclass(frozen=True, eq=False)
 class UpperConfidenceBound:
-    """``alpha(p) = mu(p) + beta^(1/2) sigma(p)`` (the paper's eq. 10, GP-UCB).
-
-    Attributes:
-        beta: the confidence parameter; the paper takes 2.
-    """
+    """``alpha(p) = mu(p) + beta^(1/2) sigma(p)`` (the paper's eq. 10, GP-UCB)."""
 
     process: GaussianProcess
-    beta: float = 2.0
+    beta: float = 2.0  # the confidence parameter; the paper takes 2
 
     def __call__(self, X: Array) -> Array:
         mean, variance = self.process.predict(X)
@@ -55,14 +51,10 @@ class UpperConfidenceBound:
 
 @dataclass(frozen=True, eq=False)
 class LogExpectedImprovement:
-    """``log E max(f(p) - best, 0)``, also if the expectation underflows (Ament et al. 2023, eqs. 8 and 9).
-
-    Attributes:
-        best: the value to improve on, in the process's units.
-    """
+    """``log E max(f(p) - best, 0)``, also if the expectation underflows (Ament et al. 2023, eqs. 8 and 9)."""
 
     process: GaussianProcess
-    best: float
+    best: float  # the value to improve on, in the process's units
 
     def __call__(self, X: Array) -> Array:
         mean, variance = self.process.predict(X)

@@ -31,22 +31,16 @@ def zero_mean(X: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class GaussianProcess:
-    """A Gaussian process conditioned on observations; make one with :func:`condition` or :func:`fit`.
-
-    Attributes:
-        X, y: observations, shapes ``(n, d)`` and ``(n,)``.
-        factor: Cholesky factor of ``K + noise I``.
-        alpha: ``(K + noise I)^-1 (y - mean(X))``.
-    """
+    """A Gaussian process conditioned on observations; make one with :func:`condition` or :func:`fit`."""
 
     kernel: Kernel
     theta: Array
     noise: float
     mean: Mean
-    X: Array
-    y: Array
-    factor: CholeskyFactor
-    alpha: Array
+    X: Array  # observed points (n, d)
+    y: Array  # observations (n,)
+    factor: CholeskyFactor  # of K + noise I
+    alpha: Array  # (K + noise I)^-1 (y - mean(X))
 
     def predict(self, X: Array) -> tuple[Array, Array]:
         """Return the posterior mean and variance of the noise-free function at ``(m, d)``, shapes ``(m,)``."""

@@ -21,15 +21,10 @@ _KERNEL = Sum(Matern(1.5, ard=True, length_scale=(0.02, 100.0)), Linear())  # th
 
 @dataclass(frozen=True, eq=False)
 class Surrogate(ShortRepr):
-    """A GP of the distance over the unit cube.
+    """A GP of the distance over the unit cube."""
 
-    Attributes:
-        process: the process of the standardised distance ``(d - shift) / scale``.
-        shift, scale: constants of the standardisation, in the distance's units.
-    """
-
-    process: GaussianProcess
-    shift: float
+    process: GaussianProcess  # of the standardised distance (d - shift) / scale
+    shift: float  # constants of the standardisation, in the distance's units
     scale: float
 
     def predict(self, points: Array) -> tuple[Array, Array]:
