@@ -42,7 +42,7 @@ class Prediction(ShortRepr):
     """A prediction of values at points of the unit cube that have not been evaluated."""
 
     expected: Callable[[Array], tuple[Array, Array]]
-    """Points ``(m, d)`` -> the expected values ``(m,)`` and their doubt ``(m,)``, both NaN if a value cannot be predicted.
+    """Points ``(m, d)`` -> expected values ``(m,)`` and their doubt ``(m,)``, both NaN if a value cannot be predicted.
     The doubt is 0 if all that leads to a value was seen before, and about 1 if nothing was."""
     left_out: Callable[[Rows], Array]
     """Rows ``(k,)`` -> leave-one-out predictions ``(k,)``. Rows count the points with a known value, in the order of
