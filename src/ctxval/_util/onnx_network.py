@@ -180,12 +180,7 @@ class GraphValue:
         return cls(name, require_onnx(), [], [])
 
     def node(self, kind: str, *others: Self | Array, output: int = 0, **attributes: Any) -> Self:
-        """Return a result of an operation on this value and others; constants are broadcast.
-
-        Args:
-            output: which of its results this is.
-            attributes: those of the operation.
-        """
+        """Return one of the results of an operation on this value and others; constants are broadcast."""
         names = [(each if isinstance(each, GraphValue) else self.constant(each)).name for each in (self, *others)]
         results = [f"value_{len(self.nodes)}_{k}" for k in range(output + 1)]
         self.nodes.append(self.onnx.helper.make_node(kind, names, results, **attributes))
@@ -210,11 +205,7 @@ class GraphValue:
     def write(self, path: str | Path, title: str, width: int, outputs: dict[str, tuple[Self, str, list[Any]]]) -> Path:
         """Write the graph whose input this is, rows of so many numbers, to an ONNX file.
 
-        Args:
-            title: the name of the graph.
-            width: the number of numbers in a row.
-            outputs: values by name, with their type (``DOUBLE`` or ``BOOL``) and shape, in which ``"N"`` is the number
-                of rows.
+        The outputs are values by name, with their type (``DOUBLE`` or ``BOOL``) and shape; ``"N"`` stands for rows.
         """
         helper, kinds, ends = self.onnx.helper, self.onnx.TensorProto, []
         for name, (value, kind, shape) in outputs.items():

@@ -110,17 +110,11 @@ def maximise(
     corners: bool = False,
     away: Array | None = None,
 ) -> Array:
-    """Return the point ``(d,)`` of the unit cube with the largest acquisition, distinct from all known points.
+    """Return the point ``(d,)`` of a box, or the unit cube, with the largest acquisition, distinct from known points.
 
-    Candidates are uniform, or small moves of the known points. The function is climbed from the best few of them.
-
-    Args:
-        known: points that must not be proposed again, shape ``(n, d)``, best first; the first few seed the local
-            candidates.
-        box: the part of the cube that is searched; all of it if None.
-        corners: whether candidates include corners, and single coordinates are moved to bounds in the end while that
-            increases the value.
-        away: points ``(k, d)`` that are pending or have failed; the result keeps a distance from them.
+    Candidates are uniform, or small moves of the known points ``(n, d)``, best first. The function is climbed from the
+    best few of them. With corners, these are candidates too, and single coordinates are moved to bounds in the end while
+    that increases the value. The result keeps a distance from points ``away``, which are pending or have failed.
     """
     diagonal = float(np.sqrt(dimension))
     others = np.empty((0, dimension)) if away is None else away

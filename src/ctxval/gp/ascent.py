@@ -26,10 +26,7 @@ _COORDINATES = (0.0, 0.25, 0.5)
 class Evaluations:
     """The evaluations of a function over a box within the unit cube, no more of them than a budget.
 
-    Args:
-        function: points ``(m, d)`` -> values ``(m,)``; values that are not finite are never a maximum.
-        budget: number of points at which the function may be evaluated.
-        strict: whether the budget is a hard limit; if not, a climb that has begun may exceed it.
+    If the budget is not strict, a climb that has begun may exceed it.
     """
 
     def __init__(self, function: Values, low: Array, high: Array, budget: int, *, strict: bool = True) -> None:
@@ -182,11 +179,8 @@ def ascend(
     approximation of the function, it is searched first, and the function itself is evaluated near the best points only;
     few dimensions need no approximation.
 
-    Args:
-        function: points ``(m, d)`` -> values ``(m,)``; values that are not finite are never a maximum.
-        budget: number of points at which the function may be evaluated; the last climb may exceed it.
-        starts: points to evaluate first, ``(s, d)``.
-        rough: a cheap approximation of the function; the function itself if None.
+    Values that are not finite are never a maximum. The budget of evaluations may be exceeded by the last climb. Starts
+    ``(s, d)`` are evaluated first.
     """
     exact, inside = Evaluations(function, *box, budget, strict=False), np.clip(starts, *box)
     if exact.dimension <= _FEW:

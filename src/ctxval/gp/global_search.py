@@ -42,12 +42,9 @@ class GlobalMaximum:
 def search_globally(
     function: Values, dimension: int, starts: Array, rng: np.random.Generator, *, evaluations: int = 9000
 ) -> GlobalMaximum:
-    """Search the unit cube for the maximum of a function, and return everything that was evaluated.
+    """Search the unit cube for the maximum of a function, and return everything that was evaluated, of so many points.
 
-    Args:
-        function: points ``(m, d)`` of the cube -> values ``(m,)``; values that are not finite are never a maximum.
-        starts: points ``(s, d)`` to evaluate first; points outside of the cube are moved to its faces.
-        evaluations: number of points at which the function may be evaluated.
+    Values that are not finite are never a maximum. Starts ``(s, d)`` are evaluated first, moved into the cube.
     """
     done = Evaluations(function, np.zeros(dimension), np.ones(dimension), evaluations)
     done.evaluate(np.clip(starts, 0, 1))

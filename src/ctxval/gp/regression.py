@@ -161,13 +161,9 @@ def fit(
     """Return the process with the most likely hyperparameters within the kernel's bounds.
 
     By default the prior of the hyperparameters is uniform within the kernel's bounds (line 2 of the paper's algorithm).
-    If ``log_prior`` is given, the result is the mode of the posterior.
-
-    Args:
-        X, y: observed points ``(n, d)`` and values ``(n,)``, about unit variance.
-        noise: bounds of the noise variance; equal bounds fix it.
-        log_prior: logarithm of the prior density of (theta, log noise), with its gradient.
-        starts: starts of the climbs, shape ``(s, len(theta) + 1)``; rough, middling and smooth functions by default.
+    With the log density of another prior of (theta, log noise), the result is the mode of the posterior. The values
+    ``(n,)`` have about unit variance, and the noise variance has bounds. The climbs start at rows (theta, log noise),
+    by default those of rough, middling and smooth functions.
     """
     bounds = [*kernel.bounds(X.shape[1]), (float(np.log(noise[0])), float(np.log(noise[1])))]
     residual = y - mean(X)
@@ -198,15 +194,11 @@ def most_likely(
     iterations: int = 60,
     tolerance: float | None = None,
 ) -> Array:
-    """Return the hyperparameters of largest density within bounds, by climbs with L-BFGS-B from several starts.
+    """Return the hyperparameters of largest density within bounds, by climbs with L-BFGS-B from starts ``(s, k)``.
 
-    Args:
-        log_density: the function to maximise; hyperparameters for which it raises an InputError, because the
-            covariance matrix is not positive definite, are impossible.
-        starts: starts of the climbs, shape ``(s, k)``.
-        best_start: whether to climb from the most likely start only, instead of from all.
-        iterations: largest number of iterations of one climb.
-        tolerance: relative change of the log density at which a climb ends; the default of L-BFGS-B if None.
+    Hyperparameters for which the density raises an InputError, because the covariance matrix is not positive definite,
+    are impossible. The tolerance is the relative change of the log density at which a climb ends. With ``best_start``,
+    only the most likely start is climbed from.
     """
 
     def negative(parameters: Array) -> tuple[float, Array]:
