@@ -113,7 +113,7 @@ def maximise(
     """Return the point ``(d,)`` of a box, or the unit cube, with the largest acquisition, distinct from known points.
 
     Candidates are uniform, or small moves of the known points ``(n, d)``, best first. The function is climbed from the
-    best few of them. With corners, these are candidates too, and single coordinates are moved to bounds in the end while
+    best few of them. With corners, these are candidates too, and single coordinates are moved to bounds at last while
     that increases the value. The result keeps a distance from points ``away``, which are pending or have failed.
     """
     diagonal = float(np.sqrt(dimension))
