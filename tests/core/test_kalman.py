@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ctxval.controllers.output_feedback import Estimate, corrected, predicted, smoothed
+from ctxval.core.kalman import Estimate, corrected, predicted, smoothed
 from ctxval.core.system import Outputs
 from ctxval.models import Linear
 

@@ -12,6 +12,7 @@ from ctxval.models.parametric import Expected, Parametric
 from ctxval.models.saved import read_model, read_refined, write_model, write_transitions
 from ctxval.models.scaling import FeedforwardReLU, GaussianProcessModel, IncrementScaling, SquaredExponential
 from ctxval.models.scikit_learn import ScikitLearn
+from ctxval.models.torch import Torch
 
 __all__ = [
     "REGISTRY",
@@ -30,6 +31,7 @@ __all__ = [
     "Refined",
     "ScikitLearn",
     "SquaredExponential",
+    "Torch",
     "by_name",
     "linearize",
     "read_model",

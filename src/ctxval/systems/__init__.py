@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from ctxval._util.registry import Registry
 from ctxval.core.system import Simulated, System, WithOutputs
-from ctxval.data.recorded import Recorded
+from ctxval.data.recordings import Recorded
 from ctxval.systems.fmu import FMU
 from ctxval.systems.function import Function, Manual
 from ctxval.systems.gymnasium import Gymnasium

@@ -257,11 +257,9 @@ def with_distribution(
             continue
         if kind != "normal":
             raise UnknownNameError.among(f"distribution of {name}", str(kind), ("normal", "uniform"))
-        for key in given.keys() - {"mean", "deviation"}:
-            raise UnknownNameError.among(f"argument of the distribution of {name}", key, ("mean", "deviation"))
-        if len(given) < 2:
+        if given.keys() <= {"mean", "deviation"} and len(given) < 2:
             raise InputError(f"the normal distribution of {name} needs a mean and a deviation, got {given!r}.")
-        stated[name] = Normal(**given)
+        stated[name] = construct(f"the distribution of {name}", Normal, given)
     return space.distributed(**stated) if stated else space
 
 

@@ -95,7 +95,6 @@ def write_onnx(path: str | Path, model: Model) -> None:
 
 
 def _require_onnx(model: Model | None) -> None:
-    """Check that onnx is installed and that a model can be written."""
     require_onnx()
     while isinstance(model, Corrected):
         model = model.model
