@@ -69,6 +69,11 @@ class Evaluations:
         """Return all points ``(m, d)`` and their values ``(m,)`` as they were evaluated."""
         return np.concatenate(self._points), np.concatenate(self._values)
 
+    def finite(self) -> Array:
+        """Return the points ``(m, d)`` whose values are finite, the largest value first."""
+        points, values = self.best_first()
+        return points[np.isfinite(values)]
+
     def best_first(self) -> tuple[Array, Array]:
         """Return all points ``(m, d)`` and their values ``(m,)``, the largest first."""
         points, values = self.in_order()
@@ -261,8 +266,7 @@ def usual_effort(dimension: int, budget: int) -> Effort:
 
 
 def _best(done: Evaluations, count: int, share: float = 0.1) -> Array:
-    points, values = done.best_first()
-    finite = points[np.isfinite(values)]
+    finite = done.finite()
     reach = share * float(np.linalg.norm(done.high - done.low))
     return finite[separated_rows(finite, reach, count)]
 
