@@ -90,7 +90,6 @@ class Expected(ShortRepr):
         draws = np.broadcast_to(self.draws.reshape(count, *[1] * len(batch), noise), (count, *batch, noise))
         drawn = np.asarray(self.function(states, inputs, draws), dtype=np.float64)
         if drawn.shape != states.shape:
-            raise ModelError(
-                f"the step of a model with noise must return next states of shape {states.shape}, got {drawn.shape}."
-            )
+            wanted = f"next states of shape {states.shape}"
+            raise ModelError(f"the step of a model with noise must return {wanted}, got {drawn.shape}.")
         return np.asarray(drawn.mean(axis=0))

@@ -239,10 +239,8 @@ class FeedforwardReLU(IncrementModel):
         widths = [pair, *[bias.size for bias in self.biases]]
         shapes = [weight.shape for weight in self.weights]
         if len(widths) < 2 or widths[-1] != states or shapes != list(itertools.pairwise(widths)):
-            what = f"a network from {pair} standardised states and inputs to {states} increments"
-            raise ShapeError(
-                f"{what} must have layers that fit together, got weights {shapes} and biases {widths[1:]}."
-            )
+            what = f"a network from {pair} standardised states and inputs to {states} increments must have layers"
+            raise ShapeError(f"{what} that fit together, got weights {shapes} and biases {widths[1:]}.")
 
     @classmethod
     @checked
