@@ -1,4 +1,4 @@
-"""The true system S, of which only the executions are costly and counted: step functions in its place, and its outputs."""
+"""The true system S, of which only the executions are costly and counted: step functions in its place, its outputs."""
 
 from __future__ import annotations
 
