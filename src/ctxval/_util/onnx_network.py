@@ -43,7 +43,15 @@ class OnnxNetwork(ShortRepr):
         # A single file goes to other processes as its bytes. Weights in a second file are found only by the path.
         self._source: bytes | str = contents[0] if len(contents) == 1 else str(Path(str(source)).absolute())
         self._digest = hashlib.sha256(b"".join(contents)).hexdigest()[:16]
-        self._session = _session(self._source)
+        onnxruntime = require_extra("onnxruntime", "onnx", "ONNX networks")
+        options = onnxruntime.SessionOptions()
+        # Small networks are slower on many threads, and their last bits depend on the number of threads.
+        options.intra_op_num_threads = options.inter_op_num_threads = 1
+        options.log_severity_level = 4
+        try:
+            self._session = onnxruntime.InferenceSession(self._source, options, providers=["CPUExecutionProvider"])
+        except Exception as error:
+            raise InputError(f"the file cannot be read as an ONNX network: {error}") from error
         self._recurrent = recurrent
         given, returned = self._session.get_inputs(), self._session.get_outputs()
         self.names = tuple(node.name for node in given)
@@ -130,18 +138,6 @@ class _Port:
         if self.layers is None or array.ndim != 3:
             return array
         return np.moveaxis(array, 0, 1).reshape(array.shape[1], -1)
-
-
-def _session(source: bytes | str) -> Any:
-    onnxruntime = require_extra("onnxruntime", "onnx", "ONNX networks")
-    options = onnxruntime.SessionOptions()
-    # Small networks are slower on many threads, and their last bits depend on the number of threads.
-    options.intra_op_num_threads = options.inter_op_num_threads = 1
-    options.log_severity_level = 4
-    try:
-        return onnxruntime.InferenceSession(source, options, providers=["CPUExecutionProvider"])
-    except Exception as error:
-        raise InputError(f"the file cannot be read as an ONNX network: {error}") from error
 
 
 def _port(node: Any, layered: bool = False) -> _Port:
