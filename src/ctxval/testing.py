@@ -6,13 +6,14 @@ Each check raises :class:`ctxval.errors.ConformanceError` with one sentence if t
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import replace
 from typing import Literal
 
 import numpy as np
 
-from ctxval._util.arrays import Array, Mask
+from ctxval._util.arrays import Array
 from ctxval._util.representation import ShortRepr
 from ctxval.certificates import Certificate, CertificateKind, Sample
 from ctxval.core.controller import Controller, ControllerWithMemory, Synthesizer, converged_of, each_alone
@@ -103,34 +104,31 @@ def check_synthesizer(synthesizer: Synthesizer, task: Task, model: Model) -> Non
     singles, converged = [], []
     for index in range(task.batch_shape[0]):
         controller = synthesizer.design(task[index], model)
-        converged.append(_converged(controller, ()))
-        singles.append(_run(controller, task[index], model))
-        _require(bool(singles[-1].finite), f"the closed loop on the model is not finite for task {index}")
-        if isinstance(controller, ControllerWithMemory):
-            again = _run(controller, task[index], model)
-            run = "the closed loop of a second run"
-            _require_close(run, again.states, "that of the first", singles[-1].states, _TOLERANCE)
+        with _conforming():
+            converged.append(converged_of(controller))
+            singles.append(rollout(model.step, controller, task[index]))
+            _require(bool(singles[-1].finite), f"the closed loop on the model is not finite for task {index}")
+            if isinstance(controller, ControllerWithMemory):
+                again = rollout(model.step, controller, task[index])
+                run = "the closed loop of a second run"
+                _require_close(run, again.states, "that of the first", singles[-1].states, _TOLERANCE)
     if getattr(synthesizer, "batched", False):
         controller = synthesizer.design(task, model)
-        together, alone = _converged(controller, task.batch_shape), [each for each in converged if each is not None]
+        with _conforming():
+            together = converged_of(controller, task.batch_shape)
+            batch = rollout(model.step, controller, task)
+        alone = [each for each in converged if each is not None]
         same = not alone if together is None else np.array_equal(together, alone)
         _require(same, f"converged of a batch is {together}, and one by one it is {converged}")
-        batch = _run(controller, task, model)
         states = np.stack([single.states for single in singles])
         _require_close("the closed loops of a batch", batch.states, "those one by one", states, 1e-8)
 
 
-def _run(controller: Controller, task: Task, model: Model) -> Trajectory:
+@contextmanager
+def _conforming() -> Iterator[None]:
     try:
-        return rollout(model.step, controller, task)
+        yield
     except InputError as error:  # the controller returned something else
-        raise ConformanceError(str(error)) from error
-
-
-def _converged(controller: Controller, batch_shape: tuple[int, ...]) -> Mask | None:
-    try:
-        return converged_of(controller, batch_shape)
-    except InputError as error:
         raise ConformanceError(str(error)) from error
 
 

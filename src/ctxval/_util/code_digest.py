@@ -88,7 +88,7 @@ def enclosed(function: types.FunctionType) -> list[Any]:
 def _source_and_uses(item: Any) -> tuple[list[str], list[Any]]:
     """Return the digests of what an object is made of, if that is source of users, and the objects that it uses."""
     if isinstance(item, _Global):
-        known = _source_of(item.module)
+        known = _read(None if is_library(item.module) else getattr(item.module, "__file__", None))
         body = known.assigned.get(item.name, [])
         used = [vars(item.module)[item.name], *known.imported(item), *_globals(item.module, _loaded(body))]
         return [_hashed(_plain(node)) for node in body], used
@@ -183,10 +183,6 @@ class _Source:
         package = item.module.__package__ or item.module.__name__
         module = sys.modules.get(importlib.util.resolve_name(source, package)) if source else None
         return [_Global(module, name)] if module is not None and name in vars(module) else []
-
-
-def _source_of(module: types.ModuleType) -> _Source:
-    return _read(None if is_library(module) else getattr(module, "__file__", None))
 
 
 def _read(file: str | None) -> _Source:

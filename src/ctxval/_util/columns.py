@@ -285,43 +285,34 @@ class CsvTable:
             raise InputError(f"{self.path}, line {line}: {name} must be a number, {shown}.") from None
 
     def _cells(self) -> Iterator[tuple[int, list[str]]]:
+        last, left, in_row = "", self._most, 0  # the last line, and characters: of the file, and since the last row
+
+        def lines(text: io.TextIOWrapper) -> Iterator[str]:
+            nonlocal last, left, in_row
+            while last := text.readline(MOST_ROW + 1):
+                in_row += len(last)
+                left -= len(last)
+                if in_row > MOST_ROW:
+                    raise InputError(f"it has a row of more than {MOST_ROW} characters")
+                if left < 0:
+                    raise InputError("it grew while it was read")
+                if "\0" in last:
+                    raise InputError("it is not text in UTF-8: it has NUL bytes")
+                yield last
+
         try:
             with (
                 open_regular(self.path, self._most) as file,
                 io.TextIOWrapper(file, encoding="utf-8-sig", newline="") as text,
             ):
-                lines = _Lines(text, self._most)
-                head = [*itertools.takewhile(lambda line: not line.strip(), lines), lines.last]
-                unquoted = re.sub('"[^"]*"', "", lines.last)
+                rest = lines(text)
+                head = [*itertools.takewhile(lambda line: not line.strip(), rest), last]
+                unquoted = re.sub('"[^"]*"', "", last)
                 self._separator = next((mark for mark in ("\t", ";") if mark in unquoted), ",")
-                reader = csv.reader(itertools.chain(head, lines), delimiter=self._separator)
+                reader = csv.reader(itertools.chain(head, rest), delimiter=self._separator)
                 for row in reader:
-                    lines.in_row = 0
+                    in_row = 0
                     if len(row) > 1 or (row and row[0].strip()):
                         yield reader.line_num, row
         except (InputError, OSError, UnicodeDecodeError, csv.Error) as error:
             raise InputError(f"{self.path} cannot be read as CSV: {str(error).removesuffix('.')}.") from error
-
-
-class _Lines:
-    """The lines of a text; ``in_row`` counts the characters since the end of the last row."""
-
-    def __init__(self, text: io.TextIOWrapper, most: int) -> None:
-        self.text, self.left, self.in_row, self.last = text, most, 0, ""
-
-    def __iter__(self) -> _Lines:
-        return self
-
-    def __next__(self) -> str:
-        line = self.last = self.text.readline(MOST_ROW + 1)
-        if not line:
-            raise StopIteration
-        self.in_row += len(line)
-        self.left -= len(line)
-        if self.in_row > MOST_ROW:
-            raise InputError(f"it has a row of more than {MOST_ROW} characters")
-        if self.left < 0:
-            raise InputError("it grew while it was read")
-        if "\0" in line:
-            raise InputError("it is not text in UTF-8: it has NUL bytes")
-        return line

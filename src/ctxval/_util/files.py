@@ -269,9 +269,8 @@ class Archive:
     def _array(self, name: str, size: int) -> npt.NDArray[Any]:
         """Return an array whose numbers or text take so many bytes in memory."""
         if size > self._left:
-            raise InputError(
-                f"its array {name} of shape {self.shape(name)} is too large: {self._left} bytes may be read"
-            )
+            too_large = f"of shape {self.shape(name)} is too large: {self._left} bytes may be read"
+            raise InputError(f"its array {name} {too_large}")
         self._left -= size
         with _damage(), self._zip.open(self._entries[name]) as file:
             return np.asarray(np.lib.format.read_array(file, allow_pickle=False))

@@ -43,7 +43,15 @@ class OnnxNetwork(ShortRepr):
         # A single file goes to other processes as its bytes. Weights in a second file are found only by the path.
         self._source: bytes | str = contents[0] if len(contents) == 1 else str(Path(str(source)).absolute())
         self._digest = hashlib.sha256(b"".join(contents)).hexdigest()[:16]
-        self._session = _session(self._source)
+        onnxruntime = require_extra("onnxruntime", "onnx", "ONNX networks")
+        options = onnxruntime.SessionOptions()
+        # Small networks are slower on many threads, and their last bits depend on the number of threads.
+        options.intra_op_num_threads = options.inter_op_num_threads = 1
+        options.log_severity_level = 4
+        try:
+            self._session = onnxruntime.InferenceSession(self._source, options, providers=["CPUExecutionProvider"])
+        except Exception as error:
+            raise InputError(f"the file cannot be read as an ONNX network: {error}") from error
         self._recurrent = recurrent
         given, returned = self._session.get_inputs(), self._session.get_outputs()
         self.names = tuple(node.name for node in given)
@@ -132,18 +140,6 @@ class _Port:
         return np.moveaxis(array, 0, 1).reshape(array.shape[1], -1)
 
 
-def _session(source: bytes | str) -> Any:
-    onnxruntime = require_extra("onnxruntime", "onnx", "ONNX networks")
-    options = onnxruntime.SessionOptions()
-    # Small networks are slower on many threads, and their last bits depend on the number of threads.
-    options.intra_op_num_threads = options.inter_op_num_threads = 1
-    options.log_severity_level = 4
-    try:
-        return onnxruntime.InferenceSession(source, options, providers=["CPUExecutionProvider"])
-    except Exception as error:
-        raise InputError(f"the file cannot be read as an ONNX network: {error}") from error
-
-
 def _port(node: Any, layered: bool = False) -> _Port:
     """Return an input or output of a network; a layered one may have the shape ``(L, N, k)``."""
     shape = node.shape if isinstance(node.shape, list) else []
@@ -180,12 +176,7 @@ class GraphValue:
         return cls(name, require_onnx(), [], [])
 
     def node(self, kind: str, *others: Self | Array, output: int = 0, **attributes: Any) -> Self:
-        """Return a result of an operation on this value and others; constants are broadcast.
-
-        Args:
-            output: which of its results this is.
-            attributes: those of the operation.
-        """
+        """Return one of the results of an operation on this value and others; constants are broadcast."""
         names = [(each if isinstance(each, GraphValue) else self.constant(each)).name for each in (self, *others)]
         results = [f"value_{len(self.nodes)}_{k}" for k in range(output + 1)]
         self.nodes.append(self.onnx.helper.make_node(kind, names, results, **attributes))
@@ -210,11 +201,7 @@ class GraphValue:
     def write(self, path: str | Path, title: str, width: int, outputs: dict[str, tuple[Self, str, list[Any]]]) -> Path:
         """Write the graph whose input this is, rows of so many numbers, to an ONNX file.
 
-        Args:
-            title: the name of the graph.
-            width: the number of numbers in a row.
-            outputs: values by name, with their type (``DOUBLE`` or ``BOOL``) and shape, in which ``"N"`` is the number
-                of rows.
+        The outputs are values by name, with their type (``DOUBLE`` or ``BOOL``) and shape; ``"N"`` stands for rows.
         """
         helper, kinds, ends = self.onnx.helper, self.onnx.TensorProto, []
         for name, (value, kind, shape) in outputs.items():

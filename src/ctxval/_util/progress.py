@@ -9,7 +9,7 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -18,7 +18,6 @@ from ctxval._util.texts import shortened, visible
 
 if TYPE_CHECKING:
     from rich.console import Console, RenderableType
-    from rich.progress import Progress as Bars
 
 
 @dataclass(frozen=True)
@@ -76,16 +75,14 @@ def listening(listener: Listener | None) -> Iterator[None]:
         _innermost.reset(tokens[1])
 
 
-@contextmanager
-def also_listening(listener: Listener) -> Iterator[None]:
+def also_listening(listener: Listener) -> AbstractContextManager[None]:
     outer = _listener.get() or ignore
 
     def both(progress: Progress) -> None:
         outer(progress)
         listener(progress)
 
-    with listening(both):
-        yield
+    return listening(both)
 
 
 def ignore(_: Progress) -> None:
@@ -181,7 +178,17 @@ class OnScreen:
     """Shows one bar for each stage while it lasts. Notes stay on the screen, one line for each."""
 
     def __init__(self, console: Console) -> None:
-        self._bars = _bars(console)
+        from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
+        from rich.progress import Progress as Bars
+
+        class Delayed(Bars):
+            def get_renderables(self) -> Iterable[RenderableType]:
+                yield self.make_tasks_table([task for task in self.tasks if (task.elapsed or 0.0) > _DELAY])
+
+        name, amount = (TextColumn(f"{{task.{part}}}", markup=False) for part in ("description", "fields[text]"))
+        self._bars = Delayed(
+            name, BarColumn(bar_width=20), amount, TimeElapsedColumn(), console=console, transient=True
+        )
         self._rows: dict[int, Any] = {}
 
     def __call__(self, progress: Progress) -> None:
@@ -199,24 +206,6 @@ class OnScreen:
             bars.remove_task(self._rows.pop(progress.depth))
             if not self._rows:
                 bars.stop()
-
-
-def _bars(console: Console) -> Bars:
-    from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
-    from rich.progress import Progress as Bars
-
-    class Delayed(Bars):
-        def get_renderables(self) -> Iterable[RenderableType]:
-            yield self.make_tasks_table([task for task in self.tasks if (task.elapsed or 0.0) > _DELAY])
-
-    return Delayed(
-        TextColumn("{task.description}", markup=False),
-        BarColumn(bar_width=20),
-        TextColumn("{task.fields[text]}", markup=False),
-        TimeElapsedColumn(),
-        console=console,
-        transient=True,
-    )
 
 
 def _in_one_line(text: str) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import importlib
 import inspect
 import sys
@@ -25,23 +26,15 @@ class Declaration:
     """Declares a class, or a function that makes an object, as a part that is found by name; checks its arguments.
 
     A part of this package is found once its package exports it in ``__all__``.
-
-    Attributes:
-        name: the name of the class by default.
-        runs_code: whether plain arguments, such as a text, can make the part run code: a program, a library, a module.
-        files: arguments that are paths of files.
-        folder: the argument that is a folder, which is the experiment's by default.
-        functions: arguments that are functions, each with its form, such as ``(x, u) -> x_next``.
-        parts: arguments that are parts themselves, each with its kind, such as ``synthesizer``.
     """
 
-    name: str = ""
+    name: str = ""  # the name of the class by default
     _: KW_ONLY
-    runs_code: bool = False
-    files: tuple[str, ...] = ()
-    folder: str | None = None
-    functions: Mapping[str, str] = field(default_factory=dict)
-    parts: Mapping[str, str] = field(default_factory=dict)
+    runs_code: bool = False  # whether plain arguments, such as a text, can make it run a program, a library, a module
+    files: tuple[str, ...] = ()  # arguments that are paths of files
+    folder: str | None = None  # the argument that is a folder, which is the experiment's by default
+    functions: Mapping[str, str] = field(default_factory=dict)  # arguments that are functions: (x, u) -> x_next
+    parts: Mapping[str, str] = field(default_factory=dict)  # arguments that are parts, each with its kind: synthesizer
 
     def __call__(self, made: Part) -> Part:
         made = checked(made)
@@ -77,22 +70,17 @@ class Registry(Mapping[str, Any], Generic[Made]):
     def __init__(
         self, kind: str, package: str, *, method: str | None = None, modules: Mapping[str, str] | None = None
     ) -> None:
-        self.kind, self.group, self.method = kind, package, method
-        self._built_in: dict[str, Any] = {}
-        self._modules = dict(modules or {})
-        if modules is None and "__all__" in vars(sys.modules[package]):
-            self.collect()
+        self.kind, self.group, self.method, self._modules = kind, package, method, modules
 
-    def collect(self) -> None:
-        """Take the parts that the package exports; for a registry that is made before the package's ``__all__``."""
-        exported = vars(sys.modules[self.group])
-        for made in map(exported.get, exported["__all__"]):
-            if (declared := declaration_of(made)) is not None:
-                self._built_in[declared.name] = made
+    @functools.cached_property
+    def _exported(self) -> dict[str, Any]:
+        exported = {} if self._modules is not None else vars(sys.modules[self.group])
+        parts = [exported.get(name) for name in exported.get("__all__", ())]
+        return {declared.name: made for made in parts if (declared := declaration_of(made)) is not None}
 
     @property
     def built_in(self) -> tuple[str, ...]:
-        return (*self._built_in, *self._modules)
+        return (*self._exported, *(self._modules or ()))
 
     @property
     def installed(self) -> tuple[str, ...]:
@@ -109,13 +97,13 @@ class Registry(Mapping[str, Any], Generic[Made]):
         """
         if not isinstance(name, str) or name not in self.built_in:
             return False
-        declared = declaration_of(self._built_in.get(name))
+        declared = declaration_of(self._exported.get(name))
         return declared is None or not declared.runs_code
 
     def find(self, name: str) -> Any:
-        if name in self._built_in:
-            return self._built_in[name]
-        if name in self._modules:
+        if name in self._exported:
+            return self._exported[name]
+        if self._modules is not None and name in self._modules:
             module, _, attribute = self._modules[name].partition(":")
             return getattr(importlib.import_module(module), attribute)
         points = [point for point in self._entry_points() if point.name == name]

@@ -113,7 +113,15 @@ def shown(value: Any, depth: int = 3) -> str:
     if isinstance(value, type | partial) or inspect.isroutine(value):
         return name_of(value)
     if isinstance(value, Mapping | Sequence | AbstractSet):
-        return _collection(value, depth)
+        if depth == 0:
+            return f"{type(value).__name__} of {len(value)}"
+        first = list(islice(value, _ITEMS))
+        texts = [shown(item, depth - 1) for item in first]
+        if isinstance(value, Mapping):
+            texts = [f"{key}: {shown(value[name], depth - 1)}" for key, name in zip(texts, first, strict=True)]
+        opening, closing = "{}" if isinstance(value, Mapping) else "[]" if isinstance(value, list) else "()"
+        single = "," if opening == "(" and len(value) == 1 else ""
+        return cut(f"{opening}{', '.join([*texts, *_rest(len(value))])}{single}{closing}", 2 * _VALUE)
     return _object(value)
 
 
@@ -178,19 +186,6 @@ def name_of(function: Any) -> Shown:
         return Shown(f"partial({name_of(function.func)})")
     name = getattr(function, "__qualname__", None)
     return Shown(line(name if isinstance(name, str) else type(function).__name__, _VALUE))
-
-
-def _collection(values: Any, depth: int) -> str:
-    if depth == 0:
-        return f"{type(values).__name__} of {len(values)}"
-    first = list(islice(values, _ITEMS))
-    texts = [shown(item, depth - 1) for item in first]
-    if isinstance(values, Mapping):
-        texts = [f"{key}: {shown(values[name], depth - 1)}" for key, name in zip(texts, first, strict=True)]
-    inside = ", ".join([*texts, *_rest(len(values))])
-    opening, closing = "{}" if isinstance(values, Mapping) else "[]" if isinstance(values, list) else "()"
-    single = "," if opening == "(" and len(values) == 1 else ""
-    return cut(f"{opening}{inside}{single}{closing}", 2 * _VALUE)
 
 
 def _rest(count: int) -> list[str]:

@@ -102,5 +102,3 @@ __all__ = [
     "tail",
     "volume_bound",
 ]
-
-KINDS.collect()

@@ -84,93 +84,76 @@ class RecedingHorizon(ShortRepr):
 
     def plan(self, t: int, x: Array) -> tuple[Array, Array]:
         """Return the predicted states ``(steps + 1, n)`` and the planned inputs ``(steps, m)``."""
-        steps = self.settings.steps
-        rows = np.minimum(t + 1 + np.arange(steps), self.task.horizon)
-        problem = _Problem(self.settings, self.model, as_floats("the state", x), self.task.reference[rows])
+        settings, limits, bounds = self.settings, self.settings.limits, self.settings.state_limits
+        rows = np.minimum(t + 1 + np.arange(settings.steps), self.task.horizon)
+        start, reference, R = as_floats("the state", x), self.task.reference[rows], settings.cost.R
+        Q = np.stack([*[settings.cost.Q] * (settings.steps - 1), settings.cost.Q_final])
+        weight = 0.0  # of what exceeds the state limits
+
+        def predicted(U: Array) -> Array:
+            X = np.empty((len(U) + 1, len(start)))
+            X[0] = start
+            for k, u in enumerate(U):
+                X[k + 1] = self.model.step(X[k], u)
+            return X
+
+        def merit(X: Array, U: Array) -> float:
+            deviations = X[1:] - reference
+            weighed = ((Q @ deviations[..., None])[..., 0] * deviations).sum()
+            cost = 0.5 * (weighed + ((U @ R) * U).sum())
+            excess = np.maximum(np.maximum(bounds.low - X[1:], X[1:] - bounds.high), 0.0)
+            violation = excess.sum() if settings.violation_cost is None else excess.max(axis=-1).sum()
+            value = float(cost + weight * violation)
+            return value if np.isfinite(value) else np.inf
+
         with np.errstate(all="ignore"):
-            return problem.solve(t)
+            U = limits.clip(np.zeros((settings.steps, len(R))))
+            X = predicted(U)
+            if not np.isfinite(X).all():
+                raise DesignError(f"MPC cannot start at step {t}: the prediction from {start.tolist()} is not finite.")
+            for _ in range(settings.iterations):
+                A, B = linearize(self.model, X[:-1], U)
+                solution = _best_change(settings, Q, X, U, A, B, reference)
+                if solution is None:
+                    aim = f"that keep the prediction from {start.tolist()} within the state limits"
+                    raise DesignError(f"MPC finds no inputs at step {t} {aim}; a violation_cost makes them soft.")
+                change, largest = solution
+                if A.ndim == 2 and B.ndim == 2:
+                    U = limits.clip(U + change)
+                    return predicted(U), U
+                weight = max(weight, 2.0 * largest) if settings.violation_cost is None else settings.violation_cost
+                before = merit(X, U)
+                for length in 0.5 ** np.arange(10):
+                    U_new = limits.clip(U + length * change)
+                    X_new = predicted(U_new)
+                    if (after := merit(X_new, U_new)) < before:
+                        break
+                else:
+                    break
+                X, U = X_new, U_new
+                if before - after <= 1e-9 * (1 + abs(before)):
+                    break
+            return X, U
 
 
-class _Problem:
-    """The optimal control problem at one step, solved by repeated improvement of a guess of the inputs."""
-
-    def __init__(self, settings: MPC, model: Model, x: Array, reference: Array) -> None:
-        self.settings, self.model, self.x, self.reference = settings, model, x, reference
-        steps, cost = settings.steps, settings.cost
-        self.Q = np.stack([*[cost.Q] * (steps - 1), cost.Q_final])
-        limits = settings.state_limits
-        self.limited: Mask = np.isfinite(limits.low) | np.isfinite(limits.high)
-        self.weight = 0.0
-
-    def solve(self, t: int) -> tuple[Array, Array]:
-        m = len(self.settings.cost.R)
-        U = self.settings.limits.clip(np.zeros((self.settings.steps, m)))
-        X = self._predicted(U)
-        if not np.isfinite(X).all():
-            raise DesignError(f"MPC cannot start at step {t}: the prediction from {self.x.tolist()} is not finite.")
-        for _ in range(self.settings.iterations):
-            A, B = linearize(self.model, X[:-1], U)
-            change = self._improved(X, U, A, B)
-            if change is None:
-                aim = f"that keep the prediction from {self.x.tolist()} within the state limits"
-                raise DesignError(f"MPC finds no inputs at step {t} {aim}; a violation_cost makes them soft.")
-            if A.ndim == 2 and B.ndim == 2:
-                U = self.settings.limits.clip(U + change)
-                return self._predicted(U), U
-            X, U, settled = self._line_search(X, U, change)
-            if settled:
-                break
-        return X, U
-
-    def _predicted(self, U: Array) -> Array:
-        X = np.empty((len(U) + 1, len(self.x)))
-        X[0] = self.x
-        for k, u in enumerate(U):
-            X[k + 1] = self.model.step(X[k], u)
-        return X
-
-    def _improved(self, X: Array, U: Array, A: Array, B: Array) -> Array | None:
-        """Return the best change of the inputs ``(steps, m)`` for the linearised prediction; None if there is none."""
-        steps, m = U.shape
-        G = _sensitivities(A, B, steps)  # (steps, n, steps * m)
-        QG = self.Q @ G
-        hessian = np.tensordot(G, QG, axes=([0, 1], [0, 1])) + np.kron(np.eye(steps), self.settings.cost.R)
-        slope = np.tensordot(X[1:] - self.reference, QG, axes=([0, 1], [0, 1])) + (U @ self.settings.cost.R).ravel()
-        low, high = (bound - U for bound in (self.settings.limits.low, self.settings.limits.high))
-        rows = G[:, self.limited].reshape(-1, steps * m)
-        gap_low = (self.settings.state_limits.low - X[1:])[:, self.limited].ravel()
-        gap_high = (self.settings.state_limits.high - X[1:])[:, self.limited].ravel()
-        box, gaps, soft = (low.ravel(), high.ravel()), (gap_low, gap_high), self.settings.violation_cost
-        if soft is None or not len(rows):
-            solution = _quadratic_program(hessian, slope, rows, box, gaps)
-        else:
-            solution = _softened(hessian, slope, rows, box, gaps, soft, steps)
-        if solution is None:
-            return None
-        change, largest = solution
-        self.weight = max(self.weight, 2.0 * largest) if soft is None else soft
-        return change[: steps * m].reshape(steps, m)
-
-    def _line_search(self, X: Array, U: Array, change: Array) -> tuple[Array, Array, bool]:
-        """Return states and inputs with a lower merit, and whether the iteration has converged."""
-        before = self._merit(X, U)
-        for length in 0.5 ** np.arange(10):
-            U_new = self.settings.limits.clip(U + length * change)
-            X_new = self._predicted(U_new)
-            after = self._merit(X_new, U_new)
-            if after < before:
-                return X_new, U_new, before - after <= 1e-9 * (1 + abs(before))
-        return X, U, True
-
-    def _merit(self, X: Array, U: Array) -> float:
-        deviations = X[1:] - self.reference
-        weighed = ((self.Q @ deviations[..., None])[..., 0] * deviations).sum()
-        cost = 0.5 * (weighed + ((U @ self.settings.cost.R) * U).sum())
-        limits = self.settings.state_limits
-        excess = np.maximum(np.maximum(limits.low - X[1:], X[1:] - limits.high), 0.0)
-        violation = excess.sum() if self.settings.violation_cost is None else excess.max(axis=-1).sum()
-        merit = float(cost + self.weight * violation)
-        return merit if np.isfinite(merit) else np.inf
+def _best_change(
+    settings: MPC, Q: Array, X: Array, U: Array, A: Array, B: Array, reference: Array
+) -> tuple[Array, float] | None:
+    """Return the best change of the inputs ``(steps, m)`` for the linearised prediction, and the largest multiplier."""
+    (steps, m), bounds, soft = U.shape, settings.state_limits, settings.violation_cost
+    limited: Mask = np.isfinite(bounds.low) | np.isfinite(bounds.high)
+    G = _sensitivities(A, B, steps)  # (steps, n, steps * m)
+    QG = Q @ G
+    hessian = np.tensordot(G, QG, axes=([0, 1], [0, 1])) + np.kron(np.eye(steps), settings.cost.R)
+    slope = np.tensordot(X[1:] - reference, QG, axes=([0, 1], [0, 1])) + (U @ settings.cost.R).ravel()
+    rows = G[:, limited].reshape(-1, steps * m)
+    box = (settings.limits.low - U).ravel(), (settings.limits.high - U).ravel()
+    gaps = (bounds.low - X[1:])[:, limited].ravel(), (bounds.high - X[1:])[:, limited].ravel()
+    if soft is None or not len(rows):
+        solution = _quadratic_program(hessian, slope, rows, box, gaps)
+    else:
+        solution = _softened(hessian, slope, rows, box, gaps, soft, steps)
+    return None if solution is None else (solution[0][: steps * m].reshape(steps, m), solution[1])
 
 
 def _sensitivities(A: Array, B: Array, steps: int) -> Array:

@@ -53,17 +53,12 @@ class OutputFeedback(ShortRepr):
         reference = (task.reference - self.outputs(zero)) @ lift if task.has_goal else None
         start, more = task.initial_state, {"name": task.name, "environment": task.environment}
         of_states = Task(start, horizon=task.horizon, dt=task.dt, reference=reference, **more)
-        covariances = tuple(
-            np.diag(np.broadcast_to(_deviations(name, value, size), (size,)) ** 2)
-            for name, value, size in (("process", self.process, n), ("measurement", self.measurement, p))
-        )
+        covariances = []
+        for name, value, size in (("process", self.process, n), ("measurement", self.measurement, p)):
+            if value.shape not in ((), (size,)):
+                raise ShapeError(f"{name} must be a number or have shape ({size},), got {value.shape}.")
+            covariances.append(np.diag(np.broadcast_to(value, (size,)) ** 2))
         return EstimatedFeedback(self.synthesizer.design(of_states, model), model, self.outputs, *covariances)
-
-
-def _deviations(name: str, value: Array, size: int) -> Array:
-    if value.shape not in ((), (size,)):
-        raise ShapeError(f"{name} must be a number or have shape ({size},), got {value.shape}.")
-    return value
 
 
 class FilterMemory(NamedTuple):
@@ -75,16 +70,12 @@ class FilterMemory(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class EstimatedFeedback(ShortRepr):
-    """The state feedback of one task or a batch on the filter's estimates, a controller with memory.
-
-    Attributes:
-        process, measurement: covariances ``(n, n)`` and ``(p, p)``.
-    """
+    """The state feedback of one task or a batch on the filter's estimates, a controller with memory."""
 
     feedback: Controller
     model: Model
     outputs: Outputs
-    process: Array
+    process: Array  # covariances (n, n) and (p, p)
     measurement: Array
 
     @property

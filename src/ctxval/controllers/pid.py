@@ -79,17 +79,11 @@ class PIDMemory(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class PIDFeedback(ShortRepr):
-    """The PID controller of one task or a batch, a controller with memory.
-
-    Attributes:
-        pid: the gains and limits.
-        reference: the reference of the chosen states, ``(..., H + 1, k)``.
-        dt: seconds in a step.
-    """
+    """The PID controller of one task or a batch, a controller with memory."""
 
     pid: PID
-    reference: Array
-    dt: float
+    reference: Array  # of the chosen states (..., H + 1, k)
+    dt: float  # seconds
 
     @property
     def limits(self) -> Limits | None:

@@ -19,11 +19,9 @@ class Estimate(NamedTuple):
 
 
 def predicted(model: Model, known: Estimate, u: Array, process: Array) -> tuple[Estimate, Array]:
-    """Return the next state, and A = df/dx at the present one.
+    """Return the next state after inputs ``(..., m)``, and A = df/dx at the present one.
 
-    Args:
-        u: inputs ``(..., m)``.
-        process: covariance ``(..., n, n)`` of what M misses in one step.
+    The process covariance ``(..., n, n)`` is that of what M misses in one step.
     """
     A, _ = linearize(model, known.mean, u)
     covariance = A @ known.covariance @ np.swapaxes(A, -1, -2) + process
@@ -31,11 +29,7 @@ def predicted(model: Model, known: Estimate, u: Array, process: Array) -> tuple[
 
 
 def corrected(outputs: Outputs, prior: Estimate, y: Array, measurement: Array) -> tuple[Estimate, Array]:
-    """Return the state after outputs ``(..., p)`` were recorded, and the innovation ``(..., p)``.
-
-    Args:
-        measurement: covariance ``(p, p)`` of the errors of the recorded outputs.
-    """
+    """Return the state after outputs ``(..., p)`` were recorded with errors of a covariance, and the innovation."""
     C = outputs.jacobian(prior.mean)
     C_t = np.swapaxes(C, -1, -2)
     innovation = y - outputs(prior.mean)

@@ -1,4 +1,4 @@
-"""A task before the execution of S (plan) and after it (outcome, measurement)."""
+"""A task before the execution of S and after it, and what is checked before an execution is spent."""
 
 from __future__ import annotations
 

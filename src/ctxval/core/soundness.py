@@ -23,18 +23,12 @@ SATURATED = 0.01  # least share of steps at a limit that is worth a note
 
 @dataclass(frozen=True)
 class Flips:
-    """How much the controllers of neighbouring tasks differ.
+    """How much the controllers of neighbouring tasks differ."""
 
-    Attributes:
-        pairs, flipped: number of pairs of neighbouring tasks, and of those whose controllers differ abruptly.
-        largest: the largest difference between their inputs on M, as a share of the range of the inputs.
-        example: the tasks of the pair with the largest difference; of a flipped pair, if there is one.
-    """
-
-    pairs: int
-    flipped: int
-    largest: float
-    example: tuple[int, int]
+    pairs: int  # of neighbouring tasks
+    flipped: int  # pairs whose controllers differ abruptly
+    largest: float  # the largest difference between their inputs on M, as a share of the range of the inputs
+    example: tuple[int, int]  # the tasks of the pair with the largest difference; of a flipped pair, if there is one
 
 
 def flips(points: Array, inputs: Sequence[Array]) -> Flips | None:

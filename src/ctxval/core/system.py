@@ -1,8 +1,9 @@
-"""The true system S, of which only the executions are costly and counted; and a step function in its place."""
+"""The true system S, of which only the executions are costly and counted: step functions in its place, its outputs."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any, Protocol, runtime_checkable
 
@@ -57,7 +58,12 @@ class Outputs(ShortRepr):
             return self._of_one(x)
         rows = rows_of(x)
         if self._batched is None and len(rows):
-            self._batched = self._takes_batches(x, rows)
+            # Whether the function returns for a batch what it returns for its first and last state alone.
+            ends, self._batched = [self._of_one(row) for row in (rows[0], rows[-1])], False
+            with suppress(Exception):  # the user's function, which may take one state only
+                y = np.asarray(self.function(x), dtype=np.float64)
+                if y.shape == (*x.shape[:-1], *ends[0].shape):
+                    self._batched = bool(np.allclose(rows_of(y)[[0, -1]], ends, rtol=1e-9, atol=0, equal_nan=True))
         if self._batched:
             return np.asarray(self.function(x), dtype=np.float64)
         return np.stack([self._of_one(row) for row in rows]).reshape(*x.shape[:-1], -1)
@@ -68,19 +74,6 @@ class Outputs(ShortRepr):
         if y.ndim != 1 or not y.size:
             raise ShapeError(f"outputs of one state must have shape (p,), got {y.shape} for a state {x.shape}.")
         return y
-
-    def _takes_batches(self, x: Array, rows: Array) -> bool:
-        """Return whether the function returns for a batch what it returns for its first and last state alone."""
-        assert callable(self.function)
-        alone = [self._of_one(row) for row in (rows[0], rows[-1])]
-        try:
-            y = np.asarray(self.function(x), dtype=np.float64)
-        except Exception:  # the user's function, which may take one state only
-            return False
-        if y.shape != (*x.shape[:-1], *alone[0].shape):
-            return False
-        ends = rows_of(y)[[0, -1]]
-        return bool(np.allclose(ends, alone, rtol=1e-9, atol=0, equal_nan=True))
 
     def jacobian(self, x: Array) -> Array:
         """Return C = dh/dx, shape ``(..., p, n)``, at states ``(..., n)``."""

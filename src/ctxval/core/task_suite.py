@@ -38,10 +38,6 @@ class TaskSuite(TaskSpace):
             are then the category ``task``.
         units: the units of parameters by name.
 
-    Raises:
-        InputError: if there are fewer than two tasks, their parameters differ in names or kinds, a parameter is the
-            same in all tasks, or two tasks have the same parameters.
-
     >>> suite = TaskSuite({"slow lift": {"speed": 0.2, "path": "lift"}, "fast turn": {"speed": 1.0, "path": "turn"}})
     >>> suite.task_names
     ('slow lift', 'fast turn')
@@ -175,7 +171,7 @@ class TaskSuite(TaskSpace):
         raise InputError("a suite of tasks has no distribution: all of its tasks count alike.")
 
     def sampled(self, sampler: Sampler) -> NoReturn:
-        raise InputError("a suite of tasks has no distribution: all of its tasks count alike.")
+        self.distributed()
 
 
 def _by_name(tasks: Any) -> dict[str, dict[str, Any]]:

@@ -127,8 +127,7 @@ class Trajectory:
 
     def to_npz(self) -> bytes:
         """Return the trajectory as the bytes of an NPZ file."""
-        buffer = io.BytesIO()
-        arrays = {name: getattr(self, name) for name in ("times", "states", "inputs")}
+        buffer, arrays = io.BytesIO(), {name: getattr(self, name) for name in ("times", "states", "inputs")}
         np.savez_compressed(buffer, allow_pickle=False, **arrays, ended=np.array(self.ended))
         return buffer.getvalue()
 

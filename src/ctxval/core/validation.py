@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from copy import copy
 from dataclasses import replace
-from typing import Any, NoReturn
+from typing import Any
 from weakref import WeakSet
 
 import numpy as np
@@ -226,17 +226,18 @@ class Validation:
 
     def measure(self, plan: Plan, trajectory: Trajectory) -> float:
         """Return d(p)."""
-        return self._measured(plan.parameters, plan.task, plan.model_trajectory, trajectory)
+        return self._measured(plan.parameters.points, self._distance(plan.task, plan.model_trajectory, trajectory))
 
     def remeasure(self, point: ArrayLike, model_trajectory: Trajectory, system_trajectory: Trajectory) -> float:
         """Return d(p) between two known trajectories, as :meth:`measure` does, without the design of a controller."""
         parameters = self.space.parameters(point)
-        return self._measured(parameters, self.task_at(parameters), model_trajectory, system_trajectory)
+        value = self._distance(self.task_at(parameters), model_trajectory, system_trajectory)
+        return self._measured(parameters.points, value)
 
-    def _measured(self, parameters: Parameters, task: Task, model: Trajectory, system: Trajectory) -> float:
-        value = self._distance(task, model, system)
+    def _measured(self, point: Array, value: Array) -> float:
         if value.shape != () or not np.isfinite(value) or value < 0:
-            self._refuse_distance(value, parameters.points)
+            where = self.space.describe_point(point)
+            raise DistanceError(f"the distance must be one finite number >= 0, got {value} for the task {where}.")
         return float(value)
 
     def outcome(self, point: ArrayLike) -> Outcome:
@@ -293,10 +294,8 @@ class Validation:
         parameters = self.space.parameters(points)
         plan = self.plan_of(parameters, self.task_at(parameters))
         if plan.task.batch_shape != (len(points),):
-            wanted = f"a batch of {len(points)} tasks of as many points, got shape {plan.task.batch_shape}"
-            raise ShapeError(
-                f"the task function must make {wanted}; use the parameters in the task, or broadcast them."
-            )
+            got = f"got shape {plan.task.batch_shape}; use the parameters in the task, or broadcast them"
+            raise ShapeError(f"the task function must make a batch of {len(points)} tasks of as many points, {got}.")
         expected = plan.model_trajectory
         if not expected.finite.all():
             where = self.space.describe_point(points[np.argmin(expected.finite)])
@@ -314,7 +313,7 @@ class Validation:
         executed = trajectory.finite if known else np.zeros(len(points), dtype=bool)
         wrong = executed & ~(np.isfinite(values) & (values >= 0))
         if wrong.any():
-            self._refuse_distance(values[np.argmax(wrong)], points[np.argmax(wrong)])
+            self._measured(points[np.argmax(wrong)], values[np.argmax(wrong)])  # which refuses it
         advance(len(points))
         return np.where(executed, values, np.nan)
 
@@ -353,9 +352,8 @@ class Validation:
         n, m = trajectory.states.shape[-1], trajectory.inputs.shape[-1]
         # Two trajectories, and the gains of affine feedback.
         size = 8e-9 * np.prod(task.batch_shape) * steps * (2 * (n + m) + n * m + m)
-        cost = (
-            f"each plan with a horizon of {steps} needs about {size:.2g} GB of memory and {seconds:.2g} s of CPU time"
-        )
+        needs = f"about {size:.2g} GB of memory and {seconds:.2g} s of CPU time"
+        cost = f"each plan with a horizon of {steps} needs {needs}"
         if steps > self.longest:
             permit = f"longest = {steps} permits them, in Validation or in the experiment file"
             raise InputError(f"{cost}, and at most {self.longest} steps are permitted: {permit}.")
@@ -370,10 +368,6 @@ class Validation:
             if raised_by_signal(error):
                 raise
             raise DistanceError(f"the distance failed: {reason_of(error).rstrip('.')}.") from error
-
-    def _refuse_distance(self, value: Array, point: Array) -> NoReturn:
-        where = self.space.describe_point(point)
-        raise DistanceError(f"the distance must be one finite number >= 0, got {value} for the task {where}.")
 
     def __repr__(self) -> str:
         return lines(

@@ -31,14 +31,10 @@ _LOG_ROOT_2PI = 0.5 * float(np.log(2 * np.pi))
 
 @dataclass(frozen=True, eq=False)
 class UpperConfidenceBound:
-    """``alpha(p) = mu(p) + beta^(1/2) sigma(p)`` (the paper's eq. 10, GP-UCB).
-
-    Attributes:
-        beta: the confidence parameter; the paper takes 2.
-    """
+    """``alpha(p) = mu(p) + beta^(1/2) sigma(p)`` (the paper's eq. 10, GP-UCB)."""
 
     process: GaussianProcess
-    beta: float = 2.0
+    beta: float = 2.0  # the confidence parameter; the paper takes 2
 
     def __call__(self, X: Array) -> Array:
         mean, variance = self.process.predict(X)
@@ -55,14 +51,10 @@ class UpperConfidenceBound:
 
 @dataclass(frozen=True, eq=False)
 class LogExpectedImprovement:
-    """``log E max(f(p) - best, 0)``, also if the expectation underflows (Ament et al. 2023, eqs. 8 and 9).
-
-    Attributes:
-        best: the value to improve on, in the process's units.
-    """
+    """``log E max(f(p) - best, 0)``, also if the expectation underflows (Ament et al. 2023, eqs. 8 and 9)."""
 
     process: GaussianProcess
-    best: float
+    best: float  # the value to improve on, in the process's units
 
     def __call__(self, X: Array) -> Array:
         mean, variance = self.process.predict(X)
@@ -118,17 +110,11 @@ def maximise(
     corners: bool = False,
     away: Array | None = None,
 ) -> Array:
-    """Return the point ``(d,)`` of the unit cube with the largest acquisition, distinct from all known points.
+    """Return the point ``(d,)`` of a box, or the unit cube, with the largest acquisition, distinct from known points.
 
-    Candidates are uniform, or small moves of the known points. The function is climbed from the best few of them.
-
-    Args:
-        known: points that must not be proposed again, shape ``(n, d)``, best first; the first few seed the local
-            candidates.
-        box: the part of the cube that is searched; all of it if None.
-        corners: whether candidates include corners, and single coordinates are moved to bounds in the end while that
-            increases the value.
-        away: points ``(k, d)`` that are pending or have failed; the result keeps a distance from them.
+    Candidates are uniform, or small moves of the known points ``(n, d)``, best first. The function is climbed from the
+    best few of them. With corners, these are candidates too, and single coordinates are moved to bounds at last while
+    that increases the value. The result keeps a distance from points ``away``, which are pending or have failed.
     """
     diagonal = float(np.sqrt(dimension))
     others = np.empty((0, dimension)) if away is None else away

@@ -26,10 +26,7 @@ _COORDINATES = (0.0, 0.25, 0.5)
 class Evaluations:
     """The evaluations of a function over a box within the unit cube, no more of them than a budget.
 
-    Args:
-        function: points ``(m, d)`` -> values ``(m,)``; values that are not finite are never a maximum.
-        budget: number of points at which the function may be evaluated.
-        strict: whether the budget is a hard limit; if not, a climb that has begun may exceed it.
+    If the budget is not strict, a climb that has begun may exceed it.
     """
 
     def __init__(self, function: Values, low: Array, high: Array, budget: int, *, strict: bool = True) -> None:
@@ -71,6 +68,11 @@ class Evaluations:
     def in_order(self) -> tuple[Array, Array]:
         """Return all points ``(m, d)`` and their values ``(m,)`` as they were evaluated."""
         return np.concatenate(self._points), np.concatenate(self._values)
+
+    def finite(self) -> Array:
+        """Return the points ``(m, d)`` whose values are finite, the largest value first."""
+        points, values = self.best_first()
+        return points[np.isfinite(values)]
 
     def best_first(self) -> tuple[Array, Array]:
         """Return all points ``(m, d)`` and their values ``(m,)``, the largest first."""
@@ -182,11 +184,8 @@ def ascend(
     approximation of the function, it is searched first, and the function itself is evaluated near the best points only;
     few dimensions need no approximation.
 
-    Args:
-        function: points ``(m, d)`` -> values ``(m,)``; values that are not finite are never a maximum.
-        budget: number of points at which the function may be evaluated; the last climb may exceed it.
-        starts: points to evaluate first, ``(s, d)``.
-        rough: a cheap approximation of the function; the function itself if None.
+    Values that are not finite are never a maximum. The budget of evaluations may be exceeded by the last climb. Starts
+    ``(s, d)`` are evaluated first.
     """
     exact, inside = Evaluations(function, *box, budget, strict=False), np.clip(starts, *box)
     if exact.dimension <= _FEW:
@@ -267,8 +266,7 @@ def usual_effort(dimension: int, budget: int) -> Effort:
 
 
 def _best(done: Evaluations, count: int, share: float = 0.1) -> Array:
-    points, values = done.best_first()
-    finite = points[np.isfinite(values)]
+    finite = done.finite()
     reach = share * float(np.linalg.norm(done.high - done.low))
     return finite[separated_rows(finite, reach, count)]
 

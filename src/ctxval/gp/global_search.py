@@ -42,12 +42,9 @@ class GlobalMaximum:
 def search_globally(
     function: Values, dimension: int, starts: Array, rng: np.random.Generator, *, evaluations: int = 9000
 ) -> GlobalMaximum:
-    """Search the unit cube for the maximum of a function, and return everything that was evaluated.
+    """Search the unit cube for the maximum of a function, and return everything that was evaluated, of so many points.
 
-    Args:
-        function: points ``(m, d)`` of the cube -> values ``(m,)``; values that are not finite are never a maximum.
-        starts: points ``(s, d)`` to evaluate first; points outside of the cube are moved to its faces.
-        evaluations: number of points at which the function may be evaluated.
+    Values that are not finite are never a maximum. Starts ``(s, d)`` are evaluated first, moved into the cube.
     """
     done = Evaluations(function, np.zeros(dimension), np.ones(dimension), evaluations)
     done.evaluate(np.clip(starts, 0, 1))
@@ -57,11 +54,9 @@ def search_globally(
     budget = done.left - int((1 - _CLIMBED) * evaluations)
     climbs = min(12, budget // (8 * (dimension + 1)))  # each with 8 slopes at least
     if climbs > 0:
-        points, values = done.best_first()
-        done.climb(_apart(points[np.isfinite(values)], 0.2)[:climbs], budget)
+        done.climb(_apart(done.finite(), 0.2)[:climbs], budget)
     _refine(done, rng)
-    points, values = done.best_first()
-    return GlobalMaximum(points, values, _apart(points[np.isfinite(values)], _REACHES[-1]))
+    return GlobalMaximum(*done.best_first(), _apart(done.finite(), _REACHES[-1]))
 
 
 def _batches(count: int, evaluations: int, most: int) -> list[int]:
@@ -93,8 +88,7 @@ def _evolve(done: Evaluations, rng: np.random.Generator) -> None:
     prominent, seen = np.empty(0, dtype=np.intp), 0
     for generation, size in enumerate(sizes):
         share = generation / max(1, len(sizes) - 1)
-        points, values = done.best_first()
-        finite = points[np.isfinite(values)]
+        finite = done.finite()
         if not len(finite):
             done.evaluate(done.samples(size, rng))
             continue
@@ -171,9 +165,7 @@ def _differences(pool: Array, shape: tuple[int, ...], rng: np.random.Generator) 
 
 def _refine(done: Evaluations, rng: np.random.Generator) -> None:
     """Try moves to bounds and ever smaller random moves around the best points."""
-    points, values = done.best_first()
-    finite = points[np.isfinite(values)]
-    if not len(finite):
+    if not len(done.finite()):
         done.evaluate(done.samples(done.left, rng))
         return
     sizes = _batches(done.left, done.budget, 12)

@@ -54,27 +54,21 @@ class Warp:
 class Prior:
     """The prior of the hyperparameters.
 
-    Attributes:
-        smoothness: values of nu of the Matern kernel, equally likely.
-        length_scale: median of the log-normal length-scales in the unit cube, times the square root of the dimension.
-        deviation: standard deviation of their logarithms.
-        noise: bounds of the noise variance relative to sigma^2; it is log-uniform between them, and equal bounds fix
-            it.
-        offset: c of ``log(y + c)``, in means of the values. If no value is negative, the logarithm and the values
-            themselves are equally likely. None excludes the logarithm.
-        spread_share: share of the data, well spread over the cube, from which hyperparameters are drawn a second time.
-            A search crowds its points where the values are smooth and high, and these points suggest smoothness
-            everywhere. So each draw from all data is made as rough as one from the well-spread data, if that one is
-            rougher. If the share is 1, there is no second draw: then bounds are exact on draws of the prior, and too
-            low on kinks, jumps and heavy tails (docs/calibration.md).
+    A search crowds its points where the values are smooth and high, and these points suggest smoothness everywhere. So
+    each draw from all data is made as rough as one from a share of them that is well spread over the cube, if that one
+    is rougher. If the share is 1, there is no second draw: then bounds are exact on draws of the prior, and too low on
+    kinks, jumps and heavy tails (docs/calibration.md).
     """
 
-    smoothness: tuple[float, ...] = (1.5, 2.5)
-    length_scale: float = 0.3
-    deviation: float = 1.0
+    smoothness: tuple[float, ...] = (1.5, 2.5)  # values of nu of the Matern kernel, equally likely
+    length_scale: float = 0.3  # median of the log-normal length-scales in the cube, times the root of the dimension
+    deviation: float = 1.0  # standard deviation of their logarithms
     noise: tuple[float, float] = (EXACT, EXACT)
+    """Bounds of the noise variance relative to sigma^2; it is log-uniform between them, and equal bounds fix it."""
     offset: float | None = 0.1
-    spread_share: float = 0.5
+    """c of ``log(y + c)``, in means of the values. If no value is negative, the logarithm and the values themselves are
+    equally likely. None excludes the logarithm."""
+    spread_share: float = 0.5  # share of the data from which hyperparameters are drawn a second time
 
     def warps(self, y: Array) -> tuple[Warp, ...]:
         """Return the scales that values ``(n,)`` may have."""

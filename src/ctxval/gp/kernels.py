@@ -57,19 +57,12 @@ class Kernel(Covariance, Protocol):
 
 @dataclass(frozen=True)
 class Matern(Kernel):
-    """Matern kernel of smoothness 3/2, 5/2 or 9/2; theta = log of (variance, length-scales).
+    """Matern kernel of smoothness 3/2, 5/2 or 9/2; theta = log of (variance, length-scales)."""
 
-    Attributes:
-        nu: smoothness, 1.5 (the paper's), 2.5 or 4.5.
-        ard: whether each dimension has its own length-scale; if not, all share one.
-        length_scale: bounds of the length-scales in the unit cube.
-        variance: bounds of the variance, for values of unit variance.
-    """
-
-    nu: float = 1.5
-    ard: bool = False
-    length_scale: tuple[float, float] = (0.03, 10.0)
-    variance: tuple[float, float] = (0.05, 50.0)
+    nu: float = 1.5  # the paper's
+    ard: bool = False  # whether each dimension has its own length-scale; if not, all share one
+    length_scale: tuple[float, float] = (0.03, 10.0)  # bounds of the length-scales in the unit cube
+    variance: tuple[float, float] = (0.05, 50.0)  # bounds of the variance, for values of unit variance
 
     def __post_init__(self) -> None:
         if self.nu not in (1.5, 2.5, 4.5):
@@ -157,15 +150,10 @@ class Matern(Kernel):
 
 @dataclass(frozen=True)
 class Linear(Kernel):
-    """Linear kernel ``v_0 + v_1 (x - c)'(z - c)``; theta = log of (v_0, v_1).
+    """Linear kernel ``v_0 + v_1 (x - c)'(z - c)``; theta = log of (v_0, v_1)."""
 
-    Attributes:
-        centre: c, the same in each dimension; the default is the middle of the unit cube.
-        variance: bounds of both variances, for values of unit variance.
-    """
-
-    centre: float = 0.5
-    variance: tuple[float, float] = (1e-4, 50.0)
+    centre: float = 0.5  # c, the same in each dimension; the default is the middle of the unit cube
+    variance: tuple[float, float] = (1e-4, 50.0)  # bounds of both variances, for values of unit variance
 
     def bounds(self, dimension: int) -> Bounds:
         low, high = np.log(self.variance).tolist()

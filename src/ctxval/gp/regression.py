@@ -31,22 +31,16 @@ def zero_mean(X: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class GaussianProcess:
-    """A Gaussian process conditioned on observations; make one with :func:`condition` or :func:`fit`.
-
-    Attributes:
-        X, y: observations, shapes ``(n, d)`` and ``(n,)``.
-        factor: Cholesky factor of ``K + noise I``.
-        alpha: ``(K + noise I)^-1 (y - mean(X))``.
-    """
+    """A Gaussian process conditioned on observations; make one with :func:`condition` or :func:`fit`."""
 
     kernel: Kernel
     theta: Array
     noise: float
     mean: Mean
-    X: Array
-    y: Array
-    factor: CholeskyFactor
-    alpha: Array
+    X: Array  # observed points (n, d)
+    y: Array  # observations (n,)
+    factor: CholeskyFactor  # of K + noise I
+    alpha: Array  # (K + noise I)^-1 (y - mean(X))
 
     def predict(self, X: Array) -> tuple[Array, Array]:
         """Return the posterior mean and variance of the noise-free function at ``(m, d)``, shapes ``(m,)``."""
@@ -59,7 +53,11 @@ class GaussianProcess:
         dk = self.kernel.input_gradient(self.theta, X, self.X)
         weights = self.factor.solve(k.T).T
         variance = np.maximum(self.kernel.diagonal(self.theta, X) - (k * weights).sum(axis=1), 0.0)
-        d_mean = (dk.transpose(0, 2, 1) @ self.alpha) + _mean_gradient(self.mean, X)
+        d_mean = dk.transpose(0, 2, 1) @ self.alpha
+        if self.mean is not zero_mean:  # by central differences, since a mean is a function without derivatives
+            moves, shape = 1e-6 * np.eye(X.shape[1]), X.shape
+            up, down = (self.mean((X[:, None, :] + m).reshape(-1, shape[1])).reshape(shape) for m in (moves, -moves))
+            d_mean = d_mean + (up - down) / 2e-6
         pull = (dk.transpose(0, 2, 1) @ weights[:, :, None])[:, :, 0]
         d_variance = self.kernel.diagonal_input_gradient(self.theta, X) - 2 * pull
         return self.mean(X) + k @ self.alpha, variance, d_mean, d_variance
@@ -104,16 +102,6 @@ def _covariances_and_variance(process: GaussianProcess | MultiOutputProcess, X: 
     k = process.kernel(process.theta, X, process.X)
     half = process.factor.whiten(k.T)
     return k, np.maximum(process.kernel.diagonal(process.theta, X) - (half**2).sum(axis=0), 0.0)
-
-
-def _mean_gradient(mean: Mean, X: Array) -> Array:
-    """Return the gradient of a prior mean by central differences, since a mean is a function without derivatives."""
-    if mean is zero_mean:
-        return np.zeros_like(X)
-    n, d = X.shape
-    moves = 1e-6 * np.eye(d)
-    up = mean((X[:, None, :] + moves).reshape(-1, d)).reshape(n, d)
-    return (up - mean((X[:, None, :] - moves).reshape(-1, d)).reshape(n, d)) / 2e-6
 
 
 def condition(
@@ -167,13 +155,9 @@ def fit(
     """Return the process with the most likely hyperparameters within the kernel's bounds.
 
     By default the prior of the hyperparameters is uniform within the kernel's bounds (line 2 of the paper's algorithm).
-    If ``log_prior`` is given, the result is the mode of the posterior.
-
-    Args:
-        X, y: observed points ``(n, d)`` and values ``(n,)``, about unit variance.
-        noise: bounds of the noise variance; equal bounds fix it.
-        log_prior: logarithm of the prior density of (theta, log noise), with its gradient.
-        starts: starts of the climbs, shape ``(s, len(theta) + 1)``; rough, middling and smooth functions by default.
+    With the log density of another prior of (theta, log noise), the result is the mode of the posterior. The values
+    ``(n,)`` have about unit variance, and the noise variance has bounds. The climbs start at rows (theta, log noise),
+    by default those of rough, middling and smooth functions.
     """
     bounds = [*kernel.bounds(X.shape[1]), (float(np.log(noise[0])), float(np.log(noise[1])))]
     residual = y - mean(X)
@@ -204,15 +188,11 @@ def most_likely(
     iterations: int = 60,
     tolerance: float | None = None,
 ) -> Array:
-    """Return the hyperparameters of largest density within bounds, by climbs with L-BFGS-B from several starts.
+    """Return the hyperparameters of largest density within bounds, by climbs with L-BFGS-B from starts ``(s, k)``.
 
-    Args:
-        log_density: the function to maximise; hyperparameters for which it raises an InputError, because the
-            covariance matrix is not positive definite, are impossible.
-        starts: starts of the climbs, shape ``(s, k)``.
-        best_start: whether to climb from the most likely start only, instead of from all.
-        iterations: largest number of iterations of one climb.
-        tolerance: relative change of the log density at which a climb ends; the default of L-BFGS-B if None.
+    Hyperparameters for which the density raises an InputError, because the covariance matrix is not positive definite,
+    are impossible. The tolerance is the relative change of the log density at which a climb ends. With ``best_start``,
+    only the most likely start is climbed from.
     """
 
     def negative(parameters: Array) -> tuple[float, Array]:

@@ -21,15 +21,10 @@ _KERNEL = Sum(Matern(1.5, ard=True, length_scale=(0.02, 100.0)), Linear())  # th
 
 @dataclass(frozen=True, eq=False)
 class Surrogate(ShortRepr):
-    """A GP of the distance over the unit cube.
+    """A GP of the distance over the unit cube."""
 
-    Attributes:
-        process: the process of the standardised distance ``(d - shift) / scale``.
-        shift, scale: constants of the standardisation, in the distance's units.
-    """
-
-    process: GaussianProcess
-    shift: float
+    process: GaussianProcess  # of the standardised distance (d - shift) / scale
+    shift: float  # constants of the standardisation, in the distance's units
     scale: float
 
     def predict(self, points: Array) -> tuple[Array, Array]:
@@ -49,13 +44,8 @@ def fit_surrogate(
     """Return the GP with the most likely hyperparameters, given values ``(n,)`` at unit-cube points ``(n, d)``.
 
     Pending and failed points have the value NaN. They are assigned the value that the others predict, which lowers the
-    uncertainty around them and leaves the mean unchanged.
-
-    Args:
-        points, values: the history; values are NaN if pending or failed.
-        kernel: the covariance; Matern 3/2 with one length-scale if None.
-        noise: bounds of the noise variance relative to that of the values; equal bounds fix it.
-        prior_mean: prior mean of the values as a function of points; their average if None.
+    uncertainty around them and leaves the mean unchanged. The kernel is Matern 3/2 with one length-scale by default,
+    the prior mean the average of the values. The noise has bounds relative to the variance of the values.
     """
     known = np.isfinite(values)
     if known.sum() < 2:

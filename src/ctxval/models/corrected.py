@@ -27,28 +27,18 @@ class Correction(ShortRepr):
     A pair is standardised, ``z = ((x, u) - shift) / scale``. Outside the box of the recorded pairs, the correction
     fades: it is multiplied by ``exp(-1/2 sum_j (e_j / fade_j)^2)``, where e_j is the distance to the box. Far from all
     records it is zero, and the model is as before.
-
-    Attributes:
-        shift, scale: constants of the standardised pairs, shapes ``(n + m,)``.
-        centres: standardised pairs, shape ``(M, n + m)``.
-        length_scales: of the covariance, shape ``(n + m,)``.
-        weights: of the covariances, in the units of the states, shape ``(M, n)``.
-        linear: slopes, and the constant as the last row, shape ``(n + m + 1, n)``.
-        low, high: the box of the recorded pairs, standardised, shapes ``(n + m,)``.
-        fade: standardised distances from the box over which the correction fades, shape ``(n + m,)``.
-        limit: largest magnitude of the correction of each state, shape ``(n,)``.
     """
 
-    shift: Array
+    shift: Array  # constants of the standardised pairs (n + m,)
     scale: Array
-    centres: Array
-    length_scales: Array
-    weights: Array
-    linear: Array
-    low: Array
+    centres: Array  # standardised pairs (M, n + m)
+    length_scales: Array  # of the covariance (n + m,)
+    weights: Array  # of the covariances, in the units of the states (M, n)
+    linear: Array  # slopes, and the constant as the last row (n + m + 1, n)
+    low: Array  # the box of the recorded pairs, standardised (n + m,)
     high: Array
-    fade: Array
-    limit: Array
+    fade: Array  # standardised distances from the box over which the correction fades (n + m,)
+    limit: Array  # largest magnitude of the correction of each state (n,)
 
     def __post_init__(self) -> None:
         n, k, M = len(self.limit), len(self.shift), len(self.centres)

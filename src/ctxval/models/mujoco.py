@@ -47,10 +47,8 @@ class MuJoCo(ShortRepr):
         if self.substeps < 1 or abs(ratio - self.substeps) > 1e-6 * max(1.0, ratio):
             raise InputError(f"dt must be a multiple of the model's timestep, {timestep:g} s, got {dt:g} s.")
         self.data = data
-        if self._model.na:
-            raise InputError(
-                f"the model has {self._model.na} activations, which are no part of the state (qpos, qvel)."
-            )
+        if (na := self._model.na) > 0:
+            raise InputError(f"the model has {na} activations, which are no part of the state (qpos, qvel).")
 
     @property
     def dt(self) -> float:

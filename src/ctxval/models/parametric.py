@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 import numpy as np
 
 from ctxval._util.arrays import Array, as_finite
-from ctxval._util.checked import PositiveInt, checked
+from ctxval._util.checked import PositiveInt
 from ctxval._util.registry import part
 from ctxval._util.representation import ShortRepr
 from ctxval.core.model import Function
@@ -68,12 +68,8 @@ class Expected(ShortRepr):
             same batch axes, which returns the next states.
         noise: the number of independent noises of one step.
         draws: the number of draws, which is rounded up to an even one.
-
-    Raises:
-        ModelError: if ``step`` does not return one next state for each draw.
     """
 
-    @checked
     def __init__(
         self,
         step: Callable[[Array, Array, Array], Array],
@@ -94,7 +90,6 @@ class Expected(ShortRepr):
         draws = np.broadcast_to(self.draws.reshape(count, *[1] * len(batch), noise), (count, *batch, noise))
         drawn = np.asarray(self.function(states, inputs, draws), dtype=np.float64)
         if drawn.shape != states.shape:
-            raise ModelError(
-                f"the step of a model with noise must return next states of shape {states.shape}, got {drawn.shape}."
-            )
+            wanted = f"next states of shape {states.shape}"
+            raise ModelError(f"the step of a model with noise must return {wanted}, got {drawn.shape}.")
         return np.asarray(drawn.mean(axis=0))

@@ -26,16 +26,11 @@ from ctxval.models.smooth_maps import Slopes, SmoothMap, kernel_sum, network
 
 @dataclass(frozen=True, eq=False)
 class IncrementScaling(ShortRepr):
-    """The model ``x_next = x + shift_out + scale_out * f(((x, u) - shift_in) / scale_in)`` around a regressor f.
+    """The model ``x_next = x + shift_out + scale_out * f(((x, u) - shift_in) / scale_in)`` around a regressor f."""
 
-    Attributes:
-        shift_in, scale_in: shift and scale of the state-input pair, shapes ``(n + m,)``.
-        shift_out, scale_out: shift and scale of the increment, shapes ``(n,)``.
-    """
-
-    shift_in: Array
+    shift_in: Array  # of the state-input pair (n + m,)
     scale_in: Array
-    shift_out: Array
+    shift_out: Array  # of the increment (n,)
     scale_out: Array
 
     @classmethod
@@ -244,10 +239,8 @@ class FeedforwardReLU(IncrementModel):
         widths = [pair, *[bias.size for bias in self.biases]]
         shapes = [weight.shape for weight in self.weights]
         if len(widths) < 2 or widths[-1] != states or shapes != list(itertools.pairwise(widths)):
-            what = f"a network from {pair} standardised states and inputs to {states} increments"
-            raise ShapeError(
-                f"{what} must have layers that fit together, got weights {shapes} and biases {widths[1:]}."
-            )
+            what = f"a network from {pair} standardised states and inputs to {states} increments must have layers"
+            raise ShapeError(f"{what} that fit together, got weights {shapes} and biases {widths[1:]}.")
 
     @classmethod
     @checked

@@ -21,17 +21,11 @@ PullBack = Callable[[Array], Array]
 
 @dataclass(frozen=True, eq=False)
 class SmoothMap:
-    """A function from rows ``(N, k)`` to values ``(N, o)``.
+    """A function from rows ``(N, k)`` to values ``(N, o)``."""
 
-    Attributes:
-        linearised: returns the values at rows, and what pulls derivatives back to the rows.
-        constant: whether the derivative is the same everywhere.
-        block: number of rows that are evaluated together: enough to be fast, few enough for the cache.
-    """
-
-    linearised: Callable[[Array], tuple[Array, PullBack]]
-    constant: bool = False
-    block: int = 1024
+    linearised: Callable[[Array], tuple[Array, PullBack]]  # the values at rows, and what pulls derivatives back to them
+    constant: bool = False  # whether the derivative is the same everywhere
+    block: int = 1024  # rows that are evaluated together: enough to be fast, few enough for the cache
 
     def value(self, Z: Array) -> Array:
         """Return the values ``(N, o)`` at rows ``(N, k)``."""

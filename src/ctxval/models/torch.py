@@ -32,9 +32,6 @@ class Torch(ShortRepr):
         module: a ``torch.nn.Module`` or a function of tensors.
         increments: whether the module returns ``x_next - x`` instead of ``x_next``.
         data: the transitions that the module was learned from, if they are known.
-
-    Raises:
-        InputError: torch is not installed.
     """
 
     def __init__(self, module: Any, *, increments: bool = False, data: Transitions | None = None) -> None:

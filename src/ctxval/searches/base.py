@@ -21,63 +21,39 @@ Note = dict[str, Any]
 
 @dataclass(frozen=True)
 class Costs:
-    """What predictions and one evaluation cost.
+    """What predictions and one evaluation cost, in seconds; of predictions, seconds of CPU time."""
 
-    Attributes:
-        prediction: seconds of CPU time of the prediction of one point in a batch.
-        evaluation: seconds of one evaluation; infinity if people make it, and None if none was timed.
-        rough: seconds of CPU time of the rough prediction of one point; that of the prediction if None.
-        batch: seconds of CPU time of each batch besides those of its points.
-    """
-
-    prediction: float
-    evaluation: float | None
-    rough: float | None = None
-    batch: float = 0.0
+    prediction: float  # of one point in a batch
+    evaluation: float | None  # infinity if people make it, and None if none was timed
+    rough: float | None = None  # of the rough prediction of one point; that of the prediction if None
+    batch: float = 0.0  # of each batch besides those of its points
 
 
 @dataclass(frozen=True, eq=False)
 class Pending(ShortRepr):
-    """Points that are being evaluated.
-
-    Attributes:
-        prediction: returns the prediction as if they had the expected values: the doubt near them is less.
-    """
+    """Points that are being evaluated."""
 
     points: Array
-    prediction: Callable[[], Prediction]
+    prediction: Callable[[], Prediction]  # as if they had the expected values: the doubt near them is less
 
 
 @dataclass(frozen=True, eq=False)
 class Prediction(ShortRepr):
-    """A prediction of values at points of the unit cube that have not been evaluated.
-
-    Attributes:
-        expected: points ``(m, d)`` -> the expected values ``(m,)`` and their doubt ``(m,)``. The doubt is 0 if all
-            that leads to a value was seen before, and about 1 if nothing was. Both are NaN if a value cannot be
-            predicted.
-        left_out: rows ``(k,)`` -> leave-one-out predictions ``(k,)``. Rows count the points with a known value, in the
-            order of asking; each is predicted as if it had not been evaluated.
-        budget: number of points that may be predicted to choose one, known points not counted; each prediction may
-            cost the design of a controller.
-        otherwise: returns another prediction to use if leave-one-out errors show that this one is not good; None if
-            there is no other.
-        costs: measures the costs, which takes some predictions; None if they cannot be measured.
-        rough: an approximation of ``expected`` that is cheaper to evaluate; None if there is none.
-        steady: whether a point ``(d,)`` has the value of its neighbours, and may be evaluated; None if all may.
-        pending: the points that are being evaluated; None if there are none.
-        candidates: the only points that may be evaluated, ``(r, d)``; None if all may.
-    """
+    """A prediction of values at points of the unit cube that have not been evaluated."""
 
     expected: Callable[[Array], tuple[Array, Array]]
+    """Points ``(m, d)`` -> expected values ``(m,)`` and their doubt ``(m,)``, both NaN if a value cannot be predicted.
+    The doubt is 0 if all that leads to a value was seen before, and about 1 if nothing was."""
     left_out: Callable[[Rows], Array]
-    budget: int
-    otherwise: Callable[[], Prediction | None] | None = None
-    costs: Callable[[], Costs] | None = None
-    rough: Callable[[Array], tuple[Array, Array]] | None = None
-    steady: Callable[[Array], bool] | None = None
-    pending: Pending | None = None
-    candidates: Array | None = None
+    """Rows ``(k,)`` -> leave-one-out predictions ``(k,)``. Rows count the points with a known value, in the order of
+    asking; each is predicted as if it had not been evaluated."""
+    budget: int  # number of points that may be predicted to choose one, known points not counted
+    otherwise: Callable[[], Prediction | None] | None = None  # another one, if leave-one-out errors show a bad one
+    costs: Callable[[], Costs] | None = None  # measures the costs, which takes some predictions
+    rough: Callable[[Array], tuple[Array, Array]] | None = None  # an approximation of ``expected`` that is cheaper
+    steady: Callable[[Array], bool] | None = None  # whether a point has the value of its neighbours; None if all have
+    pending: Pending | None = None  # the points that are being evaluated
+    candidates: Array | None = None  # the only points that may be evaluated (r, d); None if all may
 
     def with_rows(self, left_out_of: Callable[[Prediction], Callable[[Rows], Array]]) -> Prediction:
         """Return the prediction, and those that it may turn to, with a function of other rows for each ``left_out``."""

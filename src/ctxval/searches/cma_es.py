@@ -51,27 +51,25 @@ class CMAES(SequentialSearch):
 
     def propose(self, rng: np.random.Generator) -> Array:
         """Return a draw from the distribution after all complete generations."""
+        points, values = self.points, self.values
         with single_threaded():
-            self._learn_generations(self.points, self.values)
+            if not np.array_equal(values[: len(self._learned)], self._learned, equal_nan=True):
+                self._begin()  # a late value belongs to a generation that was learned without it
+            while (last := (first := len(self._learned)) + self._distribution.population_size) <= len(points):
+                generation, results = points[first:last], values[first:last]
+                known = np.isfinite(results)
+                if known.any():  # failures rank last, and a generation of failures alone is left out
+                    losses = np.where(known, -results, -results[known].min())
+                    order = np.argsort(-results, kind="stable")  # NaN last
+                    self._distribution.tell([(generation[i], float(losses[i])) for i in order])
+                if self._distribution.should_stop() or (np.ptp(generation, axis=0) < 1e-4).all():
+                    # Trial k draws from [seed, k]; the third number of the seed separates the restart from it.
+                    restart = np.random.default_rng(np.random.SeedSequence([self._seed, last, 1]))
+                    population = 2 * self._distribution.population_size
+                    self._distribution = self._started(restart.random(self.dimension), population)
+                self._learned = values[:last]
             self._distribution.reseed_rng(int(rng.integers(2**32)))
             return np.asarray(self._distribution.ask(), dtype=np.float64)
-
-    def _learn_generations(self, points: Array, values: Array) -> None:
-        if not np.array_equal(values[: len(self._learned)], self._learned, equal_nan=True):
-            self._begin()  # a late value belongs to a generation that was learned without it
-        while (last := (first := len(self._learned)) + self._distribution.population_size) <= len(points):
-            generation, results = points[first:last], values[first:last]
-            known = np.isfinite(results)
-            if known.any():  # failures rank last, and a generation of failures alone is left out
-                losses = np.where(known, -results, -results[known].min())
-                order = np.argsort(-results, kind="stable")  # NaN last
-                self._distribution.tell([(generation[i], float(losses[i])) for i in order])
-            if self._distribution.should_stop() or (np.ptp(generation, axis=0) < 1e-4).all():
-                # Trial k draws from [seed, k]; the third number of the seed separates the restart from it.
-                rng = np.random.default_rng(np.random.SeedSequence([self._seed, last, 1]))
-                population = 2 * self._distribution.population_size
-                self._distribution = self._started(rng.random(self.dimension), population)
-            self._learned = values[:last]
 
     def _started(self, mean: Array, population: int | None) -> CMA:
         bounds = np.tile([0.0, 1.0], (self.dimension, 1))

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 
-from ctxval._util.arrays import Array, Rows
+from ctxval._util.arrays import Array
 from ctxval._util.checked import PositiveInt, checked
 from ctxval.searches.base import BaseSearch, Prediction, Search, SequentialSearch
 
@@ -48,25 +46,19 @@ class Repeated(SequentialSearch):
                 return np.asarray(points[rows[0]])
         self._inner.reset(self.dimension, self._seed)
         if groups:
-            self._tell(points, groups)
+            values, known, prediction = self.values, np.isfinite(self.values), self._prediction
+            known_rows = [rows[known[rows]] for rows in groups]
+            means = [values[rows].mean() if len(rows) else np.nan for rows in known_rows]
+            self._inner.tell(points[[rows[0] for rows in groups]], means)
+            self._inner.remember([self.notes[rows[0]] for rows in groups])
+            if prediction is not None:
+                # The rows of the inner search count points, those of the prediction count all known values.
+                evaluated = np.array([known[: rows[0]].sum() for rows in known_rows if len(rows)], dtype=np.intp)
+                prediction = prediction.with_rows(lambda each: lambda rows: each.left_out(evaluated[rows]))
+            self._inner.use_prediction(prediction)
         point = np.asarray(self._inner.ask(1)[0])
         self._last_note = self._inner.note()
         return point
-
-    def _tell(self, points: Array, groups: Sequence[Rows]) -> None:
-        values, known = self.values, np.isfinite(self.values)
-        known_rows = [rows[known[rows]] for rows in groups]
-        means = [values[rows].mean() if len(rows) else np.nan for rows in known_rows]
-        self._inner.tell(points[[rows[0] for rows in groups]], means)
-        self._inner.remember([self.notes[rows[0]] for rows in groups])
-        if self._prediction is None:
-            self._inner.use_prediction(None)
-        else:
-            # The rows of the inner search count points, those of the prediction count all known values.
-            evaluated = np.array([known[: rows[0]].sum() for rows in known_rows if len(rows)], dtype=np.intp)
-            self._inner.use_prediction(
-                self._prediction.with_rows(lambda one: lambda rows: one.left_out(evaluated[rows]))
-            )
 
     def estimate(self, points: Array, values: Array) -> float | None:
         """Return the estimate of the largest mean, from the points with at least ``times`` known values.

@@ -146,12 +146,6 @@ class TrustRegion(SequentialSearch):
         self._last_note = {**note, "why": why}
         return point
 
-    @property
-    def predicted_besides(self) -> int:
-        """The number of known points that are predicted for a choice, besides those of the budget."""
-        known = int(np.isfinite(self.values).sum())
-        return min(known, _COMPARED_ON) if known >= _COMPARED_FROM else 0
-
     # How good the prediction is
 
     def _why_not(self, prediction: Prediction, surrogate_error: Callable[[], float]) -> str | None:
@@ -334,7 +328,9 @@ class Auto(TrustRegion):
         self._fixed_now = None
         if prediction is not None:
             prediction = replace(prediction, budget=self.designs(prediction))
-            expect(usual_effort(self.dimension, prediction.budget).points + self.predicted_besides)
+            known = int(np.isfinite(self.values).sum())  # of which some are predicted, too, for a comparison
+            compared = min(known, _COMPARED_ON) if known >= _COMPARED_FROM else 0
+            expect(usual_effort(self.dimension, prediction.budget).points + compared)
         super().use_prediction(prediction)
 
     def propose(self, rng: np.random.Generator) -> Array:

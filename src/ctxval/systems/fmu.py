@@ -84,14 +84,9 @@ class FMU(ShortRepr):
                 raise UnknownNameError.among("variable of the FMU", name, known)
         start = [self.start[name] for name in self.states]
         _references(known, start)
-        self._setup = {
-            "folder": self._unpacked,
-            "name": self.path.name,
-            "states": _references(known, self.states),
-            "inputs": _references(known, self.inputs),
-            "start": start,
-            "parameters": self.parameters,
-        }
+        references = {"states": _references(known, self.states), "inputs": _references(known, self.inputs)}
+        file = {"folder": self._unpacked, "name": self.path.name}
+        self._setup = file | references | {"start": start, "parameters": self.parameters}
         try:
             with self._process() as process:
                 process.ask("begin", None, 0.0, 1)
@@ -219,10 +214,8 @@ def _unpacked(path: Path) -> tuple[Any, str]:
     except Exception as error:  # of many kinds: no file, not a zip, not XML, not valid by the schema
         raise InputError(f"{path} cannot be read as an FMU: {error}") from error
     if description.coSimulation is None or not description.fmiVersion.startswith(("2", "3")):
-        raise InputError(
-            f"{path} must be an FMU for co-simulation, FMI 2 or 3, got FMI {description.fmiVersion}"
-            f"{'' if description.coSimulation else ' without co-simulation'}."
-        )
+        got = f"FMI {description.fmiVersion}{'' if description.coSimulation else ' without co-simulation'}"
+        raise InputError(f"{path} must be an FMU for co-simulation, FMI 2 or 3, got {got}.")
     folder = tempfile.mkdtemp(prefix="ctxval-")
     try:
         fmpy.extract(str(path), folder)

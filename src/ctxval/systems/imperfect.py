@@ -7,7 +7,7 @@ import zlib
 import numpy as np
 
 from ctxval._util.arrays import Array, ArrayLike
-from ctxval._util.checked import NonNegativeFloat, checked
+from ctxval._util.checked import NonNegativeFloat
 from ctxval._util.registry import part
 from ctxval._util.representation import ShortRepr
 from ctxval.core.controller import Controller
@@ -36,7 +36,6 @@ class Imperfect(ShortRepr):
 
     batched = True
 
-    @checked
     def __init__(
         self,
         step: Step | Model,
@@ -51,9 +50,8 @@ class Imperfect(ShortRepr):
         seed: int | None = None,
     ) -> None:
         self.model = as_model(step, vectorized=vectorized)
-        self.start, self.process, self.measurement, self.resolution = (
-            np.asarray(value, dtype=np.float64) for value in (start, process, measurement, resolution)
-        )
+        self.start, self.process = np.asarray(start, dtype=np.float64), np.asarray(process, dtype=np.float64)
+        self.measurement, self.resolution = (np.asarray(value, dtype=np.float64) for value in (measurement, resolution))
         for name in ("start", "process", "measurement", "resolution"):
             if not (np.isfinite(getattr(self, name)) & (getattr(self, name) >= 0)).all():
                 raise InputError(f"{name} must be finite and not negative, got {getattr(self, name).tolist()}.")

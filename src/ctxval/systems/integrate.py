@@ -10,11 +10,9 @@ Derivative = Callable[[Array, Array], Array]
 
 
 def rk4(derivative: Derivative, dt: float) -> Callable[[Array, Array], Array]:
-    """Return the step ``(x, u) -> x_next`` of the classical Runge-Kutta method of order 4.
+    """Return the step ``(x, u) -> x_next`` of the classical Runge-Kutta method of order 4, of dt seconds.
 
-    Args:
-        derivative: function ``(x, u) -> dx/dt``, shapes ``(..., n), (..., m) -> (..., n)``.
-        dt: length of the step, seconds; the input is held over it.
+    The derivative is a function ``(x, u) -> dx/dt``, shapes ``(..., n), (..., m) -> (..., n)``; inputs are held.
     """
 
     def step(x: Array, u: Array) -> Array:

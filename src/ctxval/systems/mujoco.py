@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -82,10 +83,33 @@ class MuJoCo(ShortRepr):
         if not np.isclose(task.dt, self.dt, rtol=1e-9, atol=0):
             wanted = f"{self._model.opt.timestep:g} s x {self.substeps} = {self.dt:g} s"
             raise InputError(f"the task's dt must be the model's timestep times substeps, {wanted}, got {task.dt:g} s.")
-        execution = _Execution(self, self._started(task))
-        trajectory = rollout(execution.step, controller, task)
-        ended = execution.failure or trajectory.ended
-        return Trajectory(trajectory.times, trajectory.states, trajectory.inputs, ended)
+        simulations, steps, failure = self._started(task), 0, ""
+        ctrl, healthy = simulations.ctrl, np.ones(len(simulations.qpos), dtype=bool)
+
+        def mark(failed: Mask, reason: str) -> None:
+            nonlocal failure
+            if (failed & healthy).any():
+                failure = failure or f"{reason} at step {steps}"
+                healthy[failed] = False
+
+        def step(x: Array, u: Array) -> Array:
+            nonlocal steps
+            if u.shape[-1] != ctrl.shape[1]:
+                raise ShapeError(f"the controller must return the model's {ctrl.shape[1]} inputs, got {u.shape[-1]}.")
+            inputs = u.reshape(ctrl.shape)
+            steps += 1
+            mark(np.asarray(~np.isfinite(inputs).all(axis=1)), "an input is not finite")
+            ctrl[healthy] = inputs[healthy]
+            simulations.advance(self.substeps, healthy, locate=bool(self.sites))
+            warned: Mask = np.asarray(simulations.warnings > 0)
+            if warned.any():
+                mark(np.asarray(warned.any(axis=1)), f"MuJoCo warned of {warning_of(warned.any(axis=0))}")
+            states = self._observed(simulations)
+            states[~healthy] = np.nan
+            return states.reshape(x.shape)
+
+        trajectory = rollout(step, controller, task)
+        return replace(trajectory, ended=failure or trajectory.ended)
 
     def _started(self, task: Task) -> _Batch:
         nq, nv, sites = self._model.nq, self._model.nv, self._coordinates[0].size * self._coordinates[1].size
@@ -109,37 +133,6 @@ class MuJoCo(ShortRepr):
         sites, axes = self._coordinates
         positions = simulations.site_positions[:, sites, axes]
         return np.concatenate([simulations.qpos, simulations.qvel, positions.reshape(len(positions), -1)], axis=1)
-
-
-class _Execution:
-    """The simulations of a batch of tasks as a step function; it keeps their state between steps."""
-
-    def __init__(self, system: MuJoCo, simulations: _Batch) -> None:
-        self.system, self.simulations = system, simulations
-        self.healthy: Mask = np.ones(len(simulations.qpos), dtype=bool)
-        self.steps = 0
-        self.failure = ""
-
-    def step(self, x: Array, u: Array) -> Array:
-        ctrl = self.simulations.ctrl
-        if u.shape[-1] != ctrl.shape[1]:
-            raise ShapeError(f"the controller must return the model's {ctrl.shape[1]} inputs, got {u.shape[-1]}.")
-        inputs = u.reshape(ctrl.shape)
-        self.steps += 1
-        self._mark(np.asarray(~np.isfinite(inputs).all(axis=1)), "an input is not finite")
-        ctrl[self.healthy] = inputs[self.healthy]
-        self.simulations.advance(self.system.substeps, self.healthy, locate=bool(self.system.sites))
-        warned: Mask = np.asarray(self.simulations.warnings > 0)
-        if warned.any():
-            self._mark(np.asarray(warned.any(axis=1)), f"MuJoCo warned of {warning_of(warned.any(axis=0))}")
-        states = self.system._observed(self.simulations)
-        states[~self.healthy] = np.nan
-        return states.reshape(x.shape)
-
-    def _mark(self, failed: Mask, reason: str) -> None:
-        if (failed & self.healthy).any():
-            self.failure = self.failure or f"{reason} at step {self.steps}"
-            self.healthy &= ~failed
 
 
 class _Batch:
