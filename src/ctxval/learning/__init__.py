@@ -4,11 +4,7 @@ from __future__ import annotations
 
 from ctxval.learning.coverage import Coverage
 from ctxval.learning.draws import DynamicsDraws
-from ctxval.learning.dynamics_posterior import (
-    DynamicsPosterior,
-    PosteriorSettings,
-    learn_posterior,
-)
+from ctxval.learning.dynamics_posterior import DynamicsPosterior, PosteriorSettings, learn_posterior
 from ctxval.learning.dynamics_study import DynamicsStudy
 from ctxval.learning.execution_prediction import ExecutionPrediction, PredictionScore
 from ctxval.learning.learned_dynamics import LearnedDynamics

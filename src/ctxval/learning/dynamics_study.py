@@ -21,12 +21,7 @@ from ctxval.core.validation import Validation
 from ctxval.errors import InputError
 from ctxval.learning.actuators import Actuator, found_actuator
 from ctxval.learning.closed_loops import LoopPlanner, unseen_parameters
-from ctxval.learning.dynamics_posterior import (
-    LearnedCovariances,
-    PosteriorSettings,
-    condition,
-    learn_covariances,
-)
+from ctxval.learning.dynamics_posterior import LearnedCovariances, PosteriorSettings, condition, learn_covariances
 from ctxval.learning.extended import ExtendedValidation
 from ctxval.learning.histories import Record
 from ctxval.learning.learned_dynamics import LearnedDynamics

@@ -8,6 +8,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 
@@ -17,7 +18,6 @@ from ctxval.learning.features import Features, LinearFunction
 from ctxval.learning.innovations import DrawnWeights, InnovationsFit
 from ctxval.learning.residual_data import ResidualData
 
-GROUPS, EACH = 5, 4  # draws of the hyperparameters, and of weights for each
 REPLICATES = 10  # sequences of noise of each draw in a search
 ROUGH = 3  # sequences of noise of the mean in a search of tasks, whose best ones are evaluated with all
 SETTLED = 80  # sequences of noise at the tasks that a search has found
@@ -165,20 +165,15 @@ class NoisyPosterior(ShortRepr):
     quantile: float
     seed: tuple[int, ...]
 
+    groups: ClassVar[int] = 5
+    """The number of draws of the hyperparameters."""
+    functions: ClassVar[int] = 4
+    """The usual number of weights that are drawn for each of them."""
+
     @property
     def noise(self) -> float:
         """The variance of noise as a share of the mean square of a state's error of M, where it is largest."""
         return self.fit.share
-
-    @property
-    def groups(self) -> int:
-        """The number of draws of the hyperparameters."""
-        return GROUPS
-
-    @property
-    def functions(self) -> int:
-        """The usual number of weights that are drawn for each of them."""
-        return EACH
 
     @property
     def deviations(self) -> Array:
@@ -199,9 +194,8 @@ class NoisyPosterior(ShortRepr):
     @functools.cached_property
     def searched(self) -> NoisyDraws:
         """The same with fewer sequences of noise, with which a search finds the same tasks."""
-        if self.mean.replicates <= ROUGH:
-            return self.mean
-        return replace(self.mean, rows=self.mean.rows[:, :ROUGH], start=self.mean.start[:, :ROUGH])
+        few = replace(self.mean, rows=self.mean.rows[:, :ROUGH], start=self.mean.start[:, :ROUGH])
+        return self.mean if self.mean.replicates <= ROUGH else few
 
     @property
     def rough_mean(self) -> NoisyDraws:
@@ -221,7 +215,7 @@ class NoisyPosterior(ShortRepr):
         hyperparameters: int | None = None,
     ) -> NoisyDraws:
         """Return draws; see :meth:`DynamicsPosterior.draw`. Nothing depends on ``relevant``."""
-        groups, each = GROUPS, EACH if functions is None else functions
+        groups, each = self.groups, self.functions if functions is None else functions
         if hyperparameters is not None:
             groups, each = hyperparameters // 2, 2 * each  # a few for a screening
         return self._with_noise(self.fit.draw(groups, each, rng), rng)

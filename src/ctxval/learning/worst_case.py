@@ -150,8 +150,7 @@ class WorstCaseSearch:
         """Three nearly equal tasks in a row from each task of the pool, points ``(N, 3, d)``, and their plans."""
         moves = np.random.default_rng([self._seed, 1]).uniform(-_NEARBY, _NEARBY, self.pool.shape)
         outside = (self.pool + 2 * moves < 0) | (self.pool + 2 * moves > 1)
-        steps = np.arange(3)[:, None] * np.where(outside, -moves, moves)[:, None]
-        tasks = self.pool[:, None] + steps
+        tasks = self.pool[:, None] + np.arange(3)[:, None] * np.where(outside, -moves, moves)[:, None]
         return tasks, self.planner.plan(tasks.reshape(-1, self.dimension))
 
     def largest_jump(self, posterior: AnyPosterior) -> float:
@@ -165,11 +164,10 @@ class WorstCaseSearch:
             return 0.0
         with single_threaded():
             tasks, planned = self._in_rows
-            found = self.planner.distances(posterior.mean, planned, tasks.shape[0] * tasks.shape[1])[0]
-        of_rows = found.reshape(tasks.shape[:2])
-        if is_kinked(self.planner.validation.distance):
-            of_rows = self._nearer(posterior, tasks, of_rows)
-        jumps = np.abs(of_rows[:, 1] - 0.5 * (of_rows[:, 0] + of_rows[:, 2]))
+            of_rows = self.planner.distances(posterior.mean, planned, tasks.shape[0] * 3)[0].reshape(-1, 3)
+            if is_kinked(self.planner.validation.distance):
+                of_rows = self._nearer(posterior, tasks, of_rows)
+        jumps = _bend(of_rows)
         return float(jumps[np.isfinite(jumps)].max(initial=0.0))
 
     def _nearer(self, posterior: AnyPosterior, tasks: Array, found: Array) -> Array:
@@ -177,16 +175,14 @@ class WorstCaseSearch:
 
         Of each row, the half with the larger change is kept, which a jump is in.
         """
-        bend = np.nan_to_num(np.abs(found[:, 1] - 0.5 * (found[:, 0] + found[:, 2])), nan=0.0, posinf=0.0)
-        rows = np.argsort(-bend, kind="stable")[:_BENT]
+        rows = np.argsort(-np.nan_to_num(_bend(found), nan=0.0, posinf=0.0), kind="stable")[:_BENT]
         tasks, found = tasks[rows], found[rows]
         for _ in range(int(np.log2(_NEARER))):
             later = np.abs(found[:, 2] - found[:, 1]) > np.abs(found[:, 1] - found[:, 0])
             ends = np.where(later[:, None], [1, 2], [0, 1])
             tasks, found = np.take_along_axis(tasks, ends[..., None], axis=1), np.take_along_axis(found, ends, axis=1)
             middle = tasks.mean(axis=1)
-            with single_threaded():
-                value = self.planner.distances(posterior.mean, self.planner.plan(middle), len(middle))[0]
+            value = self.planner.distances(posterior.mean, self.planner.plan(middle), len(middle))[0]
             tasks = np.stack([tasks[:, 0], middle, tasks[:, 1]], axis=1)
             found = np.stack([found[:, 0], value, found[:, 1]], axis=1)
         return found
@@ -199,8 +195,8 @@ class WorstCaseSearch:
         distance, none = self._on_one(posterior.mean), np.empty((0, self.dimension))
         evaluations = 4 * self.settings.evaluations
         with single_threaded():
-            found = [search_globally(distance, self.dimension, none, rng, evaluations=evaluations) for _ in range(2)]
-        return np.array([one.values[0] for one in found]), np.array([one.points[0] for one in found])
+            maxima = [search_globally(distance, self.dimension, none, rng, evaluations=evaluations) for _ in range(2)]
+        return np.array([maximum.values[0] for maximum in maxima]), np.array([each.points[0] for each in maxima])
 
     def on_mean(
         self, posterior: AnyPosterior, of_pool: Array, known: Array, rng: np.random.Generator, *, globally: bool = True
@@ -386,6 +382,11 @@ class WorstCaseSearch:
         few = (rng.random(shape) < 0.5) | (rng.random((*shape[:2], 1)) < 0.5)
         random = np.clip(around + share * few * rng.normal(size=shape), 0, 1)
         return np.concatenate([to_bounds, random], axis=1)
+
+
+def _bend(distances: Array) -> Array:
+    """Return how far the distances of tasks in rows ``(k, 3)`` are from the middle of those on both sides."""
+    return np.asarray(np.abs(distances[:, 1] - 0.5 * (distances[:, 0] + distances[:, 2])))
 
 
 def is_kinked(distance: object) -> bool:
