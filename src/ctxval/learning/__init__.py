@@ -8,9 +8,8 @@ from ctxval.learning.dynamics_posterior import DynamicsPosterior, PosteriorSetti
 from ctxval.learning.dynamics_study import DynamicsStudy
 from ctxval.learning.execution_prediction import ExecutionPrediction, PredictionScore
 from ctxval.learning.learned_dynamics import LearnedDynamics
-from ctxval.learning.prediction import predict_distance
+from ctxval.learning.prediction import predict_composed, predict_distance
 from ctxval.learning.replays import Replay, replay_executed
-from ctxval.learning.vector import predict_composed
 
 __all__ = [
     "Coverage",

@@ -22,7 +22,6 @@ from ctxval.core.model import Model
 from ctxval.core.trajectory import Transitions
 from ctxval.errors import InputError
 from ctxval.gp.subset import pivoted_rows
-from ctxval.learning.component import Component, draw_functions
 from ctxval.learning.draws import DynamicsDraws, bounded
 from ctxval.learning.hyperparameters import (
     FAMILIES,
@@ -31,9 +30,8 @@ from ctxval.learning.hyperparameters import (
     Hyperparameters,
     learning_rows,
 )
-from ctxval.learning.kernel_expansion import KernelExpansion, joined, weights_without
-from ctxval.learning.residual_data import ResidualData, residual_data
-from ctxval.learning.without_model import smoother_than
+from ctxval.learning.kernel_expansion import Component, KernelExpansion, draw_functions, joined, weights_without
+from ctxval.learning.residual_data import ResidualData, residual_data, smoother_than
 
 _PIVOT = 0.1  # variance, as a share of the noise, below which a transition adds nothing to those chosen before it
 
@@ -296,7 +294,7 @@ def learn_covariances(
     """Return the posterior of the hyperparameters given recorded transitions.
 
     Returns None if fewer than two transitions are usable, or if M explains all of them. If M is rougher than S, the
-    residuals are those of a linear model (:mod:`ctxval.learning.without_model`).
+    residuals are those of a linear model (:mod:`ctxval.learning.residual_data`).
 
     Args:
         sources: the execution of each transition; -1 for data that the model was made from, shape ``(N,)``.

@@ -27,9 +27,8 @@ from ctxval.learning.histories import Record
 from ctxval.learning.learned_dynamics import LearnedDynamics
 from ctxval.learning.noise_study import NoiseStudy
 from ctxval.learning.noisy_draws import NoisyPosterior
-from ctxval.learning.prediction import predict_distance
+from ctxval.learning.prediction import ErrorVectors, Executed, predict_composed, predict_distance
 from ctxval.learning.recorded import data_near, digest, recorded_transitions, scheduled
-from ctxval.learning.vector import ErrorVectors, Executed, predict_composed
 from ctxval.learning.worst_case import WorstCaseSearch, WorstCaseSettings
 from ctxval.models.corrected import before_refinement
 from ctxval.searches import Prediction

@@ -29,9 +29,9 @@ from ctxval.core.trajectory import Trajectory
 from ctxval.core.validation import Validation
 from ctxval.learning.actuators import ActuatedController, Actuator
 from ctxval.learning.histories import Record
+from ctxval.learning.prediction import Executed
 from ctxval.learning.recorded import closed_loops_on_model
 from ctxval.learning.state_estimates import StateEstimates
-from ctxval.learning.vector import Executed
 
 
 def with_states_of_model(validation: Validation) -> Validation:

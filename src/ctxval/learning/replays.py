@@ -22,7 +22,7 @@ from ctxval.core.validation import Validation
 from ctxval.learning.draws import DrawnModel
 from ctxval.learning.dynamics_study import DynamicsStudy
 from ctxval.learning.learned_dynamics import LearnedDynamics
-from ctxval.learning.vector import executions_of
+from ctxval.learning.prediction import executions_of
 
 
 @dataclass(frozen=True, eq=False)

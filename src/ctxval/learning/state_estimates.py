@@ -17,7 +17,7 @@ from ctxval.core.model import Model
 from ctxval.core.outputs import Outputs
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.validation import Validation
-from ctxval.learning.vector import Executed
+from ctxval.learning.prediction import Executed
 from ctxval.models.corrected import before_refinement
 from ctxval.models.scaling import standard_deviations
 
