@@ -113,11 +113,12 @@ def test_states_keep_their_names_and_a_parameter_of_the_same_name_gets_another()
     labels = ExtendedValidation(loaded_cart()).validation.labels
     assert labels.states == ("x0", "x1", "load [kg]")
     validation = loaded_cart()
-    named = validation.with_labels(type(validation.labels)(states=("load [N]", "speed [m/s]")))
+    named = validation.with_parts(labels=type(validation.labels)(states=("load [N]", "speed [m/s]")))
     assert ExtendedValidation(named).validation.labels.states == ("load [N]", "speed [m/s]", "task load [kg]")
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("few_loops")
 def test_dynamics_that_depend_on_a_stated_parameter_are_validated_by_a_bound_that_is_true(tmp_path: Path) -> None:
     validation = loaded_cart()
     largest = float(validation.distances(validation.space.grid(21)).max())
@@ -132,12 +133,13 @@ def test_dynamics_that_depend_on_a_stated_parameter_are_validated_by_a_bound_tha
     assert verdict.certificate is not None
     assert verdict.certificate.details["physical"] == ["load"]
     # A campaign that is opened again with another statement does not count predictions of the first one.
-    without = Campaign(validation.with_physical(()), store=store, seed=0)
+    without = Campaign(validation.with_parts(physical=()), store=store, seed=0)
     assert without.executions == campaign.executions
     assert without.recorder.dynamics.stored_prediction(campaign.trials[-1]) is None
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("few_loops")
 def test_a_statement_that_leaves_out_the_parameter_is_not_validated_below_the_largest_distance() -> None:
     validation = loaded_cart(("goal",))
     largest = float(validation.distances(validation.space.grid(21)).max())
@@ -162,7 +164,7 @@ def random_executions(validation: Validation, count: int) -> list[tuple[Array, A
 
 def test_nothing_is_suspected_if_state_and_input_explain_the_executions() -> None:
     validation = loaded_cart().with_system(systems.Simulated(lambda x, u: cart(x, u, np.array(0.3)), vectorized=True))
-    study = DynamicsStudy(validation.with_physical(()))
+    study = DynamicsStudy(validation.with_parts(physical=()))
     learned = study.learn(random_executions(validation, 8))
     assert learned is not None
     assert learned.study is study

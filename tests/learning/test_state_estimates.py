@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ctxval import Campaign, TaskSpace, distances
-from ctxval.core.outputs import Outputs
+from ctxval.core.system import Outputs
 from ctxval.learning import DynamicsStudy
 from ctxval.learning.extended import with_states_of_model
 from ctxval.learning.replays import replay_executed

@@ -283,7 +283,7 @@ class DynamicsStudy(ShortRepr):
     def _with_parameter(self, name: str) -> DynamicsStudy:
         """Return the study with another task parameter as a state; it is kept."""
         if name not in self._others:
-            given = self.given.with_physical([*self.given.physical, name])
+            given = self.given.with_parts(physical=[*self.given.physical, name])
             self._others[name] = DynamicsStudy(given, self.seed, self.quantile, self.extended.of(given))
         return self._others[name]
 

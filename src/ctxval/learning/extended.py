@@ -22,8 +22,8 @@ from ctxval.core.controller import Controller, ControllerWithMemory, Synthesizer
 from ctxval.core.distance import Distance
 from ctxval.core.labels import Labels, labels_of
 from ctxval.core.model import Model
-from ctxval.core.outputs import Outputs
 from ctxval.core.space import Parameters
+from ctxval.core.system import Outputs
 from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.validation import Validation
@@ -39,7 +39,17 @@ def with_states_of_model(validation: Validation) -> Validation:
 
     Its system is that of the given one, and cannot be executed.
     """
-    return validation if validation.outputs is None else ExtendedValidation(validation.with_physical(())).validation
+    return (
+        validation if validation.outputs is None else ExtendedValidation(validation.with_parts(physical=())).validation
+    )
+
+
+def estimates_by_loops_on_model(validation: Validation) -> StateEstimates | None:
+    """Return the estimates of states for a validation; None if no task can be planned, or if it has no outputs."""
+    if validation.outputs is None:
+        return None
+    loops = closed_loops_on_model(with_states_of_model(validation))
+    return None if loops is None else StateEstimates(validation, validation.outputs, loops.states)
 
 
 class ExtendedValidation:

@@ -14,7 +14,7 @@ import numpy as np
 from ctxval._util.arrays import Array
 from ctxval.core.kalman import Estimate, corrected, predicted, smoothed
 from ctxval.core.model import Model
-from ctxval.core.outputs import Outputs
+from ctxval.core.system import Outputs
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.validation import Validation
 from ctxval.learning.prediction import Executed

@@ -17,7 +17,7 @@ import numpy as np
 
 from ctxval._util.arrays import Array, Mask, Rows, single_threaded
 from ctxval._util.boxes import latin_hypercube, moves_to_bounds, separated_rows
-from ctxval.gp.ascent import Ascent
+from ctxval.gp.ascent import ascend
 from ctxval.gp.global_search import search_globally
 from ctxval.learning.closed_loops import AnyDraws, LoopPlanner, PlannedTasks, loop_pairs
 from ctxval.learning.dynamics_posterior import DynamicsPosterior
@@ -221,8 +221,8 @@ class WorstCaseSearch:
                 budget = min(_SCREENED[1], settings.evaluations)
                 same = posterior.rough_mean is posterior.searched
                 rough = None if same else self._on_one(posterior.rough_mean)
-                ascent = Ascent(distance, np.zeros(self.dimension), np.ones(self.dimension), budget, rough)
-                points, values = ascent.run(starts[: len(known) + _SHOWN], rng)
+                box = np.zeros(self.dimension), np.ones(self.dimension)
+                points, values = ascend(distance, box, budget, starts[: len(known) + _SHOWN], rng, rough)
                 apart = separated_rows(points, _APART * np.sqrt(self.dimension), settings.elites)
                 return self._of_mean(posterior, float(values[0]), points[apart], len(points))
             evaluations = max(len(starts) + 50, settings.evaluations - len(self.pool))
