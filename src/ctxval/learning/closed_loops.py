@@ -37,13 +37,9 @@ _REMEMBERED = 64_000_000  # largest size of the plans that are kept, in bytes, a
 
 @dataclass(frozen=True, eq=False)
 class PlannedTasks:
-    """Tasks with their controllers and the trajectories of M: a batch, or one task without batch axes.
+    """Tasks with their controllers and the trajectories of M: a batch, or one task without batch axes."""
 
-    Attributes:
-        rows: the rows of these tasks among all points that were planned, shape ``(q,)``.
-    """
-
-    rows: Rows
+    rows: Rows  # the rows of these tasks among all points that were planned, (q,)
     task: Task
     controller: Controller
     promised: Trajectory
@@ -51,17 +47,11 @@ class PlannedTasks:
 
 @dataclass(frozen=True, eq=False)
 class Loops:
-    """Closed loops of S drawn systems on q tasks; noisy ones have S R, with R sequences of noise for each draw.
+    """Closed loops of S drawn systems on q tasks; noisy ones have S R, with R sequences of noise for each draw."""
 
-    Attributes:
-        distances: d, shape ``(S, q)``; NaN if the loop of M diverges, infinity if that of a drawn system does.
-        states: shape ``(S, q, H + 1, n)``.
-        inputs: shape ``(S, q, H, m)``.
-    """
-
-    distances: Array
-    states: Array
-    inputs: Array
+    distances: Array  # d, (S, q); NaN if the loop of M diverges, infinity if that of a drawn system does
+    states: Array  # shape (S, q, H + 1, n)
+    inputs: Array  # shape (S, q, H, m)
 
 
 class LoopPlanner:

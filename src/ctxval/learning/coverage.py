@@ -26,17 +26,11 @@ _FARTHEST = 1e3  # standardised coordinates are limited to this magnitude
 
 @dataclass(frozen=True, eq=False)
 class Gap:
-    """A gap between what closed loops visit and what is recorded.
+    """A gap between what closed loops visit and what is recorded."""
 
-    Attributes:
-        size: its size, as a share of the visited range.
-        coordinates: the indices of its coordinates; states come before inputs.
-        place: the visited state-input pair, in the system's units, shape ``(n + m,)``.
-    """
-
-    size: float
-    coordinates: tuple[int, ...]
-    place: Array
+    size: float  # its size, as a share of the visited range
+    coordinates: tuple[int, ...]  # the indices of its coordinates; states come before inputs
+    place: Array  # the visited state-input pair, in the system's units, (n + m,)
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,19 +137,13 @@ def _nearest(recorded: Array, visited: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Pocket(ShortRepr):
-    """The largest region of two states that closed loops of tasks enter, and that no execution has entered.
+    """The largest region of two states that closed loops of tasks enter, and that no execution has entered."""
 
-    Attributes:
-        size: its radius, as a share of the visited ranges.
-        states: the indices of the two states.
-        place: its centre, which a loop visits, in the system's units, shape ``(2,)``.
-        within: its radius in each of the two states, in the system's units, shape ``(2,)``; they are equal if the
-            states are places with one unit.
-    """
-
-    size: float
-    states: tuple[int, int]
-    place: Array
+    size: float  # its radius, as a share of the visited ranges
+    states: tuple[int, int]  # the indices of the two states
+    place: Array  # its centre, which a loop visits, in the system's units, (2,)
+    # its radius in each of the two states, in the system's units, (2,); they are equal if the states are places with
+    # one unit
     within: Array
 
 

@@ -71,16 +71,11 @@ class DynamicsDraws(ShortRepr):
 
 @dataclass(frozen=True, eq=False)
 class DisturbedDynamics(ShortRepr):
-    """One model, to whose next states something is added, in several ways that are run together as draws are.
+    """One model, to whose next states something is added, in several ways that are run together as draws are."""
 
-    Attributes:
-        mean: the model, as the only draw.
-        ways: numbers of the ways, shape ``(S,)``.
-        added: what is added for ways ``(S,)`` at states ``(S, q, n)``, in a shape that broadcasts to theirs.
-    """
-
-    mean: DynamicsDraws
-    ways: Rows
+    mean: DynamicsDraws  # the model, as the only draw
+    ways: Rows  # numbers of the ways, (S,)
+    # what is added for ways (S,) at states (S, q, n), in a shape that broadcasts to theirs
     added: Callable[[Rows, Array], Array]
 
     def __len__(self) -> int:

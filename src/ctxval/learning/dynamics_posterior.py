@@ -66,17 +66,11 @@ class PosteriorSettings:
 
 @dataclass(frozen=True, eq=False)
 class LearnedCovariances(ShortRepr):
-    """The posterior of the hyperparameters, learned from the transitions of some executions.
+    """The posterior of the hyperparameters, learned from the transitions of some executions."""
 
-    Attributes:
-        model: the model to which residuals are added: M, or a linear one.
-        without_model: whether it is a linear one, because M is rougher than the system.
-        scale: the units of the standardised pairs to which the hyperparameters belong, shape ``(n + m,)``.
-    """
-
-    model: Model
-    without_model: bool
-    scale: Array
+    model: Model  # the model to which residuals are added: M, or a linear one
+    without_model: bool  # whether it is a linear one, because M is rougher than the system
+    scale: Array  # the units of the standardised pairs to which the hyperparameters belong, (n + m,)
     posterior: HyperparameterPosterior
     settings: PosteriorSettings
     seed: tuple[int, ...]

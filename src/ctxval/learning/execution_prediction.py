@@ -20,19 +20,13 @@ _QUANTILES = np.linspace(0.0, 1.0, 21)  # levels of the stored quantiles of the 
 
 @dataclass(frozen=True)
 class NoisePrediction(ShortRepr):
-    """What the executions of one task are predicted to be if the system is noisy, as quantiles at ``LEVELS``.
+    """What the executions of one task are predicted to be if the system is noisy, as quantiles at ``LEVELS``."""
 
-    Attributes:
-        runs: the number of closed loops that the quantiles are of.
-        distances: those of the distance.
-        roughness: root mean squares of the second differences of each state from step to step.
-        statistics: those of statistics of the trajectory: its mean squared deviation from the median, and the mean
-            square and the largest magnitude of its second differences, relative to ``roughness``.
-    """
-
-    runs: int
-    distances: tuple[float, ...]
-    roughness: tuple[float, ...]
+    runs: int  # the number of closed loops that the quantiles are of
+    distances: tuple[float, ...]  # those of the distance
+    roughness: tuple[float, ...]  # root mean squares of the second differences of each state from step to step
+    # those of statistics of the trajectory: its mean squared deviation from the median, and the mean square and the
+    # largest magnitude of its second differences, relative to roughness
     statistics: tuple[tuple[float, ...], ...]
 
     def chance_of_more(self, distance: float) -> float:

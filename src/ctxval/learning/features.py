@@ -18,23 +18,16 @@ class Features:
     """Features whose weights are independent a priori: those of a Matern-5/2 process, 1, z, and inputs times states.
 
     The products let the residual grow with the input, as that of a wrong gain does.
-
-    Attributes:
-        centres: standardised regressors, shape ``(M, D)``.
-        theta: logarithms of a unit variance and of the length-scales, shape ``(1 + D,)``.
-        linear: standard deviation of the linear part, relative to that of the Matern part.
-        states, inputs: the numbers n and m; regressors begin with the state and the input.
-        whiten: makes the weights of the Matern part independent, shape ``(M, M)``.
-        products: whether inputs times states are among the features.
     """
 
-    centres: Array
-    theta: Array
-    linear: float
+    centres: Array  # standardised regressors, (M, D)
+    theta: Array  # logarithms of a unit variance and of the length-scales, (1 + D,)
+    linear: float  # standard deviation of the linear part, relative to that of the Matern part
+    # states, inputs: the numbers n and m; regressors begin with the state and the input
     states: int
     inputs: int
-    whiten: Array
-    products: bool = True
+    whiten: Array  # makes the weights of the Matern part independent, (M, M)
+    products: bool = True  # whether inputs times states are among the features
 
     @classmethod
     def of(

@@ -24,15 +24,10 @@ Residual = Callable[[Array], Array]
 
 @dataclass(frozen=True)
 class Structure:
-    """How much history the next record depends on.
+    """How much history the next record depends on."""
 
-    Attributes:
-        lags: number of earlier errors of M and changes of inputs among the regressors.
-        ratio: variance of measurement noise over that of process noise; 0 if records are the state.
-    """
-
-    lags: int = 0
-    ratio: float = 0.0
+    lags: int = 0  # number of earlier errors of M and changes of inputs among the regressors
+    ratio: float = 0.0  # variance of measurement noise over that of process noise; 0 if records are the state
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,30 +41,20 @@ class Record:
 
 @dataclass(frozen=True, eq=False)
 class Memory:
-    """What is kept of a history; leading axes are those of a batch.
+    """What is kept of a history; leading axes are those of a batch."""
 
-    Attributes:
-        estimate: the estimated state, shape ``(..., n)``.
-        errors: the latest errors of M, the newest first, shape ``(lags, ..., n)``.
-        inputs: the latest inputs, the newest first, shape ``(lags, ..., m)``; 0 before the start, when all was at rest.
-    """
-
-    estimate: Array
-    errors: Array
-    inputs: Array
+    estimate: Array  # the estimated state, (..., n)
+    errors: Array  # the latest errors of M, the newest first, (lags, ..., n)
+    inputs: Array  # the latest inputs, the newest first, (lags, ..., m); 0 before the start, when all was at rest
 
 
 @dataclass(frozen=True, eq=False)
 class History:
-    """The recursion from record to record for one structure.
-
-    Attributes:
-        gain: K, shape ``(n, n)``.
-    """
+    """The recursion from record to record for one structure."""
 
     model: Model
     structure: Structure
-    gain: Array
+    gain: Array  # K, (n, n)
 
     @classmethod
     def of(cls, model: Model, structure: Structure, scales: Array, middle: tuple[Array, Array]) -> History:

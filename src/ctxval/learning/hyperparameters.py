@@ -45,16 +45,11 @@ class ResidualKernel(Covariance):
     theta = log of (length-scales, one for each column; constant; slope). The Matern part has unit variance. If M has
     the wrong gain from the input to the states, then the residual grows with the input; a stationary covariance would
     return to its mean outside the data.
-
-    Attributes:
-        nu: smoothness of the Matern part, 1.5, 2.5 or 4.5.
-        growth: factor of the product of the inputs; 0 for a stationary Matern part.
-        inputs: the number m of inputs of the system, which are the last columns.
     """
 
-    nu: float
-    growth: float
-    inputs: int
+    nu: float  # smoothness of the Matern part, 1.5, 2.5 or 4.5
+    growth: float  # factor of the product of the inputs; 0 for a stationary Matern part
+    inputs: int  # the number m of inputs of the system, which are the last columns
 
     def bounds(self, dimension: int) -> Bounds:
         """Return the bounds of theta; no column is irrelevant beyond 100 standard deviations of the data."""
@@ -112,30 +107,20 @@ class ResidualKernel(Covariance):
 
 @dataclass(frozen=True, eq=False)
 class Hyperparameters:
-    """One draw of the hyperparameters.
-
-    Attributes:
-        theta: logarithms of the kernel's hyperparameters.
-        noise: noise variance, relative to that of the Matern part.
-    """
+    """One draw of the hyperparameters."""
 
     kernel: ResidualKernel
-    theta: Array
-    noise: float
+    theta: Array  # logarithms of the kernel's hyperparameters
+    noise: float  # noise variance, relative to that of the Matern part
 
 
 @dataclass(frozen=True, eq=False)
 class Mode:
-    """The posterior of one family, given pairs and residuals, around one of its modes.
-
-    Attributes:
-        height: the log posterior at the mode.
-        place: the (theta, log noise) of the mode.
-    """
+    """The posterior of one family, given pairs and residuals, around one of its modes."""
 
     kernel: ResidualKernel
-    height: float
-    place: Array
+    height: float  # the log posterior at the mode
+    place: Array  # the (theta, log noise) of the mode
     Z: Array
     Y: Array
 
@@ -182,13 +167,9 @@ class Mode:
 
 @dataclass(frozen=True, eq=False)
 class HyperparameterPosterior:
-    """The posterior of the hyperparameters, given standardised residuals.
+    """The posterior of the hyperparameters, given standardised residuals."""
 
-    Attributes:
-        families: the modes of each family of covariances.
-    """
-
-    families: tuple[tuple[Mode, ...], ...]
+    families: tuple[tuple[Mode, ...], ...]  # the modes of each family of covariances
 
     @classmethod
     def given(cls, Z: Array, Y: Array, inputs: int, families: Sequence[tuple[float, float]]) -> HyperparameterPosterior:

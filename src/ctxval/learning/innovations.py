@@ -36,24 +36,16 @@ DrawnWeights = tuple[Features, Array, Array]
 
 @dataclass(frozen=True, eq=False)
 class Scaled:
-    """Regressors and errors of M, with the constants that standardise them.
+    """Regressors and errors of M, with the constants that standardise them."""
 
-    Attributes:
-        Z: standardised regressors, shape ``(N, D)``.
-        E: errors of M, shape ``(N, n)``.
-        visited: standardised regressors of closed loops on M, from which centres are chosen too, shape ``(V, D)``.
-        shift, scale: shapes ``(D,)``.
-        inputs: the number m of inputs.
-        products: whether inputs times states are among the features.
-    """
-
-    Z: Array
-    E: Array
-    visited: Array
+    Z: Array  # standardised regressors, (N, D)
+    E: Array  # errors of M, (N, n)
+    visited: Array  # standardised regressors of closed loops on M, from which centres are chosen too, (V, D)
+    # shift, scale: shapes (D,)
     shift: Array
     scale: Array
-    inputs: int
-    products: bool = True
+    inputs: int  # the number m of inputs
+    products: bool = True  # whether inputs times states are among the features
 
     @classmethod
     def of(cls, Z: Array, E: Array, pairs: Array, inputs: int, products: bool = True) -> Scaled:
@@ -94,27 +86,19 @@ class Scaled:
 
 @dataclass(frozen=True, eq=False)
 class InnovationsFit(ABC):
-    """The posterior of the residual dynamics of one structure.
-
-    Attributes:
-        theta: hyperparameters of the features; see :meth:`Scaled.features`.
-        live: the states whose error of M is not negligible, shape ``(n,)``.
-        features, weights, noise: the most probable features, weights ``(F, n)`` and standard deviations ``(n,)``.
-        evidence: logarithm of the evidence, to compare structures.
-        innovations: recorded innovations with a root mean square of 1, shape ``(N, n)``.
-        local: how the noise changes with state and input; None if it does not.
-    """
+    """The posterior of the residual dynamics of one structure."""
 
     history: History
     scaled: Scaled
-    theta: Array
-    live: Mask
+    theta: Array  # hyperparameters of the features; see Scaled.features
+    live: Mask  # the states whose error of M is not negligible, (n,)
+    # features, weights, noise: the most probable features, weights (F, n) and standard deviations (n,)
     features: Features
     weights: Array
     noise: Array
-    evidence: float
-    innovations: Array
-    local: LocalNoise | None
+    evidence: float  # logarithm of the evidence, to compare structures
+    innovations: Array  # recorded innovations with a root mean square of 1, (N, n)
+    local: LocalNoise | None  # how the noise changes with state and input; None if it does not
 
     @property
     def share(self) -> float:

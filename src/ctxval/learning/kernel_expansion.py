@@ -19,19 +19,12 @@ from ctxval.learning.hyperparameters import Hyperparameters, ResidualKernel
 
 @dataclass(frozen=True, eq=False)
 class KernelExpansion:
-    """S functions ``f_s(z) = sum_j weights_sj k_s(z, centre_sj)`` with n values each.
+    """S functions ``f_s(z) = sum_j weights_sj k_s(z, centre_sj)`` with n values each."""
 
-    Attributes:
-        kernel: the family of the covariances, the same for all functions.
-        thetas: logarithms of the hyperparameters of each function, shape ``(S, k + 2)``.
-        centres: standardised pairs, shape ``(S, M, k)``.
-        weights: shape ``(S, M, n)``.
-    """
-
-    kernel: ResidualKernel
-    thetas: Array
-    centres: Array
-    weights: Array
+    kernel: ResidualKernel  # the family of the covariances, the same for all functions
+    thetas: Array  # logarithms of the hyperparameters of each function, (S, k + 2)
+    centres: Array  # standardised pairs, (S, M, k)
+    weights: Array  # shape (S, M, n)
 
     @classmethod
     def of(cls, hyperparameters: Hyperparameters, centres: Array, weights: Array) -> KernelExpansion:
@@ -164,22 +157,14 @@ def weights_without(covariance: Array, noise: float, outputs: Array, gone: Mask)
 
 @dataclass(frozen=True, eq=False)
 class Component:
-    """The posterior of r for one draw of the hyperparameters.
-
-    Attributes:
-        centres: standardised pairs that it is conditioned on, shape ``(M, k)``.
-        factor: Cholesky factor of their covariance with noise.
-        weights: weights of the mean, shape ``(M, n)``.
-        squares: squared size of each state's residuals, relative to the covariance, shape ``(n,)``.
-        amplitudes: standard deviations of the states' residuals, relative to the covariance, shape ``(n,)``.
-    """
+    """The posterior of r for one draw of the hyperparameters."""
 
     hyperparameters: Hyperparameters
-    centres: Array
-    factor: CholeskyFactor
-    weights: Array
-    squares: Array
-    amplitudes: Array
+    centres: Array  # standardised pairs that it is conditioned on, (M, k)
+    factor: CholeskyFactor  # Cholesky factor of their covariance with noise
+    weights: Array  # weights of the mean, (M, n)
+    squares: Array  # squared size of each state's residuals, relative to the covariance, (n,)
+    amplitudes: Array  # standard deviations of the states' residuals, relative to the covariance, (n,)
 
     @classmethod
     def conditioned(cls, hyperparameters: Hyperparameters, Z: Array, Y: Array, rng: np.random.Generator) -> Component:

@@ -25,20 +25,13 @@ SETTLED = 80  # sequences of noise at the tasks that a search has found
 
 @dataclass(frozen=True, eq=False)
 class NoisyDraws(ShortRepr):
-    """S residuals with R sequences of noise each, which are the same in every task (common random numbers).
-
-    Attributes:
-        groups: residuals, in groups that are evaluated together.
-        rows: recorded innovations that are the noise of each step, shape ``(S, R, T)``; longer loops repeat them.
-        start: differences of the first records from the initial states of the tasks, shape ``(S, R, n)``.
-        quantile: q; the distance of a draw is this quantile over its sequences of noise.
-    """
+    """S residuals with R sequences of noise each, which are the same in every task (common random numbers)."""
 
     fit: InnovationsFit
-    groups: tuple[DrawnWeights, ...]
-    rows: Rows
-    start: Array
-    quantile: float
+    groups: tuple[DrawnWeights, ...]  # residuals, in groups that are evaluated together
+    rows: Rows  # recorded innovations that are the noise of each step, (S, R, T); longer loops repeat them
+    start: Array  # differences of the first records from the initial states of the tasks, (S, R, n)
+    quantile: float  # q; the distance of a draw is this quantile over its sequences of noise
     left_out: float = 0.0
 
     @classmethod
@@ -148,20 +141,13 @@ class NoisyRuns:
 
 @dataclass(frozen=True, eq=False)
 class NoisyPosterior(ShortRepr):
-    """The posterior of noisy dynamics, as a search of the worst task sees it.
-
-    Attributes:
-        data: transitions as those of a state, which tell what is recorded.
-        scatter: standard deviations of first records from the initial states of their tasks, shape ``(n,)``.
-        horizon: number of steps of the longest record.
-        replicates: sequences of noise of each draw in a search.
-    """
+    """The posterior of noisy dynamics, as a search of the worst task sees it."""
 
     fit: InnovationsFit
-    data: ResidualData
-    scatter: Array
-    horizon: int
-    replicates: int
+    data: ResidualData  # transitions as those of a state, which tell what is recorded
+    scatter: Array  # standard deviations of first records from the initial states of their tasks, (n,)
+    horizon: int  # number of steps of the longest record
+    replicates: int  # sequences of noise of each draw in a search
     quantile: float
     seed: tuple[int, ...]
 

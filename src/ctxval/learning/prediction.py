@@ -33,17 +33,12 @@ from ctxval.searches import Prediction
 
 @dataclass(frozen=True, eq=False)
 class PredictedDistance:
-    """The validation of M against M_hat, as a function of points of the unit cube.
-
-    Attributes:
-        executed: executed points ``(n, d)``, in the order of the executions that the posterior knows.
-        in_parallel: whether closed loops are distributed over the cores; their results are the same.
-    """
+    """The validation of M against M_hat, as a function of points of the unit cube."""
 
     planner: LoopPlanner
     posterior: DynamicsPosterior
-    executed: Array
-    in_parallel: bool
+    executed: Array  # executed points (n, d), in the order of the executions that the posterior knows
+    in_parallel: bool  # whether closed loops are distributed over the cores; their results are the same
     mean: DynamicsDraws
 
     _known: dict[bytes, tuple[float, float]] = field(default_factory=dict, init=False)

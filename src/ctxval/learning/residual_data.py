@@ -24,24 +24,16 @@ NEGLIGIBLE = 1e-7
 
 @dataclass(frozen=True, eq=False)
 class ResidualData:
-    """Residuals ``x' - M(x, u)`` of N transitions in units in which they are about 1.
+    """Residuals ``x' - M(x, u)`` of N transitions in units in which they are about 1."""
 
-    Attributes:
-        pairs: standardised state-input pairs, shape ``(N, n + m)``.
-        outputs: standardised residuals, shape ``(N, n)``; 0 if the residual of a state is negligible.
-        sources: the execution of each transition; -1 for data that the model was made from, shape ``(N,)``.
-        shift, scale: constants that standardise a state-input pair, shapes ``(n + m,)``.
-        sizes: root mean square of the residual of each state, shape ``(n,)``.
-        steps: standard deviation of the change of each state in one step, shape ``(n,)``.
-    """
-
-    pairs: Array
-    outputs: Array
-    sources: Rows
+    pairs: Array  # standardised state-input pairs, (N, n + m)
+    outputs: Array  # standardised residuals, (N, n); 0 if the residual of a state is negligible
+    sources: Rows  # the execution of each transition; -1 for data that the model was made from, (N,)
+    # shift, scale: constants that standardise a state-input pair, (n + m,)
     shift: Array
     scale: Array
-    sizes: Array
-    steps: Array
+    sizes: Array  # root mean square of the residual of each state, (n,)
+    steps: Array  # standard deviation of the change of each state in one step, (n,)
     transitions: Transitions
 
     @property

@@ -29,17 +29,11 @@ _LEAST, _MOST = 1e-6, 0.3  # limits of negligible residuals, as shares of a stat
 
 @dataclass(frozen=True, eq=False)
 class RunStatistics:
-    """The statistics of runs beside what was learned.
+    """The statistics of runs beside what was learned."""
 
-    Attributes:
-        learned: from the certified executions.
-        threshold: tau.
-        influences: what a unit of a constant residual of each state moves the distance of each executed task by,
-            shape ``(n, q)``.
-    """
-
-    learned: LearnedDynamics
-    threshold: float
+    learned: LearnedDynamics  # from the certified executions
+    threshold: float  # tau
+    # what a unit of a constant residual of each state moves the distance of each executed task by, (n, q)
     influences: Array
 
     @classmethod
@@ -115,16 +109,11 @@ class RunStatistics:
 
 @dataclass(frozen=True)
 class RunStatistic:
-    """One statistic of a run.
+    """One statistic of a run."""
 
-    Attributes:
-        value: positive.
-        freedom: the degrees of freedom that white noise gives it.
-        gradient, information: of the coefficients of 1, state and input, ``(k,)`` and ``(k, k)``; None without noise.
-    """
-
-    value: float
-    freedom: float
+    value: float  # positive
+    freedom: float  # the degrees of freedom that white noise gives it
+    # gradient, information: of the coefficients of 1, state and input, (k,) and (k, k); None without noise
     gradient: Array | None = None
     information: Array | None = None
 

@@ -39,29 +39,18 @@ _APART = 0.15  # least distance of two tasks that are not next to each other, as
 
 @dataclass(frozen=True)
 class WorstCaseSettings:
-    """Numbers of closed loops in a search for the largest distance.
+    """Numbers of closed loops in a search for the largest distance."""
 
-    Attributes:
-        pool: number of tasks whose controllers are designed once.
-        evaluations: number of tasks in the global search on the mean, with those of the pool.
-        elites: largest number of tasks from the global search that are run on all draws.
-        shared: number of random tasks of the pool that are run on all draws.
-        moves: number of random moves in each round of the search on each draw.
-        rounds: number of these rounds, at most 4.
-        relevant: number of state-input pairs, on the loops of elites and of random tasks, from which pivots are chosen.
-        peaks: number of elites next to which tasks are tried.
-        nearby: number of tasks next to each of them.
-    """
-
-    pool: int = 1024
-    evaluations: int = 6000
-    elites: int = 24
-    shared: int = 64
-    moves: int = 10
-    rounds: int = 4
+    pool: int = 1024  # number of tasks whose controllers are designed once
+    evaluations: int = 6000  # number of tasks in the global search on the mean, with those of the pool
+    elites: int = 24  # largest number of tasks from the global search that are run on all draws
+    shared: int = 64  # number of random tasks of the pool that are run on all draws
+    moves: int = 10  # number of random moves in each round of the search on each draw
+    rounds: int = 4  # number of these rounds, at most 4
+    # number of state-input pairs, on the loops of elites and of random tasks, from which pivots are chosen
     relevant: int = 700
-    peaks: int = 5
-    nearby: int = 32
+    peaks: int = 5  # number of elites next to which tasks are tried
+    nearby: int = 32  # number of tasks next to each of them
 
     @classmethod
     def for_dimension(cls, dimension: int, batched: bool = True) -> WorstCaseSettings:
@@ -74,25 +63,16 @@ class WorstCaseSettings:
 
 @dataclass(frozen=True, eq=False)
 class WorstCase:
-    """The largest distances over all tasks that a search found, one for each draw of the dynamics.
+    """The largest distances over all tasks that a search found, one for each draw of the dynamics."""
 
-    Attributes:
-        maxima: the largest distance of each draw, shape ``(S,)``; infinity if its closed loop diverges.
-        points: where it lies, points of the unit cube ``(S, d)``.
-        elites: tasks with large distances on the posterior mean, points ``(e, d)``, the largest first.
-        evaluations: number of closed loops that were compared; a few of them may be the same.
-        left_out: largest share of the posterior variance that a draw leaves out between its pivots.
-        unplanned: share of the pool's tasks for which no controller can be designed, or on which M diverges.
-        sharpness: largest share by which a distance on the mean is larger than those of tasks that are nearly the same.
-    """
-
-    maxima: Array
-    points: Array
+    maxima: Array  # the largest distance of each draw, (S,); infinity if its closed loop diverges
+    points: Array  # where it lies, points of the unit cube (S, d)
     of_mean: float
-    elites: Array
-    evaluations: int
-    left_out: float
-    unplanned: float
+    elites: Array  # tasks with large distances on the posterior mean, points (e, d), the largest first
+    evaluations: int  # number of closed loops that were compared; a few of them may be the same
+    left_out: float  # largest share of the posterior variance that a draw leaves out between its pivots
+    unplanned: float  # share of the pool's tasks for which no controller can be designed, or on which M diverges
+    # largest share by which a distance on the mean is larger than those of tasks that are nearly the same
     sharpness: float = 0.0
 
 
