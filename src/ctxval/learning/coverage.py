@@ -113,7 +113,7 @@ def _beyond(recorded: Array, visited: Array) -> Array:
 
 def _visited(posterior: DynamicsPosterior, loops: Sequence[Loops]) -> Array:
     """Return the standardised pairs ``(q, H, k)`` on loops; the last pair of a task with a shorter horizon repeats."""
-    parts = [posterior.data.standardised(one.states[0][:, :-1], one.inputs[0]) for one in loops]
+    parts = [posterior.data.standardised(loop.states[0][:, :-1], loop.inputs[0]) for loop in loops]
     horizon = max(part.shape[1] for part in parts)
     longest = [np.pad(part, ((0, 0), (0, horizon - part.shape[1]), (0, 0)), mode="edge") for part in parts]
     visited = np.nan_to_num(np.concatenate(longest), nan=_FARTHEST, posinf=_FARTHEST, neginf=-_FARTHEST)

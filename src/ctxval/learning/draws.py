@@ -39,7 +39,7 @@ class DynamicsDraws(ShortRepr):
         if len(rows) == len(self):
             return self
         chosen = [(each, rows[(rows >= first) & (rows < last)] - first) for each, first, last in self._groups()]
-        return replace(self, expansions=tuple(each[own] for each, own in chosen if len(own)))
+        return replace(self, expansions=tuple(each[some] for each, some in chosen if len(some)))
 
     def step(self, x: Array, u: Array) -> Array:
         """Return the next states, shapes ``(S, q, n), (S, q, m) -> (S, q, n)``."""

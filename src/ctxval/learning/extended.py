@@ -84,11 +84,11 @@ class ExtendedValidation:
 
         # If only outputs are recorded, M is that of the user, and controllers are designed on the model that is given.
         model = _ExtendedModel(given.model, k, self.inputs) if k or self.actuator else None
-        own = None if model is None else given.model
+        designed_on = None if model is None else given.model
         return given.with_parts(
             task=task,
             model=model or given.model,
-            synthesizer=_ExtendedSynthesizer(given.synthesizer, own, given.outputs, k, self.actuator),
+            synthesizer=_ExtendedSynthesizer(given.synthesizer, designed_on, given.outputs, k, self.actuator),
             distance=_ExtendedDistance(given.distance, self.recorded),
             labels=self._labels(),
             outputs=None,

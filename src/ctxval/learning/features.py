@@ -51,28 +51,28 @@ class Features:
     def values(self, z: Array, functions: Sequence[tuple[Rows, LinearFunction]]) -> Array:
         """Return the values ``(N, n)`` of functions at regressors ``(N, D)``, each at some rows."""
         matern, linear = self._matern(z), self._linear(z)
-        found = np.empty((len(z), self.states))
+        values = np.empty((len(z), self.states))
         for rows, function in functions:
-            found[rows] = matern[rows] @ function.matern + linear[rows] @ function.linear
-        return found
+            values[rows] = matern[rows] @ function.matern + linear[rows] @ function.linear
+        return values
 
     def _matern(self, z: Array) -> Array:
         scales = np.exp(-self.theta[1:])
-        own, centres = z * scales, self.centres * scales
-        s = own @ centres.T
+        scaled, centres = z * scales, self.centres * scales
+        s = scaled @ centres.T
         s *= -2.0
-        s += (own**2).sum(axis=1)[:, None]
+        s += (scaled**2).sum(axis=1)[:, None]
         s += (centres**2).sum(axis=1)
         np.maximum(s, 0.0, out=s)
         s *= 5.0
         np.sqrt(s, out=s)
-        found = s / 3.0
-        found += 1.0
-        found *= s
-        found += 1.0
+        values = s / 3.0
+        values += 1.0
+        values *= s
+        values += 1.0
         np.negative(s, out=s)
-        found *= np.exp(s, out=s)
-        return np.asarray(found)
+        values *= np.exp(s, out=s)
+        return np.asarray(values)
 
     def _linear(self, z: Array) -> Array:
         parts = [np.ones((len(z), 1)), z]

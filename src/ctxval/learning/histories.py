@@ -112,7 +112,7 @@ class History:
         Records of one horizon are a batch; the steps are in the order horizon, step, record. ``visit`` is called with
         the memory, the inputs and the regressors of each step.
         """
-        found = []
+        steps = []
         for alike in of_one_horizon(records):
             states, inputs, start = (
                 np.stack([getattr(record, name) for record in alike]) for name in ("states", "inputs", "start")
@@ -124,9 +124,9 @@ class History:
                 predicted = of_model if residual is None else of_model + residual(z)
                 if visit is not None:
                     visit(memory, u, z)
-                found.append((z, record - of_model, record - predicted))
+                steps.append((z, record - of_model, record - predicted))
                 memory = self.after(memory, u, of_model, predicted, record)
-        Z, E, innovations = (np.concatenate(parts) for parts in zip(*found, strict=True))
+        Z, E, innovations = (np.concatenate(parts) for parts in zip(*steps, strict=True))
         if not np.isfinite(innovations).all():
             raise np.linalg.LinAlgError  # the filter diverges
         return Z, E, innovations

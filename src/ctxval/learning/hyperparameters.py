@@ -62,9 +62,9 @@ class ResidualKernel(Covariance):
         linear = _LINEAR_KERNEL.towards(theta[-2:], Z)
 
         def covariances(X: Array) -> Array:
-            found = self._grow(matern(X), X, Z)
-            found += linear(X)
-            return found
+            total = self._grow(matern(X), X, Z)
+            total += linear(X)
+            return total
 
         return covariances
 
@@ -188,17 +188,17 @@ class HyperparameterPosterior:
 
     def draw(self, count: int, rng: np.random.Generator) -> list[Hyperparameters]:
         """Return ``count`` draws; hyperparameters that are drawn again are the same object, and follow each other."""
-        found, weights = [], []
+        places, weights = [], []
         for family in self.families:
             drawn = np.concatenate([mode.proposals(48 // len(family), rng) for mode in family])
             # All modes of a family make one proposal distribution: the mixture of theirs in equal parts.
             density = logsumexp([mode.log_density(drawn) for mode in family], axis=0) - np.log(len(family))
-            found += [(family[0].kernel, place) for place in drawn]
+            places += [(family[0].kernel, place) for place in drawn]
             heights = [family[0].log_posterior_or_none(place) for place in drawn]
             weights.append(np.array(heights) - density)
         chosen = _resampled(np.concatenate(weights), count, rng).tolist()
         # What follows from the same object is computed once.
-        draws = {row: Hyperparameters(found[row][0], *_within(*found[row])) for row in chosen}
+        draws = {row: Hyperparameters(places[row][0], *_within(*places[row])) for row in chosen}
         return [draws[row] for row in chosen]
 
 
@@ -267,9 +267,9 @@ def _box(kernel: ResidualKernel, dimension: int) -> tuple[Array, Array]:
 
 def _modes_of(kernel: ResidualKernel, Z: Array, Y: Array) -> tuple[Mode, ...]:
     """Return the modes of a family, the highest first: one with little noise, one with much, or one that is both."""
-    (height, place), (lower, other) = found = _climbed(kernel, Z, Y)
+    (height, place), (lower, other) = climbed = _climbed(kernel, Z, Y)
     relevant = height - lower < 12.0 and np.abs(place - other).max() > 0.5  # else negligible, or the same mode
-    return tuple(Mode(kernel, *one, Z, Y) for one in (found if relevant else found[:1]))
+    return tuple(Mode(kernel, *end, Z, Y) for end in (climbed if relevant else climbed[:1]))
 
 
 def _climbed(kernel: ResidualKernel, Z: Array, Y: Array) -> list[tuple[float, Array]]:

@@ -304,13 +304,13 @@ def fit_filter(
     live, n = plain.live, plain.scaled.states
     Z, E, _ = history.along(records)
     # The units are those of the records, not those of a filter that knows no residual yet.
-    own = Scaled.of(Z, E, pairs, records[0].inputs.shape[1])
-    width = n + own.inputs
-    shift, scale = own.shift.copy(), own.scale.copy()
+    recorded = Scaled.of(Z, E, pairs, records[0].inputs.shape[1])
+    width = n + recorded.inputs
+    shift, scale = recorded.shift.copy(), recorded.scale.copy()
     shift[:width], scale[:width] = plain.scaled.shift[:width], plain.scaled.scale[:width]
-    raw = own.Z * own.scale + own.shift
-    scaled = replace(own, Z=(raw - shift) / scale, E=plain.scaled.E, shift=shift, scale=scale)
-    scaled = replace(scaled, visited=(own.visited * own.scale + own.shift - shift) / scale)
+    raw = recorded.Z * recorded.scale + recorded.shift
+    scaled = replace(recorded, Z=(raw - shift) / scale, E=plain.scaled.E, shift=shift, scale=scale)
+    scaled = replace(scaled, visited=(recorded.visited * recorded.scale + recorded.shift - shift) / scale)
     theta = plain.theta.copy()
     theta[width] = np.log(6.0)
     centres = scaled.centres[spread_rows(scaled.centres, FILTER_CENTRES)]
@@ -375,10 +375,10 @@ def _sensitivities(
                 return np.asarray(after.reshape(x.shape))
 
             G = jacobian(step, memory.estimate, steps) @ psi
-            own = G.reshape(len(z), n, F, n)
+            by_state = G.reshape(len(z), n, F, n)
             phi = features((z - scaled.shift) / scaled.scale)
             for i in range(n):
-                own[:, i, :, i] += phi
+                by_state[:, i, :, i] += phi
             rows.append(G)
             psi = keep @ G
 

@@ -46,9 +46,9 @@ class KernelExpansion:
         largest = max(1, 20_000 // M)
         together = max(1, largest // max(1, q))
         for s, j in product(range(0, S, together), range(0, q, largest)):
-            block, own = (slice(s, s + together), slice(j, j + largest)), slice(s, s + together)
-            covariances = self._matern(own, extended[block].swapaxes(1, 2))
-            values[block] += np.matmul(covariances.swapaxes(1, 2), self.weights[own])
+            block, some = (slice(s, s + together), slice(j, j + largest)), slice(s, s + together)
+            covariances = self._matern(some, extended[block].swapaxes(1, 2))
+            values[block] += np.matmul(covariances.swapaxes(1, 2), self.weights[some])
         return np.asarray(values)
 
     def __getitem__(self, rows: Rows) -> KernelExpansion:
@@ -82,9 +82,9 @@ class KernelExpansion:
         factors[..., -1] = 1.0
         return factors
 
-    def _matern(self, own: slice, extended: Array) -> Array:
+    def _matern(self, some: slice, extended: Array) -> Array:
         """Return the Matern part of the covariances ``(s, M, q)`` of some functions, of ``(s, 2 k + 1, q)``."""
-        r2 = np.matmul(self._squared[own], extended)
+        r2 = np.matmul(self._squared[some], extended)
         np.abs(r2, out=r2)  # rounding errors around zero
         r = np.sqrt(r2)
         polynomial = _polynomial(self.kernel.nu, r, r2)
@@ -92,27 +92,27 @@ class KernelExpansion:
         decay = np.exp(r, out=r)
         decay *= polynomial
         if self.kernel.growth:
-            decay *= np.matmul(self._growth[own], extended)
+            decay *= np.matmul(self._growth[some], extended)
         return np.asarray(decay)
 
 
 def joined(expansions: Sequence[KernelExpansion]) -> tuple[KernelExpansion, ...]:
     """Return the same functions, those of one family that follow each other in one expansion."""
-    groups = [list(group) for _, group in groupby(expansions, lambda one: one.kernel)]
+    groups = [list(group) for _, group in groupby(expansions, lambda expansion: expansion.kernel)]
     return tuple(group[0] if len(group) == 1 else _joined(group) for group in groups)
 
 
 def _joined(alike: Sequence[KernelExpansion]) -> KernelExpansion:
-    most = max(one.centres.shape[1] for one in alike)
+    most = max(expansion.centres.shape[1] for expansion in alike)
 
     def padded(values: Array) -> Array:
         return np.pad(values, ((0, 0), (0, most - values.shape[1]), (0, 0)))
 
     return KernelExpansion(
         alike[0].kernel,
-        np.concatenate([one.thetas for one in alike]),
-        np.concatenate([padded(one.centres) for one in alike]),
-        np.concatenate([padded(one.weights) for one in alike]),
+        np.concatenate([expansion.thetas for expansion in alike]),
+        np.concatenate([padded(expansion.centres) for expansion in alike]),
+        np.concatenate([padded(expansion.weights) for expansion in alike]),
     )
 
 
@@ -144,15 +144,15 @@ def weights_without(covariance: Array, noise: float, outputs: Array, gone: Mask)
     factor = factorise(covariance, tenfold(noise))
     added = float((factor.L[-1] ** 2).sum() - covariance[-1, -1])
     inverse, known = factor.inverse(), factor.solve(outputs)
-    found = np.repeat(known[None], len(gone), axis=0)
-    for own, without in zip(found, gone, strict=True):
+    weights = np.repeat(known[None], len(gone), axis=0)
+    for remaining, without in zip(weights, gone, strict=True):
         rows, kept = np.flatnonzero(without), np.flatnonzero(~without)
-        own -= inverse[:, rows] @ np.linalg.solve(inverse[np.ix_(rows, rows)], known[rows])
-        own[rows] = 0.0
-        misfit = covariance[kept] @ own + added * own[kept] - outputs[kept]
+        remaining -= inverse[:, rows] @ np.linalg.solve(inverse[np.ix_(rows, rows)], known[rows])
+        remaining[rows] = 0.0
+        misfit = covariance[kept] @ remaining + added * remaining[kept] - outputs[kept]
         if not np.abs(misfit).max(initial=0.0) < 1e-6:
-            own[kept] = factorise(covariance[np.ix_(kept, kept)], tenfold(noise)).solve(outputs[kept])
-    return found
+            remaining[kept] = factorise(covariance[np.ix_(kept, kept)], tenfold(noise)).solve(outputs[kept])
+    return weights
 
 
 @dataclass(frozen=True, eq=False)
@@ -234,17 +234,17 @@ def draw_functions(
         relevant: pairs ``(R, k)`` that closed loops visit; the pivots, at which draws are exact, are chosen from them.
         pivots: largest number of pivots.
     """
-    own = alike[0]
-    chosen, L, left_out = own.pivots(relevant, pivots)
+    first = alike[0]
+    chosen, L, left_out = first.pivots(relevant, pivots)
     if not len(chosen):
-        weights = np.repeat(own.weights[None], count * len(alike), axis=0)
-        return KernelExpansion.of(own.hyperparameters, own.centres, weights), left_out
-    kernel, theta = own.hyperparameters.kernel, own.hyperparameters.theta
-    shape = (count, len(chosen), own.weights.shape[1])
-    normal = np.concatenate([rng.standard_normal(shape) * one.amplitudes for one in alike])
+        weights = np.repeat(first.weights[None], count * len(alike), axis=0)
+        return KernelExpansion.of(first.hyperparameters, first.centres, weights), left_out
+    kernel, theta = first.hyperparameters.kernel, first.hyperparameters.theta
+    shape = (count, len(chosen), first.weights.shape[1])
+    normal = np.concatenate([rng.standard_normal(shape) * component.amplitudes for component in alike])
     # The values L xi at the pivots are interpolated by the posterior covariance L L', with weights L'^-1 xi.
     weights = np.linalg.solve(L.T, normal)
-    cross = own.factor.solve(kernel(theta, own.centres, relevant[chosen]))
-    together = np.concatenate([own.weights - np.matmul(cross, weights), weights], axis=1)
-    centres = np.concatenate([own.centres, relevant[chosen]])
-    return KernelExpansion.of(own.hyperparameters, centres, together), left_out
+    cross = first.factor.solve(kernel(theta, first.centres, relevant[chosen]))
+    together = np.concatenate([first.weights - np.matmul(cross, weights), weights], axis=1)
+    centres = np.concatenate([first.centres, relevant[chosen]])
+    return KernelExpansion.of(first.hyperparameters, centres, together), left_out

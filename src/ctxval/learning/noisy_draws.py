@@ -69,10 +69,10 @@ class NoisyDraws(ShortRepr):
         chosen = np.atleast_1d(np.asarray(rows, dtype=np.intp))
         groups, first = [], 0
         for features, weights, noise in self.groups:
-            own = chosen[(chosen >= first) & (chosen < first + len(weights))] - first
+            some = chosen[(chosen >= first) & (chosen < first + len(weights))] - first
             first += len(weights)
-            if len(own):
-                groups.append((features, weights[own], noise[own]))
+            if len(some):
+                groups.append((features, weights[some], noise[some]))
         return replace(self, groups=tuple(groups), rows=self.rows[chosen], start=self.start[chosen])
 
     def reduced(self, distances: Array) -> Array:

@@ -50,11 +50,11 @@ class PredictedDistance:
         if new:
             with single_threaded():
                 if self.in_parallel and not all(map(self.planner.has, points[new])):
-                    found = np.concatenate(on_all_cores(self._predicted, list(points[new, None])), axis=1)
+                    predicted = np.concatenate(on_all_cores(self._predicted, list(points[new, None])), axis=1)
                 else:
-                    found = self._predicted(points[new])
-            found = np.where(np.isfinite(found).all(axis=0), found, np.nan)
-            self._known.update(zip((keys[row] for row in new), map(tuple, found.T.tolist()), strict=True))
+                    predicted = self._predicted(points[new])
+            predicted = np.where(np.isfinite(predicted).all(axis=0), predicted, np.nan)
+            self._known.update(zip((keys[row] for row in new), map(tuple, predicted.T.tolist()), strict=True))
         distance, doubt = np.array([self._known[key] for key in keys]).reshape(-1, 2).T
         return distance, doubt
 
@@ -64,22 +64,22 @@ class PredictedDistance:
         without = self.posterior.means_without(executions_of(self.executed, points))
 
         with single_threaded():
-            found = _nan_where_it_fails(
+            distances = _nan_where_it_fails(
                 lambda some: self.planner.own_distances(without[some], points[some, None]).T, len(rows), 1
             )[0]
-        return np.where(np.isfinite(found), found, np.nan)
+        return np.where(np.isfinite(distances), distances, np.nan)
 
     def _predicted(self, points: Array) -> Array:
         """Return distances and doubts ``(2, m)``; NaN for a task that cannot be planned or where a part fails."""
 
         def closed_loops(some: Array) -> Array:
-            found = np.full((2, len(some)), np.nan)
+            predicted = np.full((2, len(some)), np.nan)
             planned = self.planner.plan(some)
             for plan, loops in zip(planned, self.planner.run(self.mean, planned), strict=True):
                 with np.errstate(all="ignore"):
                     doubt = self.posterior.unfamiliarity(loops.states[0], loops.inputs[0])
-                found[:, plan.rows] = loops.distances[0], doubt
-            return found
+                predicted[:, plan.rows] = loops.distances[0], doubt
+            return predicted
 
         return _nan_where_it_fails(lambda rows: closed_loops(points[rows]), len(points), 2)
 

@@ -91,11 +91,11 @@ class RunStatistics:
         trend = (linear + floors) / (doubt + noise * rank / H + floors)
         gradients = columns.T @ (residuals / (noise + floors))  # (k, n)
         information = columns.T @ columns
-        found = {}
+        statistics = {}
         for i, name in enumerate(names(study, len(whole))):
-            found[f"{name} residuals"] = RunStatistic(float(whole[i]), float(H))
+            statistics[f"{name} residuals"] = RunStatistic(float(whole[i]), float(H))
             known = (gradients[:, i], information / (noise + floors)[i]) if self.has_noise else (None, None)
-            found[f"systematic {name} residuals"] = RunStatistic(float(trend[i]), float(rank), *known)
+            statistics[f"systematic {name} residuals"] = RunStatistic(float(trend[i]), float(rank), *known)
         if point is not None and distance is not None:
             predicted = None
             with contextlib.suppress(Exception):  # the user's parts, at states that no execution has reached
@@ -103,8 +103,8 @@ class RunStatistics:
             if predicted is not None and np.isfinite(predicted.median):
                 least = (NEGLIGIBLE * self.threshold) ** 2
                 error = (distance - predicted.median) ** 2
-                found[DISTANCE] = RunStatistic(float((error + least) / (predicted.deviation**2 + least)), 1.0)
-        return found
+                statistics[DISTANCE] = RunStatistic(float((error + least) / (predicted.deviation**2 + least)), 1.0)
+        return statistics
 
 
 @dataclass(frozen=True)
