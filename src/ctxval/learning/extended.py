@@ -39,9 +39,9 @@ def with_states_of_model(validation: Validation) -> Validation:
 
     Its system is that of the given one, and cannot be executed.
     """
-    return (
-        validation if validation.outputs is None else ExtendedValidation(validation.with_parts(physical=())).validation
-    )
+    if validation.outputs is None:
+        return validation
+    return ExtendedValidation(validation.with_parts(physical=())).validation
 
 
 def estimates_by_loops_on_model(validation: Validation) -> StateEstimates | None:

@@ -27,6 +27,14 @@ from ctxval.learning.noisy_draws import REPLICATES, NoisyPosterior
 from ctxval.learning.recorded import digest, scheduled
 from ctxval.learning.worst_case import WorstCaseSearch
 
+STRUCTURES = (
+    Structure(0), Structure(1), Structure(2), Structure(3), Structure(0, 3.0), Structure(0, 30.0), Structure(2, 30.0)
+)  # fmt: skip
+EXACT = 1e-3  # share of noise below which records with lags determine the next one
+NOISY = 0.01  # share of noise from which executions of one task differ
+_BETTER, _GOOD = 0.1, 0.02  # share of the error without a history, and of the residual, that a history leaves
+_UNEXPLAINED = 0.05  # share of the residual that nothing predicts if there is noise
+
 MATTERS = 0.01
 """Standard deviation of the distance of a task over its executions, as a share of the largest distance, from which
 noise matters."""
@@ -190,15 +198,6 @@ def _shaken(posterior: DynamicsPosterior) -> DisturbedDynamics:
         return deviations * rng.standard_normal(x.shape)
 
     return DisturbedDynamics(posterior.mean, np.arange(_RUNS), noise)
-
-
-STRUCTURES = (
-    Structure(0), Structure(1), Structure(2), Structure(3), Structure(0, 3.0), Structure(0, 30.0), Structure(2, 30.0)
-)  # fmt: skip
-EXACT = 1e-3  # share of noise below which records with lags determine the next one
-NOISY = 0.01  # share of noise from which executions of one task differ
-_BETTER, _GOOD = 0.1, 0.02  # share of the error without a history, and of the residual, that a history leaves
-_UNEXPLAINED = 0.05  # share of the residual that nothing predicts if there is noise
 
 
 @dataclass(frozen=True, eq=False)
