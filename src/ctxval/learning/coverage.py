@@ -35,23 +35,15 @@ class Gap:
 
 @dataclass(frozen=True, eq=False)
 class Coverage(ShortRepr):
-    """The largest gaps between what closed loops visit and what is recorded.
+    """The largest gaps between what closed loops visit and what is recorded."""
 
-    Attributes:
-        marginal: the largest gap in a single coordinate.
-        beyond: the largest excess over the largest record of a single coordinate, or below its smallest one.
-        pair: the largest gap in two coordinates together; None if there are too many coordinates to compare pairs.
-        task: the task whose closed loop leads farthest from the records, a point of the unit cube ``(d,)``.
-        resolution: the largest gap of each coordinate, in the system's units, shape ``(n + m,)``.
-        tasks: the number of tasks that were compared with the range of the records; gaps are looked for in a part of
-            them.
-    """
-
-    marginal: Gap
-    beyond: Gap
+    marginal: Gap  # the largest gap in a single coordinate
+    beyond: Gap  # the largest excess over the largest record of a single coordinate, or below its smallest one
+    # the largest gap in two coordinates together; None if there are too many coordinates to compare pairs
     pair: Gap | None
-    task: Array
-    resolution: Array
+    task: Array  # the task whose closed loop leads farthest from the records, a point of the unit cube (d,)
+    resolution: Array  # the largest gap of each coordinate, in the system's units, (n + m,)
+    # the number of tasks that were compared with the range of the records; gaps are looked for in a part of them
     tasks: int
 
 

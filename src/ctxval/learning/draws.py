@@ -16,18 +16,13 @@ from ctxval.learning.residual_data import ResidualData
 
 @dataclass(frozen=True, eq=False)
 class DynamicsDraws(ShortRepr):
-    """S models ``M + r_s``, run together: a draw is the first axis of states and inputs.
-
-    Attributes:
-        expansions: functions r_s, in groups that are evaluated together.
-        left_out: largest share of the posterior variance that draws leave out between pivots.
-        limit: the largest standardised residual of each learned state, in magnitude; None if there is no limit.
-    """
+    """S models ``M + r_s``, run together: a draw is the first axis of states and inputs."""
 
     model: Model
     data: ResidualData
-    expansions: tuple[KernelExpansion, ...]
-    left_out: float = 0.0
+    expansions: tuple[KernelExpansion, ...]  # functions r_s, in groups that are evaluated together
+    left_out: float = 0.0  # largest share of the posterior variance that draws leave out between pivots
+    # the largest standardised residual of each learned state, in magnitude; None if there is no limit
     limit: Array | None = None
 
     def __len__(self) -> int:

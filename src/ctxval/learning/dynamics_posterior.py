@@ -38,25 +38,15 @@ _PIVOT = 0.1  # variance, as a share of the noise, below which a transition adds
 
 @dataclass(frozen=True)
 class PosteriorSettings:
-    """Numbers on which the accuracy and the cost of the posterior depend.
+    """Numbers on which the accuracy and the cost of the posterior depend."""
 
-    Attributes:
-        hyperparameters: number of draws of the hyperparameters.
-        functions: number of functions that are drawn for each of them.
-        learned_from: number of transitions that the hyperparameters are learned from.
-        centres: largest number of transitions that each process is conditioned on.
-        pivots: largest number of pairs at which a draw is exact.
-        families: smoothness and growth of each family of covariances.
-        of_steps: whether the system may be learned without M, if M is rougher than the system.
-    """
-
-    hyperparameters: int = 20
-    functions: int = 2
-    learned_from: int = 120
-    centres: int = 400
-    pivots: int = 100
-    families: tuple[tuple[float, float], ...] = FAMILIES
-    of_steps: bool = True
+    hyperparameters: int = 20  # number of draws of the hyperparameters
+    functions: int = 2  # number of functions that are drawn for each of them
+    learned_from: int = 120  # number of transitions that the hyperparameters are learned from
+    centres: int = 400  # largest number of transitions that each process is conditioned on
+    pivots: int = 100  # largest number of pairs at which a draw is exact
+    families: tuple[tuple[float, float], ...] = FAMILIES  # smoothness and growth of each family of covariances
+    of_steps: bool = True  # whether the system may be learned without M, if M is rougher than the system
 
     @classmethod
     def for_horizon(cls, horizon: int) -> PosteriorSettings:

@@ -50,26 +50,16 @@ def _differences(states: Array, roughness: Array) -> tuple[Array, Array]:
 
 @dataclass(frozen=True)
 class ExecutionPrediction(ShortRepr):
-    """Draws of the trajectory and of the distance of one task, summarised in plain numbers for JSON.
-
-    Attributes:
-        quantiles: quantiles of the distance at 0, 0.05, ..., 1; infinity if a draw diverges.
-        deviation: standard deviation of the distance over the draws that do not diverge.
-        steps: indices of the predicted states, from 1 to the horizon.
-        states: medians of the states at these steps, one row for each.
-        deviations: standard deviations of the states at these steps, one row for each.
-        diverged: share of the draws that diverge.
-        noise: what noise does to the execution; None if the system is not noisy.
-    """
+    """Draws of the trajectory and of the distance of one task, summarised in plain numbers for JSON."""
 
     learned_from: int
-    quantiles: tuple[float, ...]
-    deviation: float
-    steps: tuple[int, ...]
-    states: tuple[tuple[float, ...], ...]
-    deviations: tuple[tuple[float, ...], ...]
-    diverged: float
-    noise: NoisePrediction | None = None
+    quantiles: tuple[float, ...]  # quantiles of the distance at 0, 0.05, ..., 1; infinity if a draw diverges
+    deviation: float  # standard deviation of the distance over the draws that do not diverge
+    steps: tuple[int, ...]  # indices of the predicted states, from 1 to the horizon
+    states: tuple[tuple[float, ...], ...]  # medians of the states at these steps, one row for each
+    deviations: tuple[tuple[float, ...], ...]  # standard deviations of the states at these steps, one row for each
+    diverged: float  # share of the draws that diverge
+    noise: NoisePrediction | None = None  # what noise does to the execution; None if the system is not noisy
 
     @property
     def median(self) -> float:
@@ -132,19 +122,13 @@ class ExecutionPrediction(ShortRepr):
 
 @dataclass(frozen=True)
 class PredictionScore:
-    """How an execution agrees with its prediction.
+    """How an execution agrees with its prediction."""
 
-    Attributes:
-        z2: squared standardised error, the larger one of the trajectory and of the distance; infinity if most draws
-            diverged.
-        rank: share of the draws whose distance is below the executed one.
-        ratio: the executed distance, divided by the median of the draws.
-        p_values: predicted probabilities of more than what statistics of the trajectory are; empty without noise.
-    """
-
+    # squared standardised error, the larger one of the trajectory and of the distance; infinity if most draws diverged
     z2: float
-    rank: float
-    ratio: float
+    rank: float  # share of the draws whose distance is below the executed one
+    ratio: float  # the executed distance, divided by the median of the draws
+    # predicted probabilities of more than what statistics of the trajectory are; empty without noise
     p_values: tuple[float, ...] = ()
 
 
