@@ -30,6 +30,13 @@ from ctxval.learning.draws import DynamicsDraws
 from ctxval.learning.dynamics_posterior import DynamicsPosterior
 from ctxval.searches import Prediction
 
+Executed = Sequence[tuple[Array, Trajectory]]
+"""Points of the unit cube ``(d,)`` with the system's trajectories there."""
+
+_KERNEL = Sum(Matern(2.5, ard=True, length_scale=(0.05, 100.0), variance=(1e-6, 1e3)), Linear(variance=(1e-6, 1e3)))
+_NOISE = 1e-8  # noise variance relative to the vectors' mean square: it keeps the covariance matrix positive definite
+_LEARNED_FROM = 200  # largest number of vectors, the latest ones, from which the hyperparameters are learned
+
 
 @dataclass(frozen=True, eq=False)
 class PredictedDistance:
@@ -98,14 +105,6 @@ def predict_distance(
     rough_mean = posterior.rough_mean
     rough = exact if rough_mean is posterior.mean else replace(exact, mean=rough_mean)
     return Prediction(exact, exact.left_out, 2000 if planner.batched else 150, rough=rough)
-
-
-Executed = Sequence[tuple[Array, Trajectory]]
-"""Points of the unit cube ``(d,)`` with the system's trajectories there."""
-
-_KERNEL = Sum(Matern(2.5, ard=True, length_scale=(0.05, 100.0), variance=(1e-6, 1e3)), Linear(variance=(1e-6, 1e3)))
-_NOISE = 1e-8  # noise variance relative to the vectors' mean square: it keeps the covariance matrix positive definite
-_LEARNED_FROM = 200  # largest number of vectors, the latest ones, from which the hyperparameters are learned
 
 
 def executions_of(executed: Array, points: Iterable[Array]) -> list[list[int]]:
