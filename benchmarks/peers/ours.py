@@ -10,7 +10,7 @@ from ctxval import Campaign, searches
 from ctxval._util.arrays import Array
 from ctxval.core.plan import Outcome
 from ctxval.distances import ComposedDistance
-from ctxval.learning.vector import predict_composed
+from ctxval.learning.prediction import predict_composed
 from peers.recorder import Recorder, Suggest, Suggesting
 
 

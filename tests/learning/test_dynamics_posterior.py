@@ -8,9 +8,9 @@ import pytest
 from ctxval import Transitions, models
 from ctxval._util.arrays import Array
 from ctxval.gp.kernels import factorise
-from ctxval.learning.component import Component, draw_functions
 from ctxval.learning.dynamics_posterior import DynamicsPosterior, PosteriorSettings, learn_posterior
 from ctxval.learning.hyperparameters import FAMILIES, Hyperparameters, ResidualKernel
+from ctxval.learning.kernel_expansion import Component, draw_functions
 from rig_thorough import more
 
 MODEL = models.Linear([[1.0, 0.1], [0.0, 0.9]], [[0.0], [0.1]])

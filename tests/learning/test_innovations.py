@@ -8,7 +8,7 @@ from ctxval._util.arrays import Array
 from ctxval.learning.histories import History, Record, Structure, jacobian
 from ctxval.learning.innovations import FilterFit, LaggedFit, fit_filter, fit_lagged
 from ctxval.learning.local_noise import local_noise
-from ctxval.learning.structures import EXACT, fit_structures
+from ctxval.learning.noise_study import EXACT, fit_structures
 
 MODEL = models.Linear([[1.0, 0.1], [0.0, 0.9]], [[0.0], [0.1]])
 LIVE = np.array([True, True])

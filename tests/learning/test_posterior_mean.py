@@ -7,7 +7,6 @@ import numpy as np
 from ctxval import Transitions, models
 from ctxval._util.arrays import Array, Rows
 from ctxval.core.model import Model
-from ctxval.learning.component import Component
 from ctxval.learning.dynamics_posterior import (
     DynamicsPosterior,
     PosteriorSettings,
@@ -15,6 +14,7 @@ from ctxval.learning.dynamics_posterior import (
     learn_covariances,
     learn_posterior,
 )
+from ctxval.learning.kernel_expansion import Component
 
 MODEL = models.Linear([[1.0, 0.1], [0.0, 0.9]], [[0.0], [0.1]])
 

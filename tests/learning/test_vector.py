@@ -5,7 +5,7 @@ import pytest
 
 from ctxval._util.arrays import Array
 from ctxval.errors import ShapeError
-from ctxval.learning.vector import _log_likelihood, predict_composed
+from ctxval.learning.prediction import _log_likelihood, predict_composed
 from ctxval.searches import TrustRegion
 
 C = np.random.default_rng(3).normal(size=(4, 8))

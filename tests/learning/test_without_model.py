@@ -8,8 +8,7 @@ from ctxval._util.arrays import Array
 from ctxval.core.model import Step
 from ctxval.core.trajectory import Transitions
 from ctxval.learning.dynamics_posterior import PosteriorSettings, learn_posterior
-from ctxval.learning.residual_data import residual_data
-from ctxval.learning.without_model import smoother_than
+from ctxval.learning.residual_data import residual_data, smoother_than
 
 SETTINGS = PosteriorSettings(hyperparameters=4)
 

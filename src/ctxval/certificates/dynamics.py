@@ -4,7 +4,7 @@ The residual ``r(x, u) = x' - M(x, u)`` has a Gaussian-process prior with unknow
 its posterior makes a system ``M + r_s``, whose largest distance d*_s is searched over all tasks. Under the prior, d*
 and these S maxima are exchangeable, so d* is at most the k-th smallest one with probability ``k / (S + 1)``. Draws
 that share hyperparameters make this approximate. Bayes' rule does not depend on how the tasks were chosen. If M is
-rougher than the system, a linear model takes its place in r (:mod:`ctxval.learning.without_model`).
+rougher than the system, a linear model takes its place in r (:mod:`ctxval.learning.residual_data`).
 
 The bound lies if the prior is wrong: if a state is not recorded, or the dynamics jump. So it is withdrawn by
 :mod:`ctxval.certificates.dynamics_diagnostics` unless predictions that were made before executions held, and unless the

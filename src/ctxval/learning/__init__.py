@@ -4,17 +4,12 @@ from __future__ import annotations
 
 from ctxval.learning.coverage import Coverage
 from ctxval.learning.draws import DynamicsDraws
-from ctxval.learning.dynamics_posterior import (
-    DynamicsPosterior,
-    PosteriorSettings,
-    learn_posterior,
-)
+from ctxval.learning.dynamics_posterior import DynamicsPosterior, PosteriorSettings, learn_posterior
 from ctxval.learning.dynamics_study import DynamicsStudy
 from ctxval.learning.execution_prediction import ExecutionPrediction, PredictionScore
 from ctxval.learning.learned_dynamics import LearnedDynamics
-from ctxval.learning.prediction import predict_distance
+from ctxval.learning.prediction import predict_composed, predict_distance
 from ctxval.learning.replays import Replay, replay_executed
-from ctxval.learning.vector import predict_composed
 
 __all__ = [
     "Coverage",

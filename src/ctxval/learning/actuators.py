@@ -32,14 +32,10 @@ _CLIMBED = 4  # candidates whose hyperparameters are searched for
 
 @dataclass(frozen=True)
 class Actuator:
-    """How the inputs act that a controller commands; before the first one, they are 0.
+    """How the inputs act that a controller commands; before the first one, they are 0."""
 
-    Attributes:
-        delay: steps by which inputs act late; between whole steps, two inputs act in parts.
-        lag: time constant in steps with which the delayed inputs are followed; 0 if they are followed at once.
-    """
-
-    delay: float = 0.0
+    delay: float = 0.0  # steps by which inputs act late; between whole steps, two inputs act in parts
+    # time constant in steps with which the delayed inputs are followed; 0 if they are followed at once
     lag: float = 0.0
 
     def follow(self, acting: Array, commanded: Sequence[Array]) -> Array:

@@ -37,13 +37,9 @@ _REMEMBERED = 64_000_000  # largest size of the plans that are kept, in bytes, a
 
 @dataclass(frozen=True, eq=False)
 class PlannedTasks:
-    """Tasks with their controllers and the trajectories of M: a batch, or one task without batch axes.
+    """Tasks with their controllers and the trajectories of M: a batch, or one task without batch axes."""
 
-    Attributes:
-        rows: the rows of these tasks among all points that were planned, shape ``(q,)``.
-    """
-
-    rows: Rows
+    rows: Rows  # the rows of these tasks among all points that were planned, (q,)
     task: Task
     controller: Controller
     promised: Trajectory
@@ -51,17 +47,11 @@ class PlannedTasks:
 
 @dataclass(frozen=True, eq=False)
 class Loops:
-    """Closed loops of S drawn systems on q tasks; noisy ones have S R, with R sequences of noise for each draw.
+    """Closed loops of S drawn systems on q tasks; noisy ones have S R, with R sequences of noise for each draw."""
 
-    Attributes:
-        distances: d, shape ``(S, q)``; NaN if the loop of M diverges, infinity if that of a drawn system does.
-        states: shape ``(S, q, H + 1, n)``.
-        inputs: shape ``(S, q, H, m)``.
-    """
-
-    distances: Array
-    states: Array
-    inputs: Array
+    distances: Array  # d, (S, q); NaN if the loop of M diverges, infinity if that of a drawn system does
+    states: Array  # shape (S, q, H + 1, n)
+    inputs: Array  # shape (S, q, H, m)
 
 
 class LoopPlanner:
@@ -146,25 +136,25 @@ class LoopPlanner:
 
     def distances(self, draws: Together, planned: Sequence[PlannedTasks], tasks: int) -> Array:
         """Return the distances ``(S, q)`` of all draws on the same q tasks; NaN for a task without a finite plan."""
-        found = distances_of(draws, self.run(draws, planned), planned, tasks)
-        advance(len(draws) * sum(len(one.rows) for one in planned))
-        return found
+        distances = distances_of(draws, self.run(draws, planned), planned, tasks)
+        advance(len(draws) * sum(len(plan.rows) for plan in planned))
+        return distances
 
     def own_distances(self, draws: AnyDraws, points: Array) -> Array:
         """Return the distances ``(S, q)`` of each draw on tasks of its own, at points ``(S, q, d)``."""
         S, q, d = points.shape
         R = draws.replicates if isinstance(draws, NoisyDraws) else 1
-        found = np.full((R, S * q), np.nan)
+        distances = np.full((R, S * q), np.nan)
         for plan in self.plan(points.reshape(S * q, d), together=S * q):
             if isinstance(draws, NoisyDraws):
                 of_draw = np.broadcast_to(plan.rows // q, (R, len(plan.rows)))
-                found[:, plan.rows] = self._noisy_loops(draws, plan, of_draw, np.arange(R)).distances
+                distances[:, plan.rows] = self._noisy_loops(draws, plan, of_draw, np.arange(R)).distances
             else:
                 alone = not plan.task.batch_shape
                 step = draws.model_of(int(plan.rows[0]) // q).step if alone else _own_step(draws, q, plan.rows)
-                found[0, plan.rows] = self.compared(plan, rollout(step, plan.controller, plan.task))
+                distances[0, plan.rows] = self.compared(plan, rollout(step, plan.controller, plan.task))
             advance(R * len(plan.rows))
-        return _of_draws(draws, found.reshape(R, S, q).swapaxes(0, 1).reshape(S * R, q))
+        return _of_draws(draws, distances.reshape(R, S, q).swapaxes(0, 1).reshape(S * R, q))
 
     def _noisy_loops(self, draws: NoisyDraws, planned: PlannedTasks, of_draw: Rows, replicates: Rows) -> Loops:
         """Return closed loops of draws ``(L, q)`` with a sequence of noise for each row, ``(L,)``."""
@@ -183,10 +173,10 @@ class LoopPlanner:
         return self._stacked(planned, loops)
 
     def _stacked(self, planned: PlannedTasks, loops: Sequence[Trajectory]) -> Loops:
-        states, inputs = np.stack([one.states for one in loops]), np.stack([one.inputs for one in loops])
+        states, inputs = np.stack([loop.states for loop in loops]), np.stack([loop.inputs for loop in loops])
         shape = (len(loops), len(planned.rows))
         return Loops(
-            np.array([self.compared(planned, one) for one in loops]).reshape(shape),
+            np.array([self.compared(planned, loop) for loop in loops]).reshape(shape),
             states.reshape(*shape, *states.shape[-2:]),
             inputs.reshape(*shape, *inputs.shape[-2:]),
         )
@@ -230,9 +220,9 @@ class LoopPlanner:
     def compared(self, planned: PlannedTasks, loops: Trajectory) -> Array:
         """Return the distances ``(q,)`` of loops; infinity if a loop diverges, NaN if that of M does."""
         promised, known = planned.promised.finite, planned.promised.finite & loops.finite
-        model, system = (_without_divergence(one, known) for one in (planned.promised, loops))
-        found = np.where(known, self.measured(planned.task, model, system), np.inf)
-        return np.where(promised, found, np.nan).reshape(len(planned.rows))
+        model, system = (_without_divergence(run, known) for run in (planned.promised, loops))
+        distances = np.where(known, self.measured(planned.task, model, system), np.inf)
+        return np.where(promised, distances, np.nan).reshape(len(planned.rows))
 
     def measured(self, task: Task, model: Trajectory, system: Trajectory) -> Array:
         """Return the distance of each task, ``(...)``, one by one if the distance does not take a batch.
@@ -276,10 +266,10 @@ def halved(function: Callable[[Rows], T], count: int) -> list[tuple[Rows, T | No
 
 def distances_of(draws: Together, loops: Sequence[Loops], planned: Sequence[PlannedTasks], tasks: int) -> Array:
     """Return the distances ``(S, q)`` of closed loops of S draws on planned tasks; NaN for a task without a plan."""
-    found = np.full((len(draws), tasks), np.nan)
-    for one, of_batch in zip(planned, loops, strict=True):
-        found[:, one.rows] = _of_draws(draws, of_batch.distances)
-    return found
+    distances = np.full((len(draws), tasks), np.nan)
+    for plan, of_batch in zip(planned, loops, strict=True):
+        distances[:, plan.rows] = _of_draws(draws, of_batch.distances)
+    return distances
 
 
 def _of_draws(draws: Together, distances: Array) -> Array:
@@ -308,9 +298,9 @@ def unseen_parameters(planner: LoopPlanner, some: Array) -> tuple[int, ...]:
     d = some.shape[1]
     ends = moves_to_bounds(some, np.zeros(d), np.ones(d)).reshape(-1, d)
     loops: dict[int, Array] = {}
-    for one in planner.plan(ends):
-        promised = np.concatenate([one.promised.states[..., :-1, :], one.promised.inputs], axis=-1)
-        loops.update(zip(one.rows.tolist(), promised.reshape(len(one.rows), *promised.shape[-2:]), strict=True))
+    for plan in planner.plan(ends):
+        promised = np.concatenate([plan.promised.states[..., :-1, :], plan.promised.inputs], axis=-1)
+        loops.update(zip(plan.rows.tolist(), promised.reshape(len(plan.rows), *promised.shape[-2:]), strict=True))
     if not loops:
         return ()
     size = np.maximum(np.nanstd(np.concatenate(list(loops.values())), axis=0), 1e-12)
@@ -326,15 +316,15 @@ def unseen_parameters(planner: LoopPlanner, some: Array) -> tuple[int, ...]:
 def _own_step(draws: DynamicsDraws, tasks: int, rows: Rows) -> Step:
     """Return the step of draws on tasks of their own: a flat batch has some rows of all their ``S q`` tasks."""
     first, last = int(rows[0]) // tasks, int(rows[-1]) // tasks + 1
-    needed, own = draws[np.arange(first, last)], rows - first * tasks
+    needed, here = draws[np.arange(first, last)], rows - first * tasks
 
     def of_all_tasks(part: Array) -> Array:
         whole = np.zeros(((last - first) * tasks, part.shape[-1]))
-        whole[own] = part
+        whole[here] = part
         return whole.reshape(last - first, tasks, part.shape[-1])
 
     def step(x: Array, u: Array) -> Array:
-        return np.asarray(needed.step(of_all_tasks(x), of_all_tasks(u)).reshape(-1, x.shape[-1])[own])
+        return np.asarray(needed.step(of_all_tasks(x), of_all_tasks(u)).reshape(-1, x.shape[-1])[here])
 
     return step
 

@@ -26,38 +26,24 @@ _FARTHEST = 1e3  # standardised coordinates are limited to this magnitude
 
 @dataclass(frozen=True, eq=False)
 class Gap:
-    """A gap between what closed loops visit and what is recorded.
+    """A gap between what closed loops visit and what is recorded."""
 
-    Attributes:
-        size: its size, as a share of the visited range.
-        coordinates: the indices of its coordinates; states come before inputs.
-        place: the visited state-input pair, in the system's units, shape ``(n + m,)``.
-    """
-
-    size: float
-    coordinates: tuple[int, ...]
-    place: Array
+    size: float  # its size, as a share of the visited range
+    coordinates: tuple[int, ...]  # the indices of its coordinates; states come before inputs
+    place: Array  # the visited state-input pair, in the system's units, (n + m,)
 
 
 @dataclass(frozen=True, eq=False)
 class Coverage(ShortRepr):
-    """The largest gaps between what closed loops visit and what is recorded.
+    """The largest gaps between what closed loops visit and what is recorded."""
 
-    Attributes:
-        marginal: the largest gap in a single coordinate.
-        beyond: the largest excess over the largest record of a single coordinate, or below its smallest one.
-        pair: the largest gap in two coordinates together; None if there are too many coordinates to compare pairs.
-        task: the task whose closed loop leads farthest from the records, a point of the unit cube ``(d,)``.
-        resolution: the largest gap of each coordinate, in the system's units, shape ``(n + m,)``.
-        tasks: the number of tasks that were compared with the range of the records; gaps are looked for in a part of
-            them.
-    """
-
-    marginal: Gap
-    beyond: Gap
+    marginal: Gap  # the largest gap in a single coordinate
+    beyond: Gap  # the largest excess over the largest record of a single coordinate, or below its smallest one
+    # the largest gap in two coordinates together; None if there are too many coordinates to compare pairs
     pair: Gap | None
-    task: Array
-    resolution: Array
+    task: Array  # the task whose closed loop leads farthest from the records, a point of the unit cube (d,)
+    resolution: Array  # the largest gap of each coordinate, in the system's units, (n + m,)
+    # the number of tasks that were compared with the range of the records; gaps are looked for in a part of them
     tasks: int
 
 
@@ -119,7 +105,7 @@ def _beyond(recorded: Array, visited: Array) -> Array:
 
 def _visited(posterior: DynamicsPosterior, loops: Sequence[Loops]) -> Array:
     """Return the standardised pairs ``(q, H, k)`` on loops; the last pair of a task with a shorter horizon repeats."""
-    parts = [posterior.data.standardised(one.states[0][:, :-1], one.inputs[0]) for one in loops]
+    parts = [posterior.data.standardised(loop.states[0][:, :-1], loop.inputs[0]) for loop in loops]
     horizon = max(part.shape[1] for part in parts)
     longest = [np.pad(part, ((0, 0), (0, horizon - part.shape[1]), (0, 0)), mode="edge") for part in parts]
     visited = np.nan_to_num(np.concatenate(longest), nan=_FARTHEST, posinf=_FARTHEST, neginf=-_FARTHEST)
@@ -143,19 +129,13 @@ def _nearest(recorded: Array, visited: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Pocket(ShortRepr):
-    """The largest region of two states that closed loops of tasks enter, and that no execution has entered.
+    """The largest region of two states that closed loops of tasks enter, and that no execution has entered."""
 
-    Attributes:
-        size: its radius, as a share of the visited ranges.
-        states: the indices of the two states.
-        place: its centre, which a loop visits, in the system's units, shape ``(2,)``.
-        within: its radius in each of the two states, in the system's units, shape ``(2,)``; they are equal if the
-            states are places with one unit.
-    """
-
-    size: float
-    states: tuple[int, int]
-    place: Array
+    size: float  # its radius, as a share of the visited ranges
+    states: tuple[int, int]  # the indices of the two states
+    place: Array  # its centre, which a loop visits, in the system's units, (2,)
+    # its radius in each of the two states, in the system's units, (2,); they are equal if the states are places with
+    # one unit
     within: Array
 
 

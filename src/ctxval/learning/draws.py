@@ -16,18 +16,13 @@ from ctxval.learning.residual_data import ResidualData
 
 @dataclass(frozen=True, eq=False)
 class DynamicsDraws(ShortRepr):
-    """S models ``M + r_s``, run together: a draw is the first axis of states and inputs.
-
-    Attributes:
-        expansions: functions r_s, in groups that are evaluated together.
-        left_out: largest share of the posterior variance that draws leave out between pivots.
-        limit: the largest standardised residual of each learned state, in magnitude; None if there is no limit.
-    """
+    """S models ``M + r_s``, run together: a draw is the first axis of states and inputs."""
 
     model: Model
     data: ResidualData
-    expansions: tuple[KernelExpansion, ...]
-    left_out: float = 0.0
+    expansions: tuple[KernelExpansion, ...]  # functions r_s, in groups that are evaluated together
+    left_out: float = 0.0  # largest share of the posterior variance that draws leave out between pivots
+    # the largest standardised residual of each learned state, in magnitude; None if there is no limit
     limit: Array | None = None
 
     def __len__(self) -> int:
@@ -39,7 +34,7 @@ class DynamicsDraws(ShortRepr):
         if len(rows) == len(self):
             return self
         chosen = [(each, rows[(rows >= first) & (rows < last)] - first) for each, first, last in self._groups()]
-        return replace(self, expansions=tuple(each[own] for each, own in chosen if len(own)))
+        return replace(self, expansions=tuple(each[some] for each, some in chosen if len(some)))
 
     def step(self, x: Array, u: Array) -> Array:
         """Return the next states, shapes ``(S, q, n), (S, q, m) -> (S, q, n)``."""
@@ -71,16 +66,11 @@ class DynamicsDraws(ShortRepr):
 
 @dataclass(frozen=True, eq=False)
 class DisturbedDynamics(ShortRepr):
-    """One model, to whose next states something is added, in several ways that are run together as draws are.
+    """One model, to whose next states something is added, in several ways that are run together as draws are."""
 
-    Attributes:
-        mean: the model, as the only draw.
-        ways: numbers of the ways, shape ``(S,)``.
-        added: what is added for ways ``(S,)`` at states ``(S, q, n)``, in a shape that broadcasts to theirs.
-    """
-
-    mean: DynamicsDraws
-    ways: Rows
+    mean: DynamicsDraws  # the model, as the only draw
+    ways: Rows  # numbers of the ways, (S,)
+    # what is added for ways (S,) at states (S, q, n), in a shape that broadcasts to theirs
     added: Callable[[Rows, Array], Array]
 
     def __len__(self) -> int:

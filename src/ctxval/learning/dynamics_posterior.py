@@ -22,7 +22,6 @@ from ctxval.core.model import Model
 from ctxval.core.trajectory import Transitions
 from ctxval.errors import InputError
 from ctxval.gp.kernels import pivoted_rows
-from ctxval.learning.component import Component, draw_functions
 from ctxval.learning.draws import DynamicsDraws, bounded
 from ctxval.learning.hyperparameters import (
     FAMILIES,
@@ -31,34 +30,23 @@ from ctxval.learning.hyperparameters import (
     Hyperparameters,
     learning_rows,
 )
-from ctxval.learning.kernel_expansion import KernelExpansion, joined, weights_without
-from ctxval.learning.residual_data import ResidualData, residual_data
-from ctxval.learning.without_model import smoother_than
+from ctxval.learning.kernel_expansion import Component, KernelExpansion, draw_functions, joined, weights_without
+from ctxval.learning.residual_data import ResidualData, residual_data, smoother_than
 
 _PIVOT = 0.1  # variance, as a share of the noise, below which a transition adds nothing to those chosen before it
 
 
 @dataclass(frozen=True)
 class PosteriorSettings:
-    """Numbers on which the accuracy and the cost of the posterior depend.
+    """Numbers on which the accuracy and the cost of the posterior depend."""
 
-    Attributes:
-        hyperparameters: number of draws of the hyperparameters.
-        functions: number of functions that are drawn for each of them.
-        learned_from: number of transitions that the hyperparameters are learned from.
-        centres: largest number of transitions that each process is conditioned on.
-        pivots: largest number of pairs at which a draw is exact.
-        families: smoothness and growth of each family of covariances.
-        of_steps: whether the system may be learned without M, if M is rougher than the system.
-    """
-
-    hyperparameters: int = 20
-    functions: int = 2
-    learned_from: int = 120
-    centres: int = 400
-    pivots: int = 100
-    families: tuple[tuple[float, float], ...] = FAMILIES
-    of_steps: bool = True
+    hyperparameters: int = 20  # number of draws of the hyperparameters
+    functions: int = 2  # number of functions that are drawn for each of them
+    learned_from: int = 120  # number of transitions that the hyperparameters are learned from
+    centres: int = 400  # largest number of transitions that each process is conditioned on
+    pivots: int = 100  # largest number of pairs at which a draw is exact
+    families: tuple[tuple[float, float], ...] = FAMILIES  # smoothness and growth of each family of covariances
+    of_steps: bool = True  # whether the system may be learned without M, if M is rougher than the system
 
     @classmethod
     def for_horizon(cls, horizon: int) -> PosteriorSettings:
@@ -68,17 +56,11 @@ class PosteriorSettings:
 
 @dataclass(frozen=True, eq=False)
 class LearnedCovariances(ShortRepr):
-    """The posterior of the hyperparameters, learned from the transitions of some executions.
+    """The posterior of the hyperparameters, learned from the transitions of some executions."""
 
-    Attributes:
-        model: the model to which residuals are added: M, or a linear one.
-        without_model: whether it is a linear one, because M is rougher than the system.
-        scale: the units of the standardised pairs to which the hyperparameters belong, shape ``(n + m,)``.
-    """
-
-    model: Model
-    without_model: bool
-    scale: Array
+    model: Model  # the model to which residuals are added: M, or a linear one
+    without_model: bool  # whether it is a linear one, because M is rougher than the system
+    scale: Array  # the units of the standardised pairs to which the hyperparameters belong, (n + m,)
     posterior: HyperparameterPosterior
     settings: PosteriorSettings
     seed: tuple[int, ...]
@@ -296,7 +278,7 @@ def learn_covariances(
     """Return the posterior of the hyperparameters given recorded transitions.
 
     Returns None if fewer than two transitions are usable, or if M explains all of them. If M is rougher than S, the
-    residuals are those of a linear model (:mod:`ctxval.learning.without_model`).
+    residuals are those of a linear model (:mod:`ctxval.learning.residual_data`).
 
     Args:
         sources: the execution of each transition; -1 for data that the model was made from, shape ``(N,)``.

@@ -21,20 +21,14 @@ from ctxval.core.validation import Validation
 from ctxval.errors import InputError
 from ctxval.learning.actuators import Actuator, found_actuator
 from ctxval.learning.closed_loops import LoopPlanner, unseen_parameters
-from ctxval.learning.dynamics_posterior import (
-    LearnedCovariances,
-    PosteriorSettings,
-    condition,
-    learn_covariances,
-)
+from ctxval.learning.dynamics_posterior import LearnedCovariances, PosteriorSettings, condition, learn_covariances
 from ctxval.learning.extended import ExtendedValidation
 from ctxval.learning.histories import Record
 from ctxval.learning.learned_dynamics import LearnedDynamics
 from ctxval.learning.noise_study import NoiseStudy
 from ctxval.learning.noisy_draws import NoisyPosterior
-from ctxval.learning.prediction import predict_distance
+from ctxval.learning.prediction import ErrorVectors, Executed, predict_composed, predict_distance
 from ctxval.learning.recorded import data_near, digest, recorded_transitions, scheduled
-from ctxval.learning.vector import ErrorVectors, Executed, predict_composed
 from ctxval.learning.worst_case import WorstCaseSearch, WorstCaseSettings
 from ctxval.models.corrected import before_refinement
 from ctxval.searches import Prediction

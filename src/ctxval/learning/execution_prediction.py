@@ -20,19 +20,13 @@ _QUANTILES = np.linspace(0.0, 1.0, 21)  # levels of the stored quantiles of the 
 
 @dataclass(frozen=True)
 class NoisePrediction(ShortRepr):
-    """What the executions of one task are predicted to be if the system is noisy, as quantiles at ``LEVELS``.
+    """What the executions of one task are predicted to be if the system is noisy, as quantiles at ``LEVELS``."""
 
-    Attributes:
-        runs: the number of closed loops that the quantiles are of.
-        distances: those of the distance.
-        roughness: root mean squares of the second differences of each state from step to step.
-        statistics: those of statistics of the trajectory: its mean squared deviation from the median, and the mean
-            square and the largest magnitude of its second differences, relative to ``roughness``.
-    """
-
-    runs: int
-    distances: tuple[float, ...]
-    roughness: tuple[float, ...]
+    runs: int  # the number of closed loops that the quantiles are of
+    distances: tuple[float, ...]  # those of the distance
+    roughness: tuple[float, ...]  # root mean squares of the second differences of each state from step to step
+    # those of statistics of the trajectory: its mean squared deviation from the median, and the mean square and the
+    # largest magnitude of its second differences, relative to roughness
     statistics: tuple[tuple[float, ...], ...]
 
     def chance_of_more(self, distance: float) -> float:
@@ -56,26 +50,16 @@ def _differences(states: Array, roughness: Array) -> tuple[Array, Array]:
 
 @dataclass(frozen=True)
 class ExecutionPrediction(ShortRepr):
-    """Draws of the trajectory and of the distance of one task, summarised in plain numbers for JSON.
-
-    Attributes:
-        quantiles: quantiles of the distance at 0, 0.05, ..., 1; infinity if a draw diverges.
-        deviation: standard deviation of the distance over the draws that do not diverge.
-        steps: indices of the predicted states, from 1 to the horizon.
-        states: medians of the states at these steps, one row for each.
-        deviations: standard deviations of the states at these steps, one row for each.
-        diverged: share of the draws that diverge.
-        noise: what noise does to the execution; None if the system is not noisy.
-    """
+    """Draws of the trajectory and of the distance of one task, summarised in plain numbers for JSON."""
 
     learned_from: int
-    quantiles: tuple[float, ...]
-    deviation: float
-    steps: tuple[int, ...]
-    states: tuple[tuple[float, ...], ...]
-    deviations: tuple[tuple[float, ...], ...]
-    diverged: float
-    noise: NoisePrediction | None = None
+    quantiles: tuple[float, ...]  # quantiles of the distance at 0, 0.05, ..., 1; infinity if a draw diverges
+    deviation: float  # standard deviation of the distance over the draws that do not diverge
+    steps: tuple[int, ...]  # indices of the predicted states, from 1 to the horizon
+    states: tuple[tuple[float, ...], ...]  # medians of the states at these steps, one row for each
+    deviations: tuple[tuple[float, ...], ...]  # standard deviations of the states at these steps, one row for each
+    diverged: float  # share of the draws that diverge
+    noise: NoisePrediction | None = None  # what noise does to the execution; None if the system is not noisy
 
     @property
     def median(self) -> float:
@@ -138,19 +122,13 @@ class ExecutionPrediction(ShortRepr):
 
 @dataclass(frozen=True)
 class PredictionScore:
-    """How an execution agrees with its prediction.
+    """How an execution agrees with its prediction."""
 
-    Attributes:
-        z2: squared standardised error, the larger one of the trajectory and of the distance; infinity if most draws
-            diverged.
-        rank: share of the draws whose distance is below the executed one.
-        ratio: the executed distance, divided by the median of the draws.
-        p_values: predicted probabilities of more than what statistics of the trajectory are; empty without noise.
-    """
-
+    # squared standardised error, the larger one of the trajectory and of the distance; infinity if most draws diverged
     z2: float
-    rank: float
-    ratio: float
+    rank: float  # share of the draws whose distance is below the executed one
+    ratio: float  # the executed distance, divided by the median of the draws
+    # predicted probabilities of more than what statistics of the trajectory are; empty without noise
     p_values: tuple[float, ...] = ()
 
 

@@ -29,9 +29,9 @@ from ctxval.core.trajectory import Trajectory
 from ctxval.core.validation import Validation
 from ctxval.learning.actuators import ActuatedController, Actuator
 from ctxval.learning.histories import Record
+from ctxval.learning.prediction import Executed
 from ctxval.learning.recorded import closed_loops_on_model
 from ctxval.learning.state_estimates import StateEstimates
-from ctxval.learning.vector import Executed
 
 
 def with_states_of_model(validation: Validation) -> Validation:
@@ -39,9 +39,9 @@ def with_states_of_model(validation: Validation) -> Validation:
 
     Its system is that of the given one, and cannot be executed.
     """
-    return (
-        validation if validation.outputs is None else ExtendedValidation(validation.with_parts(physical=())).validation
-    )
+    if validation.outputs is None:
+        return validation
+    return ExtendedValidation(validation.with_parts(physical=())).validation
 
 
 def estimates_by_loops_on_model(validation: Validation) -> StateEstimates | None:
@@ -84,11 +84,11 @@ class ExtendedValidation:
 
         # If only outputs are recorded, M is that of the user, and controllers are designed on the model that is given.
         model = _ExtendedModel(given.model, k, self.inputs) if k or self.actuator else None
-        own = None if model is None else given.model
+        designed_on = None if model is None else given.model
         return given.with_parts(
             task=task,
             model=model or given.model,
-            synthesizer=_ExtendedSynthesizer(given.synthesizer, own, given.outputs, k, self.actuator),
+            synthesizer=_ExtendedSynthesizer(given.synthesizer, designed_on, given.outputs, k, self.actuator),
             distance=_ExtendedDistance(given.distance, self.recorded),
             labels=self._labels(),
             outputs=None,

@@ -18,23 +18,16 @@ class Features:
     """Features whose weights are independent a priori: those of a Matern-5/2 process, 1, z, and inputs times states.
 
     The products let the residual grow with the input, as that of a wrong gain does.
-
-    Attributes:
-        centres: standardised regressors, shape ``(M, D)``.
-        theta: logarithms of a unit variance and of the length-scales, shape ``(1 + D,)``.
-        linear: standard deviation of the linear part, relative to that of the Matern part.
-        states, inputs: the numbers n and m; regressors begin with the state and the input.
-        whiten: makes the weights of the Matern part independent, shape ``(M, M)``.
-        products: whether inputs times states are among the features.
     """
 
-    centres: Array
-    theta: Array
-    linear: float
+    centres: Array  # standardised regressors, (M, D)
+    theta: Array  # logarithms of a unit variance and of the length-scales, (1 + D,)
+    linear: float  # standard deviation of the linear part, relative to that of the Matern part
+    # states, inputs: the numbers n and m; regressors begin with the state and the input
     states: int
     inputs: int
-    whiten: Array
-    products: bool = True
+    whiten: Array  # makes the weights of the Matern part independent, (M, M)
+    products: bool = True  # whether inputs times states are among the features
 
     @classmethod
     def of(
@@ -58,28 +51,28 @@ class Features:
     def values(self, z: Array, functions: Sequence[tuple[Rows, LinearFunction]]) -> Array:
         """Return the values ``(N, n)`` of functions at regressors ``(N, D)``, each at some rows."""
         matern, linear = self._matern(z), self._linear(z)
-        found = np.empty((len(z), self.states))
+        values = np.empty((len(z), self.states))
         for rows, function in functions:
-            found[rows] = matern[rows] @ function.matern + linear[rows] @ function.linear
-        return found
+            values[rows] = matern[rows] @ function.matern + linear[rows] @ function.linear
+        return values
 
     def _matern(self, z: Array) -> Array:
         scales = np.exp(-self.theta[1:])
-        own, centres = z * scales, self.centres * scales
-        s = own @ centres.T
+        scaled, centres = z * scales, self.centres * scales
+        s = scaled @ centres.T
         s *= -2.0
-        s += (own**2).sum(axis=1)[:, None]
+        s += (scaled**2).sum(axis=1)[:, None]
         s += (centres**2).sum(axis=1)
         np.maximum(s, 0.0, out=s)
         s *= 5.0
         np.sqrt(s, out=s)
-        found = s / 3.0
-        found += 1.0
-        found *= s
-        found += 1.0
+        values = s / 3.0
+        values += 1.0
+        values *= s
+        values += 1.0
         np.negative(s, out=s)
-        found *= np.exp(s, out=s)
-        return np.asarray(found)
+        values *= np.exp(s, out=s)
+        return np.asarray(values)
 
     def _linear(self, z: Array) -> Array:
         parts = [np.ones((len(z), 1)), z]

@@ -24,15 +24,10 @@ Residual = Callable[[Array], Array]
 
 @dataclass(frozen=True)
 class Structure:
-    """How much history the next record depends on.
+    """How much history the next record depends on."""
 
-    Attributes:
-        lags: number of earlier errors of M and changes of inputs among the regressors.
-        ratio: variance of measurement noise over that of process noise; 0 if records are the state.
-    """
-
-    lags: int = 0
-    ratio: float = 0.0
+    lags: int = 0  # number of earlier errors of M and changes of inputs among the regressors
+    ratio: float = 0.0  # variance of measurement noise over that of process noise; 0 if records are the state
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,30 +41,20 @@ class Record:
 
 @dataclass(frozen=True, eq=False)
 class Memory:
-    """What is kept of a history; leading axes are those of a batch.
+    """What is kept of a history; leading axes are those of a batch."""
 
-    Attributes:
-        estimate: the estimated state, shape ``(..., n)``.
-        errors: the latest errors of M, the newest first, shape ``(lags, ..., n)``.
-        inputs: the latest inputs, the newest first, shape ``(lags, ..., m)``; 0 before the start, when all was at rest.
-    """
-
-    estimate: Array
-    errors: Array
-    inputs: Array
+    estimate: Array  # the estimated state, (..., n)
+    errors: Array  # the latest errors of M, the newest first, (lags, ..., n)
+    inputs: Array  # the latest inputs, the newest first, (lags, ..., m); 0 before the start, when all was at rest
 
 
 @dataclass(frozen=True, eq=False)
 class History:
-    """The recursion from record to record for one structure.
-
-    Attributes:
-        gain: K, shape ``(n, n)``.
-    """
+    """The recursion from record to record for one structure."""
 
     model: Model
     structure: Structure
-    gain: Array
+    gain: Array  # K, (n, n)
 
     @classmethod
     def of(cls, model: Model, structure: Structure, scales: Array, middle: tuple[Array, Array]) -> History:
@@ -127,7 +112,7 @@ class History:
         Records of one horizon are a batch; the steps are in the order horizon, step, record. ``visit`` is called with
         the memory, the inputs and the regressors of each step.
         """
-        found = []
+        steps = []
         for alike in of_one_horizon(records):
             states, inputs, start = (
                 np.stack([getattr(record, name) for record in alike]) for name in ("states", "inputs", "start")
@@ -139,9 +124,9 @@ class History:
                 predicted = of_model if residual is None else of_model + residual(z)
                 if visit is not None:
                     visit(memory, u, z)
-                found.append((z, record - of_model, record - predicted))
+                steps.append((z, record - of_model, record - predicted))
                 memory = self.after(memory, u, of_model, predicted, record)
-        Z, E, innovations = (np.concatenate(parts) for parts in zip(*found, strict=True))
+        Z, E, innovations = (np.concatenate(parts) for parts in zip(*steps, strict=True))
         if not np.isfinite(innovations).all():
             raise np.linalg.LinAlgError  # the filter diverges
         return Z, E, innovations

@@ -45,16 +45,11 @@ class ResidualKernel(Covariance):
     theta = log of (length-scales, one for each column; constant; slope). The Matern part has unit variance. If M has
     the wrong gain from the input to the states, then the residual grows with the input; a stationary covariance would
     return to its mean outside the data.
-
-    Attributes:
-        nu: smoothness of the Matern part, 1.5, 2.5 or 4.5.
-        growth: factor of the product of the inputs; 0 for a stationary Matern part.
-        inputs: the number m of inputs of the system, which are the last columns.
     """
 
-    nu: float
-    growth: float
-    inputs: int
+    nu: float  # smoothness of the Matern part, 1.5, 2.5 or 4.5
+    growth: float  # factor of the product of the inputs; 0 for a stationary Matern part
+    inputs: int  # the number m of inputs of the system, which are the last columns
 
     def bounds(self, dimension: int) -> Bounds:
         """Return the bounds of theta; no column is irrelevant beyond 100 standard deviations of the data."""
@@ -67,9 +62,9 @@ class ResidualKernel(Covariance):
         linear = _LINEAR_KERNEL.towards(theta[-2:], Z)
 
         def covariances(X: Array) -> Array:
-            found = self._grow(matern(X), X, Z)
-            found += linear(X)
-            return found
+            total = self._grow(matern(X), X, Z)
+            total += linear(X)
+            return total
 
         return covariances
 
@@ -112,30 +107,20 @@ class ResidualKernel(Covariance):
 
 @dataclass(frozen=True, eq=False)
 class Hyperparameters:
-    """One draw of the hyperparameters.
-
-    Attributes:
-        theta: logarithms of the kernel's hyperparameters.
-        noise: noise variance, relative to that of the Matern part.
-    """
+    """One draw of the hyperparameters."""
 
     kernel: ResidualKernel
-    theta: Array
-    noise: float
+    theta: Array  # logarithms of the kernel's hyperparameters
+    noise: float  # noise variance, relative to that of the Matern part
 
 
 @dataclass(frozen=True, eq=False)
 class Mode:
-    """The posterior of one family, given pairs and residuals, around one of its modes.
-
-    Attributes:
-        height: the log posterior at the mode.
-        place: the (theta, log noise) of the mode.
-    """
+    """The posterior of one family, given pairs and residuals, around one of its modes."""
 
     kernel: ResidualKernel
-    height: float
-    place: Array
+    height: float  # the log posterior at the mode
+    place: Array  # the (theta, log noise) of the mode
     Z: Array
     Y: Array
 
@@ -182,13 +167,9 @@ class Mode:
 
 @dataclass(frozen=True, eq=False)
 class HyperparameterPosterior:
-    """The posterior of the hyperparameters, given standardised residuals.
+    """The posterior of the hyperparameters, given standardised residuals."""
 
-    Attributes:
-        families: the modes of each family of covariances.
-    """
-
-    families: tuple[tuple[Mode, ...], ...]
+    families: tuple[tuple[Mode, ...], ...]  # the modes of each family of covariances
 
     @classmethod
     def given(cls, Z: Array, Y: Array, inputs: int, families: Sequence[tuple[float, float]]) -> HyperparameterPosterior:
@@ -207,17 +188,17 @@ class HyperparameterPosterior:
 
     def draw(self, count: int, rng: np.random.Generator) -> list[Hyperparameters]:
         """Return ``count`` draws; hyperparameters that are drawn again are the same object, and follow each other."""
-        found, weights = [], []
+        places, weights = [], []
         for family in self.families:
             drawn = np.concatenate([mode.proposals(48 // len(family), rng) for mode in family])
             # All modes of a family make one proposal distribution: the mixture of theirs in equal parts.
             density = logsumexp([mode.log_density(drawn) for mode in family], axis=0) - np.log(len(family))
-            found += [(family[0].kernel, place) for place in drawn]
+            places += [(family[0].kernel, place) for place in drawn]
             heights = [family[0].log_posterior_or_none(place) for place in drawn]
             weights.append(np.array(heights) - density)
         chosen = _resampled(np.concatenate(weights), count, rng).tolist()
         # What follows from the same object is computed once.
-        draws = {row: Hyperparameters(found[row][0], *_within(*found[row])) for row in chosen}
+        draws = {row: Hyperparameters(places[row][0], *_within(*places[row])) for row in chosen}
         return [draws[row] for row in chosen]
 
 
@@ -286,9 +267,9 @@ def _box(kernel: ResidualKernel, dimension: int) -> tuple[Array, Array]:
 
 def _modes_of(kernel: ResidualKernel, Z: Array, Y: Array) -> tuple[Mode, ...]:
     """Return the modes of a family, the highest first: one with little noise, one with much, or one that is both."""
-    (height, place), (lower, other) = found = _climbed(kernel, Z, Y)
+    (height, place), (lower, other) = climbed = _climbed(kernel, Z, Y)
     relevant = height - lower < 12.0 and np.abs(place - other).max() > 0.5  # else negligible, or the same mode
-    return tuple(Mode(kernel, *one, Z, Y) for one in (found if relevant else found[:1]))
+    return tuple(Mode(kernel, *end, Z, Y) for end in (climbed if relevant else climbed[:1]))
 
 
 def _climbed(kernel: ResidualKernel, Z: Array, Y: Array) -> list[tuple[float, Array]]:

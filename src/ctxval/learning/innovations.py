@@ -36,24 +36,16 @@ DrawnWeights = tuple[Features, Array, Array]
 
 @dataclass(frozen=True, eq=False)
 class Scaled:
-    """Regressors and errors of M, with the constants that standardise them.
+    """Regressors and errors of M, with the constants that standardise them."""
 
-    Attributes:
-        Z: standardised regressors, shape ``(N, D)``.
-        E: errors of M, shape ``(N, n)``.
-        visited: standardised regressors of closed loops on M, from which centres are chosen too, shape ``(V, D)``.
-        shift, scale: shapes ``(D,)``.
-        inputs: the number m of inputs.
-        products: whether inputs times states are among the features.
-    """
-
-    Z: Array
-    E: Array
-    visited: Array
+    Z: Array  # standardised regressors, (N, D)
+    E: Array  # errors of M, (N, n)
+    visited: Array  # standardised regressors of closed loops on M, from which centres are chosen too, (V, D)
+    # shift, scale: shapes (D,)
     shift: Array
     scale: Array
-    inputs: int
-    products: bool = True
+    inputs: int  # the number m of inputs
+    products: bool = True  # whether inputs times states are among the features
 
     @classmethod
     def of(cls, Z: Array, E: Array, pairs: Array, inputs: int, products: bool = True) -> Scaled:
@@ -94,27 +86,19 @@ class Scaled:
 
 @dataclass(frozen=True, eq=False)
 class InnovationsFit(ABC):
-    """The posterior of the residual dynamics of one structure.
-
-    Attributes:
-        theta: hyperparameters of the features; see :meth:`Scaled.features`.
-        live: the states whose error of M is not negligible, shape ``(n,)``.
-        features, weights, noise: the most probable features, weights ``(F, n)`` and standard deviations ``(n,)``.
-        evidence: logarithm of the evidence, to compare structures.
-        innovations: recorded innovations with a root mean square of 1, shape ``(N, n)``.
-        local: how the noise changes with state and input; None if it does not.
-    """
+    """The posterior of the residual dynamics of one structure."""
 
     history: History
     scaled: Scaled
-    theta: Array
-    live: Mask
+    theta: Array  # hyperparameters of the features; see Scaled.features
+    live: Mask  # the states whose error of M is not negligible, (n,)
+    # features, weights, noise: the most probable features, weights (F, n) and standard deviations (n,)
     features: Features
     weights: Array
     noise: Array
-    evidence: float
-    innovations: Array
-    local: LocalNoise | None
+    evidence: float  # logarithm of the evidence, to compare structures
+    innovations: Array  # recorded innovations with a root mean square of 1, (N, n)
+    local: LocalNoise | None  # how the noise changes with state and input; None if it does not
 
     @property
     def share(self) -> float:
@@ -320,13 +304,13 @@ def fit_filter(
     live, n = plain.live, plain.scaled.states
     Z, E, _ = history.along(records)
     # The units are those of the records, not those of a filter that knows no residual yet.
-    own = Scaled.of(Z, E, pairs, records[0].inputs.shape[1])
-    width = n + own.inputs
-    shift, scale = own.shift.copy(), own.scale.copy()
+    recorded = Scaled.of(Z, E, pairs, records[0].inputs.shape[1])
+    width = n + recorded.inputs
+    shift, scale = recorded.shift.copy(), recorded.scale.copy()
     shift[:width], scale[:width] = plain.scaled.shift[:width], plain.scaled.scale[:width]
-    raw = own.Z * own.scale + own.shift
-    scaled = replace(own, Z=(raw - shift) / scale, E=plain.scaled.E, shift=shift, scale=scale)
-    scaled = replace(scaled, visited=(own.visited * own.scale + own.shift - shift) / scale)
+    raw = recorded.Z * recorded.scale + recorded.shift
+    scaled = replace(recorded, Z=(raw - shift) / scale, E=plain.scaled.E, shift=shift, scale=scale)
+    scaled = replace(scaled, visited=(recorded.visited * recorded.scale + recorded.shift - shift) / scale)
     theta = plain.theta.copy()
     theta[width] = np.log(6.0)
     centres = scaled.centres[spread_rows(scaled.centres, FILTER_CENTRES)]
@@ -391,10 +375,10 @@ def _sensitivities(
                 return np.asarray(after.reshape(x.shape))
 
             G = jacobian(step, memory.estimate, steps) @ psi
-            own = G.reshape(len(z), n, F, n)
+            by_state = G.reshape(len(z), n, F, n)
             phi = features((z - scaled.shift) / scaled.scale)
             for i in range(n):
-                own[:, i, :, i] += phi
+                by_state[:, i, :, i] += phi
             rows.append(G)
             psi = keep @ G
 

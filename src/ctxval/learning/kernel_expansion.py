@@ -1,34 +1,30 @@
-"""Functions that are weighted sums of covariances, many of them evaluated together."""
+"""The posterior of the residual dynamics for one draw of the hyperparameters: its mean, and functions drawn from it.
+
+All of these are weighted sums of covariances, and many of them are evaluated together.
+"""
 
 from __future__ import annotations
 
 import functools
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import groupby, product
 
 import numpy as np
 
 from ctxval._util.arrays import Array, Mask, Rows
-from ctxval.gp.kernels import factorise, tenfold
+from ctxval.gp.kernels import CholeskyFactor, factorise, pivoted_cholesky, tenfold
 from ctxval.learning.hyperparameters import Hyperparameters, ResidualKernel
 
 
 @dataclass(frozen=True, eq=False)
 class KernelExpansion:
-    """S functions ``f_s(z) = sum_j weights_sj k_s(z, centre_sj)`` with n values each.
+    """S functions ``f_s(z) = sum_j weights_sj k_s(z, centre_sj)`` with n values each."""
 
-    Attributes:
-        kernel: the family of the covariances, the same for all functions.
-        thetas: logarithms of the hyperparameters of each function, shape ``(S, k + 2)``.
-        centres: standardised pairs, shape ``(S, M, k)``.
-        weights: shape ``(S, M, n)``.
-    """
-
-    kernel: ResidualKernel
-    thetas: Array
-    centres: Array
-    weights: Array
+    kernel: ResidualKernel  # the family of the covariances, the same for all functions
+    thetas: Array  # logarithms of the hyperparameters of each function, (S, k + 2)
+    centres: Array  # standardised pairs, (S, M, k)
+    weights: Array  # shape (S, M, n)
 
     @classmethod
     def of(cls, hyperparameters: Hyperparameters, centres: Array, weights: Array) -> KernelExpansion:
@@ -50,9 +46,9 @@ class KernelExpansion:
         largest = max(1, 20_000 // M)
         together = max(1, largest // max(1, q))
         for s, j in product(range(0, S, together), range(0, q, largest)):
-            block, own = (slice(s, s + together), slice(j, j + largest)), slice(s, s + together)
-            covariances = self._matern(own, extended[block].swapaxes(1, 2))
-            values[block] += np.matmul(covariances.swapaxes(1, 2), self.weights[own])
+            block, some = (slice(s, s + together), slice(j, j + largest)), slice(s, s + together)
+            covariances = self._matern(some, extended[block].swapaxes(1, 2))
+            values[block] += np.matmul(covariances.swapaxes(1, 2), self.weights[some])
         return np.asarray(values)
 
     def __getitem__(self, rows: Rows) -> KernelExpansion:
@@ -86,9 +82,9 @@ class KernelExpansion:
         factors[..., -1] = 1.0
         return factors
 
-    def _matern(self, own: slice, extended: Array) -> Array:
+    def _matern(self, some: slice, extended: Array) -> Array:
         """Return the Matern part of the covariances ``(s, M, q)`` of some functions, of ``(s, 2 k + 1, q)``."""
-        r2 = np.matmul(self._squared[own], extended)
+        r2 = np.matmul(self._squared[some], extended)
         np.abs(r2, out=r2)  # rounding errors around zero
         r = np.sqrt(r2)
         polynomial = _polynomial(self.kernel.nu, r, r2)
@@ -96,27 +92,27 @@ class KernelExpansion:
         decay = np.exp(r, out=r)
         decay *= polynomial
         if self.kernel.growth:
-            decay *= np.matmul(self._growth[own], extended)
+            decay *= np.matmul(self._growth[some], extended)
         return np.asarray(decay)
 
 
 def joined(expansions: Sequence[KernelExpansion]) -> tuple[KernelExpansion, ...]:
     """Return the same functions, those of one family that follow each other in one expansion."""
-    groups = [list(group) for _, group in groupby(expansions, lambda one: one.kernel)]
+    groups = [list(group) for _, group in groupby(expansions, lambda expansion: expansion.kernel)]
     return tuple(group[0] if len(group) == 1 else _joined(group) for group in groups)
 
 
 def _joined(alike: Sequence[KernelExpansion]) -> KernelExpansion:
-    most = max(one.centres.shape[1] for one in alike)
+    most = max(expansion.centres.shape[1] for expansion in alike)
 
     def padded(values: Array) -> Array:
         return np.pad(values, ((0, 0), (0, most - values.shape[1]), (0, 0)))
 
     return KernelExpansion(
         alike[0].kernel,
-        np.concatenate([one.thetas for one in alike]),
-        np.concatenate([padded(one.centres) for one in alike]),
-        np.concatenate([padded(one.weights) for one in alike]),
+        np.concatenate([expansion.thetas for expansion in alike]),
+        np.concatenate([padded(expansion.centres) for expansion in alike]),
+        np.concatenate([padded(expansion.weights) for expansion in alike]),
     )
 
 
@@ -148,12 +144,107 @@ def weights_without(covariance: Array, noise: float, outputs: Array, gone: Mask)
     factor = factorise(covariance, tenfold(noise))
     added = float((factor.L[-1] ** 2).sum() - covariance[-1, -1])
     inverse, known = factor.inverse(), factor.solve(outputs)
-    found = np.repeat(known[None], len(gone), axis=0)
-    for own, without in zip(found, gone, strict=True):
+    weights = np.repeat(known[None], len(gone), axis=0)
+    for remaining, without in zip(weights, gone, strict=True):
         rows, kept = np.flatnonzero(without), np.flatnonzero(~without)
-        own -= inverse[:, rows] @ np.linalg.solve(inverse[np.ix_(rows, rows)], known[rows])
-        own[rows] = 0.0
-        misfit = covariance[kept] @ own + added * own[kept] - outputs[kept]
+        remaining -= inverse[:, rows] @ np.linalg.solve(inverse[np.ix_(rows, rows)], known[rows])
+        remaining[rows] = 0.0
+        misfit = covariance[kept] @ remaining + added * remaining[kept] - outputs[kept]
         if not np.abs(misfit).max(initial=0.0) < 1e-6:
-            own[kept] = factorise(covariance[np.ix_(kept, kept)], tenfold(noise)).solve(outputs[kept])
-    return found
+            remaining[kept] = factorise(covariance[np.ix_(kept, kept)], tenfold(noise)).solve(outputs[kept])
+    return weights
+
+
+@dataclass(frozen=True, eq=False)
+class Component:
+    """The posterior of r for one draw of the hyperparameters."""
+
+    hyperparameters: Hyperparameters
+    centres: Array  # standardised pairs that it is conditioned on, (M, k)
+    factor: CholeskyFactor  # Cholesky factor of their covariance with noise
+    weights: Array  # weights of the mean, (M, n)
+    squares: Array  # squared size of each state's residuals, relative to the covariance, (n,)
+    amplitudes: Array  # standard deviations of the states' residuals, relative to the covariance, (n,)
+
+    @classmethod
+    def conditioned(cls, hyperparameters: Hyperparameters, Z: Array, Y: Array, rng: np.random.Generator) -> Component:
+        """Return the process conditioned on pairs ``(M, k)``, with amplitudes drawn from their posterior."""
+        kernel, theta = hyperparameters.kernel, hyperparameters.theta
+        factor = factorise(kernel(theta, Z, Z), tenfold(hyperparameters.noise))
+        weights = factor.solve(Y)
+        squares = (Y * weights).sum(axis=0)
+        return cls(hyperparameters, Z, factor, weights, squares, _amplitudes(squares, len(Z), rng))
+
+    def again(self, rng: np.random.Generator) -> Component:
+        """Return the same process with other amplitudes."""
+        return replace(self, amplitudes=_amplitudes(self.squares, len(self.centres), rng))
+
+    @property
+    def mean(self) -> KernelExpansion:
+        """The posterior mean, as one function."""
+        return KernelExpansion.of(self.hyperparameters, self.centres, self.weights[None])
+
+    @property
+    def noise(self) -> Array:
+        """The standard deviation of the noise of each standardised residual, shape ``(n,)``."""
+        return np.asarray(np.sqrt(self.hyperparameters.noise) * self.amplitudes)
+
+    def variance(self, Z: Array) -> Array:
+        """Return the posterior variance at pairs ``(N, k)``, relative to the amplitudes, shape ``(N,)``."""
+        return self._whitened(Z)[1]
+
+    def _whitened(self, Z: Array) -> tuple[Array, Array]:
+        kernel, theta = self.hyperparameters.kernel, self.hyperparameters.theta
+        # For many pairs, a product with the inverse factor is several times as fast as substitution.
+        half = self.factor.whiten_many(kernel(theta, Z, self.centres).T)
+        return half, np.maximum(kernel.diagonal(theta, Z) - (half**2).sum(axis=0), 0.0)
+
+    def pivots(self, relevant: Array, count: int) -> tuple[Rows, Array, float]:
+        """Return rows by pivoted Cholesky of the posterior covariance, its factor, and the share of variance left."""
+        kernel, theta = self.hyperparameters.kernel, self.hyperparameters.theta
+        half, left = self._whitened(relevant)
+        first = left.max(initial=0.0)
+        # Variances below the noise are drawn too: many noisy transitions determine a function better than one does.
+        rounding = 1e-13 * kernel.diagonal(theta, relevant).max(initial=0.0)
+        towards, few = kernel.towards(theta, relevant), len(relevant) <= 300
+        covariance = towards(relevant) - half.T @ half if few else None  # cheaper than one row after the other
+
+        def covariances(row: int) -> Array:
+            if covariance is not None:
+                return np.asarray(covariance[row])
+            return np.asarray(towards(relevant[row : row + 1])[0] - half[:, row] @ half)
+
+        chosen = pivoted_cholesky(left, covariances, count, least=max(1e-6 * first, rounding))
+        left_out = chosen.left.max() / first if first > rounding else 0.0
+        return chosen.rows, chosen.L, float(left_out)
+
+
+def _amplitudes(squares: Array, count: int, rng: np.random.Generator) -> Array:
+    """Return a draw of the amplitudes from their posterior, given ``count`` transitions."""
+    return np.asarray(np.sqrt(squares / rng.chisquare(count, len(squares))))
+
+
+def draw_functions(
+    alike: Sequence[Component], relevant: Array, count: int, pivots: int, rng: np.random.Generator
+) -> tuple[KernelExpansion, float]:
+    """Return ``count`` draws of each of some components, and the share of the variance that they leave out elsewhere.
+
+    Args:
+        alike: components that differ in their amplitudes only.
+        relevant: pairs ``(R, k)`` that closed loops visit; the pivots, at which draws are exact, are chosen from them.
+        pivots: largest number of pivots.
+    """
+    first = alike[0]
+    chosen, L, left_out = first.pivots(relevant, pivots)
+    if not len(chosen):
+        weights = np.repeat(first.weights[None], count * len(alike), axis=0)
+        return KernelExpansion.of(first.hyperparameters, first.centres, weights), left_out
+    kernel, theta = first.hyperparameters.kernel, first.hyperparameters.theta
+    shape = (count, len(chosen), first.weights.shape[1])
+    normal = np.concatenate([rng.standard_normal(shape) * component.amplitudes for component in alike])
+    # The values L xi at the pivots are interpolated by the posterior covariance L L', with weights L'^-1 xi.
+    weights = np.linalg.solve(L.T, normal)
+    cross = first.factor.solve(kernel(theta, first.centres, relevant[chosen]))
+    together = np.concatenate([first.weights - np.matmul(cross, weights), weights], axis=1)
+    centres = np.concatenate([first.centres, relevant[chosen]])
+    return KernelExpansion.of(first.hyperparameters, centres, together), left_out

@@ -26,19 +26,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class LearnedDynamics(ShortRepr):
-    """The dynamics learned from the executions so far; everything that follows is computed once, if it is needed.
-
-    Attributes:
-        executed: the executed tasks, points of the unit cube ``(n, d)``.
-        trajectories_of_system: their trajectories.
-        with_data: whether the data that M was made from are learned from too; if they contradict the executions, M was
-            learned on another system, such as one without its load.
-    """
+    """The dynamics learned from the executions so far; everything that follows is computed once, if it is needed."""
 
     study: DynamicsStudy
     posterior: DynamicsPosterior
-    executed: Array
-    trajectories_of_system: Sequence[Trajectory]
+    executed: Array  # the executed tasks, points of the unit cube (n, d)
+    trajectories_of_system: Sequence[Trajectory]  # their trajectories
+    # whether the data that M was made from are learned from too; if they contradict the executions, M was learned on
+    # another system, such as one without its load
     with_data: bool = True
 
     _worst_cases: dict[int, WorstCase] = field(default_factory=dict, init=False)

@@ -16,15 +16,10 @@ _GAIN = 6.0  # least gain of the log likelihood of innovations that were left ou
 
 @dataclass(frozen=True, eq=False)
 class LocalNoise:
-    """The standard deviation of innovations relative to the constant one, as an average over centres.
+    """The standard deviation of innovations relative to the constant one, as an average over centres."""
 
-    Attributes:
-        centres: standardised states and inputs, shape ``(C, n + m)``.
-        variances: the relative variances there, shape ``(C,)``.
-    """
-
-    centres: Array
-    variances: Array
+    centres: Array  # standardised states and inputs, (C, n + m)
+    variances: Array  # the relative variances there, (C,)
 
     def __call__(self, pairs: Array) -> Array:
         """Return the relative standard deviations ``(N,)`` at standardised states and inputs ``(N, n + m)``."""

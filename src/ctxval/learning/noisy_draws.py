@@ -8,6 +8,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 
@@ -17,7 +18,6 @@ from ctxval.learning.features import Features, LinearFunction
 from ctxval.learning.innovations import DrawnWeights, InnovationsFit
 from ctxval.learning.residual_data import ResidualData
 
-GROUPS, EACH = 5, 4  # draws of the hyperparameters, and of weights for each
 REPLICATES = 10  # sequences of noise of each draw in a search
 ROUGH = 3  # sequences of noise of the mean in a search of tasks, whose best ones are evaluated with all
 SETTLED = 80  # sequences of noise at the tasks that a search has found
@@ -25,20 +25,13 @@ SETTLED = 80  # sequences of noise at the tasks that a search has found
 
 @dataclass(frozen=True, eq=False)
 class NoisyDraws(ShortRepr):
-    """S residuals with R sequences of noise each, which are the same in every task (common random numbers).
-
-    Attributes:
-        groups: residuals, in groups that are evaluated together.
-        rows: recorded innovations that are the noise of each step, shape ``(S, R, T)``; longer loops repeat them.
-        start: differences of the first records from the initial states of the tasks, shape ``(S, R, n)``.
-        quantile: q; the distance of a draw is this quantile over its sequences of noise.
-    """
+    """S residuals with R sequences of noise each, which are the same in every task (common random numbers)."""
 
     fit: InnovationsFit
-    groups: tuple[DrawnWeights, ...]
-    rows: Rows
-    start: Array
-    quantile: float
+    groups: tuple[DrawnWeights, ...]  # residuals, in groups that are evaluated together
+    rows: Rows  # recorded innovations that are the noise of each step, (S, R, T); longer loops repeat them
+    start: Array  # differences of the first records from the initial states of the tasks, (S, R, n)
+    quantile: float  # q; the distance of a draw is this quantile over its sequences of noise
     left_out: float = 0.0
 
     @classmethod
@@ -76,10 +69,10 @@ class NoisyDraws(ShortRepr):
         chosen = np.atleast_1d(np.asarray(rows, dtype=np.intp))
         groups, first = [], 0
         for features, weights, noise in self.groups:
-            own = chosen[(chosen >= first) & (chosen < first + len(weights))] - first
+            some = chosen[(chosen >= first) & (chosen < first + len(weights))] - first
             first += len(weights)
-            if len(own):
-                groups.append((features, weights[own], noise[own]))
+            if len(some):
+                groups.append((features, weights[some], noise[some]))
         return replace(self, groups=tuple(groups), rows=self.rows[chosen], start=self.start[chosen])
 
     def reduced(self, distances: Array) -> Array:
@@ -148,37 +141,25 @@ class NoisyRuns:
 
 @dataclass(frozen=True, eq=False)
 class NoisyPosterior(ShortRepr):
-    """The posterior of noisy dynamics, as a search of the worst task sees it.
-
-    Attributes:
-        data: transitions as those of a state, which tell what is recorded.
-        scatter: standard deviations of first records from the initial states of their tasks, shape ``(n,)``.
-        horizon: number of steps of the longest record.
-        replicates: sequences of noise of each draw in a search.
-    """
+    """The posterior of noisy dynamics, as a search of the worst task sees it."""
 
     fit: InnovationsFit
-    data: ResidualData
-    scatter: Array
-    horizon: int
-    replicates: int
+    data: ResidualData  # transitions as those of a state, which tell what is recorded
+    scatter: Array  # standard deviations of first records from the initial states of their tasks, (n,)
+    horizon: int  # number of steps of the longest record
+    replicates: int  # sequences of noise of each draw in a search
     quantile: float
     seed: tuple[int, ...]
+
+    groups: ClassVar[int] = 5
+    """The number of draws of the hyperparameters."""
+    functions: ClassVar[int] = 4
+    """The usual number of weights that are drawn for each of them."""
 
     @property
     def noise(self) -> float:
         """The variance of noise as a share of the mean square of a state's error of M, where it is largest."""
         return self.fit.share
-
-    @property
-    def groups(self) -> int:
-        """The number of draws of the hyperparameters."""
-        return GROUPS
-
-    @property
-    def functions(self) -> int:
-        """The usual number of weights that are drawn for each of them."""
-        return EACH
 
     @property
     def deviations(self) -> Array:
@@ -199,9 +180,8 @@ class NoisyPosterior(ShortRepr):
     @functools.cached_property
     def searched(self) -> NoisyDraws:
         """The same with fewer sequences of noise, with which a search finds the same tasks."""
-        if self.mean.replicates <= ROUGH:
-            return self.mean
-        return replace(self.mean, rows=self.mean.rows[:, :ROUGH], start=self.mean.start[:, :ROUGH])
+        few = replace(self.mean, rows=self.mean.rows[:, :ROUGH], start=self.mean.start[:, :ROUGH])
+        return self.mean if self.mean.replicates <= ROUGH else few
 
     @property
     def rough_mean(self) -> NoisyDraws:
@@ -221,7 +201,7 @@ class NoisyPosterior(ShortRepr):
         hyperparameters: int | None = None,
     ) -> NoisyDraws:
         """Return draws; see :meth:`DynamicsPosterior.draw`. Nothing depends on ``relevant``."""
-        groups, each = GROUPS, EACH if functions is None else functions
+        groups, each = self.groups, self.functions if functions is None else functions
         if hyperparameters is not None:
             groups, each = hyperparameters // 2, 2 * each  # a few for a screening
         return self._with_noise(self.fit.draw(groups, each, rng), rng)

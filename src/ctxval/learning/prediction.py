@@ -1,39 +1,51 @@
-"""The distance that learned dynamics predict, as a function of the task.
+"""The distance that learned dynamics predict as a function of the task, and distances composed of a short vector.
 
 The corrected model ``M_hat = M + r``, with the posterior mean of the residual, replaces the system. The distance
 predicted at p is the ordinary validation of M against M_hat, with the controller designed at p. So the prediction
 includes jumps of the design.
+
+A norm has kinks where the vector is smooth, and each evaluation shows the whole vector, such as the error of the final
+state. So the vector is modelled by Gaussian processes that share a covariance, one for each entry, and values are
+composed of predicted vectors.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
 from ctxval._util.arrays import Array, Rows, single_threaded
 from ctxval._util.cores import on_all_cores
+from ctxval._util.progress import advance
+from ctxval.core.distance import ComposedDistance
+from ctxval.core.trajectory import Trajectory
+from ctxval.errors import ShapeError
+from ctxval.gp.kernels import Linear, Matern, Sum, tenfold
+from ctxval.gp.regression import MultiOutputProcess, log_likelihood_of_outputs, most_likely
 from ctxval.learning.closed_loops import LoopPlanner, halved
 from ctxval.learning.draws import DynamicsDraws
 from ctxval.learning.dynamics_posterior import DynamicsPosterior
-from ctxval.learning.vector import executions_of
 from ctxval.searches import Prediction
+
+Executed = Sequence[tuple[Array, Trajectory]]
+"""Points of the unit cube ``(d,)`` with the system's trajectories there."""
+
+_KERNEL = Sum(Matern(2.5, ard=True, length_scale=(0.05, 100.0), variance=(1e-6, 1e3)), Linear(variance=(1e-6, 1e3)))
+_NOISE = 1e-8  # noise variance relative to the vectors' mean square: it keeps the covariance matrix positive definite
+_LEARNED_FROM = 200  # largest number of vectors, the latest ones, from which the hyperparameters are learned
 
 
 @dataclass(frozen=True, eq=False)
 class PredictedDistance:
-    """The validation of M against M_hat, as a function of points of the unit cube.
-
-    Attributes:
-        executed: executed points ``(n, d)``, in the order of the executions that the posterior knows.
-        in_parallel: whether closed loops are distributed over the cores; their results are the same.
-    """
+    """The validation of M against M_hat, as a function of points of the unit cube."""
 
     planner: LoopPlanner
     posterior: DynamicsPosterior
-    executed: Array
-    in_parallel: bool
+    executed: Array  # executed points (n, d), in the order of the executions that the posterior knows
+    in_parallel: bool  # whether closed loops are distributed over the cores; their results are the same
     mean: DynamicsDraws
 
     _known: dict[bytes, tuple[float, float]] = field(default_factory=dict, init=False)
@@ -45,11 +57,11 @@ class PredictedDistance:
         if new:
             with single_threaded():
                 if self.in_parallel and not all(map(self.planner.has, points[new])):
-                    found = np.concatenate(on_all_cores(self._predicted, list(points[new, None])), axis=1)
+                    predicted = np.concatenate(on_all_cores(self._predicted, list(points[new, None])), axis=1)
                 else:
-                    found = self._predicted(points[new])
-            found = np.where(np.isfinite(found).all(axis=0), found, np.nan)
-            self._known.update(zip((keys[row] for row in new), map(tuple, found.T.tolist()), strict=True))
+                    predicted = self._predicted(points[new])
+            predicted = np.where(np.isfinite(predicted).all(axis=0), predicted, np.nan)
+            self._known.update(zip((keys[row] for row in new), map(tuple, predicted.T.tolist()), strict=True))
         distance, doubt = np.array([self._known[key] for key in keys]).reshape(-1, 2).T
         return distance, doubt
 
@@ -59,22 +71,22 @@ class PredictedDistance:
         without = self.posterior.means_without(executions_of(self.executed, points))
 
         with single_threaded():
-            found = _nan_where_it_fails(
+            distances = _nan_where_it_fails(
                 lambda some: self.planner.own_distances(without[some], points[some, None]).T, len(rows), 1
             )[0]
-        return np.where(np.isfinite(found), found, np.nan)
+        return np.where(np.isfinite(distances), distances, np.nan)
 
     def _predicted(self, points: Array) -> Array:
         """Return distances and doubts ``(2, m)``; NaN for a task that cannot be planned or where a part fails."""
 
         def closed_loops(some: Array) -> Array:
-            found = np.full((2, len(some)), np.nan)
+            predicted = np.full((2, len(some)), np.nan)
             planned = self.planner.plan(some)
             for plan, loops in zip(planned, self.planner.run(self.mean, planned), strict=True):
                 with np.errstate(all="ignore"):
                     doubt = self.posterior.unfamiliarity(loops.states[0], loops.inputs[0])
-                found[:, plan.rows] = loops.distances[0], doubt
-            return found
+                predicted[:, plan.rows] = loops.distances[0], doubt
+            return predicted
 
         return _nan_where_it_fails(lambda rows: closed_loops(points[rows]), len(points), 2)
 
@@ -93,3 +105,97 @@ def predict_distance(
     rough_mean = posterior.rough_mean
     rough = exact if rough_mean is posterior.mean else replace(exact, mean=rough_mean)
     return Prediction(exact, exact.left_out, 2000 if planner.batched else 150, rough=rough)
+
+
+def executions_of(executed: Array, points: Iterable[Array]) -> list[list[int]]:
+    """Return the rows of executed points ``(n, d)`` at each of some points ``(d,)``."""
+    return [np.flatnonzero((executed.reshape(-1, len(point)) == point).all(axis=1)).tolist() for point in points]
+
+
+class ErrorVectors:
+    """Computes the vectors of executions; each needs the design of a controller, so it is kept like its trajectory."""
+
+    def __init__(self, planner: LoopPlanner) -> None:
+        self.validation = planner.validation
+        self._planner = planner
+        self._known: WeakKeyDictionary[Trajectory, Array] = WeakKeyDictionary()
+
+    def of(self, executed: Executed) -> Array | None:
+        """Return the vectors ``(n, k)`` of two executions or more; None if a vector cannot be computed."""
+        distance, validation = self.validation.distance, self.validation
+        if not isinstance(distance, ComposedDistance) or len(executed) < 2:
+            return None
+        try:
+            for point, trajectory in executed:
+                if trajectory in self._known:
+                    continue
+                if self._planner.batched:
+                    plan = validation.plan(validation.space.from_unit(point))
+                    advance()
+                    task, promised = plan.task, plan.model_trajectory
+                else:
+                    (planned,) = self._planner.plan(point[None])
+                    task, promised = planned.task, planned.promised
+                # Some distances change the arrays that they are given.
+                self._known[trajectory] = distance.error(promised.copy(), trajectory.copy(), task)
+            errors = np.array([self._known[trajectory] for _, trajectory in executed])
+        except Exception:  # the user's own parts: a distance may reject even tasks that were executed
+            return None
+        return errors if errors.ndim == 2 and np.isfinite(errors).all() else None
+
+
+def predict_composed(points: Array, vectors: Array, compose: Callable[[Array], Array]) -> Prediction | None:
+    """Return a prediction of values from the vectors ``(n, k)`` of which they are composed at points ``(n, d)``.
+
+    Returns None if fewer than two vectors are known, or if all of them are zero.
+
+    Args:
+        compose: vectors ``(..., k)`` -> values ``(...)``.
+    """
+    if points.ndim != 2 or vectors.ndim != 2 or len(points) != len(vectors):
+        raise ShapeError(f"points must be (n, d) and vectors (n, k), got {points.shape}, {vectors.shape}.")
+    scale = float(np.sqrt((vectors**2).mean())) if len(vectors) else 0.0
+    if len(vectors) < 2 or scale == 0:
+        return None
+    with single_threaded():
+        theta = _most_likely(points[-_LEARNED_FROM:], vectors[-_LEARNED_FROM:] / scale)
+    noises = (_NOISE, *(_NOISE + more for more in tenfold(_NOISE)))  # points may be too similar for the first
+    process = MultiOutputProcess(_KERNEL, theta, points, vectors / scale, noises)
+
+    def expected(at: Array) -> tuple[Array, Array]:
+        """Return the values composed of the expected vectors ``(m,)``, and the relative deviation of draws ``(m,)``."""
+        with single_threaded():
+            mean, variance = process.predict(at)
+        values = np.asarray(compose(scale * mean))
+        # The draws are the same at all points and in all calls, so that the result is a function of the point.
+        draws = np.random.default_rng(0).normal(size=(32, 1, mean.shape[1]))
+        drawn = compose(scale * (mean + np.sqrt(variance)[:, None] * draws))
+        deviation = np.sqrt(((drawn - values) ** 2).mean(axis=0))
+        return values, deviation / np.maximum(np.abs(values), 1e-12 * scale)
+
+    def left_out(rows: Rows) -> Array:
+        return np.asarray(compose(scale * process.left_out(rows)))
+
+    # Many points may be predicted, because no controller is designed for them.
+    return Prediction(expected, left_out, 6000)
+
+
+def _most_likely(X: Array, Y: Array) -> Array:
+    """Return the hyperparameters that make vectors ``(n, k)``, their entries independent, most likely a posteriori."""
+    d = X.shape[1]
+    variance, length, constant, slope = np.log((0.1, 0.5, 0.1, 1.0))  # prior medians, where the climb starts
+    medians = np.array([variance, *[length + 0.5 * np.log(d)] * d, constant, slope])
+    deviations = np.array([3.0, *[1.0] * d, *[3.0] * 2])
+
+    def log_density(theta: Array) -> tuple[float, Array]:
+        away = (theta - medians) / deviations
+        value, gradient = _log_likelihood(theta, X, Y)
+        return value - 0.5 * float(away @ away), gradient - away / deviations
+
+    return most_likely(log_density, medians[None], _KERNEL.bounds(d))
+
+
+def _log_likelihood(theta: Array, X: Array, Y: Array) -> tuple[float, Array]:
+    """Return ``sum_j log p(Y[:, j] | X, theta)``, up to a constant, and its gradient (Rasmussen and Williams, 5.9)."""
+    value, W = log_likelihood_of_outputs(_KERNEL(theta, X, X), _NOISE, Y)
+    return value, _KERNEL.weighted_gradient(theta, X, W)

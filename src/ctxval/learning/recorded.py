@@ -27,10 +27,7 @@ def data_near(model: Model, loops: Trajectory) -> Transitions | None:
 
 
 def recorded_transitions(
-    data: Transitions | None,
-    executed: Sequence[Trajectory],
-    loops: Trajectory,
-    logged: Sequence[Trajectory] = (),
+    data: Transitions | None, executed: Sequence[Trajectory], loops: Trajectory, logged: Sequence[Trajectory] = ()
 ) -> tuple[Transitions, Rows] | None:
     """Return the known transitions of the system and the execution of each; -1 for data that the model was made from.
 

@@ -22,21 +22,17 @@ from ctxval.core.validation import Validation
 from ctxval.learning.draws import DrawnModel
 from ctxval.learning.dynamics_study import DynamicsStudy
 from ctxval.learning.learned_dynamics import LearnedDynamics
-from ctxval.learning.vector import executions_of
+from ctxval.learning.prediction import executions_of
 
 
 @dataclass(frozen=True, eq=False)
 class Replay(ShortRepr):
-    """One executed task on M, and on the corrected model that is learned from all other tasks.
-
-    Attributes:
-        corrected: the closed loop on the corrected model; None if nothing can be learned, or if it diverges.
-        distance: the distance between the closed loops on M and on the corrected model; NaN if there is none.
-    """
+    """One executed task on M, and on the corrected model that is learned from all other tasks."""
 
     task: Task
+    # the closed loop on the corrected model; None if nothing can be learned, or if it diverges
     corrected: Trajectory | None
-    distance: float
+    distance: float  # the distance between the closed loops on M and on the corrected model; NaN if there is none
 
 
 def replay_executed(

@@ -1,4 +1,9 @@
-"""Residuals of recorded transitions, standardised for regression."""
+"""Residuals of recorded transitions, standardised for regression: those of M, or of a linear model in its place.
+
+The residual ``S - M`` is as rough as the rougher one of S and M. The kinks of a network, or the waves of a Gaussian
+process between its data, make it rough although S is smooth. Such a residual takes many executions to learn, and S
+itself only few. The data decide: both models explain the same recorded transitions, with some probability density.
+"""
 
 from __future__ import annotations
 
@@ -9,6 +14,8 @@ import numpy as np
 from ctxval._util.arrays import Array, Mask, Rows
 from ctxval.core.model import Model
 from ctxval.core.trajectory import Transitions
+from ctxval.learning.hyperparameters import highest_log_posterior, learning_rows
+from ctxval.models.linear import Linear
 from ctxval.models.scaling import standard_deviations, standardised_pairs
 
 NEGLIGIBLE = 1e-7
@@ -17,24 +24,16 @@ NEGLIGIBLE = 1e-7
 
 @dataclass(frozen=True, eq=False)
 class ResidualData:
-    """Residuals ``x' - M(x, u)`` of N transitions in units in which they are about 1.
+    """Residuals ``x' - M(x, u)`` of N transitions in units in which they are about 1."""
 
-    Attributes:
-        pairs: standardised state-input pairs, shape ``(N, n + m)``.
-        outputs: standardised residuals, shape ``(N, n)``; 0 if the residual of a state is negligible.
-        sources: the execution of each transition; -1 for data that the model was made from, shape ``(N,)``.
-        shift, scale: constants that standardise a state-input pair, shapes ``(n + m,)``.
-        sizes: root mean square of the residual of each state, shape ``(n,)``.
-        steps: standard deviation of the change of each state in one step, shape ``(n,)``.
-    """
-
-    pairs: Array
-    outputs: Array
-    sources: Rows
+    pairs: Array  # standardised state-input pairs, (N, n + m)
+    outputs: Array  # standardised residuals, (N, n); 0 if the residual of a state is negligible
+    sources: Rows  # the execution of each transition; -1 for data that the model was made from, (N,)
+    # shift, scale: constants that standardise a state-input pair, (n + m,)
     shift: Array
     scale: Array
-    sizes: Array
-    steps: Array
+    sizes: Array  # root mean square of the residual of each state, (n,)
+    steps: Array  # standard deviation of the change of each state in one step, (n,)
     transitions: Transitions
 
     @property
@@ -78,3 +77,55 @@ def residual_data(model: Model, transitions: Transitions, sources: Rows) -> Resi
     return ResidualData(
         (pairs - shift) / scale, outputs, sources[usable], shift, scale, sizes, typical, transitions[usable]
     )
+
+
+def smoother_than(data: ResidualData, count: int) -> tuple[Model, ResidualData] | None:
+    """Return a linear model and its residuals if with them the transitions are far more probable than with M's.
+
+    The hyperparameters are learned from ``count`` transitions.
+    """
+    # With at least 10 transitions for each coefficient, the fit itself explains little.
+    if len(data.pairs) < 10 * (data.pairs.shape[1] + 1) or _is_linear(data):
+        return None
+    rows = learning_rows(data.pairs, data.inputs, count)
+    needed = _log_density(data, rows) + len(rows) * len(data.sizes)  # a gain of 1 for each recorded number
+    known = data.transitions
+    # If S itself is linear, its linear model leaves no residual. The change of its state has the same prior.
+    for linear in (_fitted(known, known.x_next), Identity()):
+        other = residual_data(linear, known, data.sources)
+        if other is not None and len(other.pairs) == len(data.pairs):
+            return (linear, other) if _log_density(other, rows) > needed else None
+    return None
+
+
+class Identity:
+    """The model ``x_next = x``; its residual is the step of the system."""
+
+    def step(self, x: Array, u: Array) -> Array:
+        """Return the state itself."""
+        return x
+
+
+def _log_density(data: ResidualData, rows: Rows) -> float:
+    """Return the log density of transitions in the units of the system, up to a constant that all models share."""
+    sizes = np.maximum(data.sizes, NEGLIGIBLE * data.steps)
+    learned = highest_log_posterior(data.pairs[rows], data.outputs[rows][:, data.learned], data.inputs)
+    return learned - len(rows) * float(np.log(sizes).sum())
+
+
+def _is_linear(data: ResidualData) -> bool:
+    """Return whether the model of these residuals is linear, as far as it matters for them."""
+    known = data.transitions
+    predicted = known.x_next - data.outputs * data.units
+    deviations = predicted - _fitted(known, predicted).step(known.x, known.u)
+    return bool((np.sqrt((deviations**2).mean(axis=0)) <= 1e-3 * data.sizes).all())
+
+
+def _fitted(known: Transitions, following: Array) -> Linear:
+    """Return the linear model with the least squared errors, and with the smallest weights if they are not unique."""
+    pairs, n = np.concatenate([known.x, known.u], axis=1), known.x.shape[1]
+    shift, scale = pairs.mean(axis=0), standard_deviations(pairs)
+    regressors = np.concatenate([(pairs - shift) / scale, np.ones((len(pairs), 1))], axis=1)
+    weights = np.linalg.lstsq(regressors, following - known.x, rcond=1e-10)[0]
+    slopes = (weights[:-1] / scale[:, None]).T
+    return Linear(np.eye(n) + slopes[:, :n], slopes[:, n:], weights[-1] - slopes @ shift)

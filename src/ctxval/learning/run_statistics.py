@@ -29,17 +29,11 @@ _LEAST, _MOST = 1e-6, 0.3  # limits of negligible residuals, as shares of a stat
 
 @dataclass(frozen=True, eq=False)
 class RunStatistics:
-    """The statistics of runs beside what was learned.
+    """The statistics of runs beside what was learned."""
 
-    Attributes:
-        learned: from the certified executions.
-        threshold: tau.
-        influences: what a unit of a constant residual of each state moves the distance of each executed task by,
-            shape ``(n, q)``.
-    """
-
-    learned: LearnedDynamics
-    threshold: float
+    learned: LearnedDynamics  # from the certified executions
+    threshold: float  # tau
+    # what a unit of a constant residual of each state moves the distance of each executed task by, (n, q)
     influences: Array
 
     @classmethod
@@ -97,11 +91,11 @@ class RunStatistics:
         trend = (linear + floors) / (doubt + noise * rank / H + floors)
         gradients = columns.T @ (residuals / (noise + floors))  # (k, n)
         information = columns.T @ columns
-        found = {}
+        statistics = {}
         for i, name in enumerate(names(study, len(whole))):
-            found[f"{name} residuals"] = RunStatistic(float(whole[i]), float(H))
+            statistics[f"{name} residuals"] = RunStatistic(float(whole[i]), float(H))
             known = (gradients[:, i], information / (noise + floors)[i]) if self.has_noise else (None, None)
-            found[f"systematic {name} residuals"] = RunStatistic(float(trend[i]), float(rank), *known)
+            statistics[f"systematic {name} residuals"] = RunStatistic(float(trend[i]), float(rank), *known)
         if point is not None and distance is not None:
             predicted = None
             with contextlib.suppress(Exception):  # the user's parts, at states that no execution has reached
@@ -109,22 +103,17 @@ class RunStatistics:
             if predicted is not None and np.isfinite(predicted.median):
                 least = (NEGLIGIBLE * self.threshold) ** 2
                 error = (distance - predicted.median) ** 2
-                found[DISTANCE] = RunStatistic(float((error + least) / (predicted.deviation**2 + least)), 1.0)
-        return found
+                statistics[DISTANCE] = RunStatistic(float((error + least) / (predicted.deviation**2 + least)), 1.0)
+        return statistics
 
 
 @dataclass(frozen=True)
 class RunStatistic:
-    """One statistic of a run.
+    """One statistic of a run."""
 
-    Attributes:
-        value: positive.
-        freedom: the degrees of freedom that white noise gives it.
-        gradient, information: of the coefficients of 1, state and input, ``(k,)`` and ``(k, k)``; None without noise.
-    """
-
-    value: float
-    freedom: float
+    value: float  # positive
+    freedom: float  # the degrees of freedom that white noise gives it
+    # gradient, information: of the coefficients of 1, state and input, (k,) and (k, k); None without noise
     gradient: Array | None = None
     information: Array | None = None
 

@@ -7,7 +7,6 @@ recorded, beside what it misses in the other states, is chosen by how well the f
 
 from __future__ import annotations
 
-from dataclasses import replace
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -18,7 +17,7 @@ from ctxval.core.model import Model
 from ctxval.core.system import Outputs
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.validation import Validation
-from ctxval.learning.vector import Executed
+from ctxval.learning.prediction import Executed
 from ctxval.models.corrected import before_refinement
 from ctxval.models.scaling import standard_deviations
 
@@ -51,41 +50,34 @@ class StateEstimates:
         The first ``judged`` of them choose how much M misses in what is recorded. It is None if some states cannot be
         estimated, because M or its outputs are not defined or not finite there.
         """
+        space, model = self.validation.space, before_refinement(self.validation.model)
         try:
             with np.errstate(all="ignore"):
-                known = [self._smoothed(point, trajectory) for point, trajectory in executed]
+                for point, trajectory in executed:
+                    if trajectory not in self._known:
+                        task = self.validation.task(space.parameters(space.from_unit(point)))
+                        start = np.asarray(task.initial_state, dtype=np.float64)
+                        self._known[trajectory] = smoothed_states(
+                            model, self.outputs, start, trajectory.states, trajectory.inputs, self.steps
+                        )
         except Exception:  # the user's parts, at states that M never reaches by itself
             return None
+        known = [(*self._known[trajectory], trajectory) for _, trajectory in executed]
         if not known:
             return []
-        errors = np.sum([np.log(np.maximum(errors, 1e-300)) for _, errors in known[: max(judged, 1)]], axis=(0, 2))
-        finite = np.all([np.isfinite(states).all(axis=(0, 2)) for states, _ in known], axis=0)
+        errors = np.sum([np.log(np.maximum(errors, 1e-300)) for _, errors, _ in known[: max(judged, 1)]], axis=(0, 2))
+        finite = np.all([np.isfinite(states).all(axis=(0, 2)) for states, _, _ in known], axis=0)
         if not finite.any():
             return None
-        chosen = int(np.argmin(np.where(finite & np.isfinite(errors), errors, np.inf)))
-        return [
-            _without_end(replace(trajectory, states=states[:, chosen]), trajectory.states.shape[-1])
-            for (states, _), (_, trajectory) in zip(known, executed, strict=True)
-        ]
-
-    def _smoothed(self, point: Array, trajectory: Trajectory) -> tuple[Array, Array]:
-        """Return smoothed states ``(H + 1, k, n)`` and mean squared innovations ``(k, p)``, one for each share."""
-        known = self._known.get(trajectory)
-        if known is None:
-            space = self.validation.space
-            task = self.validation.task(space.parameters(space.from_unit(point)))
-            start, model = np.asarray(task.initial_state, dtype=np.float64), before_refinement(self.validation.model)
-            known = self._known[trajectory] = smoothed_states(
-                model, self.outputs, start, trajectory.states, trajectory.inputs, self.steps
+        chosen, estimated = int(np.argmin(np.where(finite & np.isfinite(errors), errors, np.inf))), []
+        for states, _, trajectory in known:
+            # The last states are left out, because only later outputs would show them.
+            end = min(-(-states.shape[-1] // trajectory.states.shape[-1]) - 1, trajectory.horizon - 1)
+            kept = trajectory.horizon - end
+            estimated.append(
+                Trajectory(trajectory.times[: kept + 1], states[: kept + 1, chosen], trajectory.inputs[:kept])
             )
-        return known
-
-
-def _without_end(trajectory: Trajectory, outputs: int) -> Trajectory:
-    """Return a trajectory without the last states, which only later outputs would show."""
-    n, horizon = trajectory.states.shape[-1], trajectory.horizon
-    kept = horizon - min(-(-n // outputs) - 1, horizon - 1)
-    return Trajectory(trajectory.times[: kept + 1], trajectory.states[: kept + 1], trajectory.inputs[:kept])
+        return estimated
 
 
 def smoothed_states(

@@ -23,17 +23,12 @@ NEAR = 0.05  # largest distance to a recorded state of what it shows, as a share
 
 @dataclass(frozen=True, eq=False)
 class PushResponse:
-    """The largest distances over some tasks if the posterior mean is pushed.
+    """The largest distances over some tasks if the posterior mean is pushed."""
 
-    Attributes:
-        states: the states that are pushed: those in which M errs, shape ``(k,)``.
-        residuals: the largest recorded residual of each of them per second, in the system's units, shape ``(k,)``.
-        everywhere, away: the largest distance for each state and each of ``LEVELS``, ``(k, L)``, if the push acts
-            everywhere, and if it acts only where no record is near; infinity if a rollout diverges.
-    """
-
-    states: Rows
-    residuals: Array
+    states: Rows  # the states that are pushed: those in which M errs, (k,)
+    residuals: Array  # the largest recorded residual of each of them per second, in the system's units, (k,)
+    # everywhere, away: the largest distance for each state and each of LEVELS, (k, L), if the push acts everywhere, and
+    # if it acts only where no record is near; infinity if a rollout diverges
     everywhere: Array
     away: Array
 

@@ -39,29 +39,18 @@ _APART = 0.15  # least distance of two tasks that are not next to each other, as
 
 @dataclass(frozen=True)
 class WorstCaseSettings:
-    """Numbers of closed loops in a search for the largest distance.
+    """Numbers of closed loops in a search for the largest distance."""
 
-    Attributes:
-        pool: number of tasks whose controllers are designed once.
-        evaluations: number of tasks in the global search on the mean, with those of the pool.
-        elites: largest number of tasks from the global search that are run on all draws.
-        shared: number of random tasks of the pool that are run on all draws.
-        moves: number of random moves in each round of the search on each draw.
-        rounds: number of these rounds, at most 4.
-        relevant: number of state-input pairs, on the loops of elites and of random tasks, from which pivots are chosen.
-        peaks: number of elites next to which tasks are tried.
-        nearby: number of tasks next to each of them.
-    """
-
-    pool: int = 1024
-    evaluations: int = 6000
-    elites: int = 24
-    shared: int = 64
-    moves: int = 10
-    rounds: int = 4
+    pool: int = 1024  # number of tasks whose controllers are designed once
+    evaluations: int = 6000  # number of tasks in the global search on the mean, with those of the pool
+    elites: int = 24  # largest number of tasks from the global search that are run on all draws
+    shared: int = 64  # number of random tasks of the pool that are run on all draws
+    moves: int = 10  # number of random moves in each round of the search on each draw
+    rounds: int = 4  # number of these rounds, at most 4
+    # number of state-input pairs, on the loops of elites and of random tasks, from which pivots are chosen
     relevant: int = 700
-    peaks: int = 5
-    nearby: int = 32
+    peaks: int = 5  # number of elites next to which tasks are tried
+    nearby: int = 32  # number of tasks next to each of them
 
     @classmethod
     def for_dimension(cls, dimension: int, batched: bool = True) -> WorstCaseSettings:
@@ -74,25 +63,16 @@ class WorstCaseSettings:
 
 @dataclass(frozen=True, eq=False)
 class WorstCase:
-    """The largest distances over all tasks that a search found, one for each draw of the dynamics.
+    """The largest distances over all tasks that a search found, one for each draw of the dynamics."""
 
-    Attributes:
-        maxima: the largest distance of each draw, shape ``(S,)``; infinity if its closed loop diverges.
-        points: where it lies, points of the unit cube ``(S, d)``.
-        elites: tasks with large distances on the posterior mean, points ``(e, d)``, the largest first.
-        evaluations: number of closed loops that were compared; a few of them may be the same.
-        left_out: largest share of the posterior variance that a draw leaves out between its pivots.
-        unplanned: share of the pool's tasks for which no controller can be designed, or on which M diverges.
-        sharpness: largest share by which a distance on the mean is larger than those of tasks that are nearly the same.
-    """
-
-    maxima: Array
-    points: Array
+    maxima: Array  # the largest distance of each draw, (S,); infinity if its closed loop diverges
+    points: Array  # where it lies, points of the unit cube (S, d)
     of_mean: float
-    elites: Array
-    evaluations: int
-    left_out: float
-    unplanned: float
+    elites: Array  # tasks with large distances on the posterior mean, points (e, d), the largest first
+    evaluations: int  # number of closed loops that were compared; a few of them may be the same
+    left_out: float  # largest share of the posterior variance that a draw leaves out between its pivots
+    unplanned: float  # share of the pool's tasks for which no controller can be designed, or on which M diverges
+    # largest share by which a distance on the mean is larger than those of tasks that are nearly the same
     sharpness: float = 0.0
 
 
@@ -114,16 +94,16 @@ class WorstCaseSearch:
 
     def expected_loops(self, draws: int) -> int:
         """Return about how many closed loops a search with so many draws runs, on M and on the draws."""
-        own, all_draws = self.settings, self.settings.elites + self.settings.shared + _SHOWN
-        moves = own.rounds * (2 * self.dimension + own.moves + 1)
-        return 2 * own.evaluations + all_draws + draws * (all_draws + 2 * moves)
+        settings, all_draws = self.settings, self.settings.elites + self.settings.shared + _SHOWN
+        moves = settings.rounds * (2 * self.dimension + settings.moves + 1)
+        return 2 * settings.evaluations + all_draws + draws * (all_draws + 2 * moves)
 
     @property
     def screening_loops(self) -> int:
         """About how many closed loops a screening runs."""
-        own = self.settings
-        shared = own.elites + own.shared // 4
-        return 2 * own.pool + min(_SCREENED[1], own.evaluations) + (1 + _SCREENED[0]) * shared
+        settings = self.settings
+        shared = settings.elites + settings.shared // 4
+        return 2 * settings.pool + min(_SCREENED[1], settings.evaluations) + (1 + _SCREENED[0]) * shared
 
     @functools.cached_property
     def pool(self) -> Array:
@@ -150,8 +130,7 @@ class WorstCaseSearch:
         """Three nearly equal tasks in a row from each task of the pool, points ``(N, 3, d)``, and their plans."""
         moves = np.random.default_rng([self._seed, 1]).uniform(-_NEARBY, _NEARBY, self.pool.shape)
         outside = (self.pool + 2 * moves < 0) | (self.pool + 2 * moves > 1)
-        steps = np.arange(3)[:, None] * np.where(outside, -moves, moves)[:, None]
-        tasks = self.pool[:, None] + steps
+        tasks = self.pool[:, None] + np.arange(3)[:, None] * np.where(outside, -moves, moves)[:, None]
         return tasks, self.planner.plan(tasks.reshape(-1, self.dimension))
 
     def largest_jump(self, posterior: AnyPosterior) -> float:
@@ -165,31 +144,31 @@ class WorstCaseSearch:
             return 0.0
         with single_threaded():
             tasks, planned = self._in_rows
-            found = self.planner.distances(posterior.mean, planned, tasks.shape[0] * tasks.shape[1])[0]
-        of_rows = found.reshape(tasks.shape[:2])
-        if is_kinked(self.planner.validation.distance):
-            of_rows = self._nearer(posterior, tasks, of_rows)
-        jumps = np.abs(of_rows[:, 1] - 0.5 * (of_rows[:, 0] + of_rows[:, 2]))
+            of_rows = self.planner.distances(posterior.mean, planned, tasks.shape[0] * 3)[0].reshape(-1, 3)
+            if is_kinked(self.planner.validation.distance):
+                of_rows = self._nearer(posterior, tasks, of_rows)
+        jumps = _bend(of_rows)
         return float(jumps[np.isfinite(jumps)].max(initial=0.0))
 
-    def _nearer(self, posterior: AnyPosterior, tasks: Array, found: Array) -> Array:
+    def _nearer(self, posterior: AnyPosterior, tasks: Array, distances: Array) -> Array:
         """Return distances ``(k, 3)`` of three tasks in a row that are ``_NEARER`` times nearer, where they bend most.
 
         Of each row, the half with the larger change is kept, which a jump is in.
         """
-        bend = np.nan_to_num(np.abs(found[:, 1] - 0.5 * (found[:, 0] + found[:, 2])), nan=0.0, posinf=0.0)
-        rows = np.argsort(-bend, kind="stable")[:_BENT]
-        tasks, found = tasks[rows], found[rows]
+        rows = np.argsort(-np.nan_to_num(_bend(distances), nan=0.0, posinf=0.0), kind="stable")[:_BENT]
+        tasks, distances = tasks[rows], distances[rows]
         for _ in range(int(np.log2(_NEARER))):
-            later = np.abs(found[:, 2] - found[:, 1]) > np.abs(found[:, 1] - found[:, 0])
+            later = np.abs(distances[:, 2] - distances[:, 1]) > np.abs(distances[:, 1] - distances[:, 0])
             ends = np.where(later[:, None], [1, 2], [0, 1])
-            tasks, found = np.take_along_axis(tasks, ends[..., None], axis=1), np.take_along_axis(found, ends, axis=1)
+            tasks, distances = (
+                np.take_along_axis(tasks, ends[..., None], axis=1),
+                np.take_along_axis(distances, ends, axis=1),
+            )
             middle = tasks.mean(axis=1)
-            with single_threaded():
-                value = self.planner.distances(posterior.mean, self.planner.plan(middle), len(middle))[0]
+            value = self.planner.distances(posterior.mean, self.planner.plan(middle), len(middle))[0]
             tasks = np.stack([tasks[:, 0], middle, tasks[:, 1]], axis=1)
-            found = np.stack([found[:, 0], value, found[:, 1]], axis=1)
-        return found
+            distances = np.stack([distances[:, 0], value, distances[:, 1]], axis=1)
+        return distances
 
     def deeper(self, posterior: AnyPosterior, rng: np.random.Generator) -> tuple[Array, Array]:
         """Return the largest distances on the mean ``(2,)`` in two separate searches, and their points ``(2, d)``.
@@ -199,8 +178,8 @@ class WorstCaseSearch:
         distance, none = self._on_one(posterior.mean), np.empty((0, self.dimension))
         evaluations = 4 * self.settings.evaluations
         with single_threaded():
-            found = [search_globally(distance, self.dimension, none, rng, evaluations=evaluations) for _ in range(2)]
-        return np.array([one.values[0] for one in found]), np.array([one.points[0] for one in found])
+            maxima = [search_globally(distance, self.dimension, none, rng, evaluations=evaluations) for _ in range(2)]
+        return np.array([maximum.values[0] for maximum in maxima]), np.array([each.points[0] for each in maxima])
 
     def on_mean(
         self, posterior: AnyPosterior, of_pool: Array, known: Array, rng: np.random.Generator, *, globally: bool = True
@@ -230,9 +209,9 @@ class WorstCaseSearch:
                 apart = separated_rows(points, _APART * np.sqrt(self.dimension), settings.elites)
                 return self._of_mean(posterior, float(values[0]), points[apart], len(points))
             evaluations = max(len(starts) + 50, settings.evaluations - len(self.pool))
-            found = search_globally(distance, self.dimension, starts, rng, evaluations=evaluations)
-        elites = np.concatenate([found.points[:1], found.elites[: settings.elites]])
-        return self._of_mean(posterior, float(found.values[0]), elites, found.evaluations)
+            maximum = search_globally(distance, self.dimension, starts, rng, evaluations=evaluations)
+        elites = np.concatenate([maximum.points[:1], maximum.elites[: settings.elites]])
+        return self._of_mean(posterior, float(maximum.values[0]), elites, maximum.evaluations)
 
     def _of_mean(self, posterior: AnyPosterior, highest: float, elites: Array, evaluations: int) -> WorstCase:
         if posterior.searched is not posterior.mean:
@@ -338,21 +317,21 @@ class WorstCaseSearch:
                 # Each draw tries the best tasks of all others.
                 ordered = points[np.argsort(-best, kind="stable")]
                 shown = ordered[separated_rows(ordered, 0.02 * np.sqrt(self.dimension), _SHOWN)]
-                found = self._distances(draws, shown)
-                points, best = _better(points, best, np.broadcast_to(shown, (len(best), *shown.shape)), found)
-                loops += found.size
+                distances = self._distances(draws, shown)
+                points, best = _better(points, best, np.broadcast_to(shown, (len(best), *shown.shape)), distances)
+                loops += distances.size
             some, at, highest = draws[searched], points[searched], best[searched]
             moved = self._moves(at, second[searched], share, rng)
-            found = _finite(self.planner.own_distances(some, moved))
-            together = _together(at, highest, moved, found)[:, None]
+            distances = _finite(self.planner.own_distances(some, moved))
+            together = _together(at, highest, moved, distances)[:, None]
             known = np.concatenate([at[:, None], moved], axis=1)
             if (together == known).all(axis=2).any(axis=1).all():
                 last = np.full((len(at), 1), -np.inf)  # none of them is a new task
             else:
                 last = _finite(self.planner.own_distances(some, together))
-            tried, found = np.concatenate([moved, together], axis=1), np.concatenate([found, last], axis=1)
-            points[searched], best[searched] = _better(at, highest, tried, found)
-            loops += found.size
+            tried, distances = np.concatenate([moved, together], axis=1), np.concatenate([distances, last], axis=1)
+            points[searched], best[searched] = _better(at, highest, tried, distances)
+            loops += distances.size
             # A draw that will not reach the median does not set a bound.
             searched = np.flatnonzero(best + 3 * (best - before).max() >= np.median(best))
         return points, best, loops
@@ -388,6 +367,11 @@ class WorstCaseSearch:
         return np.concatenate([to_bounds, random], axis=1)
 
 
+def _bend(distances: Array) -> Array:
+    """Return how far the distances of tasks in rows ``(k, 3)`` are from the middle of those on both sides."""
+    return np.asarray(np.abs(distances[:, 1] - 0.5 * (distances[:, 0] + distances[:, 2])))
+
+
 def is_kinked(distance: object) -> bool:
     """Return whether a distance, or the user's distance in it, has kinks."""
     while distance is not None:
@@ -410,16 +394,16 @@ def _finite(distances: Array) -> Array:
     return np.where(np.isnan(distances), -np.inf, np.minimum(distances, _DIVERGED))
 
 
-def _better(points: Array, best: Array, tried: Array, found: Array) -> tuple[Array, Array]:
+def _better(points: Array, best: Array, tried: Array, distances: Array) -> tuple[Array, Array]:
     """Return, for each draw, the best of its point ``(S, d)`` and those that were tried, ``(S, q, d)``."""
-    row, at = np.arange(len(points)), found.argmax(axis=1)
-    better = found[row, at] > best
-    return np.where(better[:, None], tried[row, at], points), np.where(better, found[row, at], best)
+    row, at = np.arange(len(points)), distances.argmax(axis=1)
+    better = distances[row, at] > best
+    return np.where(better[:, None], tried[row, at], points), np.where(better, distances[row, at], best)
 
 
-def _together(points: Array, best: Array, moved: Array, found: Array) -> Array:
+def _together(points: Array, best: Array, moved: Array, distances: Array) -> Array:
     """Return each point ``(d,)`` after all moves to bounds that help; of two that help, the better one."""
     d = points.shape[1]
-    down, up = found[:, :d], found[:, d : 2 * d]
+    down, up = distances[:, :d], distances[:, d : 2 * d]
     at_bounds = np.where(down > up, 0.0, 1.0)
     return np.where(np.maximum(down, up) > best[:, None], at_bounds, points)
