@@ -14,21 +14,20 @@ from ctxval.errors import InputError
 TAU, BUDGET = 0.3, 14
 
 
-def campaign_of(store: Path | None = None) -> Campaign:
-    validation = make_validation_without_inputs()
-    tau = threshold_of(validation)
-    return Campaign(validation, seed=2, store=store).run(BUDGET, tau, envelope=True)
-
-
 def threshold_of(validation) -> float:  # type: ignore[no-untyped-def]
     return float(np.quantile(validation.distances(validation.space.grid(15)), 0.6))
 
 
+@pytest.fixture(scope="module")
+def whole() -> Campaign:
+    """A campaign without interruption, which the tests leave as it is."""
+    validation = make_validation_without_inputs()
+    return Campaign(validation, seed=2).run(BUDGET, threshold_of(validation), envelope=True)
+
+
 @pytest.mark.slow
-@pytest.mark.in_full
-def test_it_finds_the_true_set_after_a_falsification_and_includes_nothing_else() -> None:
-    campaign = campaign_of()
-    validation = campaign.validation
+def test_it_finds_the_true_set_after_a_falsification_and_includes_nothing_else(whole: Campaign) -> None:
+    campaign, validation = whole, whole.validation
     tau = threshold_of(validation)
     assert campaign.verdict(tau).answer == "falsified"
     envelope = campaign.envelope(tau)
@@ -46,8 +45,7 @@ def test_it_finds_the_true_set_after_a_falsification_and_includes_nothing_else()
 
 
 @pytest.mark.slow
-def test_a_resumed_campaign_makes_the_same_choices(tmp_path: Path) -> None:
-    whole = campaign_of()
+def test_a_resumed_campaign_makes_the_same_choices(whole: Campaign, tmp_path: Path) -> None:
     path = tmp_path / "c.sqlite"
     validation = make_validation_without_inputs()
     tau = threshold_of(validation)

@@ -379,6 +379,7 @@ def test_a_thread_that_hangs_is_given_up() -> None:
 @pytest.mark.slow
 @pytest.mark.skipif(importlib.util.find_spec("distributed") is None, reason="needs dask.distributed")
 @pytest.mark.filterwarnings("ignore")
+@pytest.mark.thorough  # test_clusters.py kills a worker of Dask, too
 def test_a_campaign_on_dask_survives_the_death_of_a_worker(tmp_path: Path) -> None:
     script = tmp_path / "cluster.py"
     script.write_text(DASK)
@@ -485,7 +486,7 @@ def test_the_first_interrupt_ends_after_the_running_executions(tmp_path: Path, w
 
 
 @pytest.mark.parametrize("workers", [1, 2])
-@pytest.mark.parametrize(("part", "method"), [("TrialRecorder", "_open"), ("ProcessPool", "_start_worker")])
+@pytest.mark.parametrize(("part", "method"), [("TrialRecorder", "open_all"), ("ProcessPool", "_start_worker")])
 def test_an_interrupt_while_an_execution_begins_leaves_it_to_end(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, part: str, method: str, workers: int
 ) -> None:
@@ -495,7 +496,7 @@ def test_an_interrupt_while_an_execution_begins_leaves_it_to_end(
 
     def interrupted(*arguments: Any, **options: Any) -> Any:
         begun = begin(*arguments, **options)
-        if next(calls) == (1 if method == "_open" else workers):
+        if next(calls) == (1 if method == "open_all" else workers):
             signal.raise_signal(signal.SIGINT)
         return begun
 

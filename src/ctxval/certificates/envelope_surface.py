@@ -18,7 +18,7 @@ from scipy.spatial.distance import cdist
 
 from ctxval._util.arrays import Array
 from ctxval._util.files import MADE_BY
-from ctxval._util.onnx_graph import GraphValue
+from ctxval._util.onnx_network import GraphValue
 from ctxval.core.space import TaskSpace
 
 ENOUGH = 1.2  # multiple of the limit up to which an error of what exceeds it matters

@@ -19,9 +19,8 @@ from ctxval.certificates.bounds import ERRORS, rank_within
 from ctxval.certificates.sample import Sample, advice_to_remeasure, listed
 from ctxval.certificates.sentences import two_distances
 from ctxval.errors import CertificateError
-from ctxval.gp.hyperposterior import EXACT, Conditioned, Prior, draw_hyperparameters
-from ctxval.gp.sample_paths import draw_paths, maxima
-from ctxval.gp.subset import kept_rows
+from ctxval.gp.hyperposterior import EXACT, Conditioned, Prior, draw_hyperparameters, draw_paths, maxima
+from ctxval.gp.surrogate import kept_rows
 
 FEWEST = 4  # trials for a bound
 MOST = 160  # trials that a process is conditioned on; the effort of a draw grows with its cube
