@@ -75,7 +75,8 @@ class Lipschitz(CertificateKind):
 @pytest.fixture
 def recipe(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     """Import the file of the recipe, and forget the kind afterwards."""
-    monkeypatch.setattr(KINDS, "_registered", dict(KINDS._registered))
+    monkeypatch.setattr(KINDS, "_registered", set(KINDS._registered))
+    monkeypatch.setattr(KINDS, "_built_in", dict(KINDS._built_in))
     (tmp_path / "lipschitz.py").write_text(RECIPE)
     monkeypatch.syspath_prepend(str(tmp_path))
     monkeypatch.delitem(sys.modules, "lipschitz", raising=False)

@@ -265,25 +265,20 @@ def looked(known: int, smaller: Sequence[float], largest: float, quantities: Qua
     return "".join(f"; {part}" for part in parts)
 
 
-def not_fitted(known: int) -> list[str]:
-    """Return that a threshold was not chosen to suit the distances that were known; nothing if none were."""
-    which = "distance that was" if known == 1 else "distances that were"
-    sentence = f"the threshold not being chosen to suit the {known} {which} known when it was stated"
-    return [sentence] if known else []
-
-
-def not_selected(others: int, falsifying: Sequence[str]) -> str:
-    """Return that a campaign was not selected, with what other stores of the same experiment say of the threshold."""
-    alone = "this campaign not being chosen among several"
+def not_selected(known: int, others: int, falsifying: Sequence[str]) -> list[str]:
+    """Return that neither a threshold nor a campaign was selected, by what was known and by other stores."""
+    distances = "distance that was" if known == 1 else "distances that were"
+    fitted = f"the threshold not being chosen to suit the {known} {distances} known when it was stated"
+    sentences, alone = [fitted] if known else [], "this campaign not being chosen among several"
     if not others:
-        return alone
+        return [*sentences, alone]
     lie = "store of this experiment lies" if others == 1 else "stores of this experiment lie"
     which = "none of them falsifies the threshold" if others > 1 else "it does not falsify the threshold"
     if falsifying:
         verb = "falsifies" if len(falsifying) == 1 else "falsify"
         count = "it falsifies" if others == 1 else f"{len(falsifying)} of them {verb}"
         which = f"{count} the threshold ({enumerated(map(quoted, falsifying), 5)})"
-    return f"{alone} ({others} other {lie} beside it, and {which})"
+    return [*sentences, f"{alone} ({others} other {lie} beside it, and {which})"]
 
 
 def _without_assumptions(certificate: Certificate, tau: float, quantities: Quantities) -> str:
