@@ -31,15 +31,13 @@ _Outcome = tuple[Certificate, Forecast | None]
 class Automatic(CertificateKind):
     """The bound from learned dynamics if it keeps the threshold, otherwise the posterior bound of the distance.
 
-    For a suite of tasks, it is the bound from learned dynamics until all tasks were executed.
-    The dynamics bound is tried only if the experiment is loaded, the system is declared deterministic, and the
-    resolution is the usual one. If neither keeps the threshold, the certificate is the one that is nearer to a
-    decision.
+    For a suite of tasks, it is the bound from learned dynamics until all tasks were executed. That bound is tried only
+    if the experiment is loaded, the system is declared deterministic, and the resolution is the usual one. If neither
+    keeps the threshold, the certificate is the one that is nearer to a decision.
 
     Attributes:
         stochastic, resolution: as for the posterior bound.
-        tests: the number of executions at tasks drawn over the task space, which must be predicted beforehand if the
-            bound is from learned dynamics.
+        tests: the number of executions at tasks drawn over the task space that are needed.
         quantile: the share of the executions of each task that the bound is about, if they differ by noise.
     """
 

@@ -34,12 +34,10 @@ class Certificate:
         trials: the number n of trials that it is computed from.
         assumptions: conditions under which the statement holds, one sentence each.
         details: the numbers from which the statement is computed.
-        doubt: why the certificate is withdrawn, if the trials contradict an assumption; None if they do not. The
-            statement of a withdrawn certificate must not be used.
+        doubt: why the certificate is withdrawn, so that its statement must not be used; None if it is not.
         error: standard error of ``upper_bound`` in the distance's units, if it is computed from random draws; else 0.
         version: the version of ctxval that computed it.
-        distribution: the distribution of tasks as a text, under which ``volume`` is a probability; None if it is
-            uniform.
+        distribution: the distribution of tasks as a text, which ``volume`` is a share of; None if it is uniform.
     """
 
     kind: str

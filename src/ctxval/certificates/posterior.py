@@ -44,7 +44,7 @@ class Posterior(CertificateKind):
     Attributes:
         stochastic: whether two executions of one task may differ; then the largest expected distance is bounded.
         resolution: largest distance from a task to its nearest trial, in diagonals of the task space; beyond it the
-            bound is withdrawn. With 1 the bound is never withdrawn for this reason.
+            bound is withdrawn. With 1 it is never withdrawn for this reason.
     """
 
     name: ClassVar[str] = "posterior"
@@ -163,8 +163,7 @@ class Diagnosis(ShortRepr):
     """How well the process predicts its own data.
 
     Attributes:
-        surprise: p-value of the largest error upward: the probability, under the process, that the largest one of all
-            trials is at least as large.
+        surprise: the probability, under the process, that the largest error upward is at least as large.
         trial: number of the trial with the largest error upward.
         left_out: root mean square of the standardised leave-one-out errors; about 1 if the process fits the data.
         farthest: largest distance from a task to its nearest trial, in diagonals of the task space.

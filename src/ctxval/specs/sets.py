@@ -219,15 +219,15 @@ class Union(Set):
         object.__setattr__(self, "sets", as_sets("sets of a Union", self.sets))
 
     def signed_distance(self, positions: Array, task: Task) -> Array:
-        return np.asarray(functools.reduce(np.minimum, (one.signed_distance(positions, task) for one in self.sets)))
+        return np.asarray(functools.reduce(np.minimum, (each.signed_distance(positions, task) for each in self.sets)))
 
     def grown(self, by: float) -> Union:
         if by >= 0:
-            return Union([one.grown(by) for one in self.sets])
+            return Union([each.grown(by) for each in self.sets])
         left = []
-        for one in self.sets:
+        for each in self.sets:
             with suppress(InputError):  # nothing is left of it
-                left.append(one.grown(by))
+                left.append(each.grown(by))
         if not left:
             raise InputError(f"nothing is left of a Union of {len(self.sets)} sets that shrinks by {-by:g}.")
         return Union(left)
@@ -281,7 +281,7 @@ def as_sets(what: str, given: Any) -> tuple[Set, ...]:
     listed = given if isinstance(given, list | tuple) else [given]
     if not listed:
         raise InputError(f"{what} must name at least one set, got none.")
-    return tuple(as_set(what, one) for one in listed)
+    return tuple(as_set(what, each) for each in listed)
 
 
 def _other_dimension(what: str, got: int, wanted: int) -> ShapeError:
