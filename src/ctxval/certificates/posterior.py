@@ -89,8 +89,14 @@ def certify_posterior(
     drawn = draw_maxima(sample, stochastic=stochastic, seed=seed) if found is None else found
     upper, error = drawn.upper(confidence), drawn.error(confidence)
     unordered, d = np.array([origin == "manual" for origin in used.origins]), sample.points.shape[1]
-    limits: Any = {"unordered": unordered, "resolution": resolution, "covered": sample.points}
-    diagnosis = diagnose(drawn.conditioned, used.points, used.numbers, **limits)
+    diagnosis = diagnose(
+        drawn.conditioned,
+        used.points,
+        used.numbers,
+        unordered=unordered,
+        resolution=resolution,
+        covered=sample.points,
+    )
     hyperparameters = [process.hyperparameters for process in drawn.conditioned]
     rough = float(np.mean([each.nu == 1.5 for each in hyperparameters]))
     return Certificate(
