@@ -157,6 +157,9 @@ def test_a_kind_of_another_package_is_imported_when_it_is_asked_for(elsewhere: M
 def test_a_kind_is_registered_once() -> None:
     known = KindRegistry()
     assert known.register(Largest) is known.register(Largest) is known["largest"]
+    assert not known.is_data("largest")  # it is the user's own code
+    assert known.register(Posterior) is Posterior
+    assert known.is_data("posterior")
 
     class Other(Largest):
         pass

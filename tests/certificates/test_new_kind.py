@@ -16,9 +16,18 @@ from typer.testing import CliRunner
 
 from conftest import make_validation
 from ctxval import Campaign, certificates
-from ctxval.certificates import KINDS, Certificate, CertificateKind, CertificateOptions, Sample
+from ctxval.certificates import (
+    KINDS,
+    PLANNED,
+    Certificate,
+    CertificateKind,
+    CertificateOptions,
+    Sample,
+    judge,
+)
 from ctxval.cli import app
 from ctxval.cli.config.settings import CertificateTable
+from ctxval.core.trial import Trial
 from ctxval.errors import ConformanceError
 from ctxval.testing import check_certificate
 
@@ -66,7 +75,8 @@ class Lipschitz(CertificateKind):
 @pytest.fixture
 def recipe(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     """Import the file of the recipe, and forget the kind afterwards."""
-    monkeypatch.setattr(KINDS, "_registered", dict(KINDS._registered))
+    monkeypatch.setattr(KINDS, "_registered", set(KINDS._registered))
+    monkeypatch.setattr(KINDS, "_built_in", dict(KINDS._built_in))
     (tmp_path / "lipschitz.py").write_text(RECIPE)
     monkeypatch.syspath_prepend(str(tmp_path))
     monkeypatch.delitem(sys.modules, "lipschitz", raising=False)
@@ -97,6 +107,23 @@ def test_a_kind_that_counts_draws_whose_number_depended_on_results_is_noticed() 
         check_certificate(kind, trials)
     with pytest.raises(ConformanceError, match="by draws that ended with the verdict"):
         check_certificate(Counting(), trials)
+    check_certificate(Counting(all_of_them=False))
+    with pytest.raises(ConformanceError, match="by draws that ended with the verdict"):
+        check_certificate(Counting())
+
+
+@pytest.mark.parametrize(
+    ("planned", "trials"), [([0] * 5, None), ([0, 0, 5, 5, 5], 3), ([3, 3, 3, 5, 5], 2), ([5] * 5, 5)]
+)
+def test_a_verdict_gives_any_kind_only_draws_whose_number_did_not_depend_on_results(
+    planned: list[int], trials: int | None
+) -> None:
+    drawn = [
+        Trial(k, "iid", "completed", np.array([0.2 * k]), {"p": 0.2 * k}, distance=0.1 * k, note={PLANNED: draws})
+        for k, draws in enumerate(planned)
+    ]
+    verdict = judge(drawn, 1.0, CertificateOptions(Counting(), 0.9, volume=0.5))
+    assert (None if verdict.certificate is None else verdict.certificate.trials) == trials
 
 
 @pytest.mark.slow

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field, fields
 from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeVar
 
@@ -34,12 +34,10 @@ class Certificate:
         trials: the number n of trials that it is computed from.
         assumptions: conditions under which the statement holds, one sentence each.
         details: the numbers from which the statement is computed.
-        doubt: why the certificate is withdrawn, if the trials contradict an assumption; None if they do not. The
-            statement of a withdrawn certificate must not be used.
+        doubt: why the certificate is withdrawn, so that its statement must not be used; None if it is not.
         error: standard error of ``upper_bound`` in the distance's units, if it is computed from random draws; else 0.
         version: the version of ctxval that computed it.
-        distribution: the distribution of tasks as a text, under which ``volume`` is a probability; None if it is
-            uniform.
+        distribution: the distribution of tasks as a text, which ``volume`` is a share of; None if it is uniform.
     """
 
     kind: str
@@ -179,46 +177,37 @@ class KindRegistry(Registry[CertificateKind]):
 
     def __init__(self) -> None:
         super().__init__("certificate", "ctxval.certificates", method="certify")
-        self._registered: dict[str, type[CertificateKind]] = {}
+        self._registered: set[str] = set()
 
     def register(self, kind: Kind) -> Kind:
-        """Add a kind; a decorator of its class."""
+        """Add a kind; a decorator of its class. A cell that is run again replaces its own class."""
         name = _required(kind).name
-        known = self.find(name) if name in self.built_in else self._registered.get(name, kind)
+        known = self._built_in.get(name, kind)
         if (known.__module__, known.__qualname__) != (kind.__module__, kind.__qualname__):
             raise InputError(f"there is a kind of certificate called {name!r} already: {known.__qualname__}.")
-        if name not in self.built_in:
-            self._registered[name] = kind  # a cell that is run again replaces its own class
+        if name in self._registered or name not in self._built_in:
+            self._registered.add(name)
+            self._built_in[name] = kind
         return kind
+
+    def is_data(self, name: Any) -> bool:
+        """Return whether a kind with plain arguments runs no code of a user."""
+        return name not in self._registered and super().is_data(name)
 
     def find(self, name: str) -> type[CertificateKind]:
         """Return the kind of a name."""
-        kind = self._registered.get(name) or _required(super().find(name))
+        kind = _required(super().find(name))
         if kind.name != name:
             raise InputError(f"the certificate {name!r} calls itself {kind.name!r}.")
         return kind
-
-    @property
-    def imported(self) -> tuple[str, ...]:
-        """The names of built-in and registered kinds."""
-        return (*self.built_in, *self._registered)
 
     def of(self, certificate: Certificate) -> type[CertificateKind]:
         """Return the kind of a certificate; the base class :class:`CertificateKind` if the kind is not known."""
         return self.find(certificate.kind) if certificate.kind in self else CertificateKind
 
     def with_option(self, option: str) -> tuple[str, ...]:
-        """Return the names of the imported kinds that have an option."""
-        return tuple(name for name in self.imported if option in self.find(name).options())
-
-    def __contains__(self, name: object) -> bool:
-        return name in self._registered or super().__contains__(name)
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(dict.fromkeys((*self.imported, *self.installed)))
-
-    def __len__(self) -> int:
-        return sum(1 for _ in self)
+        """Return the names of the built-in and registered kinds that have an option."""
+        return tuple(name for name in self.built_in if option in self.find(name).options())
 
 
 def _required(kind: Any) -> type[CertificateKind]:

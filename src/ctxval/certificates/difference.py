@@ -41,10 +41,8 @@ class PairedDifferences:
 
     Attributes:
         values: differences D_i, shape ``(N,)``.
-        predicted: what was predicted for each of them before its task was drawn, minus the mean of this prediction over
-            other tasks, shape ``(N,)``; 0 if nothing was predicted.
-        most: a number that no distance can exceed, so that differences and predictions lie within +- most; None if none
-            is known.
+        predicted: what was predicted for each before its task was drawn, minus the mean of this prediction, or 0.
+        most: a number that no distance can exceed; None if none is known.
     """
 
     values: Array
@@ -86,8 +84,8 @@ class MeanDifference:
         sign: 1 if the expected difference is above 0, -1 if it is below, 0 if this is not decided.
         decided_after: the number of tasks after which the sign was decided; None if it is not.
         tasks: the number of tasks.
-        variance_left: the variance of the later half of the corrected differences, as a share of the variance of the
-            differences; 1 if the predictions do not help, None if there are too few tasks.
+        variance_left: the variance of the later half of the corrected differences, as a share of that of the
+            differences; None if there are too few tasks.
     """
 
     estimate: float | None

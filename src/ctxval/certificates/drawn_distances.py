@@ -21,8 +21,7 @@ class DrawnDistances(ShortRepr):
     Attributes:
         points: tasks, points of the unit cube ``(K, d)``.
         draws: distances on S draws ``(S, K)``; infinity if the loop diverges, NaN if no controller can be designed.
-        beyond: how far the loop on the mean leaves the records in a coordinate, as a share of the visited range
-            ``(K,)``.
+        beyond: how far the loop on the mean leaves the records, as a share of the visited range ``(K,)``.
     """
 
     points: Array

@@ -50,8 +50,8 @@ class Surfaces:
         centres: the tasks at which the numbers are known, shape ``(K, d)``.
         weights: shape ``(K + 1 + d, c)``.
         left_out: what each number would be if its task were left out, shape ``(K, c)``.
-        errors: by how much that is wrong, shape ``(K, c)``; the largest of the nearest tasks is the local error. Its
-            sign does not count: what is too large at a task is too small between others.
+        errors: by how much that is wrong, shape ``(K, c)``; the largest of the nearest is the local error. Its sign
+            does not count: what is too large at a task is too small between others.
     """
 
     centres: Array

@@ -65,14 +65,14 @@ def forecast(
 
 def _future(
     sample: Sample,
-    found: Maxima,
+    maxima: Maxima,
     conditioned: Conditioned,
     threshold: float,
     confidence: float,
     rng: np.random.Generator,
 ) -> tuple[float, bool]:
     """Return the number of executions until a future is decided, or infinity, and whether the threshold is kept."""
-    highest = found.points[:: max(1, len(found.points) // 100)]
+    highest = maxima.points[:: max(1, len(maxima.points) // 100)]
     candidates = np.concatenate([highest, rng.random((400, sample.points.shape[1]))])
     warp = conditioned.warp  # from here on everything is on the process's scale
     best, limit = float(warp.forward(sample.best)), float(warp.forward(threshold))
@@ -86,7 +86,7 @@ def _future(
         middle = 0.5 * (low + width)
         low, width = (middle, width) if float((mean + middle * deviation).max()) < bound else (low, middle)
     # The first bound is that of all draws together: one draw must not decide what all together leave undecided.
-    bound = max(float(warp.forward(found.upper(confidence))), best)
+    bound = max(float(warp.forward(maxima.upper(confidence))), best)
     for executions in range(HORIZON + 1):
         if best > limit:
             return executions, False

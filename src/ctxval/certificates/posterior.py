@@ -45,7 +45,7 @@ class Posterior(CertificateKind):
 
     Attributes:
         resolution: largest distance from a task to its nearest trial, in diagonals of the task space; beyond it the
-            bound is withdrawn. With 1 the bound is never withdrawn for this reason.
+            bound is withdrawn. With 1 it is never withdrawn for this reason.
     """
 
     name: ClassVar[str] = "posterior"
@@ -87,8 +87,14 @@ def certify_posterior(
     stochastic = drawn.stochastic
     upper, error = drawn.upper(confidence), drawn.error(confidence)
     unordered, d = np.array([origin == "manual" for origin in used.origins]), sample.points.shape[1]
-    limits: Any = {"unordered": unordered, "resolution": resolution, "covered": sample.points}
-    diagnosis = diagnose(drawn.conditioned, used.points, used.numbers, **limits)
+    diagnosis = diagnose(
+        drawn.conditioned,
+        used.points,
+        used.numbers,
+        unordered=unordered,
+        resolution=resolution,
+        covered=sample.points,
+    )
     hyperparameters = [process.hyperparameters for process in drawn.conditioned]
     rough = float(np.mean([each.nu == 1.5 for each in hyperparameters]))
     return Certificate(
@@ -161,8 +167,7 @@ class Diagnosis(ShortRepr):
     """How well the process predicts its own data.
 
     Attributes:
-        surprise: p-value of the largest error upward: the probability, under the process, that the largest one of all
-            trials is at least as large.
+        surprise: the probability, under the process, that the largest error upward is at least as large.
         trial: number of the trial with the largest error upward.
         left_out: root mean square of the standardised leave-one-out errors; about 1 if the process fits the data.
         farthest: largest distance from a task to its nearest trial, in diagonals of the task space.

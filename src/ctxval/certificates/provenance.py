@@ -109,10 +109,7 @@ class Provenance(ShortRepr):
     def alone(self, threshold: float, trials: Sequence[Trial]) -> list[str]:
         """Return what a validation rests on besides its certificate: that neither tau nor the campaign was selected."""
         falsifying = [other.path.name for other in self.beside if other.falsifies(threshold)]
-        return [
-            *sentences.not_fitted(self.known_before(threshold, trials)),
-            sentences.not_selected(len(self.beside), falsifying),
-        ]
+        return sentences.not_selected(self.known_before(threshold, trials), len(self.beside), falsifying)
 
     @property
     def quantities(self) -> Quantities:

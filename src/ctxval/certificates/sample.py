@@ -95,8 +95,8 @@ class Sample(ShortRepr):
             raise CertificateError("nothing was executed yet, so nothing can be certified.")
         made_good = _made_good(trials)
         # A distance that was told alone under another definition does not matter if the task was executed again.
-        told = [trial for trial in trials if trial.failure == TOLD_ALONE and trial.origin != "iid"]
-        left_out = {failure.trial for failure in made_good} | {t.number for t in told if executions_of(t, trials)}
+        alone = [trial for trial in trials if trial.failure == TOLD_ALONE and trial.origin != "iid"]
+        left_out = {failure.trial for failure in made_good} | {t.number for t in alone if executions_of(t, trials)}
         counted = [trial for trial in trials if trial.number not in left_out]
         places = [place for place, trial in enumerate(counted) if trial.origin == "manual"]
         manual = sorted(

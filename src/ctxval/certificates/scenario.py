@@ -51,21 +51,21 @@ class Scenario(CertificateKind):
 
     def certify(self, sample: Sample, confidence: float = 0.95) -> Certificate:
         """Return :func:`certify_scenario` of the trials."""
-        return certify_scenario(sample, confidence, self._discarded)
+        return certify_scenario(sample, confidence, self._require_discard())
 
     def require_audit_helps(self, origins: Iterable[Origin]) -> None:
         """Refuse trials that are no independent draws, and require the number to discard."""
-        if self._discarded >= 0 and any(origin != "iid" for origin in origins):
+        self._require_discard()
+        if any(origin != "iid" for origin in origins):
             raise CertificateError(
                 f"a {self.name} bound takes independent draws alone, but there are others; say --kind audit."
             )
 
     def require_usable(self, confidence: float, executions: int) -> None:
         """Require the number to discard, and more trials than that."""
-        require_more(executions, self._discarded)
+        require_more(executions, self._require_discard())
 
-    @property
-    def _discarded(self) -> int:
+    def _require_discard(self) -> int:
         return 0
 
 
@@ -82,8 +82,7 @@ class SamplingDiscarding(Scenario):
 
     discard: PositiveInt | None = None
 
-    @property
-    def _discarded(self) -> int:
+    def _require_discard(self) -> int:
         if not self.discard:
             raise CertificateError("sampling and discarding needs to know how many to discard, at least 1.")
         return self.discard

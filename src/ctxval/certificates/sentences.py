@@ -1,14 +1,15 @@
-"""What certificates state and assume, in sentences: numbers in, text out.
+"""What certificates state and assume, in sentences; those of verdicts are in ``verdict_sentences``.
 
-The sentences of verdicts are in :mod:`ctxval.certificates.verdict_sentences`. Why a bound is withdrawn
-stands beside the test that withdraws it, in the diagnostics.
+Why a bound is withdrawn stands beside the test that withdraws it, in the diagnostics.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
 
 from ctxval._util.representation import counted
+from ctxval._util.texts import enumerated
 from ctxval.certificates.bounds import at_most, except_for, late, of_tasks, percent, state_of, with_error, with_units
 from ctxval.certificates.dynamics_evidence import DynamicsEvidence
 from ctxval.certificates.sample import Sample, listed
@@ -54,11 +55,6 @@ EXECUTED_AGAIN = (
 """The assumption of a statement about executed tasks alone."""
 
 
-def suite_statement(sample: Sample) -> str:
-    """Return that all tasks of a suite were executed, and what their largest distance is."""
-    return f"All {sample.tasks} tasks of the suite were executed, and their largest distance is {sample.best:.6g}."
-
-
 # Independent draws
 
 
@@ -72,15 +68,18 @@ def share_above(sample: Sample, volume: float, confidence: float, limit: str, dr
 
 def how_drawn(sample: Sample, drawn: Sample, tasks: str = "the audited tasks") -> tuple[str, ...]:
     """Return, as assumptions, how the draws that count were drawn, and how many draws do not count."""
-    missing = len(sample.only("iid")) - len(drawn)
-    first = f"{tasks} are independent and {distributed(sample)}, and {_when_planned(drawn, len(drawn) + missing)}"
-    if not missing:
-        return (first,)
-    return (
-        first,
-        f"{missing} other independent draws do not count: the number of draws was changed, or the verdict ended them, "
-        "after they were known",
+    known, planned = len(sample.only("iid")), drawn.planned[-1]
+    when = "their number was chosen before they were executed"
+    if planned is None:
+        when += " (the store does not know when)"
+    elif planned > known:
+        when = f"their number did not depend on their distances, although {planned} were planned and {known} are known"
+    others = (
+        f"{known - len(drawn)} other independent draws do not count: the number of draws was changed, or the verdict "
+        "ended them, after they were known"
     )
+    first = f"{tasks} are independent and {distributed(sample)}, and {when}"
+    return (first,) if known == len(drawn) else (first, others)
 
 
 def distributed(sample: Sample) -> str:
@@ -88,15 +87,6 @@ def distributed(sample: Sample) -> str:
     if sample.distribution is None:
         return "uniform over the task space"
     return f"follow the stated distribution of tasks ({sample.distribution})"
-
-
-def _when_planned(drawn: Sample, known: int) -> str:
-    planned = drawn.planned[-1]
-    if planned is None:
-        return "their number was chosen before they were executed (the store does not know when)"
-    if planned > known:
-        return f"their number did not depend on their distances, although {planned} were planned and {known} are known"
-    return "their number was chosen before they were executed"
 
 
 def violations(sample: Sample) -> str:
@@ -254,6 +244,53 @@ def dynamics_assumptions(evidence: DynamicsEvidence) -> tuple[str, ...]:
         "posterior sample",
         ANY_ORDER,
     )
+
+
+def condition_on_dynamics(details: Mapping[str, Any]) -> str:
+    """Return the condition under which the confidence of a bound from learned dynamics holds."""
+    physical = details.get("physical") or []  # stores of earlier versions do not have it
+    state, acting = state_of(details.get("estimated")), late(details.get("actuator"))
+    acting = f" ({acting})" if acting else ""
+    lags = f" of the last {details['lags'] + 1} steps" if details["lags"] else ""
+    recorded = [f"{state.replace('state', 'states', 1)} and inputs{lags}{acting}"]
+    if details["quantile"] is not None:
+        return (
+            f" with noise, if what M misses is a smooth function of {enumerated([*recorded, *physical], 10)}, the same "
+            "in every task and over time, and noise is independent from step to step"
+        )
+    if not lags:
+        recorded = [state, f"input{acting}"] if physical else [f"{state} and input{acting}"]
+    missed = "the system" if details["without_model"] else "what M misses"
+    return (
+        f", if {missed} is one smooth function of {enumerated([*recorded, *physical], 10)}, the same in every task and "
+        "over time"
+    )
+
+
+def conditions_on_dynamics(details: Mapping[str, Any]) -> list[str]:
+    """Return what a validation by learned dynamics rests on."""
+    again, lags, estimated = details.get("differing"), details["lags"], details.get("estimated")
+    changing = f"changing neither with time nor with the task{except_for(details.get('physical') or ())}"
+    steps = f"the last {lags + 1} records and inputs" if lags else "the last record and input"
+    complete = f"{steps} determining the next record"
+    if details["quantile"] is not None:
+        complete += " up to noise"
+        alike = (
+            "noise being independent from step to step and like that of the records, and the system's dynamics "
+            f"{changing}"
+        )
+    else:
+        if not lags:
+            complete = f"{'' if estimated else 'the '}{state_of(estimated)} being complete"
+        noise = "" if again is None else f" (trials {again[0]} and {again[1]} of one task differ a little)"
+        alike = f"the system being deterministic{noise}, and its dynamics {changing}"
+    acting = late(details.get("actuator"))
+    return [
+        complete,
+        *([f"the inputs {acting} in every task, as in the executions"] if acting else []),
+        alike,
+        f"its dynamics being, in gaps of the records of up to {with_units(details['resolution'])}, like what was seen",
+    ]
 
 
 def envelope_statement(envelope: Envelope) -> str:

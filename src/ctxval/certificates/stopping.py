@@ -52,9 +52,8 @@ class StoppingRule(ShortRepr):
     Attributes:
         threshold: tau, in the distance's units.
         options: the certificate of the verdict; it must be the posterior bound.
-        confirmations: number of trials after the bound first keeps the threshold; it must still keep the threshold
-            after them. They are executed where the largest draws of d* lie, and mostly correct a bound that is too
-            low.
+        confirmations: number of trials, where the largest draws of d* lie, after the bound first keeps the threshold;
+            it must still keep it after them. They mostly correct a bound that is too low.
     """
 
     threshold: PositiveFloat

@@ -9,7 +9,7 @@ from ctxval._util.registry import part
 from ctxval._util.representation import counted
 from ctxval.certificates.base import Certificate, CertificateKind
 from ctxval.certificates.sample import Sample
-from ctxval.certificates.sentences import EXECUTED_AGAIN, suite_statement
+from ctxval.certificates.sentences import EXECUTED_AGAIN
 from ctxval.errors import CertificateError
 
 
@@ -33,7 +33,8 @@ class WholeSuite(CertificateKind):
             )
         return Certificate(
             kind=self.name,
-            statement=suite_statement(sample),
+            statement=f"All {sample.tasks} tasks of the suite were executed, and their largest distance is "
+            f"{sample.best:.6g}.",
             upper_bound=sample.best,
             confidence=confidence,
             volume=0.0,

@@ -189,7 +189,7 @@ def _certified(
 def require_suite(kind: CertificateKind) -> None:
     """Refuse a kind of certificate that is not for suites of tasks."""
     if not kind.takes_suites:
-        kinds = ", ".join(name for name in KINDS.imported if KINDS.find(name).takes_suites)
+        kinds = ", ".join(name for name in KINDS.built_in if KINDS.find(name).takes_suites)
         raise CertificateError(
             f"a certificate of the kind {kind.name!r} is not for a suite of tasks, each of which is executed once; use "
             f"one of {kinds}."

@@ -15,17 +15,15 @@ from ctxval.certificates.bounds import (
     Quantities,
     at_most,
     distinguishable,
-    except_for,
-    late,
     of_tasks,
     percent,
-    state_of,
     with_error,
     with_units,
 )
 from ctxval.certificates.covering import RESOLUTION
 from ctxval.certificates.dynamics_evidence import PushedDistances, Tolerance
 from ctxval.certificates.sample import executions_of
+from ctxval.certificates.sentences import condition_on_dynamics, conditions_on_dynamics
 from ctxval.core.space import TaskSpace
 from ctxval.core.trial import Trial
 
@@ -107,7 +105,7 @@ def validated(certificate: Certificate, tau: float, quantities: Quantities) -> s
     which = "" if quantile is None else f" in at least {100 * quantile:g} % of its executions"
     condition = "confidence, if its assumptions hold"
     if kind == "dynamics":
-        condition = f"probability under a Gaussian process{_condition_on_dynamics(details)}"
+        condition = f"probability under a Gaussian process{condition_on_dynamics(details)}"
     elif kind == "posterior":
         what = "expected distance" if details.get("stochastic") else "distance"
         condition = (
@@ -125,26 +123,6 @@ def _bound_and_limit(certificate: Certificate, tau: float, quantities: Quantitie
     if "±" not in upper:
         upper, limit = distinguishable(certificate.upper_bound, tau)
     return quantities.of(upper), quantities.of(limit)
-
-
-def _condition_on_dynamics(details: Mapping[str, Any]) -> str:
-    physical = details.get("physical") or []  # stores of earlier versions do not have it
-    state, acting = state_of(details.get("estimated")), late(details.get("actuator"))
-    acting = f" ({acting})" if acting else ""
-    lags = f" of the last {details['lags'] + 1} steps" if details["lags"] else ""
-    recorded = [f"{state.replace('state', 'states', 1)} and inputs{lags}{acting}"]
-    if details["quantile"] is not None:
-        return (
-            f" with noise, if what M misses is a smooth function of {enumerated([*recorded, *physical], 10)}, the same "
-            "in every task and over time, and noise is independent from step to step"
-        )
-    if not lags:
-        recorded = [state, f"input{acting}"] if physical else [f"{state} and input{acting}"]
-    missed = "the system" if details["without_model"] else "what M misses"
-    return (
-        f", if {missed} is one smooth function of {enumerated([*recorded, *physical], 10)}, the same in every task and "
-        "over time"
-    )
 
 
 def _unusual(resolution: Mapping[str, float] | None, quantities: Quantities) -> str:
@@ -251,7 +229,7 @@ def conditions(certificate: Certificate, space: TaskSpace | None) -> list[str]:
     details = certificate.details
     match certificate.kind:
         case "dynamics":
-            return _conditions_on_dynamics(details)
+            return conditions_on_dynamics(details)
         case "posterior":
             resolution, quantities = details.get("resolution"), Quantities(space=space)
             where = "" if resolution is None else f"{_gaps(resolution, quantities)} (a peak inside one may be missed)"
@@ -274,31 +252,6 @@ def conditions(certificate: Certificate, space: TaskSpace | None) -> list[str]:
     return ["what its certificate assumes"]
 
 
-def _conditions_on_dynamics(details: Mapping[str, Any]) -> list[str]:
-    again, lags, estimated = details.get("differing"), details["lags"], details.get("estimated")
-    changing = f"changing neither with time nor with the task{except_for(details.get('physical') or ())}"
-    steps = f"the last {lags + 1} records and inputs" if lags else "the last record and input"
-    complete = f"{steps} determining the next record"
-    if details["quantile"] is not None:
-        complete += " up to noise"
-        alike = (
-            "noise being independent from step to step and like that of the records, and the system's dynamics "
-            f"{changing}"
-        )
-    else:
-        if not lags:
-            complete = f"{'' if estimated else 'the '}{state_of(estimated)} being complete"
-        noise = "" if again is None else f" (trials {again[0]} and {again[1]} of one task differ a little)"
-        alike = f"the system being deterministic{noise}, and its dynamics {changing}"
-    acting = late(details.get("actuator"))
-    return [
-        complete,
-        *([f"the inputs {acting} in every task, as in the executions"] if acting else []),
-        alike,
-        f"its dynamics being, in gaps of the records of up to {with_units(details['resolution'])}, like what was seen",
-    ]
-
-
 def looked(known: int, smaller: Sequence[float], largest: float, quantities: Quantities) -> str:
     """Return that a threshold was stated after distances were known, and which smaller ones before it do not hold."""
     known_ones = "1 distance was" if known == 1 else f"{known} distances were"
@@ -312,25 +265,20 @@ def looked(known: int, smaller: Sequence[float], largest: float, quantities: Qua
     return "".join(f"; {part}" for part in parts)
 
 
-def not_fitted(known: int) -> list[str]:
-    """Return that a threshold was not chosen to suit the distances that were known; nothing if none were."""
-    which = "distance that was" if known == 1 else "distances that were"
-    sentence = f"the threshold not being chosen to suit the {known} {which} known when it was stated"
-    return [sentence] if known else []
-
-
-def not_selected(others: int, falsifying: Sequence[str]) -> str:
-    """Return that a campaign was not selected, with what other stores of the same experiment say of the threshold."""
-    alone = "this campaign not being chosen among several"
+def not_selected(known: int, others: int, falsifying: Sequence[str]) -> list[str]:
+    """Return that neither a threshold nor a campaign was selected, by what was known and by other stores."""
+    distances = "distance that was" if known == 1 else "distances that were"
+    fitted = f"the threshold not being chosen to suit the {known} {distances} known when it was stated"
+    sentences, alone = [fitted] if known else [], "this campaign not being chosen among several"
     if not others:
-        return alone
+        return [*sentences, alone]
     lie = "store of this experiment lies" if others == 1 else "stores of this experiment lie"
     which = "none of them falsifies the threshold" if others > 1 else "it does not falsify the threshold"
     if falsifying:
         verb = "falsifies" if len(falsifying) == 1 else "falsify"
         count = "it falsifies" if others == 1 else f"{len(falsifying)} of them {verb}"
         which = f"{count} the threshold ({enumerated(map(quoted, falsifying), 5)})"
-    return f"{alone} ({others} other {lie} beside it, and {which})"
+    return [*sentences, f"{alone} ({others} other {lie} beside it, and {which})"]
 
 
 def _without_assumptions(certificate: Certificate, tau: float, quantities: Quantities) -> str:

@@ -22,7 +22,7 @@ from ctxval.cli.options import named_values
 from ctxval.core.experiment import UnitsWarning
 from ctxval.errors import InputError
 from ctxval.studies import aspect1 as model_alone
-from ctxval.studies.safety.margins import spec_distance
+from ctxval.studies.safety.draws import spec_distance
 
 
 @command()

@@ -101,4 +101,4 @@ class ReachAvoid(NamedStates):
         InputError is raised if nothing is left of the set to reach.
         """
         reach = None if self.reach is None else self.reach.grown(-by)
-        return dataclasses.replace(self, avoid=tuple(one.grown(by) for one in self.avoid), reach=reach)
+        return dataclasses.replace(self, avoid=tuple(each.grown(by) for each in self.avoid), reach=reach)

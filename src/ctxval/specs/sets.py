@@ -10,6 +10,7 @@ import dataclasses
 import functools
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Self
 
@@ -73,7 +74,7 @@ class _Placed(Set):
 
     def _place(self, given: Place, task: Task, positions: Array) -> Array:
         """Return what is subtracted from positions ``(..., T, k)``."""
-        what, k = type(self).__name__, positions.shape[-1]
+        what, (times, k) = type(self).__name__, positions.shape[-2:]
         if isinstance(given, str):
             if given not in task.environment:
                 raise UnknownNameError.among("entry of the task's environment", given, task.environment)
@@ -81,11 +82,9 @@ class _Placed(Set):
         else:
             place = np.asarray(given, dtype=np.float64)
             if place.ndim > 1:
-                if len(place) < positions.shape[-2]:
-                    raise ShapeError(
-                        f"a {what} that moves needs a row for each of {positions.shape[-2]} times, got {len(place)}."
-                    )
-                place = place[: positions.shape[-2]]
+                if len(place) < times:
+                    raise ShapeError(f"a {what} that moves needs a row for each of {times} times, got {len(place)}.")
+                place = place[:times]
         if place.ndim and place.shape[-1] != k:
             raise _other_dimension(what, place.shape[-1], k)
         return place
@@ -137,33 +136,27 @@ class Box(_Placed):
             if isinstance(corner, list | tuple):
                 corner = [none if end is None else end for end in corner]
             object.__setattr__(self, name, as_floats(f"{name} of the Box", corner))
-        low, high = self._corners
+        low, high = self.low, self.high
         if low.ndim != 1 or low.shape != high.shape or not len(low):
-            raise ShapeError(f"low and high of a Box must be two equally long lists, got {self.low!r}, {self.high!r}.")
+            raise ShapeError(f"low and high of a Box must be two equally long lists, got {low!r}, {high!r}.")
         if not (low < high).all():
             raise InputError(f"low and high of a Box must be low < high, got {low.tolist()} and {high.tolist()}.")
         if np.isinf(low).all() and np.isinf(high).all():
             raise InputError("a Box must have an end, and all corners are infinite.")
 
-    @property
-    def _corners(self) -> tuple[Array, Array]:
-        return np.asarray(self.low), np.asarray(self.high)
-
     def _from_center(self, at: Array) -> Array:
-        low, high = self._corners
-        if at.shape[-1] != len(low):
-            raise _other_dimension("Box", len(low), at.shape[-1])
-        beyond = np.maximum(low - at, at - high)
+        if at.shape[-1] != len(self.low):
+            raise _other_dimension("Box", len(self.low), at.shape[-1])
+        beyond = np.maximum(self.low - at, at - self.high)
         outside = np.linalg.norm(np.maximum(beyond, 0.0), axis=-1)
         return np.asarray(outside + np.minimum(beyond.max(axis=-1), 0.0))
 
     def grown(self, by: float) -> Box:
-        low, high = self._corners
-        if not (low - by < high + by).all():
+        if not (self.low - by < self.high + by).all():
             raise InputError(
-                f"nothing is left of a Box from {low.tolist()} to {high.tolist()} that shrinks by {-by:g}."
+                f"nothing is left of a Box from {self.low.tolist()} to {self.high.tolist()} that shrinks by {-by:g}."
             )
-        return dataclasses.replace(self, low=low - by, high=high + by)
+        return dataclasses.replace(self, low=self.low - by, high=self.high + by)
 
 
 @checked
@@ -179,47 +172,34 @@ class Polytope(_Placed):
     """
 
     _: dataclasses.KW_ONLY
-    A: ArrayLike
-    b: ArrayLike
+    A: Any
+    b: Any
 
     def __post_init__(self) -> None:
         super().__post_init__()
         for name in ("A", "b"):
             object.__setattr__(self, name, as_finite(f"{name} of the Polytope", getattr(self, name)))
-        A, b = self._faces
+        A, b = self.A, self.b
         if A.ndim != 2 or b.shape != A.shape[:1] or not A.size:
             raise ShapeError(f"a Polytope needs A (q, k) and b (q,), got {A.shape} and {b.shape}.")
         if not A.any(axis=1).all():
             raise InputError("a row of A of a Polytope must not be zero.")
-        self._require_inside()
-
-    @property
-    def _faces(self) -> tuple[Array, Array]:
-        return np.asarray(self.A), np.asarray(self.b)
-
-    def _require_inside(self) -> None:
         from scipy.optimize import linprog  # imported here, because it is slow to load and seldom needed
 
-        A, b = self._faces
-        sizes = np.linalg.norm(A, axis=1)
         # The largest ball inside, of a radius of at most 1.
-        cost, rows = np.append(np.zeros(A.shape[1]), -1.0), np.column_stack([A, sizes])
-        bounds = [(None, None)] * A.shape[1] + [(0, 1)]
-        found = linprog(cost, A_ub=rows, b_ub=b, bounds=bounds)
-        if found.status != 0 or not found.x[-1] > 0:
+        cost, rows = np.append(np.zeros(A.shape[1]), -1.0), np.column_stack([A, np.linalg.norm(A, axis=1)])
+        ball = linprog(cost, A_ub=rows, b_ub=b, bounds=[(None, None)] * A.shape[1] + [(0, 1)])
+        if ball.status != 0 or not ball.x[-1] > 0:
             raise InputError("a Polytope must have an inside, and no position keeps A x < b.")
 
     def _from_center(self, at: Array) -> Array:
-        A, b = self._faces
-        if at.shape[-1] != A.shape[1]:
-            raise _other_dimension("Polytope", A.shape[1], at.shape[-1])
-        sizes = np.linalg.norm(A, axis=1)
-        return np.asarray(((at @ A.T - b) / sizes).max(axis=-1))
+        if at.shape[-1] != self.A.shape[1]:
+            raise _other_dimension("Polytope", self.A.shape[1], at.shape[-1])
+        return np.asarray(((at @ self.A.T - self.b) / np.linalg.norm(self.A, axis=1)).max(axis=-1))
 
     def grown(self, by: float) -> Polytope:
-        A, b = self._faces
         try:
-            return dataclasses.replace(self, b=b + by * np.linalg.norm(A, axis=1))
+            return dataclasses.replace(self, b=self.b + by * np.linalg.norm(self.A, axis=1))
         except InputError:
             raise InputError(f"nothing is left of a Polytope that shrinks by {-by:g}.") from None
 
@@ -239,17 +219,15 @@ class Union(Set):
         object.__setattr__(self, "sets", as_sets("sets of a Union", self.sets))
 
     def signed_distance(self, positions: Array, task: Task) -> Array:
-        return np.asarray(functools.reduce(np.minimum, (one.signed_distance(positions, task) for one in self.sets)))
+        return np.asarray(functools.reduce(np.minimum, (each.signed_distance(positions, task) for each in self.sets)))
 
     def grown(self, by: float) -> Union:
         if by >= 0:
-            return Union([one.grown(by) for one in self.sets])
+            return Union([each.grown(by) for each in self.sets])
         left = []
-        for one in self.sets:
-            try:
-                left.append(one.grown(by))
-            except InputError:  # of which nothing is left
-                continue
+        for each in self.sets:
+            with suppress(InputError):  # nothing is left of it
+                left.append(each.grown(by))
         if not left:
             raise InputError(f"nothing is left of a Union of {len(self.sets)} sets that shrinks by {-by:g}.")
         return Union(left)
@@ -303,7 +281,7 @@ def as_sets(what: str, given: Any) -> tuple[Set, ...]:
     listed = given if isinstance(given, list | tuple) else [given]
     if not listed:
         raise InputError(f"{what} must name at least one set, got none.")
-    return tuple(as_set(what, one) for one in listed)
+    return tuple(as_set(what, each) for each in listed)
 
 
 def _other_dimension(what: str, got: int, wanted: int) -> ShapeError:

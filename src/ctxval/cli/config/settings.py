@@ -67,7 +67,7 @@ class CertificateTable(BaseModel):
 
     @model_validator(mode="after")
     def _used(self) -> CertificateTable:
-        if self.kind not in KINDS.imported:
+        if self.kind not in KINDS.built_in:
             return self  # it is checked when it is used: reading imports nothing, and a store must stay readable
         fields, extra = type(self).model_fields, self.model_extra or {}
         changed = {name for name, field in fields.items() if name != "kind" and getattr(self, name) != field.default}

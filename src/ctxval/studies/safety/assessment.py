@@ -32,11 +32,10 @@ from ctxval.errors import CertificateError, InputError
 from ctxval.learning import DynamicsStudy
 from ctxval.learning.closed_loops import LoopPlanner
 from ctxval.specs import ReachAvoid
-from ctxval.studies.safety.margins import on_model, spec_distance
+from ctxval.studies.safety.draws import on_model, spec_distance
 
 TASKS = 4000
 """Number of tasks on M that the shares are of; of designs that are made one by one, a tenth of it."""
-
 
 _SEARCHED = 0.01
 """Share of a bound on d_b by which a search may end below its largest value, which lies on a ridge: in the study of
@@ -115,7 +114,7 @@ class SafetyReport(ShortRepr):
             "spec": repr(self.spec),
             "counterexamples": [asdict(task) for task in self.counterexamples],
             "certificate": self.certificate and self.certificate.to_json(),
-            "avoid": None if self.tightened is None else [repr(one) for one in self.tightened.avoid],
+            "avoid": None if self.tightened is None else [repr(avoided) for avoided in self.tightened.avoid],
             "reach": None if self.tightened is None or self.tightened.reach is None else repr(self.tightened.reach),
         }
 
@@ -145,11 +144,10 @@ def judged_by(experiment: Experiment, distance: UnsafeMargin) -> Experiment:
     """
     given = experiment.validation.with_distance(distance)
     labels = [parted(label)[1] for label in experiment.states]
-    spec = given.distance.spec if isinstance(given.distance, UnsafeMargin) else distance.spec
-    components = getattr(spec, "components", None)
+    components = getattr(spec_distance(given).spec, "components", None)
     places = range(len(labels)) if components is None else [i for i in components if isinstance(i, int)]
-    found = {labels[i] for i in places if -len(labels) <= i < len(labels)}
-    units = found.pop() if len(found) == 1 else ""
+    units, *others = {labels[i] for i in places if -len(labels) <= i < len(labels)} or {""}
+    units = "" if others else units
     validation = given.with_parts(labels=replace(given.labels, units=units))
     return replace(experiment, validation=validation, threshold=distance.margin, truth=None, units=units)
 
@@ -191,19 +189,16 @@ def assess(
         tasks: number of tasks on M that the shares are of.
         progress: whether to show the progress on standard error; None to show it at a terminal and in a notebook.
 
-    Raises:
-        InputError: if the distance is another one, or no drawn task satisfies the specification on M.
+    An InputError is raised if no drawn task satisfies the specification on M.
     """
     validation, options = campaign.validation, certificate or CertificateOptions(Dynamics())
     distance, space = spec_distance(validation), validation.space
     spec, margin = distance.spec, distance.margin
     with progress_shown(progress):
-        executed = [
-            _compared(campaign, trial, system) for trial, system in executed_trials(campaign.store, campaign.trials)
-        ]
-        unsafe = sorted(
-            (task for task, _ in executed if task.on_system <= 0 < task.on_model), key=lambda t: -t.on_model
-        )
+        runs = executed_trials(campaign.store, campaign.trials)
+        executed = [_compared(campaign, trial, system) for trial, system in runs]
+        unsafe = [task for task, _ in executed if task.on_system <= 0 < task.on_model]
+        unsafe.sort(key=lambda task: -task.on_model)
         verdict = None if margin is None else campaign.verdict(margin, certificate=options)
         certified, doubt = None if verdict is None else verdict.certificate, None
         if verdict is None:
@@ -271,7 +266,7 @@ def _compared(campaign: Campaign, trial: Trial, system: Trajectory) -> tuple[Uns
     model, _ = campaign.trajectories(trial)
     if model is None:
         model = validation.plan(validation.space.from_unit(trial.unit_point)).model_trajectory
-    of_model, of_system = (float(spec.robustness(one, task)) for one in (model, system))
+    of_model, of_system = (float(spec.robustness(run, task)) for run in (model, system))
     deviation = MaximumDeviation(2, getattr(spec, "components", None))(model, system, task)
     return UnsafeTask(trial.number, trial.parameters, of_model, of_system), float(deviation)
 

@@ -89,10 +89,6 @@ def disturbance_set(
             largest residuals of the campaign's other executions.
         discarded: the number k of tasks that are discarded, chosen before the draws are known.
         confidence: the confidence of the statement.
-
-    Raises:
-        CertificateError: if there is no draw, a draw has failed, or not more draws than are discarded.
-        InputError: if the scales are not known, or the trajectories have outputs in the place of states.
     """
     others: list[Trajectory] = []
     if isinstance(source, Campaign):

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ctxval._util.arrays import Array
+from ctxval._util.arrays import Array, single_threaded
 from ctxval._util.checked import NonNegativeFloat, PositiveInt, Probability, checked
 from ctxval._util.representation import ShortRepr
 from ctxval.campaign.campaign import Campaign
@@ -23,9 +23,29 @@ from ctxval.errors import InputError
 from ctxval.learning.closed_loops import LoopPlanner
 from ctxval.searches import by_name
 from ctxval.specs import Specification
-from ctxval.studies.safety.margins import on_model, spec_distance
 
 _ATTEMPTS, _TOGETHER = 64, 512  # batches of tasks that are tried for one with the margin, and tasks in each
+
+
+def spec_distance(validation: Validation) -> UnsafeMargin:
+    """Return the distance of a validation, which must be the margin of unsafe tasks."""
+    if not isinstance(validation.distance, UnsafeMargin):
+        raise InputError(
+            f"the distance must be an UnsafeMargin of a specification, got {validation.distance!r}: see "
+            "ctxval.studies.safety.judged_by."
+        )
+    return validation.distance
+
+
+def on_model(planner: LoopPlanner, spec: Specification, unit: Array) -> Array:
+    """Return rho_M at points ``(N, d)`` of the unit cube, ``(N,)``; minus infinity if a task cannot be planned."""
+    rho = np.full(len(unit), -np.inf)
+    with single_threaded():
+        for loops in planner.plan(unit):
+            with np.errstate(all="ignore"):
+                of_tasks = spec.robustness(loops.promised, loops.task)
+            rho[loops.rows] = np.where(loops.promised.finite, of_tasks, -np.inf)
+    return rho
 
 
 @dataclass(frozen=True)
@@ -60,14 +80,12 @@ class TasksWithMargin:
 
     def __call__(self, rng: np.random.Generator, n: int) -> Array:
         """Return n independent tasks, rows ``(n, d)`` in the units of the space."""
-        kept, count = list[Array](), 0
+        kept = np.empty((0, self.space.dimension))
         for _ in range(_ATTEMPTS):
             unit = self.space.unit_draws(_TOGETHER if self.planner.batched else 16, rng)
-            unit = unit[on_model(self.planner, self.spec, unit) > self.margin]
-            kept.append(unit)
-            count += len(unit)
-            if count >= n:
-                return np.asarray(self.space.from_unit(np.concatenate(kept)[:n]))
+            kept = np.concatenate([kept, unit[on_model(self.planner, self.spec, unit) > self.margin]])
+            if len(kept) >= n:
+                return np.asarray(self.space.from_unit(kept[:n]))
         raise InputError(
             f"hardly any task satisfies the specification on the model with a margin of {self.margin:g}, so there is "
             "nothing to draw from."
