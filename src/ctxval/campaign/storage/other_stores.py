@@ -10,7 +10,6 @@ import sqlite3
 from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any
-from urllib.parse import quote
 
 from ctxval._util.describe import first_difference
 from ctxval.campaign.storage import schema
@@ -53,8 +52,7 @@ def other_stores(path: Path) -> list[Neighbour]:
 
 def _read(path: Path) -> tuple[dict[str, Any], Trial | None]:
     """Return a store's description of its validation with the number that depends on its model, and its worst trial."""
-    uri = f"file:{quote(str(path.absolute()))}?mode=ro&immutable=1"  # takes no lock and replays no journal
-    with closing(sqlite3.connect(uri, uri=True, factory=schema.Guarded)) as connection:
+    with closing(schema.read_only(path)) as connection:
         if schema.difference(connection, schema.TABLES) is not None:
             raise ValueError(f"{path} is not a store")
         rows = connection.execute(

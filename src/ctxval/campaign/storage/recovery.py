@@ -12,7 +12,6 @@ from contextlib import closing, contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, get_args
-from urllib.parse import quote
 
 from ctxval._util.describe import describe
 from ctxval._util.files import MADE_BY, temporary_folder, write_text, written_whole
@@ -64,8 +63,7 @@ def recover(path: Path) -> Recovered:
     recovered = Recovered()
     with _played_back(path, recovered) as readable:
         try:
-            uri = f"file:{quote(str(readable.absolute()))}?mode=ro&immutable=1"
-            connection = sqlite3.connect(uri, uri=True, factory=schema.Guarded)
+            connection = schema.read_only(readable)
         except sqlite3.Error as error:
             raise StoreAccessError(f"{path} cannot be read: {error}.") from error
         with closing(connection):

@@ -14,6 +14,7 @@ from collections.abc import Iterable
 from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 from ctxval._util.files import why_not_regular
 from ctxval.errors import ForeignStoreError, StoreAccessError
@@ -93,6 +94,11 @@ class Guarded(sqlite3.Connection):
         """Execute a statement; the bound allows reading millions of trials."""
         self._steps[0] = 0
         return super().execute(*statement)
+
+
+def read_only(path: Path) -> sqlite3.Connection:
+    """Open a file for reading as it is: no lock is taken, and no journal is replayed."""
+    return sqlite3.connect(f"file:{quote(str(path.absolute()))}?mode=ro&immutable=1", uri=True, factory=Guarded)
 
 
 def require_files(path: Path) -> None:
