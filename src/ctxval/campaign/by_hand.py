@@ -10,9 +10,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from ctxval._util.columns import CsvTable, column_of
+from ctxval._util.columns import CsvTable, column_of, conversion
 from ctxval._util.texts import shortened, unguarded
-from ctxval._util.units import conversion
 from ctxval.campaign.campaign import Campaign
 from ctxval.campaign.choices import Execution, OpenTrial
 from ctxval.campaign.telling import ToldResult, require_file

@@ -23,11 +23,11 @@ from ctxval.certificates.dynamics_evidence import DynamicsEvidence
 from ctxval.certificates.envelope import (
     Envelope,
     boundary_tasks,
+    doubt_of_envelope,
     envelope_of,
     must_outlive_a_test,
     withdrawn,
 )
-from ctxval.certificates.envelope_diagnostics import doubt_of_envelope
 from ctxval.certificates.options import CertificateOptions
 from ctxval.certificates.prediction_tests import DRAWN
 from ctxval.core.trial import Trial

@@ -60,10 +60,7 @@ class AnytimeAudit(CertificateKind):
 
 @checked
 def certify_anytime(sample: Sample, threshold: PositiveFloat, confidence: Probability = 0.95) -> Certificate:
-    """Bound the volume of the tasks above a threshold that was fixed before the draws were known.
-
-    Only independent draws count, in their order. One without a distance counts as a violation.
-    """
+    """Bound the volume above a threshold, fixed before the draws were known; a draw without a distance violates it."""
     drawn = sample.only("iid")
     if not len(drawn):
         raise CertificateError("an anytime audit needs independent draws of tasks, and there is none; use --audit N.")

@@ -60,15 +60,10 @@ class Automatic(CertificateKind):
 
     def certify(self, sample: Sample, confidence: float = 0.95) -> Certificate:
         """Return the dynamics bound or, if it is withdrawn or refused, the posterior bound."""
-        return self._first(sample, None, confidence)[0]
+        return self.certify_against(sample, None, confidence)[0]
 
-    def certify_against(
-        self, sample: Sample, threshold: float, confidence: float = 0.95
-    ) -> tuple[Certificate, Forecast | None]:
+    def certify_against(self, sample: Sample, threshold: float | None, confidence: float = 0.95) -> _Outcome:
         """Return the first certificate that keeps the threshold, or else the one that is nearer to a decision."""
-        return self._first(sample, threshold, confidence)
-
-    def _first(self, sample: Sample, threshold: float | None, confidence: float) -> _Outcome:
         # A resolution of one's own asks for the posterior bound.
         usual = not self.stochastic and self.resolution == RESOLUTION and sample.learned is not None
         uses_dynamics = usual and len(sample) >= FEWEST and not sample.failed
@@ -106,7 +101,6 @@ class Automatic(CertificateKind):
         return max(self.tests - int((np.isfinite(sample.distances) & drawn).sum()), 0)
 
     def _tested(self, outcome: _Outcome, sample: Sample) -> _Outcome:
-        """Return the posterior bound, withdrawn if tasks of the whole space have not been executed."""
         (certificate, expected), dimension = outcome, sample.points.shape[1]
         origins = [origin for origin in sample.origins if self.tests and origin in DRAWN]
         shown = shown_by_tests(origins, dimension, certificate.confidence, uniform=sample.is_uniform)
@@ -121,7 +115,6 @@ class Automatic(CertificateKind):
 
 
 def _decides(certificate: Certificate, threshold: float | None) -> bool:
-    """Return whether a certificate keeps a threshold; if there is none, whether it is sound."""
     return _is_sound(certificate) if threshold is None else certificate.covers(threshold)
 
 

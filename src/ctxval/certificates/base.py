@@ -58,8 +58,7 @@ class Certificate:
     def covers(self, threshold: float, volume: float = 0.0) -> bool:
         """Return whether it bounds the distance by the threshold, except on at most this share of the task space.
 
-        A withdrawn certificate covers nothing. A bound that is computed from random draws must stay below the
-        threshold by two of its standard errors.
+        A bound that is computed from random draws must stay below the threshold by two of its standard errors.
         """
         return self.doubt is None and self.volume <= volume and self.upper_bound + ERRORS * self.error <= threshold
 
@@ -149,19 +148,12 @@ class CertificateKind(ShortRepr, ABC):
 
     @abstractmethod
     def certify(self, sample: Sample, confidence: float = 0.95) -> Certificate:
-        """Return the certificate of trials, whose statement must hold with the confidence.
-
-        Raises:
-            CertificateError: if its theory does not allow these trials, or an option that it needs is missing.
-        """
+        """Return the certificate of trials; a CertificateError if they or the options do not allow one."""
 
     def certify_against(
         self, sample: Sample, threshold: float, confidence: float = 0.95
     ) -> tuple[Certificate, Forecast | None]:
-        """Return a certificate that is precise enough for a threshold, and a forecast of further executions.
-
-        The forecast is None if the certificate keeps the threshold, or if nothing can be predicted.
-        """
+        """Return a certificate that is precise enough for a threshold, and a forecast of executions if there is one."""
         return self.certify(sample, confidence), None
 
     def require_audit_helps(self, origins: Iterable[Origin]) -> None:
@@ -172,10 +164,7 @@ class CertificateKind(ShortRepr, ABC):
 
     @classmethod
     def rests_on(cls, certificate: Certificate, space: TaskSpace | None = None) -> list[str]:
-        """Return what a validation by a certificate rests on: each entry completes a sentence "It rests on ...".
-
-        The task space states lengths in its units; it is None if it is not known.
-        """
+        """Return what a validation rests on, each as the end of "It rests on ..."; the space gives units."""
         return sentences.conditions(certificate, space)
 
 
@@ -229,7 +218,7 @@ class KindRegistry(Registry[CertificateKind]):
         return iter(dict.fromkeys((*self.imported, *self.installed)))
 
     def __len__(self) -> int:
-        return len(list(self))
+        return sum(1 for _ in self)
 
 
 def _required(kind: Any) -> type[CertificateKind]:

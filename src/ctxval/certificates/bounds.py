@@ -41,10 +41,7 @@ def at_most(value: float, digits: int = 4) -> str:
 
 
 def rank_of(confidence: float, draws: int) -> int:
-    """Return the rank, from 1, of the order statistic that a further draw stays below with this probability.
-
-    It is larger than the number of draws if the confidence needs more of them.
-    """
+    """Return the rank, from 1, of the order statistic that a further draw stays below with this probability."""
     return max(1, int(np.ceil((draws + 1) * confidence - 1e-9)))
 
 

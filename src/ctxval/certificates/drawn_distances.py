@@ -46,8 +46,7 @@ class DrawnDistances(ShortRepr):
     def factor(self, threshold: float, confidence: float) -> float:
         """Return k: the order statistic of the largest standardised excesses of the draws.
 
-        It is at least 1, because nothing is claimed to be known better than the least spread. A CertificateError is
-        raised if the confidence is too high for the number of draws.
+        It is at least 1, because nothing is claimed to be known better than the least spread.
         """
         known, spread = self.known, self.spread(threshold)
         excess = ((self.draws - self.mean)[:, known] / spread[known]).max(axis=1, initial=0.0)

@@ -129,10 +129,7 @@ def draws_for(confidence: float) -> int:
 
 @checked
 def certify_dynamics(sample: Sample, evidence: DynamicsEvidence, confidence: Probability = 0.95) -> Certificate:
-    """Return the bound that d* stays below with the confidence, from evidence of the same trials.
-
-    A CertificateError is raised if the confidence is too high for the number of draws, or if draws diverge.
-    """
+    """Return the bound that d* stays below with the confidence, from evidence of the same trials."""
     rank_within(confidence, len(evidence.maxima))
     bound, error = bound_of(evidence, sample.best, confidence), evidence.error(confidence)
     upper = raised(evidence, bound)
@@ -142,7 +139,8 @@ def certify_dynamics(sample: Sample, evidence: DynamicsEvidence, confidence: Pro
             "be predicted. More executions narrow them."
         )
     finite, last = evidence.maxima[np.isfinite(evidence.maxima)], counted(evidence, bound)[-PREDICTIONS:]
-    drawn = [test for test in tested(evidence.predictions, evidence.tests) if test.origin in DRAWN]
+    tests = [test for test in tested(evidence.predictions, evidence.tests) if test.origin in DRAWN]
+    drawn = [test.origin for test in tests]
     coverage, worst = evidence.coverage, failed(evidence, bound)
     doubt, differing = both_outcomes(sample, stochastic=False), sample.differing(1e-6 * bound)
     # Two executions of one task must not differ by more than a prediction may be wrong.
@@ -178,10 +176,8 @@ def certify_dynamics(sample: Sample, evidence: DynamicsEvidence, confidence: Pro
                 "held": sum(held(prediction, bound) for prediction in last),
             },
             "tests": {
-                **shown_by_tests(
-                    [test.origin for test in drawn], sample.points.shape[1], confidence, uniform=sample.is_uniform
-                ),
-                "largest_error": max((test.error for test in drawn), default=None),
+                **shown_by_tests(drawn, sample.points.shape[1], confidence, uniform=sample.is_uniform),
+                "largest_error": max((test.error for test in tests), default=None),
             },
             "checked": [{**each.to_json(), "held": bool(held(each, bound))} for each in evidence.predictions],
             "coverage_gap": coverage.marginal.size,
@@ -214,10 +210,7 @@ def certify_dynamics(sample: Sample, evidence: DynamicsEvidence, confidence: Pro
 
 
 def bound_of(evidence: DynamicsEvidence, best: float, confidence: float) -> float:
-    """Return the order statistic of the maxima, raised by what searches and predictions have missed.
-
-    If predictions failed, the bound is much higher: see :func:`~ctxval.certificates.dynamics_diagnostics.raised`.
-    """
+    """Return the order statistic of the maxima, raised by what searches and predictions have missed."""
     excess = max((prediction.excess for prediction in evidence.predictions[-PREDICTIONS:]), default=0.0)
     upper = evidence.upper(confidence) * evidence.missed
     # A noisy execution may exceed the quantile that is bounded.

@@ -66,8 +66,7 @@ def held(prediction: CheckedPrediction, bound: float) -> bool:
 def counted(evidence: DynamicsEvidence, bound: float) -> list[CheckedPrediction]:
     """Return the predictions that count: those that failed, and those that held where they could have failed.
 
-    A prediction of a task like an earlier one tells nothing. Nor does one of a run that a person chose to import, if it
-    was made afterwards.
+    A prediction of a task like an earlier one tells nothing, nor does a later one of a run that a person imported.
     """
     return [
         prediction
@@ -77,10 +76,7 @@ def counted(evidence: DynamicsEvidence, bound: float) -> list[CheckedPrediction]
 
 
 def tested(predictions: Sequence[CheckedPrediction], tests: int) -> list[CheckedPrediction]:
-    """Return the latest predictions that complete the tests, or all that were stored beforehand if none complete them.
-
-    So a test that failed matters until later tests are complete without it.
-    """
+    """Return the latest predictions that complete the tests, or all that were stored beforehand if none do."""
     stored = [prediction for prediction in predictions if prediction.stored and prediction.point]
     first = range(len(stored) - 1, -1, -1) if tests else ()
     return next((stored[k:] for k in first if not missing_tests(stored[k:], tests)), stored if tests else [])
@@ -180,10 +176,7 @@ def only_a_failed_test(evidence: DynamicsEvidence, best: float, bound: float, li
 
 
 def doubt_of(evidence: DynamicsEvidence, best: float, bound: float) -> str | None:
-    """Return why the bound is withdrawn, and what would help; None if it is not.
-
-    ``best`` is the largest executed distance, ``bound`` the bound before failed predictions raise it.
-    """
+    """Return why the bound is withdrawn, before failed predictions raise it; ``best`` is the largest distance."""
     return next(doubts(evidence, best, bound), None)
 
 
@@ -286,10 +279,7 @@ def untried_parameter(evidence: DynamicsEvidence) -> str | None:
 
 
 def untested(evidence: DynamicsEvidence, best: float, bound: float, allowed: float | None = None) -> list[str]:
-    """Return why predictions are not tested where distances are large, with errors as a bound of ``allowed`` permits.
-
-    By default, it is the bound: executions are chosen for predictions that hold, not for a bound that errors raise.
-    """
+    """Return why predictions are not tested at large distances; errors may be those of a bound ``allowed``."""
     least, reasons = TESTED * evidence.highest, []
     if evidence.quantile is not None:
         least = NOISY_TESTED * min(evidence.highest, float(np.median(evidence.maxima)))

@@ -308,7 +308,7 @@ class DynamicsEvidence(ShortRepr):
     def from_json(cls, values: Any) -> Self | None:
         """Return the evidence that :meth:`to_json` returned; None if these are not its values."""
         try:
-            coverage, untried = values["coverage"], values["untried"]
+            coverage, untried, tuples = values["coverage"], values["untried"], ("point", "quantiles", "p_values")
             gaps = {
                 name: gap and StateInputGap(**{**gap, "coordinates": tuple(gap["coordinates"])})
                 for name, gap in coverage.items()
@@ -318,9 +318,7 @@ class DynamicsEvidence(ShortRepr):
                 **{name: np.array(values[name], dtype=np.float64) for name in ("maxima", "points", "elites")},
                 **{name: values[name] and tuple(values[name]) for name in ("actuator", "suspect")},
                 "predictions": tuple(
-                    CheckedPrediction(
-                        **dict[str, Any]((k, tuple(v) if isinstance(v, list) else v) for k, v in each.items())
-                    )
+                    CheckedPrediction(**{**each, **{name: tuple(each[name]) for name in tuples}})
                     for each in values["predictions"]
                 ),
                 "coverage": StateInputCoverage(**{**coverage, **gaps, "task": np.array(coverage["task"])}),
@@ -339,20 +337,13 @@ class LearnedDistance(Protocol):
     """Predictions of the distance that are learned from trials and from the data that the model was made from."""
 
     def expected(self, points: Array, before: int) -> Array:
-        """Return predicted distances ``(m,)`` at points ``(m, d)`` of the unit cube; NaN if nothing can be predicted.
-
-        They are learned from trials with numbers below ``before`` only.
-        """
+        """Return distances ``(m,)``, or NaN, at points ``(m, d)`` of the unit cube, predicted from earlier trials."""
 
     def dynamics(self, confidence: float, quantile: float = QUANTILE) -> DynamicsEvidence | None:
         """Return what the dynamics learned from all trials say about d*; None if nothing can be learned.
 
-        If the system is noisy, it is about a quantile of the distance. The confidence
-        sets the least number of posterior samples. Users' code raises a CertificateError.
+        The confidence sets the least number of posterior samples. Users' code raises a CertificateError.
         """
 
     def tasks(self, count: int, seed: int) -> Array:
-        """Return independent draws from the distribution of tasks: points of the unit cube ``(count, d)``.
-
-        They have nothing to do with the draws of any trial.
-        """
+        """Return draws from the distribution of tasks, independent of trials: points ``(count, d)``."""

@@ -39,10 +39,7 @@ if TYPE_CHECKING:
 def falsified(
     worst: Trial, trials: Sequence[Trial], tau: float, quantities: Quantities, bets: Bets | None = None
 ) -> str:
-    """Return which executed task exceeds a threshold, and how often an execution of the same task reproduced it.
-
-    ``bets`` are those of a noisy system.
-    """
+    """Return which executed task exceeds a threshold, and how often an execution of the same task reproduced it."""
     distance, limit = distinguishable(worst.distance or 0.0, tau)
     again = [(trial.distance or 0.0) > tau for trial in executions_of(worst, trials) if trial is not worst]
     reproduced = ""
@@ -124,7 +121,6 @@ def validated(certificate: Certificate, tau: float, quantities: Quantities) -> s
 
 
 def _bound_and_limit(certificate: Certificate, tau: float, quantities: Quantities) -> tuple[str, str]:
-    """Return a bound and the threshold as texts, the bound with its error if it has one."""
     upper, limit = with_error(certificate.upper_bound, certificate.error), f"{tau:.6g}"
     if "±" not in upper:
         upper, limit = distinguishable(certificate.upper_bound, tau)
@@ -132,7 +128,6 @@ def _bound_and_limit(certificate: Certificate, tau: float, quantities: Quantitie
 
 
 def _condition_on_dynamics(details: Mapping[str, Any]) -> str:
-    """Return the condition under which the confidence of a bound from learned dynamics holds."""
     physical = details.get("physical") or []  # stores of earlier versions do not have it
     state, acting = state_of(details.get("estimated")), late(details.get("actuator"))
     acting = f" ({acting})" if acting else ""
@@ -153,7 +148,6 @@ def _condition_on_dynamics(details: Mapping[str, Any]) -> str:
 
 
 def _unusual(resolution: Mapping[str, float] | None, quantities: Quantities) -> str:
-    """Return a resolution other than the default; empty if it is the default."""
     if resolution is None or resolution["diagonals"] == RESOLUTION:
         return ""
     diagonals = f"{resolution['diagonals']:g} diagonals; usual: {RESOLUTION:g}"
@@ -218,10 +212,7 @@ def evidence(certificate: Certificate, tau: float, quantities: Quantities) -> st
 
 
 def tolerances(certificate: Certificate, tau: float) -> tuple[Tolerance, Tolerance] | None:
-    """Return the smallest pushes, everywhere and away from all records, that bring a task above a threshold.
-
-    Returns None if the certificate does not know them.
-    """
+    """Return the smallest pushes, everywhere and away from all records, that bring a task above a threshold."""
     pushed = certificate.details.get("pushed")
     if pushed is None:
         return None
@@ -343,10 +334,6 @@ def not_selected(others: int, falsifying: Sequence[str]) -> str:
 
 
 def _without_assumptions(certificate: Certificate, tau: float, quantities: Quantities) -> str:
-    """Return what drawn tests say whatever the system is: none of them exceeds the threshold.
-
-    This holds at any time: see :func:`~ctxval.certificates.prediction_tests.share_missed`.
-    """
     tests = certificate.details.get("tests", {})
     if tests.get("share_missed") is None:
         return ""
@@ -410,7 +397,6 @@ def supported(certificate: Certificate, tau: float, quantities: Quantities = NO_
 
 
 def _shortfall(certificate: Certificate) -> str:
-    """Return why the bound or the volume left out is not smaller, as the end of a sentence; empty if unknown."""
     details = certificate.details
     if details.get("raised_from") is not None:
         worst = next(checked for checked in details["checked"] if checked["trial"] == details["raised_by_trial"])

@@ -11,12 +11,20 @@ from pathlib import Path
 import numpy as np
 
 from ctxval._util.arrays import Array, Mask, Rows, as_floats, held_means, rows_of
-from ctxval._util.columns import EPISODES, FAR, CsvTable, column_of, in_seconds, time_column, unit_advice
-from ctxval._util.files import MOST_BYTES, read_bytes, written_whole
-from ctxval._util.npz import Archive
+from ctxval._util.columns import (
+    EPISODES,
+    FAR,
+    CsvTable,
+    column_of,
+    conversion,
+    in_seconds,
+    named_unit,
+    time_column,
+    unit_advice,
+)
+from ctxval._util.files import MOST_BYTES, Archive, read_bytes, written_whole
 from ctxval._util.representation import ShortRepr, Shown, call, counted, number
 from ctxval._util.texts import enumerated, guarded, parted, visible
-from ctxval._util.units import conversion, named_unit
 from ctxval.errors import InputError, ShapeError
 
 COMPLETE = "complete"

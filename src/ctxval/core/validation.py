@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from copy import copy
 from dataclasses import replace
 from typing import Any, NoReturn
@@ -257,21 +257,17 @@ class Validation:
         return list(self._planned(require_shape("points", as_floats("points", points), (self.space.dimension,))))
 
     def _planned(self, points: Array) -> Iterator[Plan]:
+        together = getattr(self.synthesizer, "batched", False)
         for chunk in (points[first : first + 256] for first in range(0, len(points), 256)):  # more is hardly faster
-            yield from self._planned_together(chunk) or map(self.plan, chunk)
-
-    def _planned_together(self, points: Array) -> list[Plan] | None:
-        if len(points) == 1 or not getattr(self.synthesizer, "batched", False):
-            return None
-        try:
-            parameters = self.space.parameters(points)
-            whole = self.plan_of(parameters, self.task_at(parameters))
-            if whole.task.batch_shape != (len(points),) or not whole.model_trajectory.finite.all():
-                return None
-            plans = [whole.of(k, self.space.parameters(point)) for k, point in enumerate(points)]
-        except Exception:  # the user's own parts, which need not take a batch
-            return None
-        return plans if all(is_controller(plan.controller) for plan in plans) else None
+            plans = list[Plan]()
+            with suppress(Exception):  # the user's own parts, which need not take a batch
+                if together and len(chunk) > 1:
+                    parameters = self.space.parameters(chunk)
+                    whole = self.plan_of(parameters, self.task_at(parameters))
+                    if whole.task.batch_shape == (len(chunk),) and whole.model_trajectory.finite.all():
+                        plans = [whole.of(k, self.space.parameters(point)) for k, point in enumerate(chunk)]
+            divisible = bool(plans) and all(is_controller(plan.controller) for plan in plans)
+            yield from plans if divisible else map(self.plan, chunk)
 
     def distances(self, points: ArrayLike) -> Array:
         """Return d at points ``(N, d)``, shape ``(N,)``; NaN if the execution fails. Executes S N times.

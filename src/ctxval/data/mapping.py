@@ -11,11 +11,10 @@ from typing import Any, Literal
 
 from ctxval._util.arrays import Array
 from ctxval._util.checked import FiniteFloat, NonNegativeInt, Seconds, checked, require
-from ctxval._util.columns import column_of
+from ctxval._util.columns import column_of, conversion, named_unit
 from ctxval._util.files import read_bytes
 from ctxval._util.representation import ShortRepr
 from ctxval._util.texts import enumerated
-from ctxval._util.units import conversion, named_unit
 from ctxval.data.log import LISTED, Clock, Log, reading
 from ctxval.errors import InputError, UnknownNameError
 

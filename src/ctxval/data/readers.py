@@ -18,8 +18,7 @@ import numpy as np
 from ctxval._util.arrays import Array
 from ctxval._util.columns import CsvTable
 from ctxval._util.extras import require_extra
-from ctxval._util.files import MOST_BYTES, read_bytes, read_json, require_regular_file
-from ctxval._util.npz import Archive
+from ctxval._util.files import MOST_BYTES, Archive, read_bytes, read_json, require_regular_file
 from ctxval._util.texts import quoted, reason_of
 from ctxval.data.log import Log, MemoryTable, Table, reading
 from ctxval.data.matlab import read_mat

@@ -10,11 +10,10 @@ from typing import Any
 import numpy as np
 
 from ctxval._util.arrays import Array, Rows
-from ctxval._util.columns import FAR, sentinels, time_column, unit_advice
+from ctxval._util.columns import FAR, conversion, sentinels, time_column, unit_advice
 from ctxval._util.registry import part
 from ctxval._util.representation import ShortRepr, call, counted
 from ctxval._util.texts import enumerated
-from ctxval._util.units import conversion
 from ctxval.core.controller import Controller, started
 from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory, Transitions

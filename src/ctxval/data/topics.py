@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from ctxval._util.arrays import Array
+from ctxval._util.columns import named_unit
 from ctxval._util.representation import ShortRepr
-from ctxval._util.units import named_unit
 from ctxval.data.log import Clock, Log, Signal
 from ctxval.errors import InputError
 

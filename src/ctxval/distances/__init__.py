@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from ctxval._util.registry import Registry
 from ctxval.core.distance import ComposedDistance, Distance
-from ctxval.distances.crossing import AtCrossing, CrossingTime
 from ctxval.distances.deviations import (
+    AtCrossing,
     AtTimes,
+    CrossingTime,
     FinalState,
     GoalError,
     MaximumDeviation,

@@ -1,4 +1,4 @@
-"""Distances between the states of M and S, or of S and its task: at the end, over time, or at stated times."""
+"""Distances between the states of M and S, or of S and its task: at the end, over time, at stated times, at events."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 
 from ctxval._util.arrays import Array, ArrayLike, as_finite
-from ctxval._util.checked import Norm
+from ctxval._util.checked import FiniteFloat, Norm, PositiveInt
 from ctxval._util.registry import part
 from ctxval.core.distance import NamedStates, require_indices, selected
 from ctxval.core.task import Task
@@ -51,7 +51,7 @@ class StateNorm(NamedStates):
     @property
     def factors(self) -> Array | None:
         """The factor of the difference of each compared state, shape ``(k,)``; None if all are 1."""
-        weights, scales = (np.asarray(1.0 if given is None else given) for given in (self.weights, self.scales))
+        weights, scales = (1.0 if given is None else np.asarray(given) for given in (self.weights, self.scales))
         factors = np.asarray(weights / scales, dtype=np.float64)
         return None if (factors == 1).all() else factors
 
@@ -63,6 +63,10 @@ class StateNorm(NamedStates):
             raise ShapeError(f"there must be a weight or a scale for each of {gap.shape[-1]} states, got {counts[0]}.")
         factors = self.factors
         return gap if factors is None else gap * factors
+
+    def norms(self, states: Array, others: Array) -> Array:
+        """Return the norms of the weighted differences of states ``(..., n)``, shape ``(...)``."""
+        return np.asarray(np.linalg.norm(self.difference(states, others), self.norm, axis=-1))
 
     def unwrapped(self, gap: Array) -> Array:
         """Return differences of states ``(..., n)``; those of angles are moved to at most pi in magnitude."""
@@ -85,8 +89,7 @@ class StateNorm(NamedStates):
     def describe(self) -> dict[str, Any]:
         names = [field.name for field in dataclasses.fields(self)]
         described = {name: getattr(self, name) for name in names if name not in ("weights", "scales", "angles")}
-        factors = self.factors
-        if factors is not None:
+        if (factors := self.factors) is not None:
             described["factors"] = factors
         return described | ({"angles": self.angles} if self.angles else {})
 
@@ -179,8 +182,7 @@ class MaximumDeviation(StateNorm):
     norm: Norm = 2
 
     def __call__(self, model_trajectory: Trajectory, system_trajectory: Trajectory, task: Task) -> Array:
-        gap = self.difference(system_trajectory.states, model_trajectory.states)
-        return np.asarray(np.linalg.norm(gap, self.norm, axis=-1).max(axis=-1))
+        return np.asarray(self.norms(system_trajectory.states, model_trajectory.states).max(axis=-1))
 
 
 @part()
@@ -194,8 +196,7 @@ class MeanDeviation(StateNorm):
     norm: Norm = 2
 
     def __call__(self, model_trajectory: Trajectory, system_trajectory: Trajectory, task: Task) -> Array:
-        gap = self.difference(system_trajectory.states, model_trajectory.states)
-        return np.asarray(np.linalg.norm(gap[..., 1:, :], self.norm, axis=-1).mean(axis=-1))
+        return np.asarray(self.norms(system_trajectory.states, model_trajectory.states)[..., 1:].mean(axis=-1))
 
 
 @part()
@@ -285,6 +286,97 @@ class TrackingError(StateNorm):
     over: Literal["maximum", "mean"] = "maximum"
 
     def __call__(self, model_trajectory: Trajectory, system_trajectory: Trajectory, task: Task) -> Array:
-        gap = self.difference(system_trajectory.states, task.reference)[..., 1:, :]
-        norms = np.linalg.norm(gap, self.norm, axis=-1)
+        norms = self.norms(system_trajectory.states, task.reference)[..., 1:]
         return np.asarray(norms.max(axis=-1) if self.over == "maximum" else norms.mean(axis=-1))
+
+
+Direction = Literal["up", "down", "either"]
+
+
+@part()
+@dataclass(frozen=True)
+class AtCrossing(ErrorNorm):
+    """Largest norm of the difference between the states at which M and S first cross a level, such as a gate.
+
+    The k-th crossing of S is compared with the k-th crossing of M, interpolated between two samples. A trajectory that
+    does not cross so often is compared at its final state.
+
+    Attributes:
+        norm, components, weights, scales, angles: as in :class:`StateNorm`. An angle crosses the level on the circle.
+        state: index or name of the state that crosses the level.
+        level: the level, in the unit of this state.
+        direction: ``up``, ``down`` or ``either``: the direction in which the state crosses the level.
+        crossings: number of crossings that are compared; only the first one by default.
+    """
+
+    norm: Norm = 2
+    state: int | str = 0
+    level: FiniteFloat = 0.0
+    direction: Direction = "either"
+    crossings: PositiveInt = 1
+
+    def error(self, model_trajectory: Trajectory, system_trajectory: Trajectory, task: Task) -> Array:
+        gap = self.difference(self._states(system_trajectory), self._states(model_trajectory))
+        return np.asarray(gap.reshape(*gap.shape[:-2], -1))
+
+    def compose(self, error: Array) -> Array:
+        gap = error.reshape(*error.shape[:-1], self.crossings, -1)
+        return np.asarray(np.linalg.norm(gap, self.norm, axis=-1).max(axis=-1))
+
+    def _states(self, trajectory: Trajectory) -> Array:
+        states = trajectory.states
+        n = states.shape[-1]
+        [state] = require_indices("state", [self.state], n)
+        on_circle = state % n in {index % n for index in require_indices("angles", self.angles, n)}
+        places = _crossings(states[..., state] - self.level, self.direction, self.crossings, on_circle)
+        before = np.minimum(places.astype(np.intp), trajectory.horizon - 1)[..., None]
+        first = np.take_along_axis(states, before, axis=-2)
+        second = np.take_along_axis(states, before + 1, axis=-2)
+        return np.asarray(first + (places[..., None] - before) * self.unwrapped(second - first))
+
+
+@part()
+@dataclass(frozen=True)
+class CrossingTime(NamedStates):
+    """Difference in seconds between the times at which M and S first cross a level; interpolated between samples.
+
+    A trajectory that does not cross the level counts as if it crossed it at its end.
+
+    Attributes:
+        state: index or name of the state that crosses the level, which is in the unit of this state.
+        direction: ``up``, ``down`` or ``either``: the direction in which the state crosses the level.
+        angle: whether the state is an angle in radians, which crosses the level on the circle.
+    """
+
+    state: int | str = 0
+    level: FiniteFloat = 0.0
+    direction: Direction = "either"
+    angle: bool = False
+
+    def __call__(self, model_trajectory: Trajectory, system_trajectory: Trajectory, task: Task) -> Array:
+        [state] = require_indices("state", [self.state], model_trajectory.states.shape[-1])
+        places = [
+            _crossings(trajectory.states[..., state] - self.level, self.direction, 1, self.angle)[..., 0]
+            for trajectory in (system_trajectory, model_trajectory)
+        ]
+        return np.asarray(np.abs(places[0] - places[1]) * task.dt)
+
+
+def _crossings(above: Array, direction: Direction, count: int, on_circle: bool) -> Array:
+    """Return the places of the first crossings of 0 in steps, ``(..., count)``; the last step if there is none."""
+    if on_circle:
+        above = turned(above)
+    first, second = above[..., :-1], above[..., 1:]
+    up, down = (first < 0) & (second >= 0), (first > 0) & (second <= 0)
+    crossed = {"up": up, "down": down, "either": up | down}[direction]
+    if on_circle:
+        crossed &= np.abs(second - first) < np.pi  # a larger step passes the opposite point of the circle
+    with np.errstate(all="ignore"):
+        places = np.arange(first.shape[-1]) + first / (first - second)
+    numbers = np.cumsum(crossed, axis=-1)
+    first_places = []
+    for number in range(1, count + 1):
+        at = crossed & (numbers == number)
+        place = np.take_along_axis(places, at.argmax(axis=-1)[..., None], axis=-1)[..., 0]
+        first_places.append(np.where(at.any(axis=-1), place, float(first.shape[-1])))
+    return np.stack(first_places, axis=-1)

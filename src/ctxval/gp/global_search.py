@@ -130,7 +130,11 @@ def _prominences(points: Array, values: Array, rows: Rows) -> Array:
 
 def _offspring(parents: Array, pool: Array, step: float, count: int, rng: np.random.Generator) -> Array:
     """Return ``count`` points: mutations in all or a few coordinates, differential moves, and moves to bounds."""
-    chosen = parents[_drawn(len(parents), count, rng)]
+    # Half of the parents are drawn uniformly, so that each niche is followed; half prefer good ones.
+    preferences = 1 / np.arange(1, len(parents) + 1)
+    uniform = rng.integers(len(parents), size=count)
+    good = rng.choice(len(parents), size=count, p=preferences / preferences.sum())
+    chosen = parents[np.where(rng.random(count) < 0.5, uniform, good)]
     all_of, few_of, differential, bound = np.array_split(chosen, 4)
     children = [
         all_of + _normal(all_of.shape, step, rng),
@@ -140,14 +144,6 @@ def _offspring(parents: Array, pool: Array, step: float, count: int, rng: np.ran
     moved = bound + _normal(bound.shape, step, rng) * _few(bound.shape, rng)
     children.append(np.where(_few(bound.shape, rng) > 0, rng.integers(2, size=bound.shape), moved))
     return np.clip(np.concatenate(children), 0, 1)
-
-
-def _drawn(parents: int, count: int, rng: np.random.Generator) -> Rows:
-    """Return rows of parents: half of them uniform, so that each niche is followed, half prefer good ones."""
-    rank_weights = 1 / np.arange(1, parents + 1)
-    uniform = rng.integers(parents, size=count)
-    good = rng.choice(parents, size=count, p=rank_weights / rank_weights.sum())
-    return np.where(rng.random(count) < 0.5, uniform, good)
 
 
 def _normal(shape: tuple[int, ...], step: float, rng: np.random.Generator) -> Array:

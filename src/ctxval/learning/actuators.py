@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from scipy.optimize import minimize
 
-from ctxval._util.arrays import Array, Mask, Rows
+from ctxval._util.arrays import Array
 from ctxval.core.controller import Controller, memory_of, stepped
 from ctxval.core.model import Model
 from ctxval.core.task import Task
@@ -92,69 +92,34 @@ def found_actuator(
     Raises:
         LinAlgError: if states cannot be estimated.
     """
-    evidence = _Evidence.of(model, records_of)
-    if not evidence.live.any():
+    records = records_of(Actuator())
+    history = History(model, Structure(0), np.eye(records[0].states.shape[1]))
+    Z, E, _ = history.along(records)
+    steps = np.concatenate([np.diff(each.states, axis=0) for each in records])
+    sizes = np.sqrt((E**2).mean(axis=0))
+    live = sizes > NEGLIGIBLE * standard_deviations(steps)
+    if not live.any():
         return None
-    without = evidence.mode(Actuator()).height
-    tried = [before] if before else [Actuator(*each) for each in _TRIED]
-    mode, best = max(((evidence.mode(each), each) for each in tried), key=lambda pair: pair[0].height)
-    values = len(evidence.rows) * int(evidence.live.sum())
-    if mode.height < without - _NEAR * values:
-        return None
-    for _ in range(2):  # the noise that a wrong actuator seems to add is less the second time
-        best = evidence.refined(best, mode, evaluations)
-        mode = evidence.mode(best)
-    return best if mode.height > without + _BETTER * values else None
+    inputs = records[0].inputs.shape[-1]
+    rows = learning_rows((Z - Z.mean(axis=0)) / standard_deviations(Z), inputs, _LEARNED_FROM)
 
+    def data(actuator: Actuator) -> tuple[Array, Array]:
+        """Return states and acting inputs ``(N, n + m)``, and residuals over their sizes if inputs act at once."""
+        Z, E, _ = history.along(records_of(actuator))
+        return Z[rows], E[rows][:, live] / sizes[live]
 
-@dataclass(frozen=True, eq=False)
-class _Evidence:
-    """How probable residuals of M are if the inputs act late.
-
-    Attributes:
-        rows: the transitions that count, shape ``(N,)``.
-        live: the states in which M errs, shape ``(n,)``.
-        sizes: of their residuals, if the inputs act at once.
-    """
-
-    history: History
-    records_of: RecordsOf
-    rows: Rows
-    live: Mask
-    sizes: Array
-
-    @classmethod
-    def of(cls, model: Model, records_of: RecordsOf) -> _Evidence:
-        records = records_of(Actuator())
-        history = History(model, Structure(0), np.eye(records[0].states.shape[1]))
-        Z, E, _ = history.along(records)
-        sizes = np.sqrt((E**2).mean(axis=0))
-        live = sizes > NEGLIGIBLE * standard_deviations(
-            np.concatenate([np.diff(each.states, axis=0) for each in records])
-        )
+    def mode_of(actuator: Actuator) -> Mode:
+        Z, E = data(actuator)
         scaled = (Z - Z.mean(axis=0)) / standard_deviations(Z)
-        rows = learning_rows(scaled, records[0].inputs.shape[-1], _LEARNED_FROM)
-        return cls(history, records_of, rows, live, sizes[live])
+        return HyperparameterPosterior.given(scaled, E, inputs, FAMILIES[:1]).highest
 
-    def data(self, actuator: Actuator) -> tuple[Array, Array]:
-        """Return states and acting inputs ``(N, n + m)``, and residuals over their sizes."""
-        Z, E, _ = self.history.along(self.records_of(actuator))
-        return Z[self.rows], E[self.rows][:, self.live] / self.sizes
-
-    def mode(self, actuator: Actuator) -> Mode:
-        """Return the most probable hyperparameters, and their log density."""
-        Z, E = self.data(actuator)
-        shift, scale = Z.mean(axis=0), standard_deviations(Z)
-        inputs = Z.shape[1] - len(self.live)
-        return HyperparameterPosterior.given((Z - shift) / scale, E, inputs, FAMILIES[:1]).highest
-
-    def refined(self, start: Actuator, mode: Mode, evaluations: int) -> Actuator:
+    def refined(start: Actuator, mode: Mode) -> Actuator:
         """Return the most likely actuator near one, with the hyperparameters that are most probable for that one."""
-        Z, _ = self.data(start)
+        Z, _ = data(start)
         shift, scale = Z.mean(axis=0), standard_deviations(Z)
 
         def unlikely(each: Array) -> float:
-            Z, E = self.data(Actuator(*np.clip(each, 0.0, _LONGEST).tolist()))
+            Z, E = data(Actuator(*np.clip(each, 0.0, _LONGEST).tolist()))
             return -log_posterior(mode.kernel, mode.place, (Z - shift) / scale, E)[0]
 
         at = np.array([start.delay, start.lag])
@@ -162,10 +127,21 @@ class _Evidence:
         options = {"initial_simplex": simplex, "maxfev": evaluations, "xatol": 1e-5, "fatol": 1e-3}
         best = np.clip(minimize(unlikely, at, method="Nelder-Mead", options=options).x, 0.0, _LONGEST)
         # Whole steps and no lag are preferred as by the Bayesian information criterion.
-        whole, each = np.array([np.round(best[0]), best[1]]), 0.5 * np.log(len(self.rows))
+        whole, each = np.array([np.round(best[0]), best[1]]), 0.5 * np.log(len(rows))
         near = [(best, 2), (whole, 1), (best * [1, 0], 1), (whole * [1, 0], 0)]
         chosen, _ = min(near, key=lambda pair: unlikely(pair[0]) + each * pair[1])
         return Actuator(*chosen.tolist())
+
+    without = mode_of(Actuator()).height
+    tried = [before] if before else [Actuator(*each) for each in _TRIED]
+    mode, best = max(((mode_of(each), each) for each in tried), key=lambda pair: pair[0].height)
+    values = len(rows) * int(live.sum())
+    if mode.height < without - _NEAR * values:
+        return None
+    for _ in range(2):  # the noise that a wrong actuator seems to add is less the second time
+        best = refined(best, mode)
+        mode = mode_of(best)
+    return best if mode.height > without + _BETTER * values else None
 
 
 @dataclass(frozen=True)

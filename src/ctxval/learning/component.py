@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ctxval._util.arrays import Array, Rows
-from ctxval.gp.cholesky import CholeskyFactor, factorise, pivoted_cholesky, tenfold
+from ctxval.gp.kernels import CholeskyFactor, factorise, pivoted_cholesky, tenfold
 from ctxval.learning.hyperparameters import Hyperparameters
 from ctxval.learning.kernel_expansion import KernelExpansion
 

@@ -44,6 +44,11 @@ class LearnedDynamics(ShortRepr):
     _worst_cases: dict[int, WorstCase] = field(default_factory=dict, init=False)
     _draws: dict[tuple[int, bool], AnyDraws] = field(default_factory=dict, init=False)
 
+    @property
+    def executions(self) -> list[tuple[Array, Trajectory]]:
+        """The executed tasks with their trajectories."""
+        return list(zip(self.executed, self.trajectories_of_system, strict=True))
+
     @functools.cached_property
     def noisy(self) -> NoisyPosterior | None:
         """The dynamics with noise and histories, if the next state does not follow from state and input; else None."""

@@ -64,19 +64,21 @@ class RunStatistics:
         others = self.learned.study.without(self.learned, k)
         if others is None:
             return None
-        point, trajectory = self.learned.executed[k], self.learned.trajectories_of_system[k]
-        return self._of(others, trajectory, point, distance)
+        point, trajectory = self.learned.executions[k]
+        return self.later(trajectory, point, distance, others)
 
-    def later(self, trajectory: Trajectory, point: Array | None, distance: float | None) -> dict[str, RunStatistic]:
-        """Return the statistics of a later run, with the states that are learned.
+    def later(
+        self,
+        trajectory: Trajectory,
+        point: Array | None,
+        distance: float | None,
+        learned: LearnedDynamics | None = None,
+    ) -> dict[str, RunStatistic]:
+        """Return the statistics of a later run, with the states that are learned, beside what was learned.
 
         Without its task, ``(d,)``, and its distance, only those of the residuals are known.
         """
-        return self._of(self.learned, trajectory, point, distance)
-
-    def _of(
-        self, learned: LearnedDynamics, trajectory: Trajectory, point: Array | None, distance: float | None
-    ) -> dict[str, RunStatistic]:
+        learned = self.learned if learned is None else learned
         study, floors = learned.study, self.floors**2
         if point is None:
             inputs = trajectory.inputs if study.actuator is None else study.actuator.acting(trajectory.inputs)
@@ -87,7 +89,8 @@ class RunStatistics:
             residuals, doubt, noise, regressors = _residuals(learned, record)
         H = len(residuals)
         columns = np.concatenate([np.ones((H, 1)), regressors], axis=1)
-        basis = _orthonormal(columns)
+        U, S, _ = np.linalg.svd(columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-300), full_matrices=False)
+        basis = U[:, 1e-3 * S[0] < S]
         rank = basis.shape[1]
         linear = ((basis.T @ residuals) ** 2).sum(axis=0) / H
         whole = ((residuals**2).mean(axis=0) + floors) / (doubt + noise + floors)
@@ -169,10 +172,3 @@ def _residuals(learned: LearnedDynamics, record: Record) -> tuple[Array, Array, 
     values = np.concatenate([features(z) @ weights for features, weights, _ in drawn])  # (k, H, n)
     relative = 1.0 if fit.local is None else float((fit.local(pairs) ** 2).mean())
     return residuals, values.var(axis=0).mean(axis=0), fit.noise**2 * relative, pairs
-
-
-def _orthonormal(columns: Array) -> Array:
-    """Return an orthonormal basis ``(H, r)`` of columns ``(H, k)``."""
-    columns = columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
-    U, S, _ = np.linalg.svd(columns, full_matrices=False)
-    return np.asarray(U[:, 1e-3 * S[0] < S])

@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 
 from ctxval._util.arrays import Array
-from ctxval._util.files import MADE_BY, read_bytes, written_whole
-from ctxval._util.npz import Archive
+from ctxval._util.files import MADE_BY, Archive, read_bytes, written_whole
 from ctxval._util.registry import part
 from ctxval.core.model import Model
 from ctxval.core.trajectory import Transitions

@@ -19,7 +19,7 @@ from ctxval._util.registry import part
 from ctxval._util.representation import ShortRepr
 from ctxval.core.trajectory import Transitions
 from ctxval.errors import InputError, ShapeError
-from ctxval.gp.cholesky import factorise
+from ctxval.gp.kernels import factorise
 from ctxval.gp.regression import log_likelihood_of_outputs, most_likely
 from ctxval.models.smooth_maps import Slopes, SmoothMap, kernel_sum, network
 

@@ -42,7 +42,17 @@ class ScikitLearn(ShortRepr):
         if features is None or not callable(getattr(regressor, "predict", None)):
             raise InputError(f"the regressor must be fitted and have predict and n_features_in_, got {regressor!r}.")
         self.features = int(features)
-        self._known = _predicts_the_same(regressor, smooth_map(regressor), self.features)
+        # Whether the formula gives what the regressor predicts, at some points: another release of scikit-learn may
+        # give the numbers another meaning.
+        self._known = False
+        if (formula := smooth_map(regressor)) is not None:
+            rows = np.random.default_rng(0).normal(size=(8, self.features))
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # of feature names
+                predicted = _as_columns(regressor.predict(rows))
+            values, largest = formula.value(rows), float(np.abs(predicted).max())
+            same = values.shape == predicted.shape
+            self._known = same and np.allclose(values, predicted, rtol=1e-4, atol=1e-4 * largest)
 
     @classmethod
     def fit(cls, regressor: Any, data: Transitions, *, increments: bool = True) -> ScikitLearn:
@@ -103,22 +113,6 @@ def _require_states(outputs: Array, n: int) -> None:
 def _as_columns(output: Any) -> Array:
     values = np.asarray(output, dtype=np.float64)
     return values[:, None] if values.ndim == 1 else values
-
-
-def _predicts_the_same(regressor: Any, formula: SmoothMap | None, features: int) -> bool:
-    """Return whether a formula gives what the regressor predicts, at some points.
-
-    It guards against releases of scikit-learn with another meaning of the numbers.
-    """
-    if formula is None:
-        return False
-    rows = np.random.default_rng(0).normal(size=(8, features))
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of feature names
-        predicted = _as_columns(regressor.predict(rows))
-    values = formula.value(rows)
-    scale = float(np.abs(predicted).max())
-    return values.shape == predicted.shape and np.allclose(values, predicted, rtol=1e-4, atol=1e-4 * scale)
 
 
 _LINEAR = {

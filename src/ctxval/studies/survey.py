@@ -15,10 +15,9 @@ from typing import Any, Literal
 import numpy as np
 
 from ctxval._util.arrays import single_threaded
-from ctxval._util.columns import TIMES, time_column
+from ctxval._util.columns import TIMES, named_unit, time_column
 from ctxval._util.representation import ShortRepr, counted
 from ctxval._util.texts import enumerated
-from ctxval._util.units import named_unit
 from ctxval.core.model import Model
 from ctxval.data import Clock, Field, Log, LogMapping, Recordings, Table, component_names, read_logs, recordings_of
 from ctxval.errors import InputError

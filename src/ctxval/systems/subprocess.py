@@ -1,4 +1,8 @@
-"""A command as the true system: a rig's own program, a simulator, any language."""
+"""A command as the true system: a rig's own program, a simulator, any language.
+
+Its child processes all end: with the command, at a timeout, and with the process that started it. If a command went on
+after ``kill -9`` of its campaign, it would move a rig at the same time as its own repetition.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +16,8 @@ import signal
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import IO
 
@@ -178,7 +183,11 @@ class Subprocess(ShortRepr):
 
     def execute(self, controller: Controller, task: Task) -> Trajectory:
         require_one(task)
-        with self._folder() as folder:
+        kept: AbstractContextManager[Path] = temporary_folder()
+        if self.keep is not None:
+            self.keep.mkdir(parents=True, exist_ok=True)
+            kept = contextlib.nullcontext(Path(tempfile.mkdtemp(prefix="execution-", dir=self.keep)).resolve())
+        with kept as folder:
             write_task(folder / "task.json", task, states=self.states)
             for kind in ("json", "npz"):
                 path = folder / f"controller.{kind}"
@@ -199,15 +208,6 @@ class Subprocess(ShortRepr):
                 stderr.seek(max(0, stderr.seek(0, os.SEEK_END) - 4096))
                 lines = [line.strip() for line in stderr.read().decode("utf-8", "replace").splitlines() if line.strip()]
                 raise ExecutionError(f"the command {how}: {lines[-1][:300] if lines else 'nothing on stderr'}")
-
-    @contextlib.contextmanager
-    def _folder(self) -> Iterator[Path]:
-        if self.keep is not None:
-            self.keep.mkdir(parents=True, exist_ok=True)
-            yield Path(tempfile.mkdtemp(prefix="execution-", dir=self.keep)).resolve()
-            return
-        with temporary_folder() as folder:
-            yield folder
 
 
 def signal_name(number: int) -> str:

@@ -11,7 +11,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from ctxval._util.locks import LOCKS_FILE_ITSELF, FileLock, LockedError
+from ctxval._util.files import LOCKS_FILE_ITSELF, FileLock, LockedError
 from ctxval._util.progress import advance, stage
 from ctxval.campaign.storage import schema
 from ctxval.campaign.storage.disks import StoreWarning, make_folder, network

@@ -16,8 +16,7 @@ from pydantic.errors import PydanticUserError
 from pydantic_core import SchemaError
 
 from ctxval import cases, controllers, distances, models, systems
-from ctxval._util.files import read_bytes
-from ctxval._util.npz import Archive
+from ctxval._util.files import Archive, read_bytes
 from ctxval._util.registry import Declaration, Registry, construct, declaration_of
 from ctxval.cli.config.references import accepts, is_function, reference, require_function, require_part
 from ctxval.core.experiment import Experiment

@@ -122,11 +122,14 @@ class Candidate:
 
     def executed(self, *, shared: bool = False) -> list[Trial]:
         """Return the trials whose execution has ended, with or without success: its own, or those of others."""
-        return [trial for trial in self.trials if trial.executed and is_shared(trial) == shared]
+        copied = {trial.number for trial, note in self.noted if note.shared is not None}
+        return [trial for trial in self.trials if trial.executed and (trial.number in copied) == shared]
 
-    def trajectories(self) -> list[tuple[Trial, Trajectory]]:
-        """Return the completed trials with a recorded trajectory; the store keeps what it has read."""
-        return executed_trials(self.campaign.store, self.trials)
+    def trajectories(self) -> list[tuple[Trial, TrialNote | None, Trajectory]]:
+        """Return the completed trials that are its own, with their notes and trajectories; the store keeps these."""
+        recorded = executed_trials(self.campaign.store, self.trials)
+        noted = [(trial, TrialNote.of(trial), trajectory) for trial, trajectory in recorded]
+        return [each for each in noted if each[1] is None or each[1].shared is None]
 
     def highest(self, executed: Executed) -> tuple[float, Array] | None:
         """Return the largest predicted distance and its task ``(d,)``; None if nothing can be predicted."""
@@ -174,12 +177,6 @@ class Candidate:
         return self._last[1]
 
 
-def is_shared(trial: Trial) -> bool:
-    """Return whether the execution of a trial is that of another candidate."""
-    note = TrialNote.of(trial)
-    return note is not None and note.shared is not None
-
-
 @dataclass(eq=False)
 class Executions:
     """Executes tasks one at a time, and records each execution for all candidates whose controllers agree.
@@ -220,13 +217,12 @@ class Executions:
 
     def history(self, without: Array | None = None) -> list[tuple[Array, Trajectory]]:
         """Return all executed tasks but one in the order in which they were executed, each execution once."""
-        executed = []
-        for row, candidate in enumerate(self.candidates):
-            for trial, trajectory in candidate.trajectories():
-                if (without is None or not np.array_equal(trial.unit_point, without)) and not is_shared(trial):
-                    note = TrialNote.of(trial)
-                    order = (-1 if note is None else note.step, row, trial.number)
-                    executed.append((order, (trial.unit_point, trajectory)))
+        executed = [
+            ((-1 if note is None else note.step, row, trial.number), (trial.unit_point, trajectory))
+            for row, candidate in enumerate(self.candidates)
+            for trial, note, trajectory in candidate.trajectories()
+            if without is None or not np.array_equal(trial.unit_point, without)
+        ]
         return [item for _, item in sorted(executed, key=lambda pair: pair[0])]
 
     def predicted(self, candidate: Candidate, note: TrialNote, point: Array) -> TrialNote:
@@ -263,13 +259,10 @@ class Executions:
     def _share_all(self) -> None:
         """Record executions for the candidates that would have given the system the same inputs."""
         for candidate in self.candidates:
-            for trial, trajectory in candidate.trajectories():
-                note = TrialNote.of(trial)
-                if note is None or note.shared is not None:
-                    continue
+            for trial, note, trajectory in candidate.trajectories():
                 for other in self.candidates:
                     key = (candidate.name, trial.number, other.name)
-                    if other is not candidate and key not in self._examined:
+                    if note is not None and other is not candidate and key not in self._examined:
                         self._examined.add(key)
                         self._share(trial, trajectory, replace(note, shared=key[:2]), other)
 
@@ -313,9 +306,8 @@ class Executions:
             trajectory
             for other in self.candidates
             if other is not candidate
-            for trial, trajectory in other.trajectories()
-            if not is_shared(trial)
-            and (other.name, trial.number) not in copied
+            for trial, _, trajectory in other.trajectories()
+            if (other.name, trial.number) not in copied
             and (self._hidden is None or not np.array_equal(trial.unit_point, self._hidden))
         ]
 
