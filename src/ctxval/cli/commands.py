@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import importlib
 import tomllib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -48,25 +50,25 @@ class Commands(TyperGroup):
 
     def make_context(self, *args: Any, **extra: Any) -> Any:
         """Read the arguments."""
-        try:
+        with _harmless_errors():
             return super().make_context(*args, **extra)
-        except Exception as error:
-            raise _harmless(error) from None
 
     def invoke(self, ctx: Any) -> Any:
         """Read the arguments of a command, and run it."""
-        try:
+        with _harmless_errors():
             return super().invoke(ctx)
-        except Exception as error:
-            raise _harmless(error) from None
 
 
-def _harmless(error: Exception) -> Exception:
-    """Return an error about arguments whose message has control characters escaped."""
-    if hasattr(error, "format_message"):
-        message = line(error.format_message())
-        vars(error)["format_message"] = lambda: message
-    return error
+@contextmanager
+def _harmless_errors() -> Iterator[None]:
+    """Escape control characters in the messages of errors about arguments."""
+    try:
+        yield
+    except Exception as error:
+        if hasattr(error, "format_message"):
+            message = line(error.format_message())
+            vars(error)["format_message"] = lambda: message
+        raise
 
 
 app = typer.Typer(

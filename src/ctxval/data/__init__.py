@@ -2,8 +2,8 @@
 
 from ctxval.data.log import Clock, Log, MemoryTable, Signal, Table
 from ctxval.data.mapping import Field, LogMapping, Observer
-from ctxval.data.readers import READERS, is_log, read_logs
-from ctxval.data.recordings import Recorded, Recording, Recordings, component_names, read_recordings, recordings_of
+from ctxval.data.readers import READERS, component_names, is_log, read_logs
+from ctxval.data.recordings import Recorded, Recording, Recordings, read_recordings, recordings_of
 from ctxval.data.sampling import Break, Channel
 from ctxval.data.topics import Message, TopicLog
 

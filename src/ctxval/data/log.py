@@ -237,10 +237,7 @@ class Table(Log):
 
 
 class MemoryTable(Table):
-    """A table whose columns are in memory; ``first`` is the number of the first row in messages."""
+    """A table whose columns are in memory."""
 
-    def __init__(self, source: str, columns: Mapping[str, Array], first: int = 0, period: float | None = None) -> None:
-        stored = dict(columns)
-        super().__init__(
-            source, tuple(stored), lambda names: {name: stored[name] for name in names}, first=first, period=period
-        )
+    def __init__(self, source: str, columns: Mapping[str, Array]) -> None:
+        super().__init__(source, tuple(columns), lambda names: {name: columns[name] for name in names})

@@ -9,6 +9,7 @@ import gzip
 import json
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -120,16 +121,19 @@ def read_lerobot(path: Path) -> list[Log]:
     return logs
 
 
-def lerobot_names(path: Path) -> Mapping[str, list[str]]:
-    """Return the names of the components of states and actions that a LeRobot data set states, if it states them."""
-    features: Any = read_json(path / "meta" / "info.json").get("features", {})
+def component_names(paths: Sequence[str | Path]) -> Mapping[str, list[str]]:
+    """Return the names of the components of states and actions, if there is one LeRobot data set that states them."""
+    if len(paths) != 1 or not is_lerobot(Path(paths[0])):
+        return {}
     stated = {}
-    for column in ("observation.state", "action"):
-        names = features.get(column, {}).get("names")
-        while isinstance(names, Mapping):  # version 2.0 has a level such as "motors"
-            names = next(iter(names.values()), None)
-        if isinstance(names, list) and len(set(map(str, names))) == len(names):
-            stated[column] = [str(name) for name in names]
+    with suppress(InputError, AttributeError, TypeError):  # names are only labels
+        features: Any = read_json(Path(paths[0]) / "meta" / "info.json").get("features", {})
+        for column in ("observation.state", "action"):
+            names = features.get(column, {}).get("names")
+            while isinstance(names, Mapping):  # version 2.0 has a level such as "motors"
+                names = next(iter(names.values()), None)
+            if isinstance(names, list) and len(set(map(str, names))) == len(names):
+                stated[column] = [str(name) for name in names]
     return stated
 
 

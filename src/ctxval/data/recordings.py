@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -21,7 +20,7 @@ from ctxval.core.trajectory import Trajectory, Transitions
 from ctxval.data.derived import with_derived
 from ctxval.data.log import Log, Signal, Table
 from ctxval.data.mapping import LogMapping
-from ctxval.data.readers import is_lerobot, lerobot_names, logs_in, read_logs, task_of
+from ctxval.data.readers import component_names, logs_in, read_logs, task_of
 from ctxval.data.sampling import Break, Channel, sampled
 from ctxval.errors import ExecutionError, InputError
 
@@ -87,14 +86,6 @@ def read_recordings(
     chosen = LogMapping.usual(logs[0], states, inputs) if mapping is None else mapping
     names = component_names(paths) if mapping is None else {}
     return recordings_of(logs, replace(chosen.in_units(states or {}, inputs or {}), **changes), names)
-
-
-def component_names(paths: Sequence[str | Path]) -> Mapping[str, list[str]]:
-    """Return the names of the components of vector fields, if a LeRobot data set states them."""
-    if len(paths) == 1 and is_lerobot(Path(paths[0])):
-        with suppress(InputError, AttributeError, TypeError):  # names are only labels
-            return lerobot_names(Path(paths[0]))
-    return {}
 
 
 def recordings_of(

@@ -111,13 +111,8 @@ def learn(points: Array, values: Array) -> Learned:
     Nardi 2024). The process models the logarithms of the values if no value is negative and if that predicts each
     value clearly better from all others; else it models the values.
     """
-    if len(values) > 300:
-        # The largest values, and others evenly spread over the history.
-        order = np.argsort(-values, kind="stable")
-        largest, others = order[:150], np.sort(order[150:])
-        evenly = others[np.linspace(0, len(others) - 1, 150).astype(int)]
-        rows = np.sort(np.concatenate([largest, evenly]))
-        points, values = points[rows], values[rows]
+    rows = spread_rows(values, 300)
+    points, values = points[rows], values[rows]
     score, learned = _learn_on(points, values, Warp())
     if values.min() >= 0 and values.max() > 0:
         log_score, of_logarithm = _learn_on(points, values, Warp(0.1 * float(values.mean())))
@@ -155,6 +150,16 @@ def _prior(d: int) -> tuple[Array, LogDensity]:
         return 0.5 * float(away @ gradient), gradient  # the density is quadratic
 
     return np.asarray(centre), log_density
+
+
+def spread_rows(values: Array, count: int) -> Rows:
+    """Return ``count`` rows: half have the largest values, the others are evenly spread over the history."""
+    if len(values) <= count:
+        return np.arange(len(values))
+    order = np.argsort(-values, kind="stable")
+    largest, others = order[: count // 2], np.sort(order[count // 2 :])
+    evenly = others[np.linspace(0, len(others) - 1, count // 2).astype(int)]
+    return np.sort(np.concatenate([largest, evenly]))
 
 
 LONG = 1000

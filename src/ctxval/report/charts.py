@@ -85,15 +85,15 @@ class Axis(ShortRepr):
         low, high = self.ends
         return np.clip((np.asarray(values, dtype=np.float64) - low) / (high - low), -0.02, 1.02)
 
-    def ticks(self, count: int = 5) -> list[float]:
-        """Return round numbers within the axis, about so many."""
+    def ticks(self) -> list[float]:
+        """Return about five round numbers within the axis."""
         low, high = self.ends
-        raw = (high - low) / count
+        raw = (high - low) / 5
         power = 10.0 ** np.floor(np.log10(raw))
         step = power * next(factor for factor in (1.0, 2.0, 2.5, 5.0, 10.0) if factor * power >= raw * (1 - 1e-9))
         step = max(step, 1.0) if self.whole else step
         first, last = np.ceil(low / step - 1e-9), np.floor(high / step + 1e-9)
-        return [float(k * step) for k in np.arange(first, last + 1)][: 4 * count]
+        return [float(k * step) for k in np.arange(first, last + 1)][:20]
 
 
 @dataclass(eq=False)

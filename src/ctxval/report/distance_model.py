@@ -12,7 +12,7 @@ import numpy as np
 from ctxval._util.arrays import Array, single_threaded
 from ctxval.core.trial import Trial
 from ctxval.gp.regression import GaussianProcess
-from ctxval.gp.surrogate import Learned, learn
+from ctxval.gp.surrogate import Learned, learn, spread_rows
 
 
 def distance_of(trial: Trial) -> float:
@@ -50,15 +50,11 @@ class DistanceModel:
     @classmethod
     def of(cls, completed: Sequence[Trial], suite: Array | None = None) -> DistanceModel | None:
         """Return the model of trials with a distance; None if they are fewer than two, or none can be fitted."""
-        known = list(completed)
-        if len(known) < 2:
+        if len(completed) < 2:
             return None
-        if len(known) > 500:  # those with the largest distances, and others evenly spread over their order
-            order = sorted(range(len(known)), key=lambda k: -distance_of(known[k]))
-            rest = sorted(order[250:])
-            evenly = np.linspace(0, len(rest) - 1, 250).astype(int)
-            known = [known[k] for k in sorted({*order[:250], *(rest[j] for j in evenly.tolist())})]
-        points, values = np.array([trial.unit_point for trial in known]), np.array(list(map(distance_of, known)))
+        points, values = np.array([trial.unit_point for trial in completed]), np.array([*map(distance_of, completed)])
+        rows = spread_rows(values, 500)
+        points, values = points[rows], values[rows]
         with single_threaded(), np.errstate(all="ignore"):
             learned = learn(points, values)
             process = learned.condition(points, values)

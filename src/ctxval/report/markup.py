@@ -93,10 +93,9 @@ def heading(words: object, level: int = 3) -> Markup:
     return element(f"h{level}", words)
 
 
-def bullets(items: Iterable[object], class_: str | None = None) -> Markup:
-    """Return a list; an item that is an ``li`` element stays as it is."""
-    rows = (item if str(item).startswith("<li") and isinstance(item, Markup) else element("li", item) for item in items)
-    return element("ul", *rows, class_=class_)
+def bullets(items: Iterable[object]) -> Markup:
+    """Return a list."""
+    return element("ul", *(element("li", item) for item in items))
 
 
 def table(
@@ -114,15 +113,16 @@ def table(
     Numbers have four digits. The label is the caption, unless it is given.
     """
     head = element("tr", *(element("th", header, scope="col") for header in headers))
-    body = [row if isinstance(row, Markup) else _row(*row) for row in rows]
+    body = []
+    for row in rows:
+        if not isinstance(row, Markup):
+            first, *others = map(cell, row)
+            row = element("tr", element("th", first, scope="row"), *(element("td", value) for value in others))
+        body.append(row)
     inside = element("caption", caption), element("thead", head), element("tbody", *body)
     whole, label = element("table", *inside, class_=class_, id=id_), label or shortened(visible(caption), 120)
     # What scrolls by itself must be reached by the keyboard.
     return element("div", whole, class_=scroll, tabindex="0", role="region", aria_label=label)
-
-
-def _row(first: object, *others: object) -> Markup:
-    return element("tr", element("th", cell(first), scope="row"), *(element("td", cell(value)) for value in others))
 
 
 def cell(value: object) -> Markup:

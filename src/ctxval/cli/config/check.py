@@ -8,7 +8,6 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ctxval._util.arrays import Array
 from ctxval._util.progress import stage
 from ctxval._util.representation import task_text
 from ctxval._util.texts import reason_of
@@ -190,18 +189,14 @@ def _batches(validation: Validation, plans: Sequence[Plan]) -> Findings:
         yield "noted", "the task function takes one point at a time, so --truth is slower"
         return
     for index, plan in enumerate(plans):
-        row = batch[index]
-        if _differ(row.reference, plan.task.reference) or _differ(row.initial_state, plan.task.initial_state):
-            yield "failed", f"task {index} of a batch differs from the same task alone: check the task function"
-            return
+        for name in ("reference", "initial_state"):
+            values, alone = getattr(batch[index], name), getattr(plan.task, name)
+            rounding = 1e-12 * np.abs(alone).max(initial=0)  # algebra of a batch sums in another order
+            if values.shape != alone.shape or not np.allclose(values, alone, rtol=0, atol=rounding):
+                yield "failed", f"task {index} of a batch differs from the same task alone: check the task function"
+                return
     check_synthesizer(with_states_of_model(validation).synthesizer, batch[:4], validation.model)
     yield "ok", "task function and synthesizer give the same results in a batch as alone"
-
-
-def _differ(values: Array, alone: Array) -> bool:
-    """Return whether two arrays differ by more than rounding: algebra of a batch sums in another order."""
-    most = 1e-12 * np.abs(alone).max(initial=0)
-    return values.shape != alone.shape or not np.allclose(values, alone, rtol=0, atol=most)
 
 
 def _distance(experiment: Experiment, plans: Sequence[Plan]) -> Findings:
