@@ -248,7 +248,7 @@ def certified(
         found = draw_maxima(sample, draws=DRAWS, paths=PATHS, seed=seed, prior=prior, stochastic=stochastic)
     except CertificateError as error:
         return {"n": len(values), "refused": str(error)}
-    details = certify_posterior(sample, found=found, stochastic=stochastic).details
+    details = certify_posterior(sample, found=found).details
     return {
         "n": len(values),
         "best": sample.best,

@@ -274,7 +274,7 @@ These are the campaigns that `ctxval reproduce` stored, with ten seeds each. Ten
 ## Noisy systems
 
 The values have normal noise with a standard deviation of {noise:g} standard deviations of the expected values. The
-tasks are random, and the option is `--stochastic`. The bound is one on the largest expected value, and it is compared
+tasks are random. The bound is one on the largest expected value, and it is compared
 with that value.
 
 {noisy}

@@ -17,7 +17,6 @@ _COMMANDS: dict[str, tuple[str, ...]] = {
         "--seed",
         "--store",
         "--timeout",
-        "--stochastic",
         "--explore",
         "--truth",
         "--json",
@@ -31,7 +30,6 @@ _COMMANDS: dict[str, tuple[str, ...]] = {
         "--constant",
         "--theorem",
         "--resolution",
-        "--stochastic",
         "--json",
     ),
     "ask": (
@@ -67,7 +65,7 @@ _COMMANDS: dict[str, tuple[str, ...]] = {
     "cases": ("--json",),
     "reproduce": ("--quick", "--out"),
 }
-_FLAGS = ("--stochastic", "--explore", "--truth", "--json", "--draw", "--resample", "--quick")
+_FLAGS = ("--explore", "--truth", "--json", "--draw", "--resample", "--quick")
 _PLACES = (
     "a.sqlite",
     FILE,

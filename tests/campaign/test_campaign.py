@@ -589,7 +589,7 @@ def test_a_resumed_random_search_keeps_its_plan(validation: Validation, tmp_path
 def test_options_beside_a_certificate_are_refused() -> None:
     campaign = Campaign(make_validation(), seed=1).run(3, explore=True)
     by = CertificateOptions(confidence=0.9)
-    for options in ({"confidence": 0.99}, {"stochastic": True}, {"resolution": 0.5}):
+    for options in ({"confidence": 0.99}, {"resolution": 0.5}):
         with pytest.raises(InputError, match="options of certificate=; state them there"):
             campaign.verdict(9.0, certificate=by, **options)  # type: ignore[arg-type]
     with pytest.raises(InputError, match="certificate must be a CertificateOptions, got 'audit'"):

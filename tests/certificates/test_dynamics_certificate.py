@@ -217,10 +217,6 @@ def test_auto_uses_the_dynamics_if_they_decide_and_the_distance_otherwise() -> N
     assert judge(trials(9), 1.1, chosen, noisy).certificate.kind == "posterior"  # type: ignore[union-attr]
     alone = judge(trials(9), 1.1, chosen)
     assert alone.reason == judge(trials(9), 1.1, CertificateOptions(Posterior())).reason
-    stochastic = judge(
-        trials(9), 1.1, CertificateOptions(Automatic(stochastic=True)), Provenance(learned=Learned(GOOD))
-    )
-    assert stochastic.certificate.kind == "posterior"  # type: ignore[union-attr]
 
 
 def test_the_kinds_are_found_by_name() -> None:

@@ -91,7 +91,6 @@ def test_the_kinds_of_this_package_are_listed_by_name() -> None:
 
 def test_which_kinds_have_a_use_for_an_option_follows_from_their_fields() -> None:
     uses = {
-        "stochastic": ("auto", "dynamics", "posterior"),
         "tests": ("auto", "dynamics"),
         "resolution": ("auto", "posterior"),
         "volume": ("anytime", "audit", "region", "sampling-discarding", "scenario"),
@@ -194,7 +193,7 @@ def test_a_class_that_is_defined_again_replaces_itself() -> None:
         lambda: certificates.CertificateOptions(confidence="high"),
         lambda: certificates.CertificateOptions(volume=True),
         lambda: Posterior(resolution="fine"),
-        lambda: Posterior(stochastic="no"),
+        lambda: Posterior(resolution="no"),
     ],
 )
 def test_options_of_another_type_are_refused(make: Any) -> None:

@@ -149,7 +149,7 @@ def test_noise_widens_what_is_expected_and_may_stay_below_the_largest_value_seen
     mean = 3 + 0.5 * np.sin(3 * X[:, 0])
     noisy = Sample(X, mean + 0.5 * rng.normal(size=40), ["iid"] * 40, ["completed"] * 40)
     maxima = quick(noisy, stochastic=True)
-    certificate = certify_posterior(noisy, 0.9, stochastic=True, found=maxima)
+    certificate = certify_posterior(noisy, 0.9, found=maxima)
     assert 3.5 < certificate.upper_bound < noisy.best
     assert "expected distance" in certificate.statement
     assert any("noise" in line for line in certificate.assumptions)
@@ -201,12 +201,14 @@ def test_distances_that_differ_by_rounding_are_refused() -> None:
 def test_one_task_with_two_distances_is_not_deterministic() -> None:
     X, y = sample().points.copy(), sample().distances
     X[5] = X[2]
-    with pytest.raises(CertificateError, match=r"trials 2 and 5 executed one task.*say --stochastic"):
-        draw_maxima(of(X, y))
-    assert np.isfinite(quick(of(X, y), stochastic=True).draws).all()
+    noisy = draw_maxima(of(X, y), draws=10, paths=4)
+    assert noisy.stochastic
+    assert np.isfinite(noisy.draws).all()
     same = y.copy()
     same[5] = y[2]
-    assert np.isfinite(quick(of(X, same)).draws).all()
+    exact = draw_maxima(of(X, same), draws=10, paths=4)
+    assert not exact.stochastic
+    assert exact.draws.min() >= same.max()
 
 
 # The error of the bound
@@ -232,9 +234,9 @@ def test_more_draws_have_a_smaller_error() -> None:
 def counted(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     seeds: list[int] = []
 
-    def few(trials: Sample, *, seed: int = 0, stochastic: bool = False) -> Maxima:
+    def few(trials: Sample, *, seed: int = 0) -> Maxima:
         seeds.append(seed)
-        return draw_maxima(trials, draws=10, paths=4, seed=seed, stochastic=stochastic)
+        return draw_maxima(trials, draws=10, paths=4, seed=seed)
 
     monkeypatch.setattr("ctxval.certificates.maxima.draw_maxima", few)
     return seeds

@@ -230,18 +230,21 @@ def test_a_confidence_beyond_the_draws_is_undecided_and_one_that_is_none_is_refu
             StoppingRule(tau, posterior(confidence)).decide(trials(), 0)
 
 
+def repeated(executed: Trial) -> Trial:
+    """Return another execution of a task, whose distance is another one because of noise."""
+    return replace(executed, number=99, distance=1.05 * (executed.distance or 0.0))
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("stochastic", [False, True])
 @pytest.mark.thorough
 def test_decided_is_what_the_verdict_is_not_undecided_of(stochastic: bool) -> None:
-    known = trials(6)
-    upper = certify_posterior(Sample.of(known), 0.95, stochastic=stochastic).upper_bound
+    known = [*trials(6), *([repeated(trials(6)[2])] if stochastic else [])]
+    upper = certify_posterior(Sample.of(known), 0.95).upper_bound
     best = max(t.distance or 0.0 for t in known)
     for threshold in (0.9 * best, 1.02 * upper, best + 0.2 * (upper - best)):
-        verdict = judge(known, threshold, posterior(stochastic=stochastic))
-        assert StoppingRule(threshold, posterior(stochastic=stochastic)).decide(known, 0).decided == (
-            verdict.answer != "undecided"
-        )
+        verdict = judge(known, threshold, posterior())
+        assert StoppingRule(threshold, posterior()).decide(known, 0).decided == (verdict.answer != "undecided")
 
 
 @pytest.mark.slow
@@ -359,7 +362,7 @@ def test_a_validation_names_what_it_rests_on() -> None:
     assert verdict.rests_on in str(verdict)
     assert "It rests on" in repr(verdict)
     assert "It rests on" in verdict._repr_html_()
-    noisy = judge(trials(), 50.0, posterior(stochastic=True), IN_SPACE)
+    noisy = judge([*trials(), repeated(trials()[2])], 50.0, posterior(), IN_SPACE)
     assert noisy.rests_on is not None
     assert "single executions may exceed it" in noisy.rests_on
     assert judge(trials(), 0.5).rests_on is None

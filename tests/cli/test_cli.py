@@ -421,8 +421,8 @@ def test_an_audit_executes_what_is_missing_and_is_remembered(invoke, campaigns: 
             "discard is for certificates of the kind region or sampling-discarding; the kind here is posterior",
         ),
         (
-            ["--kind", "audit", "--stochastic"],
-            "stochastic is for certificates of the kind auto or dynamics or posterior; the kind here is audit",
+            ["--kind", "audit", "--resolution", "1"],
+            "resolution is for certificates of the kind auto or posterior; the kind here is audit",
         ),
         (
             ["--audit", "5", "--resolution", "1"],
@@ -533,11 +533,6 @@ def test_an_audit_waits_for_what_people_are_executing(invoke, campaigns: dict[st
     assert result.exit_code == 2
     assert "trials are open: 12. Record their results with `ctxval tell`" in result.stderr.replace("\n", " ")
     assert json.loads(invoke("status", "a.sqlite", "--json").stdout)["executions"] == 12
-
-
-def test_a_run_on_a_stochastic_system_says_so(invoke) -> None:  # type: ignore[no-untyped-def]
-    result = invoke("run", "rig:experiment", "--threshold", "50", "--stochastic", "--json")
-    assert "independent normal noise" in json.loads(result.stdout)["certificate"]["assumptions"][2]
 
 
 @pytest.mark.slow

@@ -70,7 +70,7 @@ def store(invoke: Any) -> Path:
         [],
         ["--search", "gp-ucb", "--decide", "--threshold", "5", "--confidence", "0.9", "--budget", "6"],
         ["--search", "gp-ucb", "--decide", "--tests", "3", "--budget", "3"],
-        ["--search", "gp-ucb", "--resolution", "1", "--budget", "3", "--stochastic"],
+        ["--search", "gp-ucb", "--resolution", "1", "--budget", "3"],
     ],
     ids=" ".join,
 )

@@ -155,7 +155,6 @@ class Campaign:
         envelope: bool = False,
         within: PositiveFloat = WITHIN,
         confidence: float = CONFIDENCE,
-        stochastic: bool = False,
         resolution: float = RESOLUTION,
         certificate: CertificateOptions | None = None,
         until: Callable[[Campaign], bool] | None = None,
@@ -189,7 +188,7 @@ class Campaign:
                 which the distance stays below the threshold; see :meth:`envelope`.
             within: without a threshold, the share by which the bound may exceed the largest executed distance at the
                 end.
-            confidence, stochastic, resolution, certificate: as in :meth:`verdict`; unless the campaign explores, the
+            confidence, resolution, certificate: as in :meth:`verdict`; unless the campaign explores, the
                 kind of the certificate must be ``auto``, ``dynamics``, ``posterior`` or, with an acceptable volume,
                 ``anytime``.
             until: called before each execution; the campaign stops early if it returns True.
@@ -209,7 +208,7 @@ class Campaign:
                 executions are stored, and running again continues after the trial that failed.
             CampaignError: if there are no workers any more.
         """
-        options = CertificateOptions.or_automatic(certificate, confidence, stochastic, resolution)
+        options = CertificateOptions.or_automatic(certificate, confidence, resolution)
         if explore is None:
             explore = threshold is None and not isinstance(self.search, Auto)
         decides = None if explore else IntervalSearch(self.recorder, options, budget, threshold, within)
@@ -327,7 +326,6 @@ class Campaign:
         budget: PositiveInt,
         *,
         confidence: float = CONFIDENCE,
-        stochastic: bool = False,
         resolution: float = RESOLUTION,
         certificate: CertificateOptions | None = None,
         wait: NonNegativeFloat = 0.0,
@@ -338,7 +336,7 @@ class Campaign:
         Returns None if the model is validated or falsified for the threshold, or if the budget is spent. Open trials
         count for the budget. The arguments and the errors raised are those of :meth:`run` and :meth:`ask`.
         """
-        options = CertificateOptions.or_automatic(certificate, confidence, stochastic, resolution)
+        options = CertificateOptions.or_automatic(certificate, confidence, resolution)
         with progress_shown(progress), self.store.sole_writer(wait):
             self.refresh()
             search = IntervalSearch(self.recorder, options, budget, threshold)
@@ -479,7 +477,6 @@ class Campaign:
         threshold: PositiveFloat,
         confidence: float = CONFIDENCE,
         *,
-        stochastic: bool = False,
         resolution: float = RESOLUTION,
         certificate: CertificateOptions | None = None,
         progress: bool | None = None,
@@ -493,16 +490,15 @@ class Campaign:
         Args:
             threshold: tau, in the units of the distance.
             confidence: the confidence level of the certificate, at least 0.5.
-            stochastic: whether two executions of one task may differ.
             resolution: the largest distance between a task and its nearest trial that a validation permits, in
                 diagonals of the task space.
-            certificate: the kind and the options of the certificate, in place of ``auto`` with the three options above.
+            certificate: the kind and the options of the certificate, in place of ``auto`` with the two options above.
             progress: as in :meth:`run`.
 
         Raises:
             CertificateError: if an option of the certificate is not valid.
         """
-        options = CertificateOptions.or_automatic(certificate, confidence, stochastic, resolution)
+        options = CertificateOptions.or_automatic(certificate, confidence, resolution)
         self.state_threshold(threshold)
         with progress_shown(progress), stage("certifying"):
             return with_next_task(judge(self.trials, threshold, options, self.provenance), self.recorder, options)
@@ -512,7 +508,6 @@ class Campaign:
         self,
         confidence: float = CONFIDENCE,
         *,
-        stochastic: bool = False,
         resolution: float = RESOLUTION,
         certificate: CertificateOptions | None = None,
         progress: bool | None = None,
@@ -521,7 +516,7 @@ class Campaign:
 
         A CertificateError is raised if the theory of the certificate refuses the trials.
         """
-        options = CertificateOptions.or_automatic(certificate, confidence, stochastic, resolution)
+        options = CertificateOptions.or_automatic(certificate, confidence, resolution)
         with progress_shown(progress), stage("certifying"):
             certified = assess(self.trials, options, provenance=self.provenance).certificate
         assert certified is not None  # without a threshold, a refusal is raised
@@ -575,7 +570,7 @@ class Campaign:
         Raises:
             CertificateError: if the confidence needs too many posterior samples.
         """
-        options = CertificateOptions.or_automatic(certificate, confidence, False, RESOLUTION)
+        options = CertificateOptions.or_automatic(certificate, confidence, RESOLUTION)
         search = EnvelopeSearch(IntervalSearch(self.recorder, options, self.executions + 1, threshold, keeps=False))
         with progress_shown(progress):
             return search.envelope()

@@ -102,7 +102,7 @@ class IntervalSearch:
     def predicts(self) -> bool:
         """Whether learned dynamics choose the tasks, and each execution is predicted beforehand."""
         kind = self.options.kind
-        if isinstance(kind, Automatic) and not kind.stochastic and kind.resolution == RESOLUTION:
+        if isinstance(kind, Automatic) and kind.resolution == RESOLUTION:
             # Another search was chosen for its tasks: they are not replaced.
             return self.recorder.search.uses_prediction
         return isinstance(kind, Dynamics)

@@ -31,13 +31,12 @@ _Outcome = tuple[Certificate, Forecast | None]
 class Automatic(CertificateKind):
     """The bound from learned dynamics if it keeps the threshold, otherwise the posterior bound of the distance.
 
-    For a suite of tasks, it is the bound from learned dynamics until all tasks were executed.
-    The dynamics bound is tried only if the experiment is loaded, the system is declared deterministic, and the
-    resolution is the usual one. If neither keeps the threshold, the certificate is the one that is nearer to a
-    decision.
+    For a suite of tasks, it is the bound from learned dynamics until all tasks were executed. The dynamics bound is tried
+    only if the experiment is loaded and the resolution is the usual one. If neither keeps the threshold, the certificate
+    is the one that is nearer to a decision.
 
     Attributes:
-        stochastic, resolution: as for the posterior bound.
+        resolution: as for the posterior bound.
         tests: the number of executions at tasks drawn over the task space, which must be predicted beforehand if the
             bound is from learned dynamics.
         quantile: the share of the executions of each task that the bound is about, if they differ by noise.
@@ -48,7 +47,6 @@ class Automatic(CertificateKind):
     takes_suites: ClassVar[bool] = True
     sorts_draws: ClassVar[bool] = True  # its draws are tests, and count at any time
 
-    stochastic: bool = False
     resolution: PositiveFloat = RESOLUTION
     tests: NonNegativeInt = TESTS
     quantile: Probability = QUANTILE
@@ -56,7 +54,7 @@ class Automatic(CertificateKind):
     @property
     def posterior(self) -> Posterior:
         """The posterior bound with these options."""
-        return Posterior(self.stochastic, self.resolution)
+        return Posterior(self.resolution)
 
     def certify(self, sample: Sample, confidence: float = 0.95) -> Certificate:
         """Return the dynamics bound or, if it is withdrawn or refused, the posterior bound."""
@@ -65,7 +63,7 @@ class Automatic(CertificateKind):
     def certify_against(self, sample: Sample, threshold: float | None, confidence: float = 0.95) -> _Outcome:
         """Return the first certificate that keeps the threshold, or else the one that is nearer to a decision."""
         # A resolution of one's own asks for the posterior bound.
-        usual = not self.stochastic and self.resolution == RESOLUTION and sample.learned is not None
+        usual = self.resolution == RESOLUTION and sample.learned is not None
         uses_dynamics = usual and len(sample) >= FEWEST and not sample.failed
         if sample.suite is not None and (not sample.not_executed or not uses_dynamics):
             return certified(WholeSuite(), sample, threshold, confidence)

@@ -58,7 +58,6 @@ class Dynamics(CertificateKind):
     """Bound on d* from posterior draws of the residual dynamics, which are learned from the executed trajectories.
 
     Attributes:
-        stochastic: whether two executions of one task may differ; it must be False.
         tests: the number of executions that must have been predicted beforehand at tasks drawn over the task space.
         quantile: the share of the executions of each task that the bound is about, if they differ by noise.
     """
@@ -67,16 +66,8 @@ class Dynamics(CertificateKind):
     needs_model: ClassVar[bool] = True
     takes_suites: ClassVar[bool] = True
 
-    stochastic: bool = False
     tests: NonNegativeInt = TESTS
     quantile: Probability = QUANTILE
-
-    def __post_init__(self) -> None:
-        if self.stochastic:
-            raise CertificateError(
-                "the dynamics bound is for deterministic systems, and this one is declared stochastic: use --kind "
-                "posterior or an audit."
-            )
 
     def require_usable(self, confidence: float, executions: int) -> None:
         """Refuse a confidence that needs too many draws of the dynamics."""
@@ -147,7 +138,7 @@ def certify_dynamics(sample: Sample, evidence: DynamicsEvidence, confidence: Pro
     if doubt is None and evidence.quantile is None and (rows := sample.differing(ACCURATE * bound)) is not None:
         doubt = (
             f"{two_distances(sample, rows)} in the recorded state, or was changed in between, so the bound is "
-            "withdrawn; record more states, use --kind posterior with --stochastic, or use a new store after a change"
+            "withdrawn; record more states, use --kind posterior, or use a new store after a change"
         )
     return Certificate(
         kind="dynamics",

@@ -228,7 +228,7 @@ def unlearned(evidence: DynamicsEvidence, bound: float) -> Iterator[str]:
         yield (
             f"noise is learned with {100 * evidence.noise:.2g} % of the variance of the residual, and at most "
             f"{100 * NOISE:g} % is allowed: the system is not deterministic in the recorded state and input; record "
-            "more states or reduce the noise, or use --kind posterior with --stochastic"
+            "more states or reduce the noise, or use --kind posterior"
         )
     if (against := e_value(evidence)) > EVIDENCE:
         yield (

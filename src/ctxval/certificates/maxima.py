@@ -17,7 +17,6 @@ from ctxval._util.progress import advance, stage
 from ctxval._util.representation import ShortRepr
 from ctxval.certificates.bounds import ERRORS, rank_within
 from ctxval.certificates.sample import Sample, advice_to_remeasure, listed
-from ctxval.certificates.sentences import two_distances
 from ctxval.errors import CertificateError
 from ctxval.gp.hyperposterior import EXACT, Conditioned, Prior, draw_hyperparameters, draw_paths, maxima
 from ctxval.gp.surrogate import kept_rows
@@ -38,12 +37,14 @@ class Maxima(ShortRepr):
         points: a maximiser of each draw's path, in the unit cube, shape ``(S, d)``.
         conditioned: the processes under each draw of the hyperparameters.
         owners: index into ``conditioned`` of each draw, shape ``(S,)``.
+        stochastic: whether two executions of one task may differ, so that d* is the largest expected distance.
     """
 
     draws: Array
     points: Array
     conditioned: list[Conditioned]
     owners: Rows
+    stochastic: bool = False
 
     @checked
     def upper(self, confidence: Probability) -> float:
@@ -83,17 +84,16 @@ def draw_maxima(
     draws: int = 128,
     paths: int = 8,
     seed: int = 0,
-    stochastic: bool = False,
+    stochastic: bool | None = None,
     prior: Prior | None = None,
 ) -> Maxima:
     """Return draws of d* given the trials: of hyperparameters, and of so many paths for each.
 
-    If the system is stochastic, d* is the largest expected distance. ``prior`` is that of the hyperparameters.
+    If the system is stochastic, d* is the largest expected distance. By default it is stochastic if two executions of
+    one task differ. ``prior`` is that of the hyperparameters.
     """
-    if not stochastic and (rows := sample.differing(1e-6 * float(np.ptp(sample.distances)))) is not None:
-        raise CertificateError(
-            f"{two_distances(sample, rows)}; say --stochastic to bound the largest expected distance."
-        )
+    if stochastic is None:
+        stochastic = sample.repeats_differ
     used = representative(sample)
     _require_bounding(used)
     X, y = used.points, used.distances
@@ -116,7 +116,7 @@ def draw_maxima(
         draws_of_d = np.maximum(draws_of_d, y.max())
     order = np.argsort(draws_of_d, kind="stable")
     owners = np.repeat(np.arange(len(conditioned)), paths)
-    return Maxima(draws_of_d[order], np.concatenate(points)[order], conditioned, owners[order])
+    return Maxima(draws_of_d[order], np.concatenate(points)[order], conditioned, owners[order], stochastic)
 
 
 def representative(sample: Sample) -> Sample:
@@ -124,15 +124,13 @@ def representative(sample: Sample) -> Sample:
     return sample.rows(kept_rows(sample.points, sample.distances, MOST, MOST + 1).tolist())
 
 
-def settle_maxima(
-    sample: Sample, threshold: float, confidence: float, *, seed: int = 0, stochastic: bool = False
-) -> Maxima:
+def settle_maxima(sample: Sample, threshold: float, confidence: float, *, seed: int = 0) -> Maxima:
     """Return draws of d*, up to four times as many while the threshold is within two standard errors of the bound."""
-    pooled = draw_maxima(sample, seed=seed, stochastic=stochastic)
+    pooled = draw_maxima(sample, seed=seed)
     chains = [pooled]
     while len(chains) < _MOST and abs(pooled.upper(confidence) - threshold) < ERRORS * pooled.error(confidence):
         more = range(len(chains), 2 * len(chains))
-        chains += [draw_maxima(sample, seed=1_000_003 * chain + seed, stochastic=stochastic) for chain in more]
+        chains += [draw_maxima(sample, seed=1_000_003 * chain + seed) for chain in more]
         pooled = _pooled(chains)
     return pooled
 
@@ -143,7 +141,7 @@ def _pooled(chains: list[Maxima]) -> Maxima:
     owners = np.concatenate([chain.owners + first for chain, first in zip(chains, before, strict=True)])
     order = np.argsort(draws, kind="stable")
     conditioned = [process for chain in chains for process in chain.conditioned]
-    return Maxima(draws[order], points[order], conditioned, owners[order])
+    return Maxima(draws[order], points[order], conditioned, owners[order], chains[0].stochastic)
 
 
 def _require_bounding(sample: Sample) -> None:

@@ -39,21 +39,19 @@ class CertificateOptions(ShortRepr):
         require_volume(self.volume)
 
     @classmethod
-    def posterior(
-        cls, confidence: float = CONFIDENCE, *, stochastic: bool = False, resolution: float = RESOLUTION
-    ) -> CertificateOptions:
-        """Return options with the posterior bound; the arguments are those of :class:`Posterior`."""
-        return cls(Posterior(stochastic, resolution), confidence)
+    def posterior(cls, confidence: float = CONFIDENCE, *, resolution: float = RESOLUTION) -> CertificateOptions:
+        """Return options with the posterior bound; the resolution is that of :class:`Posterior`."""
+        return cls(Posterior(resolution), confidence)
 
     @classmethod
     def or_automatic(
-        cls, certificate: CertificateOptions | None, confidence: float, stochastic: bool, resolution: float
+        cls, certificate: CertificateOptions | None, confidence: float, resolution: float
     ) -> CertificateOptions:
         """Return a certificate that is given, beside which no options may stand; else ``auto`` with the options."""
         if certificate is None:
-            return cls(Automatic(stochastic, resolution), confidence)
-        if (confidence, stochastic, resolution) != (CONFIDENCE, False, RESOLUTION):
-            raise InputError("confidence, stochastic and resolution are options of certificate=; state them there.")
+            return cls(Automatic(resolution), confidence)
+        if (confidence, resolution) != (CONFIDENCE, RESOLUTION):
+            raise InputError("confidence and resolution are options of certificate=; state them there.")
         return certificate
 
 

@@ -41,30 +41,28 @@ from ctxval.gp.surrogate import fit_surrogate
 class Posterior(CertificateKind):
     """Bound on d* from the posterior of a Gaussian process of the distance.
 
+    If two executions of one task differ, the bound is one on the largest expected distance.
+
     Attributes:
-        stochastic: whether two executions of one task may differ; then the largest expected distance is bounded.
         resolution: largest distance from a task to its nearest trial, in diagonals of the task space; beyond it the
             bound is withdrawn. With 1 the bound is never withdrawn for this reason.
     """
 
     name: ClassVar[str] = "posterior"
 
-    stochastic: bool = False
     resolution: PositiveFloat = RESOLUTION
 
     def certify(self, sample: Sample, confidence: float = 0.95) -> Certificate:
         """Return :func:`certify_posterior` of the trials."""
-        return certify_posterior(sample, confidence, stochastic=self.stochastic, resolution=self.resolution)
+        return certify_posterior(sample, confidence, resolution=self.resolution)
 
     def certify_against(
         self, sample: Sample, threshold: float, confidence: float = 0.95
     ) -> tuple[Certificate, Forecast | None]:
         """Return the certificate from enough draws for the threshold, and a forecast if its bound is above that."""
         _require_covered(sample, self.resolution)
-        drawn = settle_maxima(sample, threshold, confidence, stochastic=self.stochastic)
-        certificate = certify_posterior(
-            sample, confidence, stochastic=self.stochastic, resolution=self.resolution, found=drawn
-        )
+        drawn = settle_maxima(sample, threshold, confidence)
+        certificate = certify_posterior(sample, confidence, resolution=self.resolution, found=drawn)
         if certificate.doubt is not None or certificate.upper_bound <= threshold:
             return certificate, None  # a process that the trials contradict predicts nothing
         return certificate, forecast(representative(sample), drawn, threshold, confidence)
@@ -75,7 +73,6 @@ def certify_posterior(
     sample: Sample,
     confidence: Probability = 0.95,
     *,
-    stochastic: bool = False,
     resolution: PositiveFloat = RESOLUTION,
     seed: int = 0,
     found: Maxima | None = None,
@@ -86,7 +83,8 @@ def certify_posterior(
     """
     used = representative(sample)
     _require_covered(sample, resolution)
-    drawn = draw_maxima(sample, stochastic=stochastic, seed=seed) if found is None else found
+    drawn = draw_maxima(sample, seed=seed) if found is None else found
+    stochastic = drawn.stochastic
     upper, error = drawn.upper(confidence), drawn.error(confidence)
     unordered, d = np.array([origin == "manual" for origin in used.origins]), sample.points.shape[1]
     limits: Any = {"unordered": unordered, "resolution": resolution, "covered": sample.points}

@@ -189,6 +189,11 @@ class Sample(ShortRepr):
         return (int(first_of[row]), row) if differences[row] > tolerance else None
 
     @property
+    def repeats_differ(self) -> bool:
+        """Whether two executions of one task differ by more than rounding, so that the system is stochastic."""
+        return self.differing(1e-6 * float(np.ptp(self.distances))) is not None
+
+    @property
     def failures(self) -> dict[str, list[Any]]:
         """The trials that failed, that could not be measured and that were made good, ready for JSON."""
         made_good = [asdict(failure) for failure in self.made_good]

@@ -106,21 +106,19 @@ class StoppingRule(ShortRepr):
             return False
 
     def _is_kept(self, sample: Sample) -> tuple[Maxima, bool]:
-        stochastic, confidence = self._posterior.stochastic, self.options.confidence
-        drawn = settle_maxima(sample, self.threshold, confidence, stochastic=stochastic)
+        confidence = self.options.confidence
+        drawn = settle_maxima(sample, self.threshold, confidence)
         # Coverage is left aside: its resolution is the whole task space.
-        certificate = certify_posterior(sample, confidence, stochastic=stochastic, resolution=1.0, found=drawn)
+        certificate = certify_posterior(sample, confidence, resolution=1.0, found=drawn)
         return drawn, certificate.covers(self.threshold)
 
     def _is_surely_too_high(self, sample: Sample) -> bool:
         """Return whether the bound is clearly above the threshold, by tests that cost less than the bound."""
-        stochastic = self._posterior.stochastic
-        instantaneous = None if stochastic else instantaneous_bound(sample)
+        instantaneous = None if sample.repeats_differ else instantaneous_bound(sample)
         if instantaneous is not None and instantaneous["max_ucb"] > self.threshold:
             return True
         return any(
-            draw_maxima(sample, draws=draws, stochastic=stochastic).probability(self.threshold)
-            < self.options.confidence - margin
+            draw_maxima(sample, draws=draws).probability(self.threshold) < self.options.confidence - margin
             for draws, margin in _SCREENINGS
         )
 

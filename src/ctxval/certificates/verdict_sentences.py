@@ -258,7 +258,7 @@ def conditions(certificate: Certificate, space: TaskSpace | None) -> list[str]:
             once = "each task having one distance, however often it is executed"
             if details.get("stochastic"):
                 once = (
-                    "the noise that you declared being normal and alike everywhere (it is the expected distance that "
+                    "the noise being normal and alike everywhere (it is the expected distance that "
                     "is bounded: single executions may exceed it)"
                 )
             return [f"the distance being as smooth between the trials as at them{where}", once]

@@ -60,7 +60,6 @@ def run(
     within: float | None = None,
     tests: int | None = None,
     quantile: float | None = None,
-    stochastic: bool | None = None,
     resolution: float | None = None,
     seed: int | None = None,
     store: Path | None = None,
@@ -75,7 +74,7 @@ def run(
 ) -> Any:
     stated: dict[str, Any] = {"budget": budget, "search": search, "threshold": threshold, "confidence": confidence}
     stated |= {"seed": seed, "explore": explore, "within": within, "store": store, "options": named_values(option)}
-    certified = {"stochastic": stochastic, "resolution": resolution, "tests": tests, "quantile": quantile}
+    certified = {"resolution": resolution, "tests": tests, "quantile": quantile}
     settings = read_settings(target, stated).certified_as(certified)
     experiment = settings.load()
     certificate = settings.certificate_options

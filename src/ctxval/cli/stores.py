@@ -126,7 +126,6 @@ class Asked:
     kind: str | None = None
     volume: float | None = None
     discard: int | None = None
-    stochastic: bool | None = None
     resolution: float | None = None
     tests: int | None = None
     quantile: float | None = None
@@ -134,7 +133,7 @@ class Asked:
 
     def options(self, settings: Settings, kind: str | None) -> CertificateOptions:
         """Return the kind, the options and the confidence of the certificate."""
-        names = ("discard", "volume", "stochastic", "resolution", "tests", "quantile")
+        names = ("discard", "volume", "resolution", "tests", "quantile")
         given = {name: getattr(self, name) for name in names}
         level = settings.confidence if self.confidence is None else self.confidence
         return settings.certificate.options(level, kind=kind, stated=named_values(self.option, **given))

@@ -127,7 +127,6 @@ def refine_model(
     out_: Path | None = None,
     force: bool = False,
     confidence: float | None = None,
-    stochastic: bool | None = None,
     seed: int | None = None,
     workers: int | None = None,
     timeout: float | None = None,
@@ -139,7 +138,7 @@ def refine_model(
     require_model_file(out_, [target, allowed.experiment], force=force)
     opened = open_target(target, {"seed": seed, "options": named_values(option) or None}, allowed)
     chosen = CauseRepair(opened.campaign) if known is None else known
-    settings = opened.settings.certified_as({"stochastic": stochastic})
+    settings = opened.settings
     if confidence is not None:
         settings = settings.model_copy(update={"confidence": confidence})
     limit = limit_of(opened.experiment, settings, threshold)

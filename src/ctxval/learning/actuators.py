@@ -27,6 +27,7 @@ _DELAYS, _LAGS = (0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0), (0.5, 1.0, 1.5, 2.0, 
 _TRIED = [*((each, 0.0) for each in _DELAYS), *((0.0, each) for each in _LAGS), (1.0, 1.0), (1.0, 2.0), (2.0, 2.0)]
 _BETTER, _NEAR = 0.3, 0.1  # differences of the log evidence per recorded value; see `found_actuator`
 _LEARNED_FROM = 150  # transitions
+_CLIMBED = 4  # candidates whose hyperparameters are searched for
 
 
 @dataclass(frozen=True)
@@ -113,6 +114,10 @@ def found_actuator(
         scaled = (Z - Z.mean(axis=0)) / standard_deviations(Z)
         return HyperparameterPosterior.given(scaled, E, inputs, FAMILIES[:1]).highest
 
+    def height_at(mode: Mode, actuator: Actuator) -> float:
+        Z, E = data(actuator)
+        return log_posterior(mode.kernel, mode.place, (Z - Z.mean(axis=0)) / standard_deviations(Z), E)[0]
+
     def refined(start: Actuator, mode: Mode) -> Actuator:
         """Return the most likely actuator near one, with the hyperparameters that are most probable for that one."""
         Z, _ = data(start)
@@ -132,9 +137,11 @@ def found_actuator(
         chosen, _ = min(near, key=lambda pair: unlikely(pair[0]) + each * pair[1])
         return Actuator(*chosen.tolist())
 
-    without = mode_of(Actuator()).height
-    tried = [before] if before else [Actuator(*each) for each in _TRIED]
-    mode, best = max(((mode_of(each), each) for each in tried), key=lambda pair: pair[0].height)
+    base = mode_of(Actuator())
+    without, tried = base.height, [before] if before else [Actuator(*each) for each in _TRIED]
+    if len(tried) > _CLIMBED:  # those that explain most with the hyperparameters of inputs that act at once
+        tried.sort(key=lambda each: -height_at(base, each))
+    mode, best = max(((mode_of(each), each) for each in tried[:_CLIMBED]), key=lambda pair: pair[0].height)
     values = len(rows) * int(live.sum())
     if mode.height < without - _NEAR * values:
         return None

@@ -160,7 +160,11 @@ def test_a_described_experiment_can_be_asked_by_hand(invoke: Any) -> None:
         ('goal = [0.5, 3.0, "m"]', "goal = 3", "space.goal"),
         ("experiment_system:step", "nowhere:step", "cannot be loaded"),
         ("[system] ", "[sistem] ", "no setting is called 'sistem'; did you mean 'system'?"),
-        ("stochastic = false", "stochastik = true", "no setting is called 'stochastik'; did you mean 'stochastic'?"),
+        (
+            "[certificate]",
+            "[certificate]\nresolutoin = 1",
+            "no setting is called 'resolutoin'; did you mean 'resolution'?",
+        ),
         (
             'kind = "auto"',
             'kind = "audit"\nresolution = 0.3',
@@ -196,9 +200,7 @@ def test_options_of_a_case_are_plain_values(invoke: Any, options: str) -> None:
 
 def test_what_the_certificate_of_the_file_would_ignore_is_refused(invoke: Any) -> None:
     target = changed(('kind = "auto"', 'kind = "scenario"'))
-    for option in (["--stochastic"], ["--resolution", "1"]):
-        said = sentence(invoke("run", target, *option))
-        assert f"{option[0][2:]} is for certificates of the kind auto or " in said
+    assert "resolution is for certificates of the kind auto or " in sentence(invoke("run", target, "--resolution", "1"))
     assert not Path("runs").exists()
 
 

@@ -59,7 +59,6 @@ class CertificateTable(BaseModel):
     model_config = ConfigDict(extra="allow")
 
     kind: str = "auto"
-    stochastic: bool = False
     volume: float = Field(default=0.0, ge=0, le=MOST_VOLUME, strict=True)
     tests: int = Field(default=TESTS, ge=0, strict=True)
     quantile: float = Field(default=QUANTILE, ge=0.5, lt=1, strict=True)
@@ -91,7 +90,7 @@ class CertificateTable(BaseModel):
         if kind in (None, self.kind):
             planned, given = self.model_dump(), {**(self.model_extra or {}), **given}
         else:  # only those settings of the file hold that are not about one kind
-            planned = self.model_dump(include={"stochastic", "resolution", "volume", "tests", "quantile"})
+            planned = self.model_dump(include={"resolution", "volume", "tests", "quantile"})
         merged = {**planned, **require_types(f"certificate {chosen.name!r}", chosen, given)}
         return CertificateOptions(chosen.of(merged), confidence, merged["volume"])
 

@@ -118,7 +118,6 @@ def command_of(context: ReportContext, budget: int | None = None, *others: str) 
     flags = {
         "--explore": settings.get("explore"),
         "--decide": settings.get("explore") is False,
-        "--stochastic": certificate.get("stochastic"),
     }
     words += [flag for flag, wanted in flags.items() if wanted is True]
     for name, value in options.items():

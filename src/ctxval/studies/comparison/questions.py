@@ -47,7 +47,7 @@ class WorstQuestion:
         # A decision is false only if the bound of its smaller candidate is. The candidate that has the smallest d* can
         # cause no false decision, so the error is divided among all others.
         share = (1 - self.confidence) / max(1, len(self.candidates) - 1)
-        self.options = CertificateOptions(Automatic(self.stochastic, tests=0), 1 - share)
+        self.options = CertificateOptions(Automatic(tests=0), 1 - share)
 
     @property
     def decisions(self) -> tuple[Decision, ...]:

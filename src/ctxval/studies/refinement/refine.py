@@ -25,7 +25,7 @@ from ctxval.learning.state_estimates import StateEstimates
 from ctxval.models import Refined, read_refined, write_model
 from ctxval.models.corrected import before_refinement
 from ctxval.models.saved import is_savable, read_note
-from ctxval.studies.refinement.design import SameControllers, same_controllers, with_best_jacobian
+from ctxval.studies.refinement.design import same_controllers, with_best_jacobian
 from ctxval.studies.refinement.held_out import Records, measure_residual
 from ctxval.studies.refinement.methods import Learned, Method, method_of
 from ctxval.studies.refinement.rounds import Refinement, Round
@@ -187,9 +187,7 @@ class _Loop:
                     raise
                 return f"no better model can be learned: {str(error).removesuffix('.')}"
         validation = self.first.validation.with_model(model)
-        same = SameControllers()
-        if not getattr(self.options.kind, "stochastic", False):
-            same = same_controllers(validation, list(self._executed(self.rounds)))
+        same = same_controllers(validation, list(self._executed(self.rounds)))
         if same.worst is not None and same.worst > self.threshold:
             return (
                 f"the model that round {number} would learn has the distance {same.worst:.4g} on a task that it has "
