@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import importlib
 import inspect
+import json
 import re
 from collections.abc import Callable, Iterable
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -197,7 +198,9 @@ class Results:
             waiting = {pool.submit(run_job, job): job for job in missing}
             try:
                 for future in as_completed(waiting):
-                    job, result = waiting[future], _rounded(future.result())
+                    job, plain = waiting[future], json.dumps(future.result())
+                    # More than ten digits are in no figure, and double the size.
+                    result = json.loads(plain, parse_float=lambda text: float(f"{float(text):.10g}"))
                     stored = {"key": job.key, **result, "case_digest": case_digest(job.case), **provenance()}
                     self._of_kind(job.kind).append(stored)
                     on_done(job)
@@ -215,13 +218,3 @@ class Results:
 def case_digest(case: str) -> str:
     """Return a digest of what a case's source computes, whatever its imports, docstrings, annotations and layout."""
     return module_digest(inspect.getsource(importlib.import_module(f"ctxval.paper.cases.{case}")))
-
-
-def _rounded(value: Any) -> Any:
-    if isinstance(value, float):
-        return float(f"{value:.10g}")  # more digits than any figure shows, at half the size
-    if isinstance(value, list):
-        return [_rounded(item) for item in value]
-    if isinstance(value, dict):
-        return {key: _rounded(item) for key, item in value.items()}
-    return value

@@ -20,7 +20,7 @@ _LARGEST = 1e3  # of a residual, as a multiple of the typical one of M
 
 
 @dataclass(frozen=True, eq=False)
-class Windows(ShortRepr):
+class Predictions(ShortRepr):
     """Predictions over some steps: where they begin, and residuals ``(n,)`` that are too small to be evidence.
 
     ``states`` and ``inputs`` are rows of the first state and, in all padded runs, of the first input, shape ``(N,)``.
@@ -32,7 +32,7 @@ class Windows(ShortRepr):
     floors: Array
 
 
-class Records:
+class Evidence:
     """Recorded executions, and what M misses in them.
 
     Attributes:
@@ -55,7 +55,7 @@ class Records:
         self.inputs = np.zeros((len(runs), longest, runs[0].inputs.shape[1]))
         for padded, run in zip(self.inputs, runs, strict=True):
             padded[: len(run.inputs)] = run.inputs
-        self.windows, self.sizes = list[Windows](), list[Array]()
+        self.windows, self.sizes = list[Predictions](), list[Array]()
         for number, length in enumerate(steps):
             window = self._window(min(length, min(self.horizons)), most[number])
             left = self.left_by(Repaired(model, ()), window)
@@ -65,7 +65,7 @@ class Records:
             self.windows.append(replace(window, floors=np.maximum(least, 1e-15)))
             self.sizes.append(np.maximum(_size(left), self.windows[-1].floors))
 
-    def _window(self, steps: int, most: int) -> Windows:
+    def _window(self, steps: int, most: int) -> Predictions:
         states, inputs, first = [], [], 0
         for number, horizon in enumerate(self.horizons):
             begins = np.arange(0, horizon - steps + 1, max(1, steps // 2))
@@ -74,7 +74,7 @@ class Records:
             first += horizon + 1
         of_states, of_inputs = np.concatenate(states), np.concatenate(inputs)
         rows = np.linspace(0, len(of_states) - 1, min(len(of_states), most)).round().astype(np.intp)
-        return Windows(steps, of_states[rows], of_inputs[rows], np.zeros(self.states.shape[1]))
+        return Predictions(steps, of_states[rows], of_inputs[rows], np.zeros(self.states.shape[1]))
 
     @property
     def pairs(self) -> tuple[Array, Array, Array]:
@@ -84,7 +84,7 @@ class Records:
         inputs = self.inputs.reshape(-1, self.inputs.shape[-1])
         return self.states[window.states], inputs[window.inputs], residuals
 
-    def left_by(self, repaired: Repaired, window: Windows) -> Array:
+    def left_by(self, repaired: Repaired, window: Predictions) -> Array:
         """Return predicted minus recorded states ``(N, n)``."""
         acting = repaired.acting(self.inputs).reshape(-1, self.inputs.shape[-1])
         x = repaired.true(self.states[window.states])
@@ -143,7 +143,7 @@ class Explanation(ShortRepr):
         return [size for cause in self.repaired.causes for size in cause.sizes]
 
 
-def explained(records: Records, candidates: tuple[Candidate, ...], begun: Sequence[float] | Array) -> Explanation:
+def explained(evidence: Evidence, candidates: tuple[Candidate, ...], begun: Sequence[float] | Array) -> Explanation:
     """Return causes whose sizes are fitted to records by nonlinear least squares.
 
     The residuals of each state are first divided by those of M, and then twice by what is left of them.
@@ -151,42 +151,42 @@ def explained(records: Records, candidates: tuple[Candidate, ...], begun: Sequen
     Args:
         begun: the sizes of all causes with which the fit begins.
     """
-    fit = _Fit(records, candidates)
+    fit = _Fit(evidence, candidates)
     theta = np.array(begun)
     if len(theta):
-        theta = fit.most_likely_of_states(fit.best(theta, records.sizes, 8))
+        theta = fit.most_likely_of_states(fit.best(theta, evidence.sizes, 8))
         for _ in range(2):
             model = fit.repaired(theta)
             sizes = [
-                np.clip(np.hypot(_size(records.left_by(model, window)), window.floors), window.floors, size)
-                for window, size in zip(records.windows, records.sizes, strict=True)
+                np.clip(np.hypot(_size(evidence.left_by(model, window)), window.floors), window.floors, size)
+                for window, size in zip(evidence.windows, evidence.sizes, strict=True)
             ]
             theta = fit.best(theta, sizes, 6)
     model = fit.repaired(theta)
-    misfit, left = records.measured(model)
+    misfit, left = evidence.measured(model)
     fitted = tuple(replace(each, cause=cause) for each, cause in zip(candidates, model.causes, strict=True))
     return Explanation(fitted, model, misfit + fit.penalty, left)
 
 
-def screened(records: Records, candidates: tuple[Candidate, ...]) -> tuple[float, Array]:
+def screened(evidence: Evidence, candidates: tuple[Candidate, ...]) -> tuple[float, Array]:
     """Return how badly causes explain records at most, and sizes to begin a fit with.
 
     The last cause is tried at each of its first guesses, and one Gauss-Newton step is made from there. The criterion is
     that of residuals which are linear in the sizes.
     """
-    fit = _Fit(records, candidates)
+    fit = _Fit(evidence, candidates)
     known = [size for each in candidates[:-1] for size in each.cause.sizes]
     results = []
     for start in candidates[-1].starts:
         theta = np.array([*known, *start])
-        here = fit.errors(theta, records.sizes)
+        here = fit.errors(theta, evidence.sizes)
         linear, moved = here, theta
         if len(theta):
-            J = fit.slope(theta, records.sizes, here)
+            J = fit.slope(theta, evidence.sizes, here)
             moved = np.clip(theta + np.linalg.lstsq(J, -here, rcond=1e-8)[0], fit.low, fit.high)
             linear = here + J @ (moved - theta)
         misfit, first = 0.0, 0
-        for window, size in zip(records.windows, records.sizes, strict=True):
+        for window, size in zip(evidence.windows, evidence.sizes, strict=True):
             count, n = len(window.states), len(size)
             squares = (linear[first : first + count * n].reshape(count, n) ** 2).sum(axis=0)
             misfit += count * float(np.log(squares + (window.floors / size) ** 2).sum())
@@ -198,15 +198,15 @@ def screened(records: Records, candidates: tuple[Candidate, ...]) -> tuple[float
 class _Fit:
     """The residuals of records as a function of the sizes of causes."""
 
-    def __init__(self, records: Records, candidates: tuple[Candidate, ...]) -> None:
-        self.records, self.candidates = records, candidates
+    def __init__(self, evidence: Evidence, candidates: tuple[Candidate, ...]) -> None:
+        self.evidence, self.candidates = evidence, candidates
         self.low, self.high, self.scales = (
             np.array([value for each in candidates for value in getattr(each, name)])
             for name in ("low", "high", "scales")
         )
         # Which cause it is counts like a size.
         count = len(self.scales) + len(candidates)
-        self.penalty = count * float(np.log(len(records.windows[0].states)))
+        self.penalty = count * float(np.log(len(evidence.windows[0].states)))
 
     def repaired(self, theta: Array) -> Repaired:
         causes, rest = [], theta
@@ -214,13 +214,13 @@ class _Fit:
             count = len(each.scales)
             causes.append(each.cause.with_sizes(rest[:count].tolist()))
             rest = rest[count:]
-        return Repaired(self.records.model, tuple(causes))
+        return Repaired(self.evidence.model, tuple(causes))
 
     def errors(self, theta: Array, sizes: Sequence[Array]) -> Array:
         """Return residuals in given sizes, whose squares are means over the predictions of each window."""
         model, parts = self.repaired(theta), []
-        for window, size in zip(self.records.windows, sizes, strict=True):
-            left = np.nan_to_num(self.records.left_by(model, window) / size, nan=_LARGEST).clip(-_LARGEST, _LARGEST)
+        for window, size in zip(self.evidence.windows, sizes, strict=True):
+            left = np.nan_to_num(self.evidence.left_by(model, window) / size, nan=_LARGEST).clip(-_LARGEST, _LARGEST)
             parts.append(left.ravel() / np.sqrt(len(left)))
         return np.concatenate(parts)
 
@@ -237,14 +237,14 @@ class _Fit:
 
         Where M integrates a position otherwise than the system does, a cause explains the rate alone.
         """
-        here = self.errors(theta, self.records.sizes)
-        J = self.slope(theta, self.records.sizes, here)
-        n = len(self.records.sizes[0])
+        here = self.errors(theta, self.evidence.sizes)
+        J = self.slope(theta, self.evidence.sizes, here)
+        n = len(self.evidence.sizes[0])
         tried = [theta]
         for i in range(n):  # rows of errors are predictions after predictions, each with all states
             step = np.linalg.lstsq(J[i::n], -here[i::n], rcond=1e-8)[0]
             tried.append(np.clip(theta + step, self.low, self.high))
-        return min(tried, key=lambda each: self.records.measured(self.repaired(each))[0])
+        return min(tried, key=lambda each: self.evidence.measured(self.repaired(each))[0])
 
     def best(self, start: Array, sizes: Sequence[Array], evaluations: int) -> Array:
         inside = np.clip(start, self.low + 1e-9 * self.scales, self.high - 1e-9 * self.scales)

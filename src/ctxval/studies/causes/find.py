@@ -19,7 +19,7 @@ from ctxval.errors import CtxvalError, InputError
 from ctxval.learning.extended import estimates_by_loops_on_model
 from ctxval.studies.causes.candidates import Candidate, candidates
 from ctxval.studies.causes.cause import Repaired
-from ctxval.studies.causes.evidence import STEPS, Explanation, Records, explained, screened
+from ctxval.studies.causes.evidence import STEPS, Evidence, Explanation, explained, screened
 from ctxval.studies.causes.mechanics import Force
 from ctxval.studies.causes.plant import Plant, plant_of
 from ctxval.studies.causes.report import CauseReport, Explained, Separating
@@ -78,12 +78,12 @@ class _Study:
         horizon = min(len(run.inputs) for run in runs)
         # Estimated states are worth little in one step.
         steps = (max(1, horizon // 60), max(1, horizon // 12)) if self.outputs else STEPS
-        self.records = Records(self.model, runs, steps=steps)
-        floors = [window.floors for window in self.records.windows]
-        self.some = Records(self.model, runs, floors, (200, 40), steps)  # all causes are screened on these
-        self.others = [Records(self.model, runs[:k] + runs[k + 1 :], floors, steps=steps) for k in range(len(runs))]
-        self.structure, _ = self.records.structure(Repaired(self.model, ()))
-        x, u, residuals = self.records.pairs
+        self.evidence = Evidence(self.model, runs, steps=steps)
+        floors = [window.floors for window in self.evidence.windows]
+        self.some = Evidence(self.model, runs, floors, (200, 40), steps)  # all causes are screened on these
+        self.others = [Evidence(self.model, runs[:k] + runs[k + 1 :], floors, steps=steps) for k in range(len(runs))]
+        self.structure, _ = self.evidence.structure(Repaired(self.model, ()))
+        x, u, residuals = self.evidence.pairs
         usable = np.isfinite(residuals).all(axis=1)
         if not usable.any():
             raise InputError("the model's steps are not finite at the recorded states.")
@@ -140,7 +140,7 @@ class _Study:
                 results.append((*screened(self.some, together), together))
             advance(1)
         results.sort(key=lambda result: result[0])
-        refined = [explained(self.records, together, begun) for _, begun, together in results[:8]]
+        refined = [explained(self.evidence, together, begun) for _, begun, together in results[:8]]
         return sorted(refined, key=lambda explanation: explanation.criterion)
 
     def _chosen(self, ranked: list[Explanation]) -> tuple[Explained | None, list[Explained]]:
@@ -170,7 +170,7 @@ class _Study:
             deviations.append(self._deviation(execution, loop))
             distances.append(self._distance(execution, loop))
         share = 1 - float(np.sum(deviations) / max(np.sum(self.without), 1e-300))
-        left, whole = self.records.structure(explanation.repaired)
+        left, whole = self.evidence.structure(explanation.repaired)
         structure, noise = 1 - left / max(self.structure, 1e-300), 1 - left / max(whole, 1e-300)
         spreads = tuple(map(float, np.ptp(sizes, axis=0)))
         return Explained(explanation, share, float(np.max(distances)), spreads, min(structure, 1.0), min(noise, 1.0))

@@ -151,8 +151,8 @@ class CauseReport(ShortRepr):
     @property
     def mjcf(self) -> tuple[str, ...]:
         """The lines of MJCF that put the causes into a MuJoCo model; empty if there are none."""
-        found = [cause.mjcf(self.plant) for cause in self.causes]
-        return tuple(each for each in found if each is not None)
+        changes = (cause.mjcf(self.plant) for cause in self.causes)
+        return tuple(each for each in changes if each is not None)
 
     def to_dict(self) -> dict[str, Any]:
         """Return everything as plain values."""

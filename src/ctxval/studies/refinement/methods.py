@@ -141,7 +141,7 @@ class CauseRepair(ShortRepr, Method):
             if not some.executed:
                 raise InputError("the method 'causes' needs executions with trajectories.")
             with single_threaded():
-                return evidence.explained(evidence.Records(model, some.executed), best.candidates, best.sizes).repaired
+                return evidence.explained(evidence.Evidence(model, some.executed), best.candidates, best.sizes).repaired
 
         learned = repaired(records)
         note = " and ".join(cause.text(self.report.plant) for cause in learned.causes)

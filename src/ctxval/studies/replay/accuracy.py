@@ -72,50 +72,45 @@ class RecordedSteps:
     def __init__(self, recordings: Recordings, used: Sequence[int]) -> None:
         self.recordings = recordings
         runs = [recordings.runs[number].trajectory for number in used]
-        self.all_states = np.concatenate([run.states for run in runs])
-        self.all_inputs = np.concatenate([run.inputs for run in runs])
+        self.states = np.concatenate([run.states for run in runs])
+        self.inputs = np.concatenate([run.inputs for run in runs])
         self._horizons = [run.horizon for run in runs]
-        self.first_input = np.cumsum([0, *self._horizons[:-1]])
-        self.first_state = self.first_input + np.arange(len(runs))
 
     def windows(self, before: int, after: int, most: int = 40_000) -> Windows:
         """Return places with so many recorded steps before and after them; of too many, every second, third, ..."""
-        parts = []
+        parts, first = [], 0
         for number, horizon in enumerate(self._horizons):
             at = np.arange(before, horizon - after + 1)
-            run = np.full(len(at), number)
-            parts.append((run, at, run if len(self._horizons) > 1 else (5 * at) // (horizon + 1)))
-        runs, places, groups = (np.concatenate(part).astype(np.intp) for part in zip(*parts, strict=True))
-        every = max(1, -(-len(runs) // most))
-        return Windows(self, runs[::every], places[::every], groups[::every])
+            group = np.full(len(at), number) if len(self._horizons) > 1 else (5 * at) // (horizon + 1)
+            parts.append((first + number + at, first + at, group))
+            first += horizon
+        rows, of_inputs, groups = (np.concatenate(part).astype(np.intp) for part in zip(*parts, strict=True))
+        every = max(1, -(-len(rows) // most))
+        return Windows(self, rows[::every], of_inputs[::every], groups[::every])
 
 
 @dataclass(frozen=True, eq=False)
 class Windows:
-    """The places in recordings from which so many steps before and after are recorded.
-
-    Attributes:
-        runs, places, groups: the recording, the step in it, and the part of the recordings, shapes ``(N,)``.
-    """
+    """Places in recordings: their rows among all states and inputs, and the parts that they lie in, shapes ``(N,)``."""
 
     recorded: RecordedSteps
-    runs: Rows
-    places: Rows
+    of_states: Rows
+    of_inputs: Rows
     groups: Rows
 
     def __len__(self) -> int:
-        return len(self.runs)
+        return len(self.groups)
 
     def __getitem__(self, chosen: Mask) -> Windows:
-        return Windows(self.recorded, self.runs[chosen], self.places[chosen], self.groups[chosen])
+        return Windows(self.recorded, self.of_states[chosen], self.of_inputs[chosen], self.groups[chosen])
 
     def states(self, shift: int = 0) -> Array:
         """Return the recorded states so many steps later, shape ``(N, n)``."""
-        return np.asarray(self.recorded.all_states[self.recorded.first_state[self.runs] + self.places + shift])
+        return np.asarray(self.recorded.states[self.of_states + shift])
 
     def inputs(self, shift: int = 0) -> Array:
         """Return the recorded inputs so many steps later, shape ``(N, m)``."""
-        return np.asarray(self.recorded.all_inputs[self.recorded.first_input[self.runs] + self.places + shift])
+        return np.asarray(self.recorded.inputs[self.of_inputs + shift])
 
     def pairs(self, shift: int = 0) -> Array:
         """Return the recorded states and inputs so many steps later, shape ``(N, n + m)``."""

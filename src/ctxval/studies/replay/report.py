@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
@@ -75,9 +76,8 @@ class ReplayReport(ShortRepr):
 
     def to_json(self) -> dict[str, Any]:
         """Return all results as plain values; numbers that are not finite are None."""
-        report: dict[str, Any] = plain_numbers(asdict(self))
-        for row, error in zip(report["errors"], self.errors, strict=True):
-            row["relative"] = plain_numbers(error.relative)
+        errors = [{**asdict(error), "relative": error.relative} for error in self.errors]
+        report: dict[str, Any] = plain_numbers({**asdict(self), "errors": errors})
         return report
 
 
@@ -164,11 +164,7 @@ def _require_same_step(validation: Validation, recordings: Recordings) -> None:
 
 def plain_numbers(value: Any) -> Any:
     """Return plain values for JSON; numbers that are not finite are None."""
-    if isinstance(value, dict):
-        return {key: plain_numbers(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [plain_numbers(item) for item in value]
-    return None if isinstance(value, float) and not np.isfinite(value) else value
+    return json.loads(json.dumps(value), parse_constant=lambda _: None)
 
 
 # What follows, in sentences
