@@ -77,14 +77,13 @@ def fill(path: Path, search: str, count: int = TRIALS) -> None:
     store, space = first.store, first.validation.space
     points = np.random.default_rng(0).random((count, 2))
     plans, values = first.validation.plans(space.from_unit(points)), height(points)
-    with store._database.transaction():
-        for number in range(1, count):
-            point = points[number]
-            names = space.describe_point(space.from_unit(point))
-            trial = Trial(number, "acquisition", "completed", point, names, 1, True, float(values[number]), seconds=1.0)
-            store._insert(trial)
-            for party in ("model", "system"):
-                store._write_trajectory(number, party, plans[number].model_trajectory)
+    new = []
+    for number in range(1, count):
+        point, trajectory = points[number], plans[number].model_trajectory
+        names = space.describe_point(space.from_unit(point))
+        trial = Trial(number, "acquisition", "completed", point, names, 1, True, float(values[number]), seconds=1.0)
+        new.append((trial, trajectory, trajectory))
+    store.add(new)
     store.close()
 
 

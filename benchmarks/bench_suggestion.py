@@ -75,14 +75,14 @@ def fill(path: Path, system: str, count: int) -> None:
     """Write a store of executed trials, in one transaction."""
     parts = validation(system)
     store: Store = Campaign(parts, search=searches.Auto("thorough"), store=path).store
-    with store._database.transaction():
-        for number, unit_point in enumerate(np.random.default_rng(0).random((count, 2))):
-            point = parts.space.from_unit(unit_point)
-            outcome, names = parts.outcome(point), parts.space.describe_point(point)
-            distance = float(outcome.distance)
-            store._insert(Trial(number, "acquisition", "completed", unit_point, names, 1, True, distance, seconds=1.0))
-            store._write_trajectory(number, "model", outcome.plan.model_trajectory)
-            store._write_trajectory(number, "system", outcome.system_trajectory)
+    new = []
+    for number, unit_point in enumerate(np.random.default_rng(0).random((count, 2))):
+        point = parts.space.from_unit(unit_point)
+        outcome, names = parts.outcome(point), parts.space.describe_point(point)
+        distance = float(outcome.distance)
+        trial = Trial(number, "acquisition", "completed", unit_point, names, 1, True, distance, seconds=1.0)
+        new.append((trial, outcome.plan.model_trajectory, outcome.system_trajectory))
+    store.add(new)
     store.close()
 
 

@@ -25,7 +25,7 @@ import study_auto
 from ctxval import Validation
 from ctxval._util.arrays import Array
 from ctxval._util.json_lines import JsonLines
-from ctxval.gp.evaluations import Values
+from ctxval.gp.ascent import Values
 from ctxval.gp.global_search import search_globally
 
 KEY = ("case", "seed", "evaluations")

@@ -26,7 +26,7 @@ from ctxval._util.arrays import Array, single_threaded
 from ctxval._util.json_lines import JsonLines
 from ctxval.learning import LearnedDynamics
 from ctxval.learning.coverage import Coverage
-from ctxval.learning.tolerance import PushedDynamics
+from ctxval.learning.tolerance import pushed
 from strangers_development import DEVELOPMENT
 from study_drawn_tests import truth
 
@@ -72,18 +72,10 @@ def most_changed(learned: LearnedDynamics) -> Array:
             learned_states
         ]
         pushes[1] = -pushes[0]
-        pushed = PushedDynamics(
-            model=posterior.model,
-            data=data,
-            expansions=posterior.mean.expansions,
-            limit=posterior.mean.limit,
-            pushes=pushes.reshape(-1, n),
-            widths=widths,
-            recorded=recorded,
-        )
+        disturbed = pushed(posterior.mean, pushes.reshape(-1, n), widths, recorded)
         plans = planner.plan(tasks)
         plain = planner.distances(posterior.mean, plans, len(tasks))
-        change = np.abs(planner.distances(pushed, plans, len(tasks)) - plain).max(axis=0)
+        change = np.abs(planner.distances(disturbed, plans, len(tasks)) - plain).max(axis=0)
     return np.asarray(tasks[int(np.nan_to_num(change, nan=-1.0, posinf=np.inf).argmax())])
 
 

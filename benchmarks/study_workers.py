@@ -40,7 +40,7 @@ from ctxval import (
 from ctxval._util.arrays import Array, single_threaded
 from ctxval._util.json_lines import JsonLines
 from ctxval.campaign.choices import Choice, Execution
-from ctxval.campaign.execution import RetryPolicy, Schedule, execute_schedule
+from ctxval.campaign.execution import ExecutionLoop
 from ctxval.campaign.interval_search import IntervalSearch
 from ctxval.campaign.workers import WorkerPool, execute_task
 from ctxval.certificates import CertificateOptions
@@ -228,7 +228,7 @@ def study(one: tuple[str, str, int, int]) -> dict[str, Any]:
             ended.append((round(pool.now, 4), trial.number, (trial.distance or 0.0) / largest))
 
         with recorder.predicting(decides is not None and decides.predicts):
-            execute_schedule(Schedule(recorder, rule), pool, note, RetryPolicy())
+            ExecutionLoop(recorder, rule, pool, note).run()
     return {**dict(zip(KEY, one, strict=True)), "ended": ended, **provenance((*AUTO, "campaign"))}
 
 

@@ -9,7 +9,7 @@ from ctxval.certificates import Maxima, Sample, draw_maxima
 from ctxval.learning.dynamics_posterior import PosteriorSettings
 from ctxval.learning.hyperparameters import FAMILIES
 from ctxval.learning.worst_case import WorstCaseSettings
-from ctxval.searches.auto import FAST
+from ctxval.searches.trust_region import FAST
 
 
 def take_few_draws(replace: Callable[[str, Any], None]) -> None:
@@ -31,7 +31,7 @@ def run_few_loops(replace: Callable[[str, Any], None]) -> None:
     draws = PosteriorSettings(hyperparameters=10, learned_from=40, centres=80, pivots=40, families=FAMILIES[:1])
     replace("ctxval.learning.worst_case.WorstCaseSettings.for_dimension", lambda *_: loops)
     replace("ctxval.learning.dynamics_posterior.PosteriorSettings.for_horizon", lambda *_: draws)
-    replace("ctxval.searches.auto._SHARES", (FAST,))
+    replace("ctxval.searches.trust_region._SHARES", (FAST,))
     # Delays and lags of inputs are looked for in each campaign whose model errs: half of its time.
     replace("ctxval.learning.actuators._LEARNED_FROM", 40)
     replace("ctxval.learning.actuators._TRIED", [(1.0, 0.0), (3.0, 0.0), (0.0, 1.5)])

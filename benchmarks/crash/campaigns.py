@@ -20,7 +20,6 @@ sys.path[:0] = [str(ROOT / "tests"), str(ROOT / "benchmarks")]
 
 from conftest import make_validation  # noqa: E402
 from ctxval import Campaign, Store, Trajectory, searches  # noqa: E402
-from ctxval.campaign.storage.database import Database  # noqa: E402
 from ctxval.core.controller import Controller  # noqa: E402
 from ctxval.core.task import Task  # noqa: E402
 from ctxval.core.trial import Trial  # noqa: E402
@@ -63,31 +62,20 @@ class Picky:
         return abs(system.states[..., -1, 0] - model.states[..., -1, 0])
 
 
-class MarkedDatabase(Database):
-    """A database that says after each transaction what it holds then."""
-
-    def __init__(self, path: str | Path | None, say: Callable[[object], None]) -> None:
-        self._say = say
-        super().__init__(path)
-
-    @contextlib.contextmanager
-    def transaction(self) -> Iterator[None]:
-        with super().transaction():
-            yield
-        self._say(content(self._connection))
-
-
 class Marked(Store):
-    """A store that acknowledges each transaction in a file of marks."""
+    """A store that acknowledges in a file of marks what it holds after each transaction."""
 
     def __init__(self, path: Path, marks: Path, synchronous: str | None) -> None:
         self.marks = os.open(marks, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
         super().__init__(path)
         if synchronous is not None:
-            self._database.execute(f"PRAGMA synchronous = {synchronous}")
+            self._execute(f"PRAGMA synchronous = {synchronous}")
 
-    def _opened(self, path: str | Path | None) -> Database:
-        return MarkedDatabase(path, self.say)
+    @contextlib.contextmanager
+    def _transaction(self) -> Iterator[None]:
+        with super()._transaction():
+            yield
+        self.say(content(self._connection))
 
     def say(self, what: object) -> None:
         """Acknowledge something."""

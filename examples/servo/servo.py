@@ -18,7 +18,7 @@ from scipy.optimize import least_squares
 from ctxval import Array, Experiment, Labels, Parameters, Task, TaskSuite, Validation, distances, rollout, systems
 from ctxval.core.controller import Controller
 from ctxval.core.model import Model
-from ctxval.core.outputs import Outputs
+from ctxval.core.system import Outputs
 from ctxval.data import LogMapping, read_recordings
 
 RECORDINGS = Path(__file__).parent / "recordings"

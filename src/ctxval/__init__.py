@@ -90,27 +90,10 @@ __all__ = [
 ]
 
 _MODULES = {
-    "aspect1": "studies.aspect1",
-    "cases": "paper.cases",
-    "certificates": "certificates",
-    "comparison": "studies.comparison",
-    "controllers": "controllers",
-    "data": "data",
-    "distances": "distances",
-    "errors": "errors",
-    "fitting": "studies.fitting",
-    "gp": "gp",
-    "models": "models",
-    "plot": "campaign.plot",
-    "refinement": "studies.refinement",
-    "replay": "studies.replay",
-    "report": "report",
-    "reproduce": "paper.reproduce",
-    "safety": "studies.safety",
-    "searches": "searches",
-    "specs": "specs",
-    "systems": "systems",
-    "testing": "testing",
+    **{name: name for name in ("certificates", "controllers", "data", "distances", "errors", "gp", "models", "report")},
+    **{name: name for name in ("searches", "specs", "systems", "testing")},
+    **{name: f"studies.{name}" for name in ("aspect1", "comparison", "fitting", "refinement", "replay", "safety")},
+    **{"cases": "paper.cases", "plot": "campaign.plot", "reproduce": "paper.reproduce"},
 }
 """The public modules, which ``import ctxval`` alone makes usable: each is imported when it is first used."""
 

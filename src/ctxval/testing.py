@@ -18,9 +18,8 @@ from ctxval.certificates import Certificate, CertificateKind, Sample
 from ctxval.core.controller import Controller, ControllerWithMemory, Synthesizer, converged_of, each_alone
 from ctxval.core.distance import Distance
 from ctxval.core.model import Model, central_differences, linearize
-from ctxval.core.outputs import OutputsLike, as_outputs
 from ctxval.core.rollout import rollout
-from ctxval.core.system import System
+from ctxval.core.system import OutputsLike, System, as_outputs
 from ctxval.core.task import Task
 from ctxval.core.trajectory import COMPLETE, Trajectory
 from ctxval.core.trial import Origin

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from ctxval import Trajectory
-from ctxval._util.csv_table import CsvTable
+from ctxval._util.columns import CsvTable
 from ctxval.data import LogMapping, read_recordings
 from ctxval.errors import InputError
 

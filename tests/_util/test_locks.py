@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from ctxval._util.locks import LOCKS_FILE_ITSELF, FileLock, LockedError
+from ctxval._util.files import LOCKS_FILE_ITSELF, FileLock, LockedError
 
-TRY = "import sys; from ctxval._util.locks import FileLock; FileLock(sys.argv[1]).acquire()"
+TRY = "import sys; from ctxval._util.files import FileLock; FileLock(sys.argv[1]).acquire()"
 
 
 def taken_elsewhere(path: Path) -> bool:

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import array_shapes, arrays
 
 from ctxval import Trajectory
-from ctxval._util.npz import Archive
+from ctxval._util.files import Archive
 from ctxval.errors import InputError, ShapeError
 
 DTYPES = st.sampled_from(["<f8", ">f8", "<f4", "<f2", "|b1", "|i1", "<u2", ">i4", "<i8"])

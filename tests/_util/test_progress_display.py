@@ -11,9 +11,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
 
-from ctxval._util import progress_display
-from ctxval._util.progress import Progress, advance, is_heard, listening, stage
-from ctxval._util.progress_display import amount, duration, is_screen, progress_shown
+from ctxval._util import progress as progress_display
+from ctxval._util.progress import (
+    Progress,
+    advance,
+    amount,
+    duration,
+    is_heard,
+    is_screen,
+    listening,
+    progress_shown,
+    stage,
+)
 
 
 def console(*, terminal: bool) -> Console:

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ctxval._util.units import conversion, named_unit
+from ctxval._util.columns import conversion, named_unit
 from ctxval.errors import InputError
 
 

@@ -18,7 +18,6 @@ from typer.testing import CliRunner, Result
 
 from ctxval import Campaign, Store, TaskSpace, Trajectory, searches
 from ctxval.campaign.by_hand import parameters_from
-from ctxval.campaign.storage.database import Database
 from ctxval.certificates import Sample
 from ctxval.cli import app
 from ctxval.controllers import read_controller
@@ -560,12 +559,12 @@ def test_many_runs_are_imported_in_one_transaction_and_told_once(invoke: Any, mo
     rows = [f"{0.5 + k / 100},{k / 1000}" for k in range(100)]
     Path("runs.csv").write_text("\n".join(["goal,distance", *rows, rows[7]]))
     calls: Counter[str] = Counter()
-    for kind, name in ((Store, "add"), (Database, "transaction")):
+    for kind, name in ((Store, "add"), (Store, "_transaction")):
         monkeypatch.setattr(kind, name, counted(getattr(kind, name), name, calls))
     result = invoke("import", "a.sqlite", "runs.csv")
     assert result.exit_code == 0, result.stderr
     assert (calls["add"], len(Store("a.sqlite").trials())) == (1, 101)
-    assert calls["transaction"] < 10
+    assert calls["_transaction"] < 10
     assert result.stdout.splitlines()[-2:] == [
         "... and 90 other trials; --json lists them.",
         "100 runs imported, 1 already in the store.",

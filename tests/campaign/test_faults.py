@@ -26,7 +26,7 @@ from conftest import make_validation
 from ctxval import Campaign, Store, Trajectory, searches
 from ctxval.campaign.storage.disks import StoreWarning, file_system
 from ctxval.campaign.storage.recovery import recover
-from ctxval.campaign.storage.store import Side
+from ctxval.campaign.storage.rows import Side
 from ctxval.cli import app
 from ctxval.errors import CtxvalError, ForeignStoreError, InputError, StoreAccessError
 from rig_cli import SMALL
@@ -179,7 +179,7 @@ def test_an_edited_distance_is_noticed(whole: Path, tmp_path: Path) -> None:
     path = tmp_path / "edited.sqlite"
     shutil.copy(whole, path)
     store = Store(path)
-    store._database.execute("UPDATE trials SET distance = distance * 1.5 WHERE number = 3")
+    store._execute("UPDATE trials SET distance = distance * 1.5 WHERE number = 3")
     with pytest.raises(ForeignStoreError, match="is damaged: its trial 3 cannot be read; `ctxval export` saves"):
         store.trials()
     assert 3 not in recover(path).trials
@@ -190,7 +190,7 @@ def test_a_missing_trial_is_noticed(whole: Path, tmp_path: Path) -> None:
     path = tmp_path / "short.sqlite"
     shutil.copy(whole, path)
     store = Store(path)
-    store._database.execute("DELETE FROM trials WHERE number = 3")
+    store._execute("DELETE FROM trials WHERE number = 3")
     with pytest.raises(ForeignStoreError, match="its trial 3 cannot be read"):
         store.trials()
 
@@ -396,11 +396,11 @@ class Acts(RuleBasedStateMachine):
             def __getattr__(self, name: str) -> Any:
                 return getattr(connection, name)
 
-        connection = store._database._connection
-        store._database._connection = Cut()  # type: ignore[assignment]
+        connection = store._connection
+        store._connection = Cut()  # type: ignore[assignment]
         with pytest.raises(KeyboardInterrupt):
             act()
-        store._database._connection = connection
+        store._connection = connection
         self.die(who)
 
     @invariant()

@@ -27,7 +27,7 @@ def without_goal() -> Validation:
 
 
 def test_a_campaign_warns_once_that_the_model_misses_its_goals() -> None:
-    validation = make_validation(horizon=SHORT).with_labels(Labels(("angle [rad]", "rate [rad/s]"), ("torque",)))
+    validation = make_validation(horizon=SHORT).with_parts(labels=Labels(("angle [rad]", "rate [rad/s]"), ("torque",)))
     campaign = Campaign(validation, search=Random(), seed=0)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")

@@ -67,7 +67,7 @@ def test_a_sample_keeps_the_predictions_and_a_kind_asks_for_them() -> None:
     ],
 )
 def test_evidence_names_states_and_inputs_as_the_experiment_does(labels: Labels, coordinates: list[str]) -> None:
-    campaign = Campaign(make_validation().with_labels(labels), search=searches.Random(), seed=1).run(3)
+    campaign = Campaign(make_validation().with_parts(labels=labels), search=searches.Random(), seed=1).run(3)
     learned = campaign.provenance.learned
     assert learned is not None
     evidence = learned.dynamics(0.5)

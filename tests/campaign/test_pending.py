@@ -13,7 +13,7 @@ import pytest
 from ctxval import Campaign, Validation, cases, searches
 from ctxval.campaign.choices import Choice, Execution
 from ctxval.campaign.dynamics import NEAR
-from ctxval.campaign.execution import RetryPolicy, Schedule, execute_schedule
+from ctxval.campaign.execution import ExecutionLoop
 from ctxval.campaign.interval_search import IntervalSearch
 from ctxval.campaign.workers import WorkerPool, execute_task
 from ctxval.certificates import CertificateOptions
@@ -48,7 +48,7 @@ def linear(dim: int = 2, seed: int = 0) -> Validation:
 
 
 def run(campaign: Campaign, pool: Pool, budget: int, rule: Callable[[], Choice | None] = Choice) -> Campaign:
-    execute_schedule(Schedule(campaign.recorder, rule, budget), pool, None, RetryPolicy())
+    ExecutionLoop(campaign.recorder, rule, pool, budget=budget).run()
     return campaign
 
 

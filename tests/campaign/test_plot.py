@@ -28,7 +28,7 @@ from ctxval.errors import InputError
 @pytest.fixture(scope="module")
 def campaign() -> Campaign:
     labels = Labels(("angle [rad]", "rate"), ("torque [N m]",), "rad")
-    return Campaign(make_validation().with_labels(labels), search=searches.GPUCB(), seed=1).run(9)
+    return Campaign(make_validation().with_parts(labels=labels), search=searches.GPUCB(), seed=1).run(9)
 
 
 def test_the_surrogate_shows_every_sample_and_the_maximum(campaign: Campaign, ax: Axes) -> None:
@@ -148,7 +148,7 @@ def test_threshold_and_bound_are_drawn_and_no_band_is_below_zero(campaign: Campa
 
 def test_labels_are_those_of_the_validation() -> None:
     labels = Labels(("angle [rad]", "rate [rad/s]"), ("torque [N m]",), "rad")
-    named = Campaign(make_validation().with_labels(labels), search=searches.Random()).run(2)
+    named = Campaign(make_validation().with_parts(labels=labels), search=searches.Random()).run(2)
     figure = plot.worst_trajectories(named)
     assert [axes.get_ylabel() for axes in figure.axes] == ["angle [rad]", "rate [rad/s]", "torque [N m]"]
     axes = plot.convergence(named, ax=Figure().add_subplot())

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from conftest import make_validation
 from ctxval import Campaign, Store, Verdict, searches
-from ctxval.campaign.provenance import provenance_of_store
+from ctxval.campaign.storage.other_stores import provenance_of_store
 from ctxval.certificates import CertificateOptions, Posterior
 from ctxval.cli import app
 from ctxval.errors import ForeignStoreError

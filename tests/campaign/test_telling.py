@@ -13,7 +13,8 @@ import pytest
 
 from conftest import make_validation
 from ctxval import Campaign, Experiment, Store, Trajectory, Validation, searches
-from ctxval.campaign.telling import ToldResult, parameters_of_trial, result_sentence, tell_result
+from ctxval.campaign.by_hand import parameters_of_trial, result_sentence, tell_result
+from ctxval.campaign.telling import ToldResult
 from ctxval.core.trial import Trial
 from ctxval.data import LogMapping
 from ctxval.errors import InputError

@@ -486,7 +486,7 @@ def test_the_first_interrupt_ends_after_the_running_executions(tmp_path: Path, w
 
 
 @pytest.mark.parametrize("workers", [1, 2])
-@pytest.mark.parametrize(("part", "method"), [("TrialRecorder", "_open"), ("ProcessPool", "_start_worker")])
+@pytest.mark.parametrize(("part", "method"), [("TrialRecorder", "open_all"), ("ProcessPool", "_start_worker")])
 def test_an_interrupt_while_an_execution_begins_leaves_it_to_end(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, part: str, method: str, workers: int
 ) -> None:
@@ -496,7 +496,7 @@ def test_an_interrupt_while_an_execution_begins_leaves_it_to_end(
 
     def interrupted(*arguments: Any, **options: Any) -> Any:
         begun = begin(*arguments, **options)
-        if next(calls) == (1 if method == "_open" else workers):
+        if next(calls) == (1 if method == "open_all" else workers):
             signal.raise_signal(signal.SIGINT)
         return begun
 

@@ -9,13 +9,6 @@ def test_a_threshold_is_kept_only_beyond_two_errors() -> None:
     assert not certificate.covers(1.19)
 
 
-def test_remarks_are_assumptions() -> None:
-    certificate = Certificate("posterior", "", 1.0, 0.95, 0.0, 9, ("a",)).with_remarks(
-        ["S was changed after trial 3: oil"]
-    )
-    assert certificate.assumptions == ("a", "S was changed after trial 3: oil")
-
-
 HOSTILE = Certificate(
     "audit",
     "At most 5 % are above 0.5.",

@@ -24,11 +24,12 @@ from ctxval.certificates import (
     Sample,
     certify_dynamics,
 )
+from ctxval.certificates.bounds import NO_UNITS
 from ctxval.certificates.dynamics import bound_of
 from ctxval.certificates.dynamics_diagnostics import ACCURATE, GAP, PREDICTIONS
 from ctxval.certificates.dynamics_evidence import PushedDistances, StatePocket
 from ctxval.certificates.verdict import judge, judge_by
-from ctxval.certificates.verdict_sentences import NO_UNITS, undecided
+from ctxval.certificates.verdict_sentences import undecided
 from ctxval.errors import CertificateError
 from rig_evidence import COVERED, GOOD, gap, prediction
 

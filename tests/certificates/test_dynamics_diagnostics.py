@@ -77,8 +77,8 @@ BAD: list[tuple[dict[str, Any], str]] = [
 
 def test_good_evidence_withdraws_nothing() -> None:
     assert doubt() is None
-    assert uncovered(GOOD) is None
-    assert untested(GOOD, BEST, BOUND) is None
+    assert uncovered(GOOD) == []
+    assert untested(GOOD, BEST, BOUND) == []
 
 
 @pytest.mark.parametrize(("changed", "said"), BAD)

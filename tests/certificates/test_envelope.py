@@ -15,11 +15,11 @@ from ctxval.certificates.drawn_distances import DrawnDistances
 from ctxval.certificates.envelope import (
     Envelope,
     boundary_tasks,
+    doubt_of_envelope,
     envelope_of,
     must_outlive_a_test,
     withdrawn,
 )
-from ctxval.certificates.envelope_diagnostics import doubt_of_envelope
 from ctxval.errors import CertificateError, InputError
 from rig_evidence import GOOD
 

@@ -106,6 +106,17 @@ def test_it_finds_the_margin_and_other_commands_read_its_store(folder: Path, inv
     assert "unsafe: wall = " in asked.stdout
 
 
+def test_check_says_what_the_model_does(folder: Path, invoke: Invoke) -> None:
+    checked = invoke("check", "wall.toml")
+    assert checked.exit_code == 0
+    # At the ends of the space: a wall at 0.4 m and a speed of 0.5 m/s, and a wall at 2 m and a speed of 0.5 to 1.5 m/s.
+    assert "specification: the model satisfies it in" in checked.stdout
+    (folder / "wall.toml").write_text(FILE.replace('center = "wall"', "center = [-9.0]"))
+    assert "failed  specification: the model satisfies it in 0 of 11 tasks" in invoke("check", "wall.toml").stdout
+    (folder / "wall.toml").write_text(FILE.replace('"wall", low', '"wal", low'))
+    assert "no entry of the task's environment is called 'wal'" in " ".join(invoke("check", "wall.toml").output.split())
+
+
 @pytest.mark.parametrize(
     ("old", "new", "expected"),
     [

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from ctxval import Task, controllers, models
-from ctxval.core.outputs import Outputs
 from ctxval.core.rollout import rollout
+from ctxval.core.system import Outputs
 from ctxval.errors import InputError, ShapeError
 from ctxval.testing import check_synthesizer
 

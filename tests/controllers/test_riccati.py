@@ -8,7 +8,7 @@ from scipy.linalg import solve_discrete_are
 
 from ctxval import Task
 from ctxval.controllers import ILQR, LQR
-from ctxval.controllers.cost import LinearGains, QuadraticCost, linear_gains
+from ctxval.controllers.lqr import LinearGains, QuadraticCost, linear_gains
 from ctxval.models import Linear
 
 A, B = np.array([[1.0, 0.1], [0.3, 0.9]]), np.array([[0.0], [0.1]])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ctxval.core.kalman import Estimate, corrected, predicted, smoothed
-from ctxval.core.outputs import Outputs
+from ctxval.core.system import Outputs
 from ctxval.models import Linear
 
 H = 6

@@ -32,16 +32,16 @@ def test_an_experiment_gives_its_labels_to_its_validation_and_takes_those_it_has
 
 def test_labels_do_not_identify_an_experiment() -> None:
     validation = make_validation()
-    assert validation.with_labels(Labels(units="m")).describe() == validation.describe()
+    assert validation.with_parts(labels=Labels(units="m")).describe() == validation.describe()
 
 
 def test_other_parts_keep_the_labels() -> None:
     labels = Labels(units="m")
-    validation = make_validation().with_labels(labels)
+    validation = make_validation().with_parts(labels=labels)
     assert validation.with_space(validation.space).labels is labels
     assert validation.with_distance(validation.distance).labels is labels
     with pytest.raises(InputError, match="labels must be a Labels"):
-        validation.with_labels("m")  # type: ignore[arg-type]
+        validation.with_parts(labels="m")  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
@@ -89,4 +89,4 @@ def test_an_index_is_part_of_a_name() -> None:
     Validation(**{**vars(validation), "system": SimpleNamespace(execute=validation.system.execute, **vars(system))})
     assert Labels().names(system, 3, 1) == ({"q[1]": "", "q[2]": "", "der(q[1])": ""}, {"u[1]": ""})
     assert Labels(("q[1] [rad]", "q[2][m]")).names(None, 2, 0)[0] == {"q[1]": "rad", "q[2]": "m"}
-    assert Labels(("q[1]", "q[2]")).state_names(None) == ("q[1]", "q[2]")
+    assert Labels(("q[1]", "q[2]")).names(None, 2, 0)[0] == {"q[1]": "", "q[2]": ""}

@@ -9,7 +9,7 @@ import pytest
 from conftest import make_validation
 from ctxval import Campaign, Task, Validation, distances, searches
 from ctxval.core.labels import Labels
-from ctxval.core.preflight import DistanceWarning, start_offset
+from ctxval.core.plan import DistanceWarning, start_offset
 from ctxval.core.validation import CostWarning
 from ctxval.distances import AtCrossing, AtTimes, CrossingTime, FinalState, GoalError, RelativeDeviation, TrackingError
 from ctxval.errors import DistanceError, InputError, UnknownNameError
@@ -65,7 +65,7 @@ def test_every_distance_takes_states_by_name(name: str) -> None:
     assert options
     for option in options:
         by_name, by_index = (0 if option == "state" else (0,)), ("state 0" if option == "state" else ["state 0"])
-        validation = make_validation().with_labels(labels)
+        validation = make_validation().with_parts(labels=labels)
         named = validation.with_distance(cls(**required, **{option: by_index})).distance
         indexed = cls(**required, **{option: by_name})
         assert named == indexed
@@ -77,7 +77,7 @@ def test_every_distance_takes_states_by_name(name: str) -> None:
 def test_names_given_before_the_labels_are_resolved_with_them() -> None:
     unnamed = make_validation().with_distance(FinalState(components=["angle"]))
     n = len(unnamed.plan([0.5]).task.initial_state)
-    labelled = unnamed.with_labels(Labels(("angle", *(f"x{i}" for i in range(1, n)))))
+    labelled = unnamed.with_parts(labels=Labels(("angle", *(f"x{i}" for i in range(1, n)))))
     assert labelled.distance == FinalState(components=(0,))
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from ctxval import Campaign, Task, Trajectory, distances, systems
-from ctxval.core.outputs import Outputs, as_outputs
+from ctxval.core.system import Outputs, as_outputs
 from ctxval.errors import InputError, ModelError, ShapeError, StoreMismatchError
 from ctxval.testing import check_system
 from rig_outputs import DT, H, swing, swing_validation

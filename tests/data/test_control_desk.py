@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from ctxval.data import Clock, Field, LogMapping, read_logs, read_recordings
-from ctxval.data.control_desk import ControlDeskLog, control_desk_log, is_control_desk
+from ctxval.data.control_desk import ControlDeskLog, is_control_desk
 from ctxval.errors import InputError
 from rig_logs import DT, run, write_control_desk
 
@@ -68,7 +68,7 @@ def structure(**changes: Any) -> dict[str, Any]:
 
 
 def test_names_are_as_long_as_they_must_be() -> None:
-    log = control_desk_log("a", structure())
+    log = ControlDeskLog("a", structure())
     assert log.fields() == ("Root/A/y", "Root/B/y", "pair")
     signals = log.signals(["Root/B/y", "pair", "pair[1]"], Clock())
     assert signals["Root/B/y"].times == pytest.approx(1e-3 * np.arange(8))
@@ -81,10 +81,10 @@ def test_names_are_as_long_as_they_must_be() -> None:
 def test_a_signal_on_two_rasters_has_two_names() -> None:
     twice = [{"Name": "y", "Data": np.arange(n), "XIndex": k, "Raster": raster} for n, k, raster in
              ((4, 1, "slow"), (8, 2, "fast"))]  # fmt: skip
-    log = control_desk_log("a", structure(Y=twice))
+    log = ControlDeskLog("a", structure(Y=twice))
     assert log.fields() == ("slow/y", "fast/y")
     by_raster = [{"Name": "y", "Data": np.arange(8), "Raster": "fast"}]
-    assert len(control_desk_log("a", structure(Y=by_raster)).signals(["y"], Clock())["y"].times) == 8
+    assert len(ControlDeskLog("a", structure(Y=by_raster)).signals(["y"], Clock())["y"].times) == 8
 
 
 @pytest.mark.parametrize(
@@ -96,13 +96,13 @@ def test_a_signal_on_two_rasters_has_two_names() -> None:
 )
 def test_signals_that_do_not_fit_are_refused(signal: dict[str, Any], message: str) -> None:
     with pytest.raises(InputError, match=message):
-        control_desk_log("a", structure(Y=[signal])).signals(["y"], Clock())
+        ControlDeskLog("a", structure(Y=[signal])).signals(["y"], Clock())
 
 
 def test_times_must_be_finite() -> None:
     axes = [{"Data": np.array([0.0, np.nan, 2.0, 3.0])}]
     with pytest.raises(InputError, match=r"the times X\(1\) must be finite numbers"):
-        control_desk_log("a", structure(X=axes, Y=structure()["Y"][:1])).signals(["y"], Clock())
+        ControlDeskLog("a", structure(X=axes, Y=structure()["Y"][:1])).signals(["y"], Clock())
 
 
 def test_other_structures_are_read_as_before(tmp_path: Path) -> None:

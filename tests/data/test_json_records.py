@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from ctxval.data import LogMapping, read_recordings
-from ctxval.data.json_records import read_json_records
 from ctxval.data.log import Clock
+from ctxval.data.readers import read_json_records
 from ctxval.errors import InputError
 
 RECORDS: list[dict[str, Any]] = [
@@ -23,7 +23,7 @@ RECORDS: list[dict[str, Any]] = [
 
 def written(path: Path, content: Any) -> Path:
     text = json.dumps(content).encode()
-    path.write_bytes(gzip.compress(text) if path.suffix == ".gz" else text)
+    path.write_bytes(gzip.compress(text, mtime=0) if path.suffix == ".gz" else text)
     return path
 
 
@@ -74,7 +74,7 @@ def test_other_json_is_refused(tmp_path: Path, content: Any, message: str) -> No
         ("run.json", b"\xff\xfe"),
         ("run.json", b"[" * 100_000),
         ("run.json.gz", b"not compressed"),
-        ("run.json.gz", gzip.compress(b"[{}]")[:-6]),
+        ("run.json.gz", gzip.compress(b"[{}]", mtime=0)[:-6]),
     ],
 )
 def test_damaged_files_are_refused(tmp_path: Path, name: str, content: bytes) -> None:

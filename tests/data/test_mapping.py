@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ctxval._util.units import conversion
+from ctxval._util.columns import conversion
 from ctxval.data import Field, LogMapping, MemoryTable
 from ctxval.errors import InputError, UnknownNameError
 

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from ctxval._util.arrays import Array
-from ctxval.gp.ascent import Ascent, usual_effort
+from ctxval.gp.ascent import ascend, usual_effort
 
 
 def maximum(function: object, dimension: int, budget: int = 1500, seed: int = 0) -> tuple[Array, float]:
-    ascent = Ascent(function, np.zeros(dimension), np.ones(dimension), budget)  # type: ignore[arg-type]
-    points, values = ascent.run(np.empty((0, dimension)), np.random.default_rng(seed))
+    box = np.zeros(dimension), np.ones(dimension)
+    points, values = ascend(function, box, budget, np.empty((0, dimension)), np.random.default_rng(seed))  # type: ignore[arg-type]
     return points[0], float(values[0])
 
 
@@ -41,7 +41,7 @@ def test_it_stays_in_its_box_and_its_budget_and_sorts_what_it_saw() -> None:
         return X.sum(axis=1)
 
     low, high = np.array([0.2, 0.0, 0.1, 0.5]), np.array([0.4, 0.3, 0.9, 0.52])
-    points, values = Ascent(function, low, high, 300).run(np.full((3, 4), 0.7), np.random.default_rng(0))
+    points, values = ascend(function, (low, high), 300, np.full((3, 4), 0.7), np.random.default_rng(0))
     asked = np.concatenate(seen)
     assert ((asked >= low - 1e-12) & (asked <= high + 1e-12)).all()
     assert len(asked) <= 1.2 * 300
@@ -67,8 +67,8 @@ def test_an_approximation_is_searched_and_the_function_itself_decides(dimension:
         return -((X - 0.3) ** 2).sum(axis=1)
 
     low, high = np.zeros(dimension), np.ones(dimension)
-    ascent = Ascent(exact, low, high, 1000, rough=lambda X: -((X - 0.33) ** 2).sum(axis=1))
-    points, values = ascent.run(np.empty((0, dimension)), np.random.default_rng(0))
+    rng, rough = np.random.default_rng(0), lambda X: -((X - 0.33) ** 2).sum(axis=1)
+    points, values = ascend(exact, (low, high), 1000, np.empty((0, dimension)), rng, rough)
     assert sum(asked) == len(points) < 300
     np.testing.assert_allclose(points[0], 0.3, atol=0.05)
     np.testing.assert_allclose(values, -((points - 0.3) ** 2).sum(axis=1))
@@ -82,8 +82,7 @@ def test_in_few_dimensions_the_function_is_asked_for_the_same_points_each_time()
         return np.sin(9 * X).prod(axis=1)
 
     for seed, low in enumerate([0.0, 0.4]):
-        ascent = Ascent(function, np.full(2, low), np.ones(2), 600)
-        ascent.run(np.empty((0, 2)), np.random.default_rng(seed))
+        ascend(function, (np.full(2, low), np.ones(2)), 600, np.empty((0, 2)), np.random.default_rng(seed))
     pools = [points for points in asked if len(points) == 200]
     assert len(pools) == 2
     np.testing.assert_array_equal(*pools)
@@ -109,8 +108,8 @@ def test_the_usual_effort_is_about_that_of_a_search(dimension: int, budget: int)
         return function
 
     starts = np.random.default_rng(1).random((8, dimension))
-    ascent = Ascent(counted("exact"), np.zeros(dimension), np.ones(dimension), budget, counted("rough"))
-    ascent.run(starts, np.random.default_rng(0))
+    box = np.zeros(dimension), np.ones(dimension)
+    ascend(counted("exact"), box, budget, starts, np.random.default_rng(0), counted("rough"))
     usual, batches = usual_effort(dimension, budget), sum(map(len, seen.values()))
     assert usual.points <= budget
     assert 0.6 * usual.points <= sum(map(sum, seen.values())) <= 1.6 * usual.points

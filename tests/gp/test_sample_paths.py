@@ -7,8 +7,7 @@ import pytest
 from scipy.optimize import check_grad, minimize
 from scipy.stats import chi2, kstest, t
 
-from ctxval.gp.hyperposterior import EXACT, Conditioned, Hyperparameters, condition
-from ctxval.gp.sample_paths import Paths, draw_paths, maxima
+from ctxval.gp.hyperposterior import EXACT, Conditioned, Hyperparameters, Paths, condition, draw_paths, maxima
 
 
 def given(

@@ -150,9 +150,9 @@ def test_values_that_say_nothing_are_learned_from_without_harm(values: np.ndarra
 
 
 def test_the_prior_of_the_hyperparameters_has_the_gradient_that_differences_show() -> None:
-    from ctxval.gp.surrogate import _LogPrior
+    from ctxval.gp.surrogate import _prior
 
-    prior, at = _LogPrior(4), np.random.default_rng(0).normal(size=8)
+    (_, prior), at = _prior(4), np.random.default_rng(0).normal(size=8)
     numeric = [(prior(at + 1e-6 * e)[0] - prior(at - 1e-6 * e)[0]) / 2e-6 for e in np.eye(8)]
     np.testing.assert_allclose(prior(at)[1], numeric, rtol=1e-6, atol=1e-6)
 

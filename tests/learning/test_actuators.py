@@ -14,7 +14,7 @@ from ctxval import Campaign, Task, TaskSpace, Validation, controllers, distances
 from ctxval._util.arrays import Array
 from ctxval.core.controller import started
 from ctxval.learning import DynamicsStudy
-from ctxval.learning.actuators import Actuator, found_actuator, with_actuator
+from ctxval.learning.actuators import Actuator, found_actuator
 from ctxval.learning.closed_loops import LoopPlanner
 from ctxval.learning.extended import ExtendedValidation
 from ctxval.learning.histories import Record
@@ -70,7 +70,7 @@ def test_what_acts_is_what_the_simulation_of_such_actuators_applies(delay: float
 
 def test_a_closed_loop_has_what_acts_and_what_is_commanded() -> None:
     actuator = Actuator(1.5, 2.0)
-    extended = with_actuator(cart(), actuator, 1)
+    extended = ExtendedValidation(cart(), actuator, 1).validation
     task = extended.task(extended.space.parameters([1.0, 0.5]))
     pi = started(extended.synthesizer.design(task, extended.model), task)
     both = np.stack([pi(t, np.array([0.1 * t, 0.3])) for t in range(8)])
@@ -80,7 +80,8 @@ def test_a_closed_loop_has_what_acts_and_what_is_commanded() -> None:
 def test_what_m_promises_is_what_it_promises_without_an_actuator() -> None:
     plain, points = cart(), np.random.default_rng(0).random((3, 2))
     (one,), (other,) = (
-        LoopPlanner(validation).plan(points) for validation in (plain, with_actuator(plain, Actuator(2.0), 1))
+        LoopPlanner(validation).plan(points)
+        for validation in (plain, ExtendedValidation(plain, Actuator(2.0), 1).validation)
     )
     np.testing.assert_array_equal(other.promised.states, one.promised.states)
     np.testing.assert_array_equal(other.promised.inputs[..., 1:], one.promised.inputs)

@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 
 from ctxval import Campaign, TaskSpace, distances
-from ctxval.core.outputs import Outputs
+from ctxval.core.system import Outputs
 from ctxval.learning import DynamicsStudy
+from ctxval.learning.extended import with_states_of_model
 from ctxval.learning.replays import replay_executed
-from ctxval.learning.state_estimates import smoothed_states, with_states_of_model
+from ctxval.learning.state_estimates import smoothed_states
 from rig_outputs import Swing, swing, swing_validation
 
 POINTS = np.array([[-0.8], [-0.2], [0.5], [1.0]])

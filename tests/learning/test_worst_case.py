@@ -11,7 +11,7 @@ import pytest
 
 from ctxval import Task, TaskSpace, Trajectory, Transitions, Validation, controllers, distances, models, systems
 from ctxval._util.arrays import Array
-from ctxval.gp.ascent import Ascent
+from ctxval.gp.ascent import ascend
 from ctxval.learning import worst_case
 from ctxval.learning.closed_loops import LoopPlanner, loop_pairs
 from ctxval.learning.draws import DynamicsDraws
@@ -92,7 +92,7 @@ def remembering() -> Remembering:
 
 def maxima(search: WorstCaseSearch, posterior: DynamicsPosterior, known: Array, rng: np.random.Generator) -> WorstCase:
     (of_pool,) = search.planner.distances(posterior.mean, search.plans, len(search.pool))
-    return search.maxima(posterior, search.on_mean(posterior, of_pool, known, rng), known, rng)
+    return search.maxima(posterior, search.on_mean(posterior, of_pool, known, rng), known, rng, posterior.functions)
 
 
 def grid(dimension: int) -> Array:
@@ -226,11 +226,11 @@ def test_the_number_of_loops_is_counted() -> None:
 def test_an_approximation_that_is_the_mean_itself_is_not_searched_first(monkeypatch: pytest.MonkeyPatch) -> None:
     search, roughs = WorstCaseSearch(make_planner(1), 0), list[object]()
 
-    def spied(*arguments: Any) -> Ascent:
-        roughs.append(arguments[4])
-        return Ascent(*arguments)
+    def spied(*arguments: Any) -> Any:
+        roughs.append(arguments[5])
+        return ascend(*arguments)
 
-    monkeypatch.setattr(worst_case, "Ascent", spied)
+    monkeypatch.setattr(worst_case, "ascend", spied)
     exact, rough = replace(learned()), replace(learned())
     assert exact.rough_mean is exact.mean
     rough.__dict__["rough_mean"] = copy.copy(rough.mean)

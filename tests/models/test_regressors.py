@@ -35,7 +35,7 @@ from sklearn.preprocessing import (
     StandardScaler,
 )
 
-from ctxval.models.regressors import smooth_map
+from ctxval.models.scikit_learn import smooth_map
 
 RNG = np.random.default_rng(0)
 X = RNG.normal(size=(60, 3)) * [1.0, 3.0, 0.5] + [0.0, 1.0, -2.0]

@@ -32,7 +32,7 @@ HOSTILE = "</script><script>document.title='hacked'</script><img src=x onerror=a
 def pendulum(store: Path | None = None, executions: int = 9) -> Campaign:
     """Return a campaign with one task parameter."""
     labels = Labels(("angle [rad]", "rate [rad/s]"), ("torque [N m]",), "rad")
-    validation = make_validation().with_labels(labels)
+    validation = make_validation().with_parts(labels=labels)
     return Campaign(validation, search=searches.GPUCB(), store=store, seed=1, name="pendulum").run(executions)
 
 

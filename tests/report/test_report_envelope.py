@@ -11,7 +11,7 @@ from rig_pages import pendulum, plane
 from ctxval.certificates.envelope import Envelope, withdrawn
 from ctxval.certificates.envelope_surface import Surfaces
 from ctxval.report import ReportContext, context_of_campaign
-from ctxval.report.sections.envelope import envelope
+from ctxval.report.sections.distances import envelope
 
 
 def with_envelope(dimension: int) -> ReportContext:

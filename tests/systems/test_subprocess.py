@@ -21,8 +21,9 @@ from ctxval import Campaign, Task, TaskSpace, Validation, controllers, distances
 from ctxval._util.arrays import Array
 from ctxval.core.controller import AffineFeedback
 from ctxval.errors import ExecutionError, InputError
-from ctxval.systems import Subprocess, supervised
+from ctxval.systems import Subprocess
 from ctxval.systems import subprocess as adapter
+from ctxval.systems import subprocess as supervised
 from rig_thorough import more
 
 MODEL = models.Linear([[1.0, 0.1], [0.0, 1.0]], [[0.0], [0.05]])

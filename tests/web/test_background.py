@@ -12,7 +12,7 @@ import pytest
 
 from ctxval._util.progress import Progress, advance, stage
 from ctxval.errors import CampaignError, InputError
-from ctxval.web.background import BackgroundProcess
+from ctxval.web.service import BackgroundProcess
 
 pytestmark = pytest.mark.slow
 

@@ -92,17 +92,15 @@ def separated_rows(points: Array, reach: float, count: int) -> list[int]:
     return chosen
 
 
-def farthest_rows(
-    points: Array, gaps: Array, count: int, *, squared: bool = False, reach: float = -np.inf
-) -> list[int]:
+def farthest_rows(points: Array, gaps: Array, count: int, *, squared: bool = False) -> list[int]:
     """Return rows of points ``(n, d)``, each farthest from all points chosen before it (Gonzalez 1985).
 
     The gaps ``(n,)`` are the distances of the points to the nearest one that is chosen already; minus infinity if the
-    point is one of them. The choice ends where no point is farther than the reach from the chosen ones.
+    point is one of them.
     """
     left = np.array(gaps, dtype=np.float64)
     rows: list[int] = []
-    while len(rows) < count and left.max() > reach:
+    while len(rows) < count and left.max() > -np.inf:
         row = int(left.argmax())
         distances = ((points - points[row]) ** 2).sum(axis=1)
         left = np.minimum(left, distances if squared else np.sqrt(distances))

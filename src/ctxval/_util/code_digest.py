@@ -11,10 +11,10 @@ import linecache
 import sys
 import sysconfig
 import types
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 _SKIPPED = ("ctx", "kind", "type_comment", "returns", "annotation")
 """Fields of a syntax tree that do not affect the computation."""
@@ -22,8 +22,7 @@ _SKIPPED = ("ctx", "kind", "type_comment", "returns", "annotation")
 _Function = ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda
 
 
-@dataclass(frozen=True)
-class _Global:
+class _Global(NamedTuple):
     """A name in a module of users, whose definition is source, whatever its value is."""
 
     module: types.ModuleType
@@ -42,18 +41,11 @@ def source_digest(value: Any) -> str | None:
     while waiting:
         item = waiting.pop()
         key = item if isinstance(item, _Global) else id(item)
-        if key in reached:
-            continue
-        reached[key] = item  # also keeps it alive, so that its id stays its own
-        waiting += _reached_from(item)
-        if isinstance(item, _Global):
-            digests.update(_hashed(_plain(node)) for node in _source_of(item.module).assigned.get(item.name, ()))
-        elif isinstance(item, types.FunctionType | type) and not is_library(item):
-            node = _class_node(item) if isinstance(item, type) else _function_node(item.__code__)
-            if node is not None:
-                digests.add(_hashed(_plain(node, top=True)))
-            else:  # its constants, because instructions differ between versions of Python
-                digests.add("" if isinstance(item, type) else _constants(item.__code__))
+        if key not in reached:
+            reached[key] = item  # also keeps it alive, so that its id stays its own
+            source, used = _source_and_uses(item)
+            digests.update(source)
+            waiting += used
     return _hashed(sorted(digests)) if digests else None
 
 
@@ -93,54 +85,54 @@ def enclosed(function: types.FunctionType) -> list[Any]:
 # What source may use
 
 
-def _reached_from(item: Any) -> list[Any]:
-    if type(item) in (list, tuple, dict):
-        items = list(item.values() if isinstance(item, dict) else item)
-        return items if len(items) <= 100 else []  # a longer one holds data
-    if isinstance(item, functools.partial):
-        return [item.func, *item.args, *item.keywords.values()]
-    if isinstance(item, types.MethodType):
-        return [item.__func__, item.__self__]
-    if isinstance(item, types.FunctionType):
-        defaults = (*(item.__defaults__ or ()), *(item.__kwdefaults__ or {}).values())
-        used = [] if is_library(item) else _globals(sys.modules.get(item.__module__), _names(item.__code__))
-        return [*enclosed(item), *defaults, *used]
-    if isinstance(item, type):
-        if is_library(item):
-            return []
-        functions = [function for member in vars(item).values() for function in functions_in(member)]
-        if (node := _class_node(item)) is None:
-            return [*item.__bases__, *functions]
-        # The functions of the class without generated ones, and the definitions that its body uses.
-        written = [function for function in functions if not function.__code__.co_filename.startswith("<")]
-        return [*item.__bases__, *written, *_globals(sys.modules.get(item.__module__), _loaded([node]))]
+def _source_and_uses(item: Any) -> tuple[list[str], list[Any]]:
+    """Return the digests of what an object is made of, if that is source of users, and the objects that it uses."""
     if isinstance(item, _Global):
         known = _source_of(item.module)
-        body = known.assigned.get(item.name, ())
-        return [vars(item.module)[item.name], *known.imported(item), *_globals(item.module, _loaded(body))]
-    try:
-        attributes = vars(item)
-    except TypeError:
-        return [type(item)]
+        body = known.assigned.get(item.name, [])
+        used = [vars(item.module)[item.name], *known.imported(item), *_globals(item.module, _loaded(body))]
+        return [_hashed(_plain(node)) for node in body], used
+    if type(item) in (list, tuple, dict):
+        items = list(item.values() if isinstance(item, dict) else item)
+        return [], items if len(items) <= 100 else []  # a longer one holds data
+    if isinstance(item, functools.partial):
+        return [], [item.func, *item.args, *item.keywords.values()]
+    if isinstance(item, types.MethodType):
+        return [], [item.__func__, item.__self__]
+    if isinstance(item, types.FunctionType):
+        used = [*enclosed(item), *(item.__defaults__ or ()), *(item.__kwdefaults__ or {}).values()]
+        if is_library(item):
+            return [], used
+        node = _function_node(item.__code__)
+        # Without source, its constants are its identity, because instructions differ between versions of Python.
+        digest = _constants(item.__code__) if node is None else _hashed(_plain(node, top=True))
+        return [digest], used + _globals(sys.modules.get(item.__module__), _names(item.__code__))
+    if isinstance(item, type):
+        if is_library(item):
+            return [], []
+        functions = [function for member in vars(item).values() for function in _functions_in(member)]
+        module = sys.modules.get(item.__module__)
+        tree = _read(getattr(module, "__file__", None)).classes.get(item.__qualname__)
+        if tree is None:
+            return [""], [*item.__bases__, *functions]
+        # The functions of the class without generated ones, and the definitions that its body uses.
+        written = [function for function in functions if not function.__code__.co_filename.startswith("<")]
+        return [_hashed(_plain(tree, top=True))], [*item.__bases__, *written, *_globals(module, _loaded([tree]))]
+    attributes = getattr(item, "__dict__", None)
+    if attributes is None:
+        return [], [type(item)]
     if inspect.ismodule(item):
-        return []
+        return [], []
     if is_library(type(item)) and not is_own(type(item)):
-        return [attributes["__wrapped__"]] if "__wrapped__" in attributes else []  # e.g. functools.cache
-    return [type(item), *attributes.values()]
+        return [], [attributes["__wrapped__"]] if "__wrapped__" in attributes else []  # e.g. functools.cache
+    return [], [type(item), *attributes.values()]
 
 
-def functions_in(item: Any) -> list[types.FunctionType]:
+def _functions_in(member: Any) -> list[types.FunctionType]:
     """Return the Python functions of a class attribute: a method, the functions of a property, wrapped functions."""
-    seen: list[Any] = []
-    waiting = [item]
-    while waiting:
-        member = waiting.pop()
-        if any(member is other for other in seen):
-            continue
-        seen.append(member)
-        inner = (getattr(member, name, None) for name in ("fget", "fset", "__func__", "func", "__wrapped__"))
-        waiting.extend(wrapped for wrapped in inner if callable(wrapped))
-    return [member for member in seen if isinstance(member, types.FunctionType)]
+    inner = (getattr(member, name, None) for name in ("fget", "fset", "__func__", "func", "__wrapped__"))
+    functions = [function for wrapped in inner if callable(wrapped) for function in _functions_in(wrapped)]
+    return [member, *functions] if isinstance(member, types.FunctionType) else functions
 
 
 def _globals(module: types.ModuleType | None, names: set[str]) -> list[_Global]:
@@ -164,6 +156,16 @@ def _loaded(nodes: Iterable[ast.AST]) -> set[str]:
         names |= {node.id} if isinstance(node, ast.Name) else {node.attr} if isinstance(node, ast.Attribute) else set()
         names |= _loaded(child for child in ast.iter_child_nodes(node) if not isinstance(child, _Function))
     return names
+
+
+def _constants(code: types.CodeType) -> str:
+    constants = [
+        _constants(item)
+        if isinstance(item, types.CodeType)
+        else repr(sorted(map(repr, item)) if isinstance(item, frozenset) else item)
+        for item in code.co_consts
+    ]
+    return _hashed((code.co_names, constants))
 
 
 # The syntax tree
@@ -201,45 +203,28 @@ def _parsed(source: str) -> _Source:
         tree = ast.parse(source)
     except (SyntaxError, ValueError, RecursionError):
         return definitions
-    for node in ast.walk(tree):
-        if isinstance(node, _Function):
-            definitions.functions.setdefault(getattr(node, "name", "<lambda>"), []).append(node)
-        elif isinstance(node, ast.ImportFrom):
-            place = "." * node.level + (node.module or "")
-            definitions.imports.update((alias.asname or alias.name, (place, alias.name)) for alias in node.names)
+
+    def visit(parent: ast.AST, path: str) -> None:
+        for node in ast.iter_child_nodes(parent):
+            inside = path
+            if isinstance(node, ast.ClassDef):
+                definitions.classes[f"{path}{node.name}"] = node
+                inside = f"{path}{node.name}."
+            elif isinstance(node, _Function):
+                definitions.functions.setdefault(getattr(node, "name", "<lambda>"), []).append(node)
+                inside = path if isinstance(node, ast.Lambda) else f"{path}{node.name}.<locals>."
+            elif isinstance(node, ast.ImportFrom):
+                place = "." * node.level + (node.module or "")
+                definitions.imports.update((alias.asname or alias.name, (place, alias.name)) for alias in node.names)
+            visit(node, inside)
+
+    visit(tree, "")
     for node in tree.body:
         if isinstance(node, ast.Assign | ast.AnnAssign | ast.AugAssign):
             for name in ast.walk(node):
                 if isinstance(name, ast.Name) and isinstance(name.ctx, ast.Store):
                     definitions.assigned.setdefault(name.id, []).append(node)
-    definitions.classes.update(_classes(tree, ""))
     return definitions
-
-
-def _constants(code: types.CodeType) -> str:
-    constants = [
-        _constants(item)
-        if isinstance(item, types.CodeType)
-        else repr(sorted(map(repr, item)) if isinstance(item, frozenset) else item)
-        for item in code.co_consts
-    ]
-    return _hashed((code.co_names, constants))
-
-
-def _class_node(cls: type) -> ast.AST | None:
-    module = sys.modules.get(cls.__module__)
-    return _read(getattr(module, "__file__", None)).classes.get(cls.__qualname__)
-
-
-def _classes(node: ast.AST, path: str) -> Iterator[tuple[str, ast.AST]]:
-    for child in ast.iter_child_nodes(node):
-        if isinstance(child, ast.ClassDef):
-            yield f"{path}{child.name}", child
-            yield from _classes(child, f"{path}{child.name}.")
-        elif isinstance(child, ast.FunctionDef | ast.AsyncFunctionDef):
-            yield from _classes(child, f"{path}{child.name}.<locals>.")
-        else:
-            yield from _classes(child, path)
 
 
 def _function_node(code: types.CodeType) -> ast.AST | None:

@@ -1,17 +1,107 @@
-"""Columns of tables: which one is meant, which one has the times, and what stands for a missing value in them."""
+"""Units, columns and times of tables, what stands for a missing value in them, and the reader of CSV files."""
 
 from __future__ import annotations
 
+import csv
+import io
+import itertools
 import math
+import re
+from array import array
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from pathlib import Path
 
 import numpy as np
 
 from ctxval._util.arrays import Array
-from ctxval._util.texts import enumerated
-from ctxval._util.units import conversion, named_unit
+from ctxval._util.files import MOST_BYTES, open_regular
+from ctxval._util.texts import enumerated, unguarded
 from ctxval.errors import InputError
+
+# Units. Angles have a dimension of their own here: ``pint`` converts 1 Hz to 1 rad/s, and degrees to numbers.
+
+Powers = tuple[int, int, int, int, int]
+"""Powers of m, kg, s, A and rad."""
+
+_UNITS: dict[str, tuple[float, Powers]] = {
+    **{"1": (1.0, (0, 0, 0, 0, 0)), "m": (1.0, (1, 0, 0, 0, 0)), "kg": (1.0, (0, 1, 0, 0, 0))},
+    **{"s": (1.0, (0, 0, 1, 0, 0)), "min": (60.0, (0, 0, 1, 0, 0)), "h": (3600.0, (0, 0, 1, 0, 0))},
+    **{"rad": (1.0, (0, 0, 0, 0, 1)), "deg": (math.pi / 180, (0, 0, 0, 0, 1)), "rev": (2 * math.pi, (0, 0, 0, 0, 1))},
+    **{"rpm": (2 * math.pi / 60, (0, 0, -1, 0, 1)), "Hz": (1.0, (0, 0, -1, 0, 0)), "g": (9.80665, (1, 0, -2, 0, 0))},
+    **{"N": (1.0, (1, 1, -2, 0, 0)), "Nm": (1.0, (2, 1, -2, 0, 0)), "J": (1.0, (2, 1, -2, 0, 0))},
+    **{"W": (1.0, (2, 1, -3, 0, 0)), "V": (1.0, (2, 1, -3, -1, 0)), "A": (1.0, (0, 0, 0, 1, 0))},
+}
+_PREFIXES = {"M": 1e6, "k": 1e3, "c": 1e-2, "m": 1e-3, "u": 1e-6, "µ": 1e-6, "μ": 1e-6, "n": 1e-9}
+_WITH_PREFIX = ("m", "s", "rad", "Hz", "N", "Nm", "J", "W", "V", "A")
+_OTHER_NAMES = {
+    **{"sec": "s", "secs": "s", "second": "s", "seconds": "s", "msec": "ms", "millisecond": "ms", "usec": "us"},
+    **{"milliseconds": "ms", "microseconds": "us", "nanoseconds": "ns", "nsec": "ns", "minutes": "min"},
+    **{"°": "deg", "degree": "deg", "degrees": "deg", "radian": "rad", "radians": "rad", "meter": "m", "meters": "m"},
+    **{"metre": "m", "metres": "m", "dps": "deg/s", "mps": "m/s", "kph": "km/h", "kmh": "km/h", "N.m": "Nm"},
+}
+_FACTOR = re.compile(r"([A-Za-z°µμ]+|1)(?:\^?(-?[1-4]))?")
+
+# The forms ``angle [deg]``, ``angle (deg)``, ``angle_deg`` and ``rate_deg_s``.
+_BRACKETS = re.compile(r"(.*?)\s*(?:\[\s*(?!\d+\s*\])([^\[\]]*?)\s*\]|\(([^()]*)\))\s*")
+_SUFFIX = re.compile(
+    r"(.+?)_(deg|rad|mrad|rpm|dps|mps|kmh|(?:[kcmun]?(?:m|s|N|Nm|V|A))|sec|msec|usec|nsec)(?:_(?:per_)?(s2?))?"
+)
+
+
+def conversion(recorded: str, wanted: str) -> float:
+    """Return the factor from one unit to another."""
+    if _plain(recorded) == _plain(wanted):
+        return 1.0
+    source, target = _parsed(recorded), _parsed(wanted)
+    if source is None or target is None or source[1] != target[1]:
+        units = f"from {recorded or 'no unit'} to {wanted or 'no unit'}"
+        raise InputError(f"there is no known factor {units}: give factor = ...")
+    return source[0] / target[0]
+
+
+def named_unit(column: str) -> tuple[str, str, bool]:
+    """Return the name and the unit that a column states, and whether the unit may be part of the name instead.
+
+    ``x_m`` may be a measured x, so such endings are weak.
+    """
+    if len(column) > 200:
+        return column, "", False
+    if (bracketed := _BRACKETS.fullmatch(column)) is not None:
+        return bracketed[1], (bracketed[2] or bracketed[3] or "").strip(), False
+    if (ended := _SUFFIX.fullmatch(column)) is None:
+        return column.strip(), "", False
+    rate = {"s": "/s", "s2": "/s^2"}.get(ended[3] or "", "")
+    return ended[1], ended[2] + rate, not rate and ended[2] in ("m", "s", "N", "V", "A")
+
+
+def _parsed(unit: str) -> tuple[float, Powers] | None:
+    """Return the factor to SI units and the powers of them; None if the unit is not known."""
+    text = _OTHER_NAMES.get(unit.strip(), unit.strip()).replace("²", "^2").replace("³", "^3").replace("**", "^")
+    numerator, *denominators = text.split("/")
+    factor, powers = 1.0, [0] * 5
+    for sign, part in ((1, numerator), *((-1, denominator) for denominator in denominators)):
+        names = re.split(r"[\s*·.]+", part.strip())
+        if sign < 0 and len(names) > 1:
+            return None  # m/s kg is ambiguous
+        for name in names:
+            matched = _FACTOR.fullmatch(name)
+            if matched is None:
+                return None
+            base, prefix = _OTHER_NAMES.get(matched[1], matched[1]), 1.0
+            if base not in _UNITS and base[:1] in _PREFIXES and base[1:] in _WITH_PREFIX:
+                base, prefix = base[1:], _PREFIXES[base[:1]]
+            if base not in _UNITS:
+                return None
+            power = sign * int(matched[2] or 1)
+            factor *= (prefix * _UNITS[base][0]) ** power
+            powers = [total + power * single for total, single in zip(powers, _UNITS[base][1], strict=True)]
+    return factor, tuple(powers)  # type: ignore[return-value]
+
+
+def _plain(unit: str) -> str:
+    return re.sub(r"[\s*·.]", "", unit).replace("°", "deg").replace("²", "^2").replace("s2", "s^2")
+
 
 TIMES = ("t", "time", "times", "timestamp")
 """Names of columns of times, the first of which is taken: a state may be called ``time`` too."""
@@ -112,3 +202,126 @@ def sentinels(values: Array, factor: float = 1.0) -> list[float]:
 def _all_nines(value: float) -> bool:
     """Return whether all digits are nines, also if the number was rounded to 32 bits or converted to another unit."""
     return abs(value) >= 99 and any(set(f"{abs(value):.{digits}g}".replace(".", "")) == {"9"} for digits in (7, 15))
+
+
+# CSV files. Columns are separated by commas, semicolons or tabs. With the latter, numbers may have decimal commas.
+
+MOST_ROW = 2**20  # largest number of characters in a row
+
+
+class CsvTable:
+    """The cells of a CSV file of at most so many bytes, and the names of its columns, empty ones where it has none."""
+
+    def __init__(self, path: str | Path, most: int = MOST_BYTES) -> None:
+        self.path, self._most, self._separator = path, most, ","
+        self._marks: dict[str, int] = {}
+        first = next(self._cells(), (0, list[str]()))[1]
+        self.names = tuple(unguarded(name).strip() for name in first)
+        require_distinct(str(path), self.names)
+
+    def rows(self) -> Iterator[tuple[int, list[str]]]:
+        """Yield the rows below the header that are not blank, each with the number of its last line.
+
+        Only the last row may be shorter than the header, because a trajectory has no inputs at its last time.
+        """
+        width, short = len(self.names), ""
+        for line, row in itertools.islice(self._cells(), 1, None):
+            if len(row) != width and not short:
+                short = f"{self.path}, line {line}: the row must have {width} cells, as the header has, got {len(row)}."
+                if len(row) < width:
+                    yield line, row + [""] * (width - len(row))
+                    continue
+                if self._separator == ",":
+                    short += " If commas are decimal commas, semicolons must separate the columns."
+            if short:
+                raise InputError(short)
+            yield line, row
+
+    def columns(
+        self, names: Sequence[str], *, missing: Sequence[str] = (), last: Sequence[str] = (), most: int | None = None
+    ) -> dict[str, Array]:
+        places = {name: place for place, name in enumerate(self.names)}
+        columns = {name: array("d") for name in names}
+        wrong: InputError | None = None
+        for count, (line, row) in enumerate(self.rows(), 1):
+            if wrong is not None:
+                raise wrong
+            if most is not None and count > most:
+                raise InputError(f"{self.path} must have {most} rows below its header, and has more.")
+            if 8 * len(names) * count > MOST_BYTES:
+                raise InputError(f"{self.path} has too many numbers: {MOST_BYTES} bytes may be read.")
+            for name, numbers in columns.items():
+                cell = row[places[name]]
+                try:
+                    empty = name in missing and cell.strip().lower() in ("", "nan", "na", "null", "none", "-")
+                    numbers.append(math.nan if empty else self.number(line, name, cell))
+                except InputError as error:
+                    if name not in last:
+                        raise
+                    wrong = wrong or error
+                    numbers.append(math.nan)
+        return {name: np.array(numbers) for name, numbers in columns.items()}
+
+    def texts(self, name: str) -> Array:
+        place = self.names.index(name)
+        return np.array([row[place].strip() for _, row in self.rows()])
+
+    def number(self, line: int, name: str, cell: str) -> float:
+        text = cell
+        if self._separator != ",":
+            mark = "," if "," in cell else "." if "." in cell else ""
+            if mark:
+                self._marks.setdefault(mark, line)
+            if len(self._marks) > 1:
+                commas, points = f"commas (line {self._marks[',']})", f"points (line {self._marks['.']})"
+                raise InputError(f"{self.path} has decimal {commas} and {points} in numbers: use one mark.")
+            text = cell.replace(",", ".")
+        try:
+            if "_" in text:
+                raise ValueError
+            return float(text)
+        except ValueError:
+            shown = f"got {cell[:60]!r}" if cell.strip() else "and the cell is empty"
+            raise InputError(f"{self.path}, line {line}: {name} must be a number, {shown}.") from None
+
+    def _cells(self) -> Iterator[tuple[int, list[str]]]:
+        try:
+            with (
+                open_regular(self.path, self._most) as file,
+                io.TextIOWrapper(file, encoding="utf-8-sig", newline="") as text,
+            ):
+                lines = _Lines(text, self._most)
+                head = [*itertools.takewhile(lambda line: not line.strip(), lines), lines.last]
+                unquoted = re.sub('"[^"]*"', "", lines.last)
+                self._separator = next((mark for mark in ("\t", ";") if mark in unquoted), ",")
+                reader = csv.reader(itertools.chain(head, lines), delimiter=self._separator)
+                for row in reader:
+                    lines.in_row = 0
+                    if len(row) > 1 or (row and row[0].strip()):
+                        yield reader.line_num, row
+        except (InputError, OSError, UnicodeDecodeError, csv.Error) as error:
+            raise InputError(f"{self.path} cannot be read as CSV: {str(error).removesuffix('.')}.") from error
+
+
+class _Lines:
+    """The lines of a text; ``in_row`` counts the characters since the end of the last row."""
+
+    def __init__(self, text: io.TextIOWrapper, most: int) -> None:
+        self.text, self.left, self.in_row, self.last = text, most, 0, ""
+
+    def __iter__(self) -> _Lines:
+        return self
+
+    def __next__(self) -> str:
+        line = self.last = self.text.readline(MOST_ROW + 1)
+        if not line:
+            raise StopIteration
+        self.in_row += len(line)
+        self.left -= len(line)
+        if self.in_row > MOST_ROW:
+            raise InputError(f"it has a row of more than {MOST_ROW} characters")
+        if self.left < 0:
+            raise InputError("it grew while it was read")
+        if "\0" in line:
+            raise InputError("it is not text in UTF-8: it has NUL bytes")
+        return line

@@ -1,4 +1,4 @@
-"""Bounded reading of files from elsewhere, and writing of files that are complete or missing.
+"""Bounded reading of files from elsewhere, writing of files that are complete or missing, and locks of files.
 
 Only regular files are read, and only up to a stated number of bytes.
 
@@ -8,16 +8,26 @@ The message of an error of reading is only the reason; the caller puts the name 
 
 from __future__ import annotations
 
+import contextlib
+import io
 import json
+import math
 import os
 import secrets
+import sqlite3
 import stat
 import sys
 import tempfile
+import warnings
+import weakref
+import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, Any, BinaryIO
+
+import numpy as np
+import numpy.typing as npt
 
 from ctxval.errors import InputError
 
@@ -133,3 +143,147 @@ def write_text(path: str | Path, content: str) -> Path:
     with written_whole(path, text=True) as file:
         file.write(content)
     return Path(path)
+
+
+# Locks that are released when their process ends, however it ends. The lock is exclusive, whatever path the file is
+# opened by, and a forked process does not inherit it. ``filelock`` does not serve here: it closes the file at each
+# release, which releases this process's own locks of a database in use.
+
+
+LOCKS_FILE_ITSELF = sys.platform == "linux"
+"""Whether a file can be locked while SQLite uses it. On Linux ``flock`` does not interfere with the locks of SQLite."""
+
+
+class LockedError(OSError):
+    """The lock is held already, by this process or another one."""
+
+
+if sys.platform == "linux":
+    import fcntl
+
+    class FileLock:
+        """The lock of a file, which is created if it does not exist."""
+
+        def __init__(self, path: str | Path) -> None:
+            self._file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+            self.close = weakref.finalize(self, os.close, self._file)  # which releases the lock
+            _open.add(self)
+
+        def acquire(self) -> None:
+            """Take the lock; it is held until it is released or the process ends."""
+            try:
+                fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise LockedError("the lock is held") from None
+
+        def release(self) -> None:
+            """Release the lock. The file stays open: closing it would release this process's SQLite locks of it."""
+            fcntl.flock(self._file, fcntl.LOCK_UN)
+
+    _open: weakref.WeakSet[FileLock] = weakref.WeakSet()
+    os.register_at_fork(after_in_child=lambda: [lock.close() for lock in list(_open)])
+else:
+
+    class FileLock:
+        """The lock of a file that has no other use: a transaction of SQLite."""
+
+        def __init__(self, path: str | Path) -> None:
+            try:
+                self._connection = sqlite3.connect(path, isolation_level=None, timeout=0, check_same_thread=False)
+            except sqlite3.DatabaseError as error:
+                raise OSError(str(error)) from error
+            self.close = self._connection.close
+
+        def acquire(self) -> None:
+            try:
+                self._connection.execute("BEGIN EXCLUSIVE")
+            except sqlite3.DatabaseError as error:
+                raise LockedError("the lock is held") if "locked" in str(error) else OSError(str(error)) from error
+
+        def release(self) -> None:
+            self._connection.execute("ROLLBACK")
+
+
+# NPZ files: ``numpy.load`` takes as much memory as a header asks for, and raises many kinds of exceptions.
+
+
+class Archive:
+    """The arrays of an NPZ file. An array is read when it is requested, and nothing in the file is ever run.
+
+    The message of every error is only the reason; the caller puts the name of the file before it. At most so many bytes
+    of arrays are read, with each number as a float64.
+    """
+
+    def __init__(self, content: bytes, most: int = MOST_BYTES) -> None:
+        if content.count(b"PK\x01\x02") > 1000:  # the mark of an entry; each entry takes memory
+            raise InputError("it has more than 1000 entries")
+        with _damage():
+            self._zip = zipfile.ZipFile(io.BytesIO(content))
+        entries = (info for info in self._zip.infolist() if info.filename.endswith(".npy"))
+        self._entries = {info.filename.removesuffix(".npy"): info for info in entries}
+        self._left = most
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(self._entries)
+
+    def __contains__(self, name: str) -> bool:
+        return name in self._entries
+
+    def shape(self, name: str) -> tuple[int, ...]:
+        return self._header(name)[0]
+
+    def numbers(self, name: str) -> npt.NDArray[np.float64]:
+        shape, dtype = self._header(name)
+        if dtype.kind not in "fiub" or dtype.itemsize > 8:
+            raise InputError(f"its array {name} must be real numbers")
+        return np.asarray(self._array(name, 8 * math.prod(shape)), dtype=np.float64)
+
+    def text(self, name: str) -> str:
+        shape, dtype = self._header(name)
+        if dtype.kind not in "US" or math.prod(shape) != 1:
+            raise InputError(f"its array {name} must be one text")
+        # Surrogates are replaced, because no file or terminal can hold them.
+        order = {"<": "little", ">": "big"}.get(dtype.byteorder, sys.byteorder)
+        encoding = "utf-8" if dtype.kind == "S" else f"utf-32-{order[0]}e"
+        return self._array(name, 2 * dtype.itemsize).tobytes().decode(encoding, "replace").rstrip("\0")
+
+    def _header(self, name: str) -> tuple[tuple[int, ...], np.dtype[Any]]:
+        """Return the shape and the type of an array whose entry is as long as its header states."""
+        if name not in self._entries:
+            raise InputError(f"it has no array {name}")
+        entry = self._entries[name]
+        if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+            raise InputError("its compression method must be one that numpy writes, stored or deflated")
+        with _damage(), self._zip.open(entry) as file:
+            # The third version differs from the second in names of fields only.
+            version = np.lib.format.read_magic(file)
+            read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+            shape, _, dtype = read(file)
+            if dtype.kind not in "fiubUS":
+                raise InputError(f"its array {name} holds neither real numbers nor text")
+            if entry.file_size != file.tell() + math.prod(shape) * dtype.itemsize:
+                raise InputError(f"its array {name} is not as long as its header states")
+        return shape, dtype
+
+    def _array(self, name: str, size: int) -> npt.NDArray[Any]:
+        """Return an array whose numbers or text take so many bytes in memory."""
+        if size > self._left:
+            raise InputError(
+                f"its array {name} of shape {self.shape(name)} is too large: {self._left} bytes may be read"
+            )
+        self._left -= size
+        with _damage(), self._zip.open(self._entries[name]) as file:
+            return np.asarray(np.lib.format.read_array(file, allow_pickle=False))
+
+
+@contextlib.contextmanager
+def _damage() -> Iterator[None]:
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of headers that Python 2 wrote
+            yield
+    except InputError:
+        raise
+    except Exception as error:
+        raise InputError(f"it is not a complete NPZ archive ({type(error).__name__})") from error

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import json
+import os
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -22,16 +24,16 @@ class JsonLines(Mapping[Key, Record]):
 
     def __init__(self, path: Path, key: Sequence[str]) -> None:
         self.path, self.key = path, tuple(key)
-        self._records: dict[Key, Record] | None = None
+        self._last = b""  # what follows the last newline of the file
 
     def __getitem__(self, key: Key) -> Record:
-        return self._known()[key]
+        return self._records[key]
 
     def __iter__(self) -> Iterator[Key]:
-        return iter(self._known())
+        return iter(self._records)
 
     def __len__(self) -> int:
-        return len(self._known())
+        return len(self._records)
 
     def select(self, **fields: Any) -> list[Record]:
         """Return the records with these values, in the order in which their keys were first stored."""
@@ -41,31 +43,33 @@ class JsonLines(Mapping[Key, Record]):
         # What is read again later is what is known now: tuples are lists, for instance.
         line = json.dumps(dict(record))
         stored: Record = json.loads(line)
-        known = self._known()
         key = self._key_of(stored, "the record")
+        records = self._records
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        if self.path.exists():
-            _mend_end(self.path)
-        data = f"{line}\n".encode()
+        data, last, self._last = f"{line}\n".encode(), self._last, b""
+        if last and _parsed(last) is None:  # its end was never written
+            os.truncate(self.path, self.path.stat().st_size - len(last))
+        elif last:  # it lacks its newline only
+            data = b"\n" + data
         # Without a buffer the line is written in one call, so that readers find the whole of it or nothing.
         with self.path.open("ab", buffering=0) as file:
             if file.write(data) != len(data):
                 raise OSError(f"{self.path}: the disk took a part of a record only.")
-        known[key] = stored
+        records[key] = stored
 
-    def _known(self) -> dict[Key, Record]:
-        if self._records is None:
-            self._records = {}
-            *lines, last = self.path.read_bytes().split(b"\n") if self.path.exists() else [b""]
-            if _parsed(last) is not None:  # otherwise its end was never written
-                lines.append(last)
-            for number, line in enumerate(lines, start=1):
-                where = f"{self.path}, line {number}"
-                if (record := _parsed(line)) is None:
-                    start = line[:40].decode(errors="replace")
-                    raise InputError(f"{where}: a line must be a JSON object, got {start!r}.")
-                self._records[self._key_of(record, where)] = record
-        return self._records
+    @functools.cached_property
+    def _records(self) -> dict[Key, Record]:
+        records: dict[Key, Record] = {}
+        *lines, last = self.path.read_bytes().split(b"\n") if self.path.exists() else [b""]
+        self._last = last
+        if _parsed(last) is not None:  # otherwise its end was never written
+            lines.append(last)
+        for number, line in enumerate(lines, start=1):
+            where = f"{self.path}, line {number}"
+            if (record := _parsed(line)) is None:
+                raise InputError(f"{where}: a line must be a JSON object, got {line[:40].decode(errors='replace')!r}.")
+            records[self._key_of(record, where)] = record
+        return records
 
     def _key_of(self, record: Record, where: str) -> Key:
         missing = [name for name in self.key if name not in record]
@@ -80,18 +84,3 @@ def _parsed(line: bytes) -> Record | None:
     except ValueError:
         return None
     return record if isinstance(record, dict) else None
-
-
-def _mend_end(path: Path) -> None:
-    """Remove a last line whose end was never written; one that only lacks its newline is given it."""
-    with path.open("r+b") as file:
-        size = file.seek(0, 2)
-        file.seek(max(0, size - 1))
-        if size == 0 or file.read(1) == b"\n":
-            return
-        file.seek(0)
-        last = file.read().rpartition(b"\n")[2]
-        if _parsed(last) is None:
-            file.truncate(size - len(last))
-        else:
-            file.write(b"\n")

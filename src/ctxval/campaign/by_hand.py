@@ -1,4 +1,4 @@
-"""Trials that people execute: the files of the task and controller, and the recordings of the results."""
+"""Trials that people execute: the files of the task and controller, and the results that they report."""
 
 from __future__ import annotations
 
@@ -10,19 +10,18 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from ctxval._util.columns import column_of
-from ctxval._util.csv_table import CsvTable
+from ctxval._util.columns import CsvTable, column_of, conversion
 from ctxval._util.texts import shortened, unguarded
-from ctxval._util.units import conversion
+from ctxval.campaign.campaign import Campaign
 from ctxval.campaign.choices import Execution, OpenTrial
-from ctxval.campaign.recording_file import require_file
-from ctxval.campaign.telling import ToldResult
+from ctxval.campaign.telling import ToldResult, require_file
 from ctxval.core.controller import AffineFeedback
 from ctxval.core.exchange import write_controller, write_task
 from ctxval.core.experiment import Experiment
-from ctxval.core.plan import Plan
+from ctxval.core.plan import Plan, StartOffset
 from ctxval.core.space import TaskSpace
 from ctxval.core.task_suite import TASK
+from ctxval.core.trial import Trial
 from ctxval.core.validation import Validation
 from ctxval.errors import InputError
 
@@ -73,10 +72,13 @@ class KnownRun(NamedTuple):
 
     def checked(self, validation: Validation, experiment: Experiment) -> tuple[Plan, Execution]:
         """Return the plan of the task and the measured execution; nothing is stored."""
-        plan = validation.plan(validation.space.point(self.parameters))
-        recording = self.told.read(experiment, plan)
-        execution = Execution.reported(recording, self.told.distance, self.told.failed)
-        return plan, execution.measured(validation, plan, self.told.start_tolerance)
+        try:
+            plan = validation.plan(validation.space.point(self.parameters))
+            recording = self.told.read(experiment, plan)
+            execution = Execution.reported(recording, self.told.distance, self.told.failed)
+            return plan, execution.measured(validation, plan, self.told.start_tolerance)
+        except InputError as error:
+            raise InputError(f"{self.where}: {error}") from error
 
 
 def read_runs(
@@ -136,7 +138,7 @@ def _table(path: Path, space: TaskSpace, reading: Mapping[str, Any]) -> list[Kno
     return runs
 
 
-_NUMBER = re.compile(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)(.*)", re.DOTALL)
+_QUANTITY = re.compile(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)(.*)", re.DOTALL)
 
 
 def parameters_from(settings: Sequence[str], space: TaskSpace) -> dict[str, Any]:
@@ -159,37 +161,6 @@ def parameters_from(settings: Sequence[str], space: TaskSpace) -> dict[str, Any]
             if not equals or not name or name in given:
                 raise InputError(f"each task parameter must be given once, as name=value, got {text!r}.")
             given[name] = _value(name, value.strip(), space)
-    return _whole(given, space)
-
-
-def _value(name: str, text: str, space: TaskSpace) -> float | list[float]:
-    """Return the number or the list of numbers in a text, which may have the unit of the parameter."""
-    unit = space.units.get(name if name in space.units else name.partition("[")[0], "")
-    inside, given_unit, is_list = text, "", text.startswith("[")
-    if is_list:
-        inside, bracket, given_unit = text[1:].partition("]")
-        if not bracket:
-            raise InputError(f"{name} must be a list such as [1.5, 0.5], got {text!r}.")
-    numbers = [_quantity(name, f"{number} {given_unit}", unit) for number in inside.split(",")]
-    return numbers if is_list or len(numbers) > 1 else numbers[0]
-
-
-def _quantity(name: str, text: str, unit: str) -> float:
-    matched = _NUMBER.fullmatch(text)
-    if matched is None:
-        try:
-            return float(text)  # NaN and infinity are refused elsewhere
-        except ValueError:
-            raise InputError(f"--set: {name} must be a number, got {text.strip()!r}.") from None
-    given = matched[2].strip().removeprefix("[").removesuffix("]").strip()
-    if given and given != unit:
-        declared = f"in {unit}" if unit else "a number without a unit"
-        raise InputError(f"--set: {name} must be {declared}, got {text.strip()!r}.")
-    return float(matched[1])
-
-
-def _whole(given: Mapping[str, Any], space: TaskSpace) -> dict[str, Any]:
-    """Return values by parameter, with the single components of a vector put together."""
     whole = {name: value for name, value in given.items() if name in space.units or name not in space.names}
     for name in {name.partition("[")[0]: None for name in given if name not in whole}:
         columns = space.columns(name)
@@ -201,3 +172,60 @@ def _whole(given: Mapping[str, Any], space: TaskSpace) -> dict[str, Any]:
             raise InputError(f"--set: {name} must be given completely: {', '.join(missing)} is missing.")
         whole[name] = [given[component] for component in components]
     return whole
+
+
+def _value(name: str, text: str, space: TaskSpace) -> float | list[float]:
+    """Return the number or the list of numbers in a text, which may have the unit of the parameter."""
+    unit = space.units.get(name if name in space.units else name.partition("[")[0], "")
+    inside, given_unit, is_list = text, "", text.startswith("[")
+    if is_list:
+        inside, bracket, given_unit = text[1:].partition("]")
+        if not bracket:
+            raise InputError(f"{name} must be a list such as [1.5, 0.5], got {text!r}.")
+    numbers = []
+    for number in inside.split(","):
+        quantity = f"{number} {given_unit}"
+        matched = _QUANTITY.fullmatch(quantity)
+        try:
+            numbers.append(float(quantity if matched is None else matched[1]))  # NaN and infinity are refused elsewhere
+        except ValueError:
+            raise InputError(f"--set: {name} must be a number, got {quantity.strip()!r}.") from None
+        given = "" if matched is None else matched[2].strip().removeprefix("[").removesuffix("]").strip()
+        if given and given != unit:
+            declared = f"in {unit}" if unit else "a number without a unit"
+            raise InputError(f"--set: {name} must be {declared}, got {quantity.strip()!r}.")
+    return numbers if is_list or len(numbers) > 1 else numbers[0]
+
+
+def tell_result(campaign: Campaign, experiment: Experiment, trial: OpenTrial | int, told: ToldResult) -> Trial:
+    """Check and store the result of an open trial."""
+    recording = None
+    if told.recording is not None:
+        trial = trial if isinstance(trial, OpenTrial) else campaign.reopen(trial, ended=told.replace is not None)
+        recording = told.read(experiment, trial.plan)
+    return campaign.tell(
+        trial,
+        recording,
+        distance=told.distance,
+        failed=told.failed,
+        start_tolerance=told.start_tolerance,
+        replace=told.replace,
+    )
+
+
+def result_sentence(trial: Trial, units: str = "", start: StartOffset | None = None) -> str:
+    """Return the result of a trial that has ended, in one sentence without its full stop."""
+    if trial.state == "unmeasured":
+        return f"trial {trial.number} is stored without a distance: {trial.failure}"
+    if trial.distance is None:
+        return f"trial {trial.number} failed: {trial.failure}"
+    sentence = f"trial {trial.number} has the distance {trial.distance:.4g} {units}".rstrip()
+    return sentence if start is None or not start.size else f"{sentence}; its start was off by {start.text}"
+
+
+def parameters_of_trial(campaign: Campaign, number: int) -> Mapping[str, Any]:
+    """Return the parameters of the task of a trial."""
+    known = {trial.number: trial.parameters for trial in campaign.trials}
+    if number not in known:
+        raise InputError(f"there is no trial {number}; there are {len(known)}, numbered from 0.")
+    return known[number]

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
+from dataclasses import replace as replaced
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -10,17 +11,18 @@ import numpy as np
 
 from ctxval._util.arrays import Array
 from ctxval._util.checked import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, Seconds, checked
-from ctxval._util.progress import stage
-from ctxval._util.progress_display import progress_shown
+from ctxval._util.progress import progress_shown, stage
 from ctxval.campaign import display
 from ctxval.campaign.choices import Choice, Execution, OpenTrial
+from ctxval.campaign.dynamics import LearnedFromTrials
 from ctxval.campaign.envelope import EnvelopeSearch
-from ctxval.campaign.execution import RetryPolicy, Schedule, execute_schedule
+from ctxval.campaign.execution import ExecutionLoop
 from ctxval.campaign.executors import Executor, worker_pool
+from ctxval.campaign.history import executed_trials
 from ctxval.campaign.identity import description_of, identify, search_of
 from ctxval.campaign.interval_search import IntervalSearch, with_next_task
 from ctxval.campaign.plot import overview
-from ctxval.campaign.provenance import provenance_of
+from ctxval.campaign.storage.other_stores import provenance_of_store
 from ctxval.campaign.storage.store import Store
 from ctxval.campaign.trials import TrialRecorder
 from ctxval.campaign.watching import FALSE_ALARMS, Watch
@@ -29,8 +31,7 @@ from ctxval.certificates.envelope import Envelope
 from ctxval.certificates.expiry import WatchState
 from ctxval.certificates.options import CONFIDENCE, WITHIN
 from ctxval.core.distance import Distance
-from ctxval.core.plan import Plan
-from ctxval.core.preflight import StartOffset
+from ctxval.core.plan import StartOffset, start_offset
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import Trial
 from ctxval.core.validation import Validation
@@ -66,7 +67,6 @@ class Campaign:
         recorder: opens and closes the trials, for code that chooses the tasks of several campaigns.
 
     Raises:
-        InputError: if a value cannot be used.
         DistanceError: if the distance of a stored execution cannot be recomputed; nothing is changed.
         StoreError: if the store cannot be used, if another experiment made it, or if its search must be given.
     """
@@ -204,7 +204,6 @@ class Campaign:
             progress: whether to show the progress on standard error; None to show it at a terminal and in a notebook.
 
         Raises:
-            InputError: if a value cannot be used, or the system cannot be sent to the workers.
             CertificateError: if an option of the certificate is not valid.
             ModelError, DesignError, DistanceError: if the task, the model or the distance cannot be used. All
                 executions are stored, and running again continues after the trial that failed.
@@ -214,11 +213,9 @@ class Campaign:
         if explore is None:
             explore = threshold is None and not isinstance(self.search, Auto)
         decides = None if explore else IntervalSearch(self.recorder, options, budget, threshold, within)
-        enlarges: EnvelopeSearch | None = None
-        if envelope:
-            if decides is None or threshold is None:
-                raise InputError("an envelope needs a threshold, and a campaign that does not explore.")
-            enlarges = EnvelopeSearch(decides)
+        if envelope and (decides is None or threshold is None):
+            raise InputError("an envelope needs a threshold, and a campaign that does not explore.")
+        enlarges = EnvelopeSearch(decides) if envelope and decides is not None else None
         by_search = Choice(planned_draws=budget if until is None else 0)
 
         def rule() -> Choice | None:
@@ -234,11 +231,17 @@ class Campaign:
             raise InputError("retry_failures needs workers, an executor or a timeout.")
         if threshold is not None:
             self.state_threshold(threshold)
-        predicts = decides is not None and decides.predicts
-        with self.recorder.predicting(predicts), progress_shown(progress):
-            independent = decides is None and self.recorder.search.iid and until is None
-            schedule = Schedule(self.recorder, rule, budget, independent=independent)
-            execute_schedule(schedule, pool, on_trial, RetryPolicy(retries, retry_failures))
+        with self.recorder.predicting(decides is not None and decides.predicts), progress_shown(progress):
+            ExecutionLoop(
+                self.recorder,
+                rule,
+                pool,
+                on_trial,
+                budget=budget,
+                independent=decides is None and self.recorder.search.iid and until is None,
+                retries=retries,
+                retry_failures=retry_failures,
+            ).run()
         return self
 
     @checked
@@ -274,8 +277,8 @@ class Campaign:
                 "before an audit."
             )
         with progress_shown(progress):
-            schedule = Schedule(self.recorder, rule, expected=self.executions + missing(), independent=True)
-            execute_schedule(schedule, pool, on_trial, RetryPolicy())
+            expected = self.executions + missing()
+            ExecutionLoop(self.recorder, rule, pool, on_trial, expected=expected, independent=True).run()
         return self
 
     # Trials that people execute
@@ -300,7 +303,6 @@ class Campaign:
             progress: as in :meth:`run`.
 
         Raises:
-            InputError: if the parameters are not in the task space.
             StoreAccessError: if another process is running the store.
             ModelError, DesignError: if no controller can be designed and run on the model. The trial is stored as
                 failed and does not count as an execution.
@@ -349,8 +351,7 @@ class Campaign:
     def reopen(self, number: int, *, ended: bool = False) -> OpenTrial:
         """Return an open trial again, with its task and controller.
 
-        With ``ended``, return a trial whose result was told, to replace the result. An InputError is raised if there is
-        no such trial, or it is in another state.
+        With ``ended``, return a trial whose result was told, to replace the result.
         """
         self.refresh()
         trial = self.recorder.trial(number, told=ended)
@@ -379,8 +380,6 @@ class Campaign:
                 keeps the earlier result with its trajectory.
 
         Raises:
-            InputError: if not exactly one result is given, if the trial is not open (with ``replace``: if its result
-                was not told by a person), or if the trajectory belongs to another task.
             ExecutionError: if the trajectory is not a complete execution of the task; the trial stays open.
             DistanceError: if the distance function gives no usable number; the execution is stored.
         """
@@ -415,16 +414,9 @@ class Campaign:
         Returns None if the execution is already in the store. Nothing is stored if an error is raised: those of
         :meth:`tell`, and a ModelError or a DesignError if the task cannot be planned.
         """
-        point = self.validation.space.point(parameters)
         execution = Execution.reported(trajectory, distance, failed)
-        plan = self.validation.plan(point)
-        return self.add_known([(plan, execution.measured(self.validation, plan, start_tolerance))], wait)[0]
-
-    def add_known(
-        self, executions: Sequence[tuple[Plan, Execution]], wait: NonNegativeFloat = 0.0
-    ) -> list[Trial | None]:
-        """Record earlier executions that are measured; None if one is already in the store."""
-        return self.recorder.add(executions, wait)
+        plan = self.validation.plan(self.validation.space.point(parameters))
+        return self.recorder.add([(plan, execution.measured(self.validation, plan, start_tolerance))], wait)[0]
 
     def refresh(self) -> None:
         """Read the trials again if another process has changed the store; refuse it if its experiment has changed."""
@@ -458,7 +450,18 @@ class Campaign:
     @property
     def provenance(self) -> Provenance:
         """What a certificate needs besides the trials: the task space, the search, changes, and what M predicts."""
-        return provenance_of(self.store, self.validation, self.trials, self.recorder.dynamics)
+        validation, trials = self.validation, self.trials
+        offsets = [
+            (start_offset(validation, validation.space.point(trial.parameters), executed), trial.number)
+            for trial, executed in executed_trials(self.store, trials)
+        ]
+        return replaced(
+            provenance_of_store(self.store),
+            space=validation.space,
+            learned=LearnedFromTrials(validation, trials, self.recorder.dynamics),
+            start=max(((offset.size, f"{offset.text} (trial {number})") for offset, number in offsets), default=None),
+            units=validation.labels.units,
+        )
 
     @checked
     def state_threshold(self, threshold: PositiveFloat) -> None:
@@ -497,7 +500,7 @@ class Campaign:
             progress: as in :meth:`run`.
 
         Raises:
-            InputError, CertificateError: if an option of the certificate is not valid.
+            CertificateError: if an option of the certificate is not valid.
         """
         options = CertificateOptions.or_automatic(certificate, confidence, stochastic, resolution)
         self.state_threshold(threshold)
@@ -537,13 +540,12 @@ class Campaign:
 
         Args:
             threshold: tau; what moves no distance by 1 % of it is no change.
-            false_alarms: largest rate of false alarms, such as one in 1,000 executions.
+            false_alarms: largest rate of false alarms, below 1, such as one in 1,000 executions.
             state: the state of an earlier watch of the same campaign, to go on with.
             progress: as in :meth:`run`.
 
         Raises:
             CertificateError: if too little can be learned from the executions.
-            InputError: if the rate is not below 1, or the state belongs to another watch.
         """
         if not false_alarms < 1:
             raise InputError(f"false_alarms must be less than 1, such as 0.001, got {false_alarms:g}.")
@@ -571,7 +573,6 @@ class Campaign:
             progress: as in :meth:`run`.
 
         Raises:
-            InputError: if the certificate is of another kind.
             CertificateError: if the confidence needs too many posterior samples.
         """
         options = CertificateOptions.or_automatic(certificate, confidence, False, RESOLUTION)

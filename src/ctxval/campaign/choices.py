@@ -41,6 +41,11 @@ class Choice:
     rejected: int | None = None
     parameters: Mapping[str, Any] | None = None
 
+    @classmethod
+    def tested(cls, unit_point: Array, origin: Origin = "covering") -> Choice:
+        """Return the choice of a task that needs no test whether it is steady, for a number that results decide."""
+        return cls(unit_point, origin, planned_draws=0, rejected=0)
+
 
 @dataclass(frozen=True, eq=False)
 class OpenTrial:

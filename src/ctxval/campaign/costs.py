@@ -18,13 +18,11 @@ from ctxval._util.arrays import Array
 from ctxval._util.progress import stage
 from ctxval.certificates.dynamics import draws_for
 from ctxval.certificates.options import CONFIDENCE
-from ctxval.core.plan import Plan
-from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import Trial
 from ctxval.core.validation import Validation
 from ctxval.learning import DynamicsStudy
 from ctxval.searches import Auto, Costs, Prediction
-from ctxval.searches.auto import FAST
+from ctxval.searches.trust_region import FAST
 
 
 @dataclass(frozen=True)
@@ -56,7 +54,11 @@ class ThinkingCosts:
         controller = validation.synthesizer.design(task, model)
         design = min(_seconds(lambda: validation.synthesizer.design(task, model)) for _ in range(3))
         loop = min(_seconds(lambda: validation.closed_loop(controller, task)) for _ in range(3))
-        made_up = [(validation.space.to_unit(point), _unlike(validation.plan(point))) for point in points]
+        made_up = []
+        for point in points:  # trajectories that differ from those of M by a tenth of the range of each state
+            promised = validation.plan(point).model_trajectory
+            away = 0.1 * np.ptp(promised.states, axis=0) * np.sin(np.linspace(0, 3, promised.horizon + 1))[:, None]
+            made_up.append((validation.space.to_unit(point), replace(promised, states=promised.states + away)))
         begun, study = _now(), DynamicsStudy(validation)
         learned = study.learn(made_up)
         prediction = study.prediction_of(learned, made_up)
@@ -79,13 +81,6 @@ class ThinkingCosts:
         designs = search.designs(prediction)
         thorough, fast = (search.thinking_seconds(costs, number) for number in (designs, round(FAST * designs)))
         return cls(design, loop, choice, verdict, learning + thorough, designs, learning + fast)
-
-
-def _unlike(plan: Plan) -> Trajectory:
-    """Return a trajectory that differs from that of M by a tenth of the range of each state."""
-    promised = plan.model_trajectory
-    away = 0.1 * np.ptp(promised.states, axis=0) * np.sin(np.linspace(0, 3, promised.horizon + 1))[:, None]
-    return replace(promised, states=promised.states + away)
 
 
 def costs_of(prediction: Prediction, validation: Validation, trials: Sequence[Trial]) -> Costs:

@@ -36,7 +36,7 @@ from ctxval.errors import CertificateError
 from ctxval.learning import DynamicsStudy, ExecutionPrediction, LearnedDynamics
 from ctxval.learning.closed_loops import LoopPlanner
 from ctxval.learning.coverage import Coverage, Gap
-from ctxval.learning.tolerance import LEVELS, PushResponse
+from ctxval.learning.tolerance import LEVELS
 from ctxval.learning.vector import Executed
 from ctxval.learning.worst_case import WorstCase, is_kinked
 from ctxval.searches import Prediction
@@ -92,7 +92,6 @@ class CampaignDynamics:
     def _learned_from(
         self, executed: Sequence[tuple[Trial, Trajectory]], others: Sequence[Trajectory]
     ) -> LearnedDynamics | None:
-        """Return what executed trials and other recordings teach; the latest are kept."""
         if not self._study.is_current:
             self._study, self._learned = self._study.anew(), {}
         # The other recordings are kept with what they taught, so that their identities stay theirs. A result may be
@@ -113,28 +112,19 @@ class CampaignDynamics:
     def prediction(self, trials: Sequence[Trial], *, pending: bool = False) -> Prediction | None:
         """Return the distance predicted from the executed trajectories, for a search; None if there is none.
 
-        With ``pending``, open trials count as if they had been executed as predicted.
+        With ``pending``, open trials count as if they had been executed as predicted. How good a prediction is, is
+        still seen from what was executed.
         """
-        executed = executed_trials(self._store, trials)
-        learned = self._learned_from(executed, self.elsewhere())
-        pairs = [(trial.unit_point, trajectory) for trial, trajectory in executed]
-        prediction = self._study.prediction_of(learned, pairs)
-        if prediction is None:
+        trajectories = executed_trials(self._store, trials)
+        learned = self._learned_from(trajectories, self.elsewhere())
+        executed = [(trial.unit_point, trajectory) for trial, trajectory in trajectories]
+        predicted = self._study.prediction_of(learned, executed)
+        if predicted is None:
             return None
-        prediction = for_known_values(prediction, trials, [trial for trial, _ in executed])
-        return self._with_pending(prediction, learned, pairs, trials) if pending else prediction
-
-    def _with_pending(
-        self, prediction: Prediction, learned: LearnedDynamics | None, executed: Executed, trials: Sequence[Trial]
-    ) -> Prediction:
-        """Return a prediction to which open trials are executions that have gone as predicted.
-
-        How good a prediction is, is still seen from what was executed.
-        """
-        waiting = waiting_points(trials)
-        if not len(waiting):
+        prediction = for_known_values(predicted, trials, [trial for trial, _ in trajectories])
+        waiting, otherwise = waiting_points(trials), prediction.otherwise
+        if not pending or not len(waiting):
             return prediction
-        otherwise = prediction.otherwise
 
         def after() -> Prediction:
             as_if = None if learned is None else self._as_if(learned, executed, waiting)
@@ -210,7 +200,6 @@ class CampaignDynamics:
         return DynamicsEvidence.from_json(self._store.computed(self._key(trials, confidence)))
 
     def _key(self, trials: Sequence[Trial], confidence: float) -> str:
-        """Return the key of the evidence of some trials in the store."""
         text = json.dumps([(trial.number, trial.state, trial.distance, trial.note) for trial in trials])
         physical = "".join(f"{name} " for name in self._study.given.physical)
         return f"evidence {confidence} {self._study.quantile} {physical}{hashlib.sha256(text.encode()).hexdigest()}"
@@ -233,14 +222,31 @@ class CampaignDynamics:
             return evidence
         # Many closed loops, which only matter to a bound that nothing else withdraws.
         evidence = _with_jumps(evidence, learned, bound)
-        evidence = replace(evidence, pocket=self._pocket(learned))
+        labels = self._coordinates(learned)
+        names = [parted(label)[1] for label in labels]
+        states = len(learned.posterior.data.sizes)
+        if (pocket := learned.pocket(names[:states])) is not None:
+            of = [labels[i] for i in pocket.states]
+            place, within = (dict(zip(of, each.tolist(), strict=True)) for each in (pocket.place, pocket.within))
+            evidence = replace(evidence, pocket=StatePocket(pocket.size, place, within))
         if learned.noisy is not None:
             return evidence  # a push is compared with residuals of state and input, which do not hold here
-        return replace(evidence, pushed=_pushed(learned.push_response, self._coordinates(learned)))
+        push, rates = learned.push_response, []
+        for name, unit in (parted(labels[i]) for i in push.states):
+            per_second = f"{unit}^2" if unit.endswith("/s") else f"{unit}/s"
+            rates.append(f"{name} [{per_second}]" if unit else name)
+        residuals = dict(zip(rates, push.residuals.tolist(), strict=True))
+        return replace(evidence, pushed=PushedDistances(residuals, LEVELS, push.everywhere, push.away))
 
     def _evidence(self, learned: LearnedDynamics, trials: Sequence[Trial], worst: WorstCase) -> DynamicsEvidence:
         names, untried, noisy = self._study.validation.space.names, learned.untried_parameter, learned.noisy
-        actuator = learned.study.actuator
+        actuator, predictions = learned.study.actuator, list(self.checked(trials))
+        # Drawn tests come with the distances of their tasks on what is learned by now.
+        drawn = [k for k, test in enumerate(predictions) if test.origin in DRAWN and test.stored and not test.is_noisy]
+        if drawn:
+            expected = learned.expected(np.array([predictions[k].point for k in drawn]))
+            for k, distance in zip(drawn, np.nan_to_num(expected, nan=1e30, posinf=1e30).tolist(), strict=True):
+                predictions[k] = replace(predictions[k], explained=distance)
         return DynamicsEvidence(
             worst.maxima,
             worst.points,
@@ -250,7 +256,7 @@ class CampaignDynamics:
             len(learned.executed),
             worst.left_out,
             0.0,
-            _explained(self.checked(trials), learned),
+            tuple(predictions),
             _coverage(learned.coverage, self._coordinates(learned)),
             unplanned=worst.unplanned,
             untried=None if untried is None else UntriedParameter(names[untried[0]], *untried[1:]),
@@ -263,16 +269,6 @@ class CampaignDynamics:
             without_data=not learned.with_data,
             estimated=learned.study.given.outputs is not None,
         )
-
-    def _pocket(self, learned: LearnedDynamics) -> StatePocket | None:
-        """Return the largest region that no execution has entered, by the names of its states."""
-        labels = self._coordinates(learned)[: len(learned.posterior.data.sizes)]
-        pocket = learned.pocket([parted(label)[1] for label in labels])
-        if pocket is None:
-            return None
-        names = [labels[i] for i in pocket.states]
-        place, within = (dict(zip(names, each.tolist(), strict=True)) for each in (pocket.place, pocket.within))
-        return StatePocket(pocket.size, place, within)
 
     def _coordinates(self, learned: LearnedDynamics) -> tuple[str, ...]:
         """Return the labels of the states and inputs, with units; ``x[0], ..., u[0], ...`` for those without names."""
@@ -301,29 +297,24 @@ class CampaignDynamics:
                 if not recent or self.learned(before, alone=True) is None:
                     continue
                 prediction = self.predict(before, trial.unit_point, alone=True)
-            checked.append(self._compared(trial, prediction, before, stored is not None))
+            known = np.array([earlier.unit_point for earlier in before]).reshape(-1, len(trial.unit_point))
+            how: dict[str, Any] = {
+                "stored": stored is not None,
+                "new": not len(known) or float(np.abs(known - trial.unit_point).max(axis=1).min()) > NEAR,
+                "origin": trial.origin,
+                "point": tuple(trial.unit_point.tolist()),
+            }
+            distance, rank, median, upper, z2 = trial.distance or 0.0, np.nan, np.inf, np.inf, np.nan
+            if prediction is not None:
+                median, upper = prediction.median, prediction.upper
+                trajectory = self._store.trajectory(trial.number, "system")
+                if trajectory is not None and (score := prediction.score(trajectory, distance)) is not None:
+                    z2, rank = score.z2, score.rank
+                    if prediction.noise is not None:
+                        noise = prediction.noise
+                        how |= {"quantiles": noise.distances, "runs": noise.runs, "p_values": score.p_values}
+            checked.append(CheckedPrediction(trial.number, rank, median, upper, distance, z2, **how))
         return tuple(checked)
-
-    def _compared(
-        self, trial: Trial, prediction: ExecutionPrediction | None, before: Sequence[Trial], stored: bool
-    ) -> CheckedPrediction:
-        known = np.array([earlier.unit_point for earlier in before]).reshape(-1, len(trial.unit_point))
-        how: dict[str, Any] = {
-            "stored": stored,
-            "new": not len(known) or float(np.abs(known - trial.unit_point).max(axis=1).min()) > NEAR,
-            "origin": trial.origin,
-            "point": tuple(trial.unit_point.tolist()),
-        }
-        distance = trial.distance or 0.0
-        if prediction is None:
-            return CheckedPrediction(trial.number, np.nan, np.inf, np.inf, distance, **how)
-        trajectory = self._store.trajectory(trial.number, "system")
-        score = None if trajectory is None else prediction.score(trajectory, distance)
-        z2, rank = (np.nan, np.nan) if score is None else (score.z2, score.rank)
-        if prediction.noise is not None and score is not None:
-            noise = prediction.noise
-            how |= {"quantiles": noise.distances, "runs": noise.runs, "p_values": score.p_values}
-        return CheckedPrediction(trial.number, rank, prediction.median, prediction.upper, distance, z2, **how)
 
     def stored_prediction(self, trial: Trial) -> ExecutionPrediction | None:
         """Return the prediction that was stored before an execution, if it is one of the present distance."""
@@ -377,17 +368,6 @@ class LearnedFromTrials:
         return self.validation.space.unit_draws(count, np.random.default_rng([seed, 0x7461]))
 
 
-def _explained(predictions: Sequence[CheckedPrediction], learned: LearnedDynamics) -> tuple[CheckedPrediction, ...]:
-    """Return predictions; those of drawn tests with the distances of their tasks on what is learned by now."""
-    rows = [k for k, each in enumerate(predictions) if each.origin in DRAWN and each.stored and not each.is_noisy]
-    explained = list(predictions)
-    if rows:
-        expected = learned.expected(np.array([predictions[k].point for k in rows]))
-        for k, distance in zip(rows, expected.tolist(), strict=True):
-            explained[k] = replace(predictions[k], explained=float(np.nan_to_num(distance, nan=1e30, posinf=1e30)))
-    return tuple(explained)
-
-
 def _with_jumps(evidence: DynamicsEvidence, learned: LearnedDynamics, bound: float) -> DynamicsEvidence:
     """Return evidence with the largest jump between tasks; if there are jumps, with what deeper searches have found.
 
@@ -403,18 +383,6 @@ def _with_jumps(evidence: DynamicsEvidence, learned: LearnedDynamics, bound: flo
         return evidence
     elites = np.concatenate([points[values.argmax()][None], evidence.elites])
     return replace(evidence, missed=float(high / evidence.highest), highest=float(high), elites=elites)
-
-
-def _pushed(response: PushResponse, names: Sequence[str]) -> PushedDistances:
-    """Return the distances of pushed systems with the rates of change of their states by name and unit."""
-    labels = [parted(names[i]) for i in response.states]
-    rates = [f"{name} [{_per_second(unit)}]" if unit else name for name, unit in labels]
-    residuals = dict(zip(rates, response.residuals.tolist(), strict=True))
-    return PushedDistances(residuals, LEVELS, response.everywhere, response.away)
-
-
-def _per_second(unit: str) -> str:
-    return f"{unit}^2" if unit.endswith("/s") else f"{unit}/s"
 
 
 def _coverage(coverage: Coverage, names: Sequence[str]) -> StateInputCoverage:

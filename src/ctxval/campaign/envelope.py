@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
 
-from ctxval._util.arrays import Array, Mask
+from ctxval._util.arrays import Array
 from ctxval._util.progress import stage
 from ctxval._util.texts import reason_of
 from ctxval.campaign.choices import Choice
@@ -18,16 +18,16 @@ from ctxval.campaign.trials import TrialRecorder
 from ctxval.certificates.automatic import Automatic
 from ctxval.certificates.drawn_distances import DrawnDistances
 from ctxval.certificates.dynamics import Dynamics, draws_for
-from ctxval.certificates.dynamics_diagnostics import fewest_executions, missing_tests, untried_parameter
+from ctxval.certificates.dynamics_diagnostics import fewest_executions, missing_tests, most_beyond, untried_parameter
 from ctxval.certificates.dynamics_evidence import DynamicsEvidence
 from ctxval.certificates.envelope import (
     Envelope,
     boundary_tasks,
+    doubt_of_envelope,
     envelope_of,
     must_outlive_a_test,
     withdrawn,
 )
-from ctxval.certificates.envelope_diagnostics import doubt_of_envelope, most_beyond
 from ctxval.certificates.options import CertificateOptions
 from ctxval.certificates.prediction_tests import DRAWN
 from ctxval.core.trial import Trial
@@ -43,93 +43,48 @@ _SPREADS = 3.0  # spreads above the mean within which a task is uncertain
 _SETTLED = 0.03  # share of the tasks predicted below the threshold that may be uncertain or uncovered at the end
 
 
-@dataclass(frozen=True, eq=False)
 class EnvelopeSearch:
     """Computes the envelope of the trials, and chooses executions that enlarge it.
 
-    Attributes:
+    Args:
         interval: the search that leads to the verdict, with its threshold, options and tests.
     """
 
-    interval: IntervalSearch
-
-    def __post_init__(self) -> None:
-        kind = self.interval.options.kind
+    def __init__(self, interval: IntervalSearch) -> None:
+        kind = interval.options.kind
         if not isinstance(kind, Automatic | Dynamics):
             raise InputError(f"an envelope needs one of the certificates auto and dynamics, got {kind.name!r}.")
-
-    @property
-    def _trials(self) -> list[Trial]:
-        return [trial for trial in self.interval.recorder.trials if trial.state != "open"]
-
-    @property
-    def _threshold(self) -> float:
-        return self.interval.limit
+        self._interval, self._recorder = interval, interval.recorder
+        self._threshold, self._confidence = interval.limit, interval.options.confidence
 
     def envelope(self) -> Envelope:
         """Return the envelope that the executions give, or why there is none. The system is never executed."""
-        space, confidence = self.interval.recorder.validation.space, self.interval.options.confidence
-        dynamics, trials = self.interval.recorder.dynamics, self._trials
+        space, units = self._recorder.validation.space, self._recorder.validation.labels.units
+        threshold, confidence, trials = self._threshold, self._confidence, self._ended()
         failed = [trial.number for trial in trials if trial.distance is None]
         if failed:
             why = f"trial {failed[0]} has no distance, so nothing is known of its task; execute it again"
-            return withdrawn(space, self._threshold, confidence, why)
+            return withdrawn(space, threshold, confidence, why)
         with stage("computing the envelope", unit="closed loops"):
             known = self._known(trials)
             if known is None:
-                unknown = dynamics.failure or (
+                unknown = self._recorder.dynamics.failure or (
                     "no dynamics can be learned: there are no recorded trajectories, or M explains all of them, or no "
                     "controller can be designed"
                 )
-                return withdrawn(space, self._threshold, confidence, unknown)
+                return withdrawn(space, threshold, confidence, unknown)
             learned, evidence = known
-            if (doubt := doubt_of_envelope(evidence, self._threshold)) is not None:
-                return withdrawn(space, self._threshold, confidence, doubt)
+            if (doubt := doubt_of_envelope(evidence, threshold)) is not None:
+                return withdrawn(space, threshold, confidence, doubt)
             executed = [(trial.unit_point, float(trial.distance or 0.0)) for trial in trials]
             # Each further task of a planner without batches costs a design of its own.
             checks = (_CHECKS if evidence.quantile is None else _NOISY_CHECKS) if learned.study.planner.batched else 0
+            at = partial(self._at, learned) if checks else None
             try:
-                return envelope_of(
-                    space,
-                    self._drawn(learned, evidence),
-                    evidence,
-                    executed,
-                    self._threshold,
-                    confidence,
-                    partial(self._at, learned) if checks else None,
-                    checks,
-                    self.interval.recorder.validation.labels.units,
-                )
+                drawn = self._drawn(learned, evidence)
+                return envelope_of(space, drawn, evidence, executed, threshold, confidence, at, checks, units)
             except Exception as error:  # users' parts, at states that no execution has reached
-                return withdrawn(space, self._threshold, confidence, reason_of(error))
-
-    def _known(self, trials: Sequence[Trial]) -> tuple[LearnedDynamics, DynamicsEvidence] | None:
-        """Return what the executions teach, and what they say of the predictions."""
-        dynamics = self.interval.recorder.dynamics
-        learned, evidence = dynamics.learned(trials), dynamics.screening(trials)
-        if learned is None or evidence is None:
-            return None
-        noise, without = learned.drawn_from.noise, learned.posterior.covariances.without_model
-        return learned, replace(evidence, noise=noise, without_model=without, tests=self.interval.tests)
-
-    def _drawn(self, learned: LearnedDynamics, evidence: DynamicsEvidence) -> DrawnDistances:
-        """Return the drawn distances of the pool's tasks, of executed ones and of tasks next to the boundary."""
-        confidence, threshold = self.interval.options.confidence, self._threshold
-        pool, space = learned.study.search.pool, self.interval.recorder.validation.space
-        if space.members is not None:
-            return self._at(learned, pool)
-        noisy = evidence.quantile is not None
-        drawn = self._at(learned, np.concatenate([pool[:_NOISY] if noisy else pool, learned.executed]))
-        if not learned.study.planner.batched:
-            return drawn  # each further task costs a design of its own
-        candidates = np.random.default_rng(1).random((_CANDIDATES, space.dimension))
-        count = _NOISY_BOUNDARY if noisy else _BOUNDARY
-        nearest = boundary_tasks(drawn, evidence, threshold, confidence, candidates, count)
-        return drawn.and_others(self._at(learned, nearest))
-
-    def _at(self, learned: LearnedDynamics, points: Array, *, settled: bool = True) -> DrawnDistances:
-        draws = draws_for(self.interval.options.confidence)
-        return DrawnDistances(points, *learned.drawn_distances(points, draws, settled=settled))
+                return withdrawn(space, threshold, confidence, reason_of(error))
 
     def choose(self) -> Choice | None:
         """Return the next task that enlarges the envelope, or a test of it; None if it would hardly grow.
@@ -138,8 +93,7 @@ class EnvelopeSearch:
         records. The larger of these two parts is worked on. Tests come last, when hardly anything is uncertain or the
         budget is just enough for them: those that are predicted by better dynamics raise k less.
         """
-        interval = self.interval
-        recorder, trials = interval.recorder, self._trials
+        interval, recorder, trials = self._interval, self._recorder, self._ended()
         if not interval.predicts or not recorder.has_tasks or any(trial.distance is None for trial in trials):
             return None
         known = self._known(trials)
@@ -150,34 +104,52 @@ class EnvelopeSearch:
         waiting = sum(trial.state == "open" for trial in recorder.trials)
         if missing and interval.budget - recorder.executions - waiting <= missing:
             return interval.test()
-        pool = learned.study.search.pool
-        some = pool[:_SCREENED] if recorder.validation.space.members is None else pool
-        drawn = self._at(learned, some, settled=False)
+        if evidence.untried is not None and untried_parameter(evidence) is not None:
+            return Choice.tested(evidence.untried.task)
+        pool, is_suite = learned.study.search.pool, recorder.validation.space.members is not None
+        drawn = self._at(learned, pool if is_suite else pool[:_SCREENED], settled=False)
         below = drawn.mean <= self._threshold
         straddle = _SPREADS * drawn.spread(self._threshold) - np.abs(drawn.mean - self._threshold)  # Bryan et al. 2006
-        uncertain = below & (straddle > 0)
-        uncovered = below & (drawn.beyond > most_beyond(evidence))
+        uncertain, uncovered = below & (straddle > 0), below & (drawn.beyond > most_beyond(evidence))
         few = evidence.executions < fewest_executions(evidence)
-        if evidence.untried is not None and untried_parameter(evidence) is not None:
-            return _choice(evidence.untried.task)
         if few or (uncertain | uncovered).sum() > _SETTLED * below.sum():
-            score = np.where(uncovered, drawn.beyond, -np.inf)
-            if uncertain.sum() >= uncovered.sum():
-                score = straddle
-            new = self._is_new(drawn.points)
+            leading = np.where(uncovered, drawn.beyond, -np.inf)
+            score = straddle if uncertain.sum() >= uncovered.sum() else leading
+            executed = np.array([trial.unit_point for trial in recorder.trials])
+            away = np.abs(drawn.points[:, None] - executed).max(axis=2)
+            new = (away > (0.0 if is_suite else NEAR)).all(axis=1)
             if (np.isfinite(score) & new).any():
-                return _choice(drawn.points[int(np.where(new, score, -np.inf).argmax())])
+                return Choice.tested(drawn.points[int(np.where(new, score, -np.inf).argmax())])
         return interval.test() if missing or must_outlive_a_test(drawn, evidence, self._threshold) else None
 
-    def _is_new(self, points: Array) -> Mask:
-        """Return which points ``(m, d)`` are not next to an executed or open task."""
-        known = np.array([trial.unit_point for trial in self.interval.recorder.trials])
-        near = 0.0 if self.interval.recorder.validation.space.members is not None else NEAR
-        return np.asarray((np.abs(points[:, None] - known).max(axis=2) > near).all(axis=1))
+    def _ended(self) -> list[Trial]:
+        return [trial for trial in self._recorder.trials if trial.state != "open"]
 
+    def _known(self, trials: Sequence[Trial]) -> tuple[LearnedDynamics, DynamicsEvidence] | None:
+        """Return what the executions teach, and what they say of the predictions."""
+        dynamics = self._recorder.dynamics
+        learned, evidence = dynamics.learned(trials), dynamics.screening(trials)
+        if learned is None or evidence is None:
+            return None
+        noise, without = learned.drawn_from.noise, learned.posterior.covariances.without_model
+        return learned, replace(evidence, noise=noise, without_model=without, tests=self._interval.tests)
 
-def _choice(point: Array) -> Choice:
-    return Choice(point, "covering", planned_draws=0, rejected=0)
+    def _drawn(self, learned: LearnedDynamics, evidence: DynamicsEvidence) -> DrawnDistances:
+        """Return the drawn distances of the pool's tasks, of executed ones and of tasks next to the boundary."""
+        pool, space = learned.study.search.pool, self._recorder.validation.space
+        if space.members is not None:
+            return self._at(learned, pool)
+        noisy = evidence.quantile is not None
+        drawn = self._at(learned, np.concatenate([pool[:_NOISY] if noisy else pool, learned.executed]))
+        if not learned.study.planner.batched:
+            return drawn  # each further task costs a design of its own
+        candidates = np.random.default_rng(1).random((_CANDIDATES, space.dimension))
+        count = _NOISY_BOUNDARY if noisy else _BOUNDARY
+        nearest = boundary_tasks(drawn, evidence, self._threshold, self._confidence, candidates, count)
+        return drawn.and_others(self._at(learned, nearest))
+
+    def _at(self, learned: LearnedDynamics, points: Array, *, settled: bool = True) -> DrawnDistances:
+        return DrawnDistances(points, *learned.drawn_distances(points, draws_for(self._confidence), settled=settled))
 
 
 def has_tests(recorder: TrialRecorder, options: CertificateOptions) -> bool:

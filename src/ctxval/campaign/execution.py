@@ -6,128 +6,118 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 
-from ctxval._util.checked import NonNegativeInt, checked
-from ctxval._util.interrupts import Interrupts, exits_as_exceptions
+from ctxval._util.cores import Interrupts, exits_as_exceptions
 from ctxval._util.progress import advance, is_heard, stage
 from ctxval._util.representation import named
 from ctxval.campaign.choices import Choice, Execution, OpenTrial
 from ctxval.campaign.trials import TrialRecorder
 from ctxval.campaign.workers import AHEAD, SerialPool, WorkerPool
-from ctxval.core.preflight import start_offset
+from ctxval.core.plan import start_offset
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import CONVERGED, Trial
 from ctxval.errors import CtxvalError, ExecutionError, InputError, StoreError
 
-OnTrial = Callable[[Trial], None]
-"""Called with each trial that has ended."""
 
-
-@checked
-@dataclass(frozen=True)
-class RetryPolicy:
-    """Limits on the repetitions of the execution of one trial.
-
-    Attributes:
-        retries: the largest number of repetitions if the worker is lost.
-        retry_failures: the largest number of repetitions if the system fails.
-    """
-
-    retries: NonNegativeInt = 2
-    retry_failures: NonNegativeInt = 0
-
-
-@dataclass(frozen=True, eq=False)
-class Schedule:
-    """The order of the executions: first the interrupted trials, then the choices of a rule.
+class ExecutionLoop:
+    """Keeps all workers busy with interrupted trials and with the choices of a rule, and records what they give.
 
     The rule returns None if there is no choice at present; it is called again after an execution has ended. Without a
-    budget, the total number of executions, only the rule ends the campaign, after about the expected number. If the
-    choices are ``independent`` of results, they are made before the executions in front of them have ended.
+    budget, only the rule ends the loop.
+
+    Args:
+        recorder: opens and closes the trials.
+        rule: chooses the tasks.
+        pool: the workers; None for this process.
+        on_trial: called with each trial that has ended.
+        budget: largest total number of executions, including earlier ones.
+        expected: their expected number if there is no budget, for the display of the progress.
+        independent: whether the choices depend on no result, so that they are made before earlier executions end.
+        retries: largest number of repetitions of one execution if its worker is lost.
+        retry_failures: the same if the system fails.
     """
 
-    recorder: TrialRecorder
-    rule: Callable[[], Choice | None]
-    budget: int | None = None
-    expected: int | None = None
-    independent: bool = False
+    def __init__(
+        self,
+        recorder: TrialRecorder,
+        rule: Callable[[], Choice | None],
+        pool: WorkerPool | None = None,
+        on_trial: Callable[[Trial], None] | None = None,
+        *,
+        budget: int | None = None,
+        expected: int | None = None,
+        independent: bool = False,
+        retries: int = 2,
+        retry_failures: int = 0,
+    ) -> None:
+        self.recorder, self.rule, self.on_trial = recorder, rule, on_trial
+        self.pool = SerialPool(recorder.validation.system) if pool is None else pool
+        self.budget, self.expected, self.independent = budget, expected, independent
+        self.retries, self.retry_failures = retries, retry_failures
+        self.running: dict[int, OpenTrial] = {}
+        self.losses: Counter[int] = Counter()
+        self.failures: Counter[int] = Counter()
+        self.stopped: BaseException | None = None
 
-    def next(self) -> Choice | Trial | None:
-        """Return an interrupted trial, or the choice of a new one; None if there is nothing to execute at present."""
+    def run(self) -> None:
+        """Execute to the end, as the only process that runs the store.
+
+        If an error or Ctrl-C stops the loop, it first waits for the running executions, which were paid for.
+        """
         recorder = self.recorder
-        if self.budget is not None and recorder.executions + recorder.executing >= self.budget:
-            return None
-        return recorder.interrupted or self.rule()
+        with recorder.store.sole_writer(), Interrupts() as interrupts, exits_as_exceptions():
+            recorder.refresh()
+            if any(trial.state == "unmeasured" for trial in recorder.trials):
+                recorder.remeasure()
+            total = self.expected if self.budget is None else self.budget
+            try:
+                with stage("executions", total, done=recorder.executions):
+                    with interrupts.shielded():
+                        try:
+                            # The heart of a campaign: choose and store, execute, measure and store.
+                            while True:
+                                self._fill_pool(interrupts)
+                                if not self.running:
+                                    break
+                                self._record(self.pool.wait())
+                        finally:
+                            self.pool.close()
+                    if self.stopped is not None:
+                        raise self.stopped
+                    if interrupts.asked:
+                        raise KeyboardInterrupt
+            finally:
+                recorder.abandon_executions()
 
-    def choices(self, first: Choice, most: int) -> Iterator[Choice]:
+    def _next(self) -> Choice | Trial | None:
+        """Return an interrupted trial, or the choice of a new one; None if there is nothing to execute at present."""
+        if self.budget is not None and self.recorder.executions + self.recorder.executing >= self.budget:
+            return None
+        return self.recorder.interrupted or self.rule()
+
+    def _choices(self, first: Choice, most: int) -> Iterator[Choice]:
         """Yield a choice and those that follow it: at most so many, and no more after half a second."""
         until = time.monotonic() + AHEAD
         chosen: Choice | Trial | None = first
         while isinstance(chosen, Choice):
             yield chosen
             most -= 1
-            chosen = self.next() if most and time.monotonic() < until else None
-
-
-def execute_schedule(schedule: Schedule, pool: WorkerPool | None, on_trial: OnTrial | None, retry: RetryPolicy) -> None:
-    """Execute a schedule to its end, as the only process that runs the store; without a pool, in this process."""
-    recorder = schedule.recorder
-    with recorder.store.sole_writer(), Interrupts() as interrupts, exits_as_exceptions():
-        recorder.refresh()
-        if any(trial.state == "unmeasured" for trial in recorder.trials):
-            recorder.remeasure()
-        workers = SerialPool(recorder.validation.system) if pool is None else pool
-        total = schedule.expected if schedule.budget is None else schedule.budget
-        try:
-            with stage("executions", total, done=recorder.executions):
-                _Loop(schedule, workers, on_trial, retry).run(interrupts)
-        finally:
-            recorder.abandon_executions()
-
-
-class _Loop:
-    """Keeps all workers busy, and records what their executions gave."""
-
-    def __init__(self, schedule: Schedule, pool: WorkerPool, on_trial: OnTrial | None, retry: RetryPolicy) -> None:
-        self.schedule, self.pool, self.on_trial, self.retry = schedule, pool, on_trial, retry
-        self.recorder = schedule.recorder
-        self.running: dict[int, OpenTrial] = {}
-        self.losses: Counter[int] = Counter()
-        self.failures: Counter[int] = Counter()
-        self.stopped: BaseException | None = None
-
-    def run(self, interrupts: Interrupts) -> None:
-        """Execute the schedule; if an error stops it, first wait for the running executions."""
-        with interrupts.shielded():
-            try:
-                while True:
-                    self._fill_pool(interrupts)
-                    if not self.running:
-                        break
-                    self._take(self.pool.wait())
-            finally:
-                self.pool.close()
-        if self.stopped is not None:
-            raise self.stopped
-        if interrupts.asked:
-            raise KeyboardInterrupt
+            chosen = self._next() if most and time.monotonic() < until else None
 
     def _fill_pool(self, interrupts: Interrupts) -> None:
-        ahead = self.pool.ahead if self.schedule.independent else 0
+        ahead = self.pool.ahead if self.independent else 0
         while self.stopped is None and not interrupts.asked:
-            free = self.pool.size + ahead - len(self.running)
-            if free <= 0:
-                return
             idle = self.pool.size - len(self.running)
-            most = idle if idle > 0 else free  # no worker is idle while the tasks that will wait are chosen
+            if idle + ahead <= 0:
+                return
+            most = idle if idle > 0 else idle + ahead  # no worker is idle while the tasks that will wait are chosen
             try:
                 with interrupts.shielded(False):  # a choice may take long, and nothing is lost with it
-                    chosen = self.schedule.next()
+                    chosen = self._next()
                 if chosen is None:
                     return
-                if isinstance(chosen, Choice) and self.schedule.independent and most > 1:
-                    opened = self.recorder.start_together(self.schedule.choices(chosen, most))
+                if isinstance(chosen, Choice) and self.independent and most > 1:
+                    opened = self.recorder.open_all(self._choices(chosen, most), attempts=1)
                 else:
                     opened = [self.recorder.start(chosen)]
                 for each in opened:
@@ -143,12 +133,17 @@ class _Loop:
         self.pool.start(opened.number, opened.plan)
         self.running[opened.number] = opened
 
-    def _take(self, executions: Sequence[tuple[int, Execution]]) -> None:
-        """Record executions that have ended, or repeat them."""
+    def _record(self, executions: Sequence[tuple[int, Execution]]) -> None:
+        """Store executions that have ended, or repeat them."""
         measured = list[tuple[Trial, Execution]]()
         for number, execution in executions:
+            opened = self.running.pop(number)
             try:
-                measured += self._measured(self.running.pop(number), execution)
+                final = self._measured(opened, execution)
+                if final is not None:
+                    measured.append((opened.trial, final))
+                elif self.stopped is None:
+                    self._start(self.recorder.repeat(opened))
             except CtxvalError as error:
                 self.stopped = self.stopped or error
         ended = list[Trial]()
@@ -167,30 +162,23 @@ class _Loop:
             if self.on_trial is not None:
                 self.on_trial(trial)
 
-    def _measured(self, opened: OpenTrial, execution: Execution) -> list[tuple[Trial, Execution]]:
-        """Return the trial of an execution with what is recorded of it; nothing if the execution is repeated."""
+    def _measured(self, opened: OpenTrial, execution: Execution) -> Execution | None:
+        """Return an execution with its distance; None if it is to be repeated."""
         if execution.lost is not None:
             self.losses[opened.number] += 1
             losses = self.losses[opened.number]
-            if losses <= self.retry.retries:
-                self._repeat(opened)
-                return []
-            failure = f"the worker was lost {losses} times, at last: {execution.lost}"
-            return [(opened.trial, Execution(failed=failure))]
+            if losses <= self.retries:
+                return None
+            return Execution(failed=f"the worker was lost {losses} times, at last: {execution.lost}")
         try:
             execution = execution.measured(self.recorder.validation, opened.plan)
         except (ExecutionError, InputError) as error:
             execution = Execution(failed=str(error), seconds=execution.seconds)
         if execution.failed is not None:
             self.failures[opened.number] += 1
-            if self.failures[opened.number] <= self.retry.retry_failures:
-                self._repeat(opened)
-                return []
-        return [(opened.trial, execution)]
-
-    def _repeat(self, opened: OpenTrial) -> None:
-        if self.stopped is None:
-            self._start(self.recorder.repeat(opened))
+            if self.failures[opened.number] <= self.retry_failures:
+                return None
+        return execution
 
 
 def _result(recorder: TrialRecorder, ended: Trial, executed: Trajectory | None) -> str:

@@ -20,8 +20,7 @@ from ctxval.core.plan import Plan
 from ctxval.core.system import System
 from ctxval.errors import CampaignError, InputError
 
-_SHORT = 5.0
-"""Seconds of the longest execution behind which another one may wait."""
+_SHORT = 5.0  # seconds of the longest execution behind which another one may wait
 
 
 @runtime_checkable
@@ -47,15 +46,11 @@ class ExecutorPool(WorkerPool):
 
     @property
     def ahead(self) -> int:
-        """The number of further plans that wait for a free worker: half a second of work, if executions are short.
-
-        Ctrl-C waits for them. There are none with a time limit, because it is not known when they start.
-        """
+        # Half a second of work, for which Ctrl-C waits; with a time limit none, as it is not known when they start.
         short = self.timeout is None and self._seconds <= _SHORT
         return self.size * min(8, math.ceil(AHEAD / self._seconds)) if short else 0
 
     def start(self, number: int, plan: Plan) -> None:
-        """Start the execution of a trial."""
         self._await_scheduler()
         try:
             job = self.executor.submit(execute_task, self.system, plan.controller, plan.task)
@@ -66,7 +61,6 @@ class ExecutorPool(WorkerPool):
         self._running[number] = job, time.monotonic()
 
     def wait(self) -> list[tuple[int, Execution]]:
-        """Wait for the next execution that ends, or that takes too long."""
         while True:
             jobs = [job for job, _ in self._running.values()]
             if all(isinstance(job, cf.Future) for job in jobs):
@@ -91,17 +85,16 @@ class ExecutorPool(WorkerPool):
 
     def _await_scheduler(self) -> None:
         """Wait while a Dask client searches for a scheduler that it has lost."""
-        while self._status() == "connecting":
+        client = getattr(self.executor, "_client", None)
+        while (status := getattr(client, "status", "running")) == "connecting":
             time.sleep(0.5)
-        if self._status() == "closed":
+        if status == "closed":
             raise CampaignError("the executor takes no more work: its scheduler is gone.")
-
-    def _status(self) -> str:
-        return str(getattr(getattr(self.executor, "_client", None), "status", "running"))
 
     def _result(self, job: Any) -> Execution:
         try:
             execution: Execution = job.result()
+            return execution
         except (Exception, cf.CancelledError) as error:
             if _is_loss(error):
                 self._await_scheduler()
@@ -110,10 +103,9 @@ class ExecutorPool(WorkerPool):
             errors = re.findall(r"^[\w.]*(?:Error|Exception): .*$", str(error), re.MULTILINE)
             reason = errors[-1] if errors else reason_of(error)
             raise InputError(f"the execution cannot be sent to a worker: {reason.rstrip('.')}.") from error
-        return execution
 
     def close(self) -> None:
-        """Cancel the executions that have not started; the owner of the executor closes it."""
+        # Executions that have not started are cancelled; the owner of the executor closes it.
         for job, _ in self._running.values():
             _cancel(job)
 
@@ -123,16 +115,13 @@ def _cancel(job: Any) -> None:
         job.cancel()
 
 
-_ENGINES = {"distributed", "ray", "submitit"}
-_RAISED_BY_FUNCTION = {"FailedJobError", "RayTaskError", "RaySystemError", "RuntimeEnvSetupError"}
-
-
 def _is_loss(error: BaseException) -> bool:
     """Return whether an error means that a worker was lost, which is not a failure of the system."""
-    known = (cf.BrokenExecutor, cf.CancelledError, EOFError, OSError)
-    of_engine = type(error).__module__.split(".")[0] in _ENGINES
-    raised = not _RAISED_BY_FUNCTION.isdisjoint(cls.__name__ for cls in type(error).__mro__)
-    return isinstance(error, known) or (of_engine and not raised)
+    if isinstance(error, cf.BrokenExecutor | cf.CancelledError | EOFError | OSError):
+        return True
+    of_engine = type(error).__module__.split(".")[0] in {"distributed", "ray", "submitit"}
+    raised_by_function = {"FailedJobError", "RayTaskError", "RaySystemError", "RuntimeEnvSetupError"}
+    return of_engine and raised_by_function.isdisjoint(kind.__name__ for kind in type(error).__mro__)
 
 
 def worker_pool(

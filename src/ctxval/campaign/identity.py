@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 
@@ -50,13 +50,11 @@ def _ready_made(described: Any) -> Search | None:
     if not isinstance(described, dict):
         return None
     name = described.get("type")
-    kind = next((kind for kind in map(REGISTRY.find, REGISTRY.built_in) if kind.__name__ == name), None)
     try:
         if name == Repeated.__name__:
             repeated = _ready_made(described.get("search"))
             return None if repeated is None else Repeated(repeated, described.get("times", 0))
-        if kind is None:
-            return None
+        kind = next(kind for kind in map(REGISTRY.find, REGISTRY.built_in) if kind.__name__ == name)
         default = described_plainly(kind())
         options = {name: value for name, value in described.items() if value != default.get(name)}
         for name, value in options.items():
@@ -64,9 +62,9 @@ def _ready_made(described: Any) -> Search | None:
             if not (isinstance(default.get(name), str) or all(isinstance(item, int | float | None) for item in items)):
                 return None
         search: Search = kind(**{name: tuple(v) if isinstance(v, list) else v for name, v in options.items()})
-    except (TypeError, InputError):
+        return search
+    except (StopIteration, TypeError, InputError):
         return None
-    return search
 
 
 def described_plainly(value: Any) -> Any:
@@ -93,44 +91,43 @@ def identify(
     with store.snapshot():
         stored, trials = store.description(), store.trials()
     differing = list(differences(stored, description))
-    asked = [sentence for path, sentence in differing if path.startswith(_QUESTION)]
-    if asked:
-        raise _mismatch(store, asked[0], "use another store")
-    loop = _changed_loop(store, validation, trials)
+    samples = _samples(trials)
+
+    def refuse(difference: str, advice: str) -> NoReturn:
+        raise StoreMismatchError(f"{store.name} was made by another experiment: {difference}; {advice}.")
+
+    for path, sentence in differing:
+        if path.startswith(_QUESTION):
+            refuse(sentence, "use another store")
+    loop = _changed_loop(store, validation, samples)
     if loop is not None:
         advice = "the model, the task or the controller design has changed since the executions: use another store"
-        raise _mismatch(store, next((sentence for _, sentence in differing), loop), advice)
-    others = [sentence for path, sentence in differing if not path.startswith("validation.distance")]
+        refuse(differing[0][1] if differing else loop, advice)
+    of_distance = [sentence for path, sentence in differing if path.startswith("validation.distance")]
+    others = [sentence for _, sentence in differing if sentence not in of_distance]
     if others and accept is None:
-        raise _mismatch(store, others[0], _OTHER_CHANGED)
+        refuse(
+            others[0],
+            "the closed loops on the model have not changed. If the difference does not matter, or if it is a repair "
+            'of the system, give the reason: --accept-change "REASON" (accept_change= in Python); otherwise use '
+            "another store",
+        )
     if not remeasuring:
-        described = [sentence for path, sentence in differing if path.startswith("validation.distance")]
-        measured = _changed_distance(store, validation, trials)
+        advice = (
+            "`ctxval remeasure STORE --experiment FILE.toml` (remeasure=True in Python) recomputes the distances "
+            "without an execution; in place of FILE.toml, a case or module:attr can name the experiment"
+        )
+        measured = _changed_distance(store, validation, samples)
         if measured is not None:
-            raise _mismatch(store, (described or [measured])[0], _DISTANCE_CHANGED)
-        if described and accept is None:
-            advice = f'{_DISTANCE_CHANGED}; if the distance still computes the same, give --accept-change "REASON"'
-            raise _mismatch(store, described[0], advice)
+            refuse(of_distance[0] if of_distance else measured, advice)
+        if of_distance and accept is None:
+            refuse(of_distance[0], f'{advice}; if the distance still computes the same, give --accept-change "REASON"')
         others = [sentence for _, sentence in differing]
     if others or accept is not None:
         change = Change("accepted", str(accept), {"differences": others, "trials": len(trials)})
         if remeasuring:  # the stored values are still those of the earlier distance
             description = with_distance(description, stored["validation"]["distance"])
         store.describe_anew(description, change)
-
-
-_OTHER_CHANGED = (
-    "the closed loops on the model have not changed. If the difference does not matter, or if it is a repair of the "
-    'system, give the reason: --accept-change "REASON" (accept_change= in Python); otherwise use another store'
-)
-_DISTANCE_CHANGED = (
-    "`ctxval remeasure STORE --experiment FILE.toml` (remeasure=True in Python) recomputes the distances without an "
-    "execution; in place of FILE.toml, a case or module:attr can name the experiment"
-)
-
-
-def _mismatch(store: Store, difference: str, advice: str) -> StoreMismatchError:
-    return StoreMismatchError(f"{store.name} was made by another experiment: {difference}; {advice}.")
 
 
 def _samples(trials: Sequence[Trial]) -> list[Trial]:
@@ -141,27 +138,28 @@ def _samples(trials: Sequence[Trial]) -> list[Trial]:
     return [chosen[number] for number in sorted(chosen)]
 
 
-def _changed_loop(store: Store, validation: Validation, trials: Sequence[Trial]) -> str | None:
+def _changed_loop(store: Store, validation: Validation, samples: Sequence[Trial]) -> str | None:
     """Return a sentence about a stored closed loop on the model that has changed; None if none has."""
-    for trial in _samples(trials):
-        stored, point = store.trajectory(trial.number, "model"), validation.space.point
-        if stored is None:
+    for trial in samples:
+        before, point = store.trajectory(trial.number, "model"), validation.space.point
+        if before is None:
             continue
         what = f"the closed loop on the model for the task of trial {trial.number}"
         try:
             now = validation.plan(point(trial.parameters)).model_trajectory
-            gap = _gap(stored, now)
+            gap = _gap(before, now)
             # Results that differ from one call to the next, such as those of a random planner, cannot be compared.
-            if gap > 1e-4 and _gap(now, validation.plan(point(trial.parameters)).model_trajectory) <= 1e-4:
-                if np.isinf(gap):
-                    before, after = (
-                        f"{loop.horizon} steps of {loop.states.shape[-1]} states and {loop.inputs.shape[-1]} inputs"
-                        for loop in (stored, now)
-                    )
-                    return f"{what} had {before} and has now {after}"
-                return f"{what} differs from the stored one by {100 * min(gap, 1e6):.2g} % of its range"
+            if gap <= 1e-4 or _gap(now, validation.plan(point(trial.parameters)).model_trajectory) > 1e-4:
+                continue
         except CtxvalError as error:
             return f"{what} cannot be computed any more ({error})"
+        if np.isfinite(gap):
+            return f"{what} differs from the stored one by {100 * min(gap, 1e6):.2g} % of its range"
+        had, has = (
+            f"{loop.horizon} steps of {loop.states.shape[-1]} states and {loop.inputs.shape[-1]} inputs"
+            for loop in (before, now)
+        )
+        return f"{what} had {had} and has now {has}"
     return None
 
 
@@ -178,16 +176,15 @@ def _gap(before: Trajectory, after: Trajectory) -> float:
     return max(gaps)
 
 
-def _changed_distance(store: Store, validation: Validation, trials: Sequence[Trial]) -> str | None:
+def _changed_distance(store: Store, validation: Validation, samples: Sequence[Trial]) -> str | None:
     """Return a sentence about a stored distance that has changed; None if none has."""
-    for trial in _samples(trials):
+    for trial in samples:
         model, system = store.trajectory(trial.number, "model"), store.trajectory(trial.number, "system")
         if trial.distance is None or model is None or system is None:
             continue
         try:
             point = validation.space.point(trial.parameters)
-            now = validation.remeasure(point, model, system)
-            again = validation.remeasure(point, model, system)
+            now, again = (validation.remeasure(point, model, system) for _ in range(2))
         except (DistanceError, InputError) as error:
             return f"the distance of trial {trial.number} cannot be computed any more ({error})"
         if now == again and not _equal(trial.distance, now):

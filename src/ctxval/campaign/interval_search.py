@@ -9,6 +9,7 @@ dynamics can be learned, if most predictions fail, or if it decides earlier, it 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -23,7 +24,7 @@ from ctxval.certificates import CertificateOptions, DynamicsEvidence, Sample, St
 from ctxval.certificates.anytime import AnytimeAudit
 from ctxval.certificates.automatic import Automatic
 from ctxval.certificates.bets import bets_against
-from ctxval.certificates.bounds import with_units
+from ctxval.certificates.bounds import Quantities, with_units
 from ctxval.certificates.covering import RESOLUTION, covering
 from ctxval.certificates.dynamics import Dynamics, bound_of, certify_dynamics
 from ctxval.certificates.dynamics_diagnostics import (
@@ -44,15 +45,12 @@ from ctxval.certificates.prediction_tests import DRAWN, MANY, TESTS
 from ctxval.certificates.sample import SAME
 from ctxval.certificates.suite import WholeSuite
 from ctxval.certificates.verdict import counterexample, quantile_of, require_suite
-from ctxval.certificates.verdict_sentences import Quantities
 from ctxval.core.trial import Trial
 from ctxval.errors import CertificateError, InputError
 from ctxval.learning.worst_case import is_kinked
 
 _FAILING = 6  # of so many last predictions, at least half must hold
-
 _REPEATED = 2  # times that a noisy task is repeated in any case if its distance exceeds the limit
-
 _PATIENCE = 16  # executions, besides tests, after which `auto` uses the posterior bound if the dynamics decide nothing
 
 
@@ -86,15 +84,19 @@ class IntervalSearch:
         self.recorder.dynamics.use_quantile(quantile_of(self.options.kind))
 
     @property
-    def _suite(self) -> Array | None:
-        return self.recorder.validation.space.members
-
-    @property
     def limit(self) -> float:
         """The value that the bound must not exceed at the end: the threshold, or a little more than was executed."""
-        if self.threshold is not None:
-            return self.threshold
-        return (1 + self.within) * self.best
+        return (1 + self.within) * self.best if self.threshold is None else self.threshold
+
+    @property
+    def best(self) -> float:
+        """The largest executed distance; 0 if none is known."""
+        return largest_distance(self.recorder.trials)
+
+    @property
+    def tests(self) -> int:
+        """The number of tests that the certificate needs."""
+        return self.options.kind.tests if isinstance(self.options.kind, Automatic | Dynamics) else 0
 
     @property
     def predicts(self) -> bool:
@@ -111,43 +113,6 @@ class IntervalSearch:
         evidence = self._evidence()
         return self.best, None if evidence is None else self._bound(evidence)
 
-    def choose(self) -> Choice | None:
-        """Return the next task; None if the interval decides, or no task of a suite is left."""
-        if not self.recorder.has_tasks:
-            return None
-        if self.best > self.limit:
-            if (repeated := self._against_noise()) is not None:
-                return repeated
-            if self.is_falsified:
-                return None
-        if isinstance(self.options.kind, AnytimeAudit):
-            return self._by_draws(self.options.kind)
-        if (test := self._next_test()) is not None:
-            return test
-        evidence = self._evidence()
-        if evidence is not None and (task := self._beside_a_failed_test(evidence)) is not None:
-            return Choice(task, "covering", planned_draws=0, rejected=0)
-        # Earlier predictions may have failed before it was known that a history or noise matters.
-        history = evidence is not None and (evidence.quantile is not None or evidence.lags > 0)
-        if evidence is None or (self._fails(evidence) and not history):
-            return self._by_distance()
-        if self._may_decide(evidence):
-            whole = self.recorder.dynamics.evidence(self.recorder.trials, self.options.confidence, keep=self.keeps)
-            if whole is None:
-                return self._by_distance()
-            evidence = replace(whole, tests=self.tests)
-            if self._decides(evidence):
-                return None
-        if isinstance(self.options.kind, Automatic) and evidence.quantile is None and self._suite is None:
-            known = self._points(self.recorder.trials)
-            patient = sum(trial.origin not in DRAWN for trial in self.recorder.trials) < _PATIENCE
-            # In few dimensions, executions soon cover the tasks, and the posterior bound of the distance may decide.
-            if not patient or covering(known, self.options.kind.posterior.resolution, 0) is not None:
-                choice = self._by_distance()
-                if not patient or choice is None:
-                    return choice
-        return self._by_evidence(evidence)
-
     @property
     def is_falsified(self) -> bool:
         """Whether the executed distances falsify the limit; of a noisy system, one above it may not suffice."""
@@ -155,11 +120,59 @@ class IntervalSearch:
         known = Quantities(space=self.recorder.validation.space)
         return counterexample(self.recorder.trials, self.limit, known, confidence, quantile_of(kind)) is not None
 
-    def _against_noise(self) -> Choice | None:
-        """Return a task whose execution tells whether noise explains a distance above the limit.
+    def choose(self) -> Choice | None:
+        """Return the next task; None if the interval decides, or no task of a suite is left."""
+        kind = self.options.kind
+        if not self.recorder.has_tasks:
+            return None
+        if self.best > self.limit:
+            if (repeated := self._against_noise()) is not None:
+                return repeated
+            if self.is_falsified:
+                return None
+        if isinstance(kind, AnytimeAudit):
+            return self._by_draws(kind)
+        if (test := self._next_test()) is not None:
+            return test
+        evidence = self._evidence()
+        if evidence is not None and (task := self._beside_a_failed_test(evidence)) is not None:
+            return Choice.tested(task)
+        # Earlier predictions may have failed before it was known that a history or noise matters.
+        history = evidence is not None and (evidence.quantile is not None or evidence.lags > 0)
+        if evidence is None or (self._fails(evidence) and not history):
+            return self._by_distance()
+        # The whole evidence may decide if nothing that a few draws show leaves the verdict open.
+        bound, enough = self._bound(evidence), len(self._ended) >= FEWEST
+        if enough and raised(evidence, bound) <= self.limit and doubt_of(evidence, self.best, bound) is None:
+            whole = self.recorder.dynamics.evidence(self.recorder.trials, self.options.confidence, keep=self.keeps)
+            if whole is None:
+                return self._by_distance()
+            evidence = replace(whole, tests=self.tests)
+            with suppress(CertificateError):
+                if certify_dynamics(Sample.of(self._ended), evidence, self.options.confidence).covers(self.limit):
+                    return None
+        if isinstance(kind, Automatic) and evidence.quantile is None and self._suite is None:
+            known = self._points(self.recorder.trials)
+            patient = sum(trial.origin not in DRAWN for trial in self.recorder.trials) < _PATIENCE
+            # In few dimensions, executions soon cover the tasks, and the posterior bound of the distance may decide.
+            if not patient or covering(known, kind.posterior.resolution, 0) is not None:
+                choice = self._by_distance()
+                if not patient or choice is None:
+                    return choice
+        return self._by_evidence(evidence)
 
-        It is None if the system is not noisy, if the limit is falsified, or if no task is predicted to exceed it.
-        """
+    def test(self) -> Choice:
+        """Return the next task that tests predictions where nobody chose to look; see ``prediction_tests``."""
+        trials = self.recorder.trials
+        # A hypercube that was begun is completed, because what a part of it shows must not decide that it is left.
+        if self.tests < MANY or self._suite is not None or spread_tests(trials) % TESTS:
+            return Choice.tested(self.recorder.draws.test(trials), "spread")
+        return Choice.tested(self.recorder.draw(), "iid")
+
+    # The choices, in the order in which they are tried
+
+    def _against_noise(self) -> Choice | None:
+        """Return a task whose execution tells whether noise explains a distance above the limit, if there is one."""
         trials, quantile = self.recorder.trials, quantile_of(self.options.kind)
         bets = bets_against(trials, self.limit, quantile)
         if self._suite is not None or not self.predicts or (bets is not None and bets.falsify(self.options.confidence)):
@@ -170,17 +183,68 @@ class IntervalSearch:
         worst = max((trial for trial in trials if trial.distance is not None), key=lambda trial: trial.distance or 0.0)
         alike = (trial for trial in trials if trial.distance is not None or trial.state == "open")
         if sum(np.abs(trial.unit_point - worst.unit_point).max() <= 1e-9 for trial in alike) <= _REPEATED:
-            return Choice(worst.unit_point, "covering", planned_draws=0, rejected=0)
+            return Choice.tested(worst.unit_point)
         tasks = [worst.unit_point, learned.worst_of_mean.elites[0]]
-        chances = []
-        for task in tasks:
-            predicted = learned.predict(task)
-            noise = None if predicted is None else predicted.noise
-            chances.append(0.0 if noise is None else noise.chance_of_more(self.limit))
-        best = int(np.argmax(chances))
-        if chances[best] <= 1 - quantile:
+        noises = [None if (predicted := learned.predict(task)) is None else predicted.noise for task in tasks]
+        chances = [0.0 if noise is None else noise.chance_of_more(self.limit) for noise in noises]
+        likeliest = int(np.argmax(chances))
+        return Choice.tested(tasks[likeliest]) if chances[likeliest] > 1 - quantile else None
+
+    def _by_draws(self, kind: AnytimeAudit) -> Choice | None:
+        """Return the next independent draw of an anytime audit, which may end whenever its bound suffices."""
+        if any(trial.origin == "iid" for trial in self._ended):
+            certificate, _ = kind.certify_against(Sample.of(self._ended), self.limit, self.options.confidence)
+            if certificate.covers(self.limit, self.options.volume):
+                return None
+        return Choice(self.recorder.draw(), "iid", planned_draws=0)
+
+    def _next_test(self) -> Choice | None:
+        """Return the next test if the last one held and more are missing: nothing needs to be searched for that."""
+        trials = self.recorder.trials
+        if not self.tests or not self.predicts or any(trial.state != "completed" for trial in trials):
             return None
-        return Choice(tasks[best], "covering", planned_draws=0, rejected=0)
+        if not trials or trials[-1].origin not in DRAWN:
+            return None
+        predictions = self.recorder.dynamics.checked(trials)
+        passed = predictions and held(predictions[-1], self.best)
+        return self.test() if passed and missing_tests(predictions, self.tests) else None
+
+    def _beside_a_failed_test(self, evidence: DynamicsEvidence) -> Array | None:
+        """Return a task where a test that failed may be worst; None if there is no such test, or all are executed.
+
+        A dynamics that depends on the task is large where the one parameter that it depends on is that of the test and
+        the others are those of the worst task. Parameters that M's loops do not depend on come first.
+        """
+        if raised(evidence, self._bound(evidence)) <= self.limit:
+            return None
+        trials = self.recorder.trials
+        tests = (test for test in reversed(evidence.predictions) if test.stored and test.origin in DRAWN)
+        failed = next((test for test in tests if not held(test, self.best)), None)
+        worst = next((trial.unit_point for trial in trials if trial.distance == self.best), None)
+        if failed is None or worst is None:
+            return None
+        known, learned = self._points(trials), self.recorder.dynamics.learned(trials)
+        unseen = [] if learned is None else learned.study.unseen_parameters
+        for j in [*unseen, *(j for j in range(len(worst)) if j not in unseen)][:6]:
+            task = worst.copy()
+            task[j] = failed.point[j]
+            task = task if self._suite is None else self.recorder.validation.space.rounded(task)
+            if np.abs(known - task).max(axis=1).min() > self._near:
+                return task
+        return None
+
+    def _by_distance(self) -> Choice | None:
+        kind = self.options.kind
+        # No distance is known, all are 0, or each task of a suite is executed.
+        if isinstance(kind, Dynamics) or not self.limit > 0 or self._suite is not None:
+            return Choice(planned_draws=0)
+        posterior = kind.posterior if isinstance(kind, Automatic) else kind
+        rule = StoppingRule(self.limit, replace(self.options, kind=posterior))
+        now = rule.decide(self.recorder.trials, self.budget - self.recorder.executions)
+        if not now.decided:
+            return Choice(now.next_point, "covering", planned_draws=0)
+        missing = isinstance(kind, Automatic) and kind.missing_tests(Sample.of(self._ended))
+        return self.test() if missing else None
 
     def _by_evidence(self, evidence: DynamicsEvidence) -> Choice:
         """Return the task that the learned dynamics choose, or a test if nothing else is missing."""
@@ -203,41 +267,13 @@ class IntervalSearch:
             point = next_task(after, self._points(trials), best, limit, confidence, steady, self._near)
         return Choice(point, "covering", planned_draws=0, rejected=steady.rejected)
 
-    def by_dynamics(self) -> Array | None:
-        """Return the next task, a point ``(d,)``; None if it is decided or learned dynamics do not choose the task."""
-        evidence = self._evidence()
-        choice = None if evidence is None or self._fails(evidence) else self.choose()
-        return None if choice is None else choice.unit_point
-
-    @property
-    def tests(self) -> int:
-        """The number of tests that the certificate needs."""
-        return self.options.kind.tests if isinstance(self.options.kind, Automatic | Dynamics) else 0
-
-    @property
-    def best(self) -> float:
-        """The largest executed distance; 0 if none is known."""
-        return largest_distance(self.recorder.trials)
-
-    @property
-    def _ended(self) -> list[Trial]:
-        return [trial for trial in self.recorder.trials if trial.state != "open"]
-
-    def _points(self, trials: Sequence[Trial]) -> Array:
-        return np.array([trial.unit_point for trial in trials]).reshape(-1, self.recorder.validation.space.dimension)
-
-    def _bound(self, evidence: DynamicsEvidence) -> float:
-        return bound_of(evidence, self.best, self.options.confidence)
+    # What is known
 
     def _evidence(self) -> DynamicsEvidence | None:
-        """Return what the store keeps, or else what a few draws of the learned dynamics say.
-
-        It is None if the certificate does not use them.
-        """
-        trials = self.recorder.trials
+        """Return what the store keeps, or what a few posterior samples say; None if the certificate uses neither."""
+        trials, dynamics = self.recorder.trials, self.recorder.dynamics
         if not self.predicts or any(trial.state == "failed" for trial in trials):
             return None
-        dynamics = self.recorder.dynamics
         evidence = dynamics.kept_evidence(trials, self.options.confidence) or dynamics.screening(trials)
         return None if evidence is None else replace(evidence, tests=self.tests)
 
@@ -249,94 +285,27 @@ class IntervalSearch:
         tolerated = max(min(bound, self.limit), self.limit - bound)  # as far as the margin to the limit allows
         return len(last) == _FAILING and 2 * sum(held(prediction, tolerated) for prediction in last) < _FAILING
 
-    def _may_decide(self, screened: DynamicsEvidence) -> bool:
-        """Return whether the whole evidence may decide: nothing that a few draws show leaves the verdict open."""
-        bound = self._bound(screened)
-        enough = len(self._ended) >= FEWEST
-        return enough and raised(screened, bound) <= self.limit and doubt_of(screened, self.best, bound) is None
+    def _bound(self, evidence: DynamicsEvidence) -> float:
+        return bound_of(evidence, self.best, self.options.confidence)
 
-    def _decides(self, evidence: DynamicsEvidence) -> bool:
-        try:
-            return certify_dynamics(Sample.of(self._ended), evidence, self.options.confidence).covers(self.limit)
-        except CertificateError:
-            return False
+    @property
+    def _suite(self) -> Array | None:
+        return self.recorder.validation.space.members
 
-    def _next_test(self) -> Choice | None:
-        """Return the next test if the last one held and more are missing: nothing needs to be searched for that."""
-        trials = self.recorder.trials
-        if not self.tests or not self.predicts or any(trial.state != "completed" for trial in trials):
-            return None
-        if not trials or trials[-1].origin not in DRAWN:
-            return None
-        predictions = self.recorder.dynamics.checked(trials)
-        if not predictions or not held(predictions[-1], self.best):
-            return None
-        return self.test() if missing_tests(predictions, self.tests) else None
+    @property
+    def _ended(self) -> list[Trial]:
+        return [trial for trial in self.recorder.trials if trial.state != "open"]
 
-    def _beside_a_failed_test(self, evidence: DynamicsEvidence) -> Array | None:
-        """Return a task where a test that failed may be worst; None if there is no such test, or all are executed.
-
-        A dynamics that depends on the task is large where the one parameter that it depends on is that of the test and
-        the others are those of the worst task. Parameters that M's loops do not depend on come first.
-        """
-        if raised(evidence, self._bound(evidence)) <= self.limit:
-            return None
-        tests = (test for test in reversed(evidence.predictions) if test.stored and test.origin in DRAWN)
-        failed = next((test for test in tests if not held(test, self.best)), None)
-        worst = next((trial.unit_point for trial in self.recorder.trials if trial.distance == self.best), None)
-        if failed is None or worst is None:
-            return None
-        known = self._points(self.recorder.trials)
-        learned = self.recorder.dynamics.learned(self.recorder.trials)
-        unseen = [] if learned is None else learned.study.unseen_parameters
-        for j in [*unseen, *(j for j in range(len(worst)) if j not in unseen)][:6]:
-            task = worst.copy()
-            task[j] = failed.point[j]
-            task = task if self._suite is None else self.recorder.validation.space.rounded(task)
-            if np.abs(known - task).max(axis=1).min() > self._near:
-                return task
-        return None
+    def _points(self, trials: Sequence[Trial]) -> Array:
+        return np.array([trial.unit_point for trial in trials]).reshape(-1, self.recorder.validation.space.dimension)
 
     @property
     def _near(self) -> float:
-        """The largest change of each coordinate to a task that is no new one.
-
-        A distance with kinks may be large in a few tasks only, which are next to others where it is 0.
-        """
+        """The largest change of each coordinate to a task that is no new one."""
         if self._suite is not None:
             return SAME
+        # A distance with kinks may be large in a few tasks only, which are next to others where it is 0.
         return 0.1 * NEAR if is_kinked(self.recorder.validation.distance) else NEAR
-
-    def test(self) -> Choice:
-        """Return the next task that tests predictions where nobody chose to look; see ``prediction_tests``."""
-        trials = self.recorder.trials
-        # A hypercube that was begun is completed, because what a part of it shows must not decide that it is left.
-        if self.tests < MANY or self._suite is not None or spread_tests(trials) % TESTS:
-            return Choice(self.recorder.draws.test(trials), "spread", planned_draws=0, rejected=0)
-        # The results decide when the campaign ends, so the number of independent draws is not planned.
-        return Choice(self.recorder.draw(), "iid", planned_draws=0, rejected=0)
-
-    def _by_draws(self, kind: AnytimeAudit) -> Choice | None:
-        """Return the next independent draw of an anytime audit, which may end whenever its bound suffices."""
-        if any(trial.origin == "iid" for trial in self._ended):
-            certificate, _ = kind.certify_against(Sample.of(self._ended), self.limit, self.options.confidence)
-            if certificate.covers(self.limit, self.options.volume):
-                return None
-        return Choice(self.recorder.draw(), "iid", planned_draws=0)
-
-    def _by_distance(self) -> Choice | None:
-        kind = self.options.kind
-        if isinstance(kind, Dynamics):
-            return Choice(planned_draws=0)
-        if not self.limit > 0 or self._suite is not None:
-            return Choice(planned_draws=0)  # no distance is known, all are 0, or each task of a suite is executed
-        posterior = kind.posterior if isinstance(kind, Automatic) else kind
-        rule = StoppingRule(self.limit, replace(self.options, kind=posterior))
-        now = rule.decide(self.recorder.trials, self.budget - self.recorder.executions)
-        if not now.decided:
-            return Choice(now.next_point, "covering", planned_draws=0)
-        missing = isinstance(kind, Automatic) and kind.missing_tests(Sample.of(self._ended))
-        return self.test() if missing else None
 
 
 def is_decisive(options: CertificateOptions) -> bool:
@@ -362,11 +331,12 @@ def with_next_task(verdict: Verdict, recorder: TrialRecorder, options: Certifica
     if verdict.answer != "undecided" or failed or not is_decisive(options):
         return verdict
     search = IntervalSearch(recorder, options, recorder.executions + 1, verdict.threshold, keeps=False)
-    unit_point = search.by_dynamics()
-    if unit_point is None:
+    evidence = search._evidence()
+    choice = None if evidence is None or search._fails(evidence) else search.choose()
+    if choice is None or choice.unit_point is None:
         return verdict
     space = recorder.validation.space
-    point = space.from_unit(space.rounded(unit_point))
+    point = space.from_unit(space.rounded(choice.unit_point))
     task = with_units(space.labelled(point))
     reason = f"{verdict.reason.removesuffix('.')}; next task: {task}."
     return replace(verdict, reason=reason, next_task=space.describe_point(point))
@@ -403,11 +373,11 @@ def next_task(
         candidates = [largest, highest, farthest]
     elif exceeds:
         candidates = [highest, farthest]
-    elif uncovered(evidence) is not None:
+    elif uncovered(evidence):
         candidates = [farthest, highest, largest]
         if evidence.untried is not None and evidence.untried.gap > GAP:
             candidates = [evidence.untried.task[None], *candidates]
-    elif evidence.missed > 1 or untested(evidence, best, limit) is not None:
+    elif evidence.missed > 1 or untested(evidence, best, limit):
         candidates = [largest, highest, farthest]
     else:
         candidates = [highest, farthest] if len(known) % 2 else [farthest, highest]

@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Sequence
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
@@ -27,7 +27,6 @@ from ctxval.campaign.dynamics import PREDICTION, CampaignDynamics
 from ctxval.campaign.history import waiting_points
 from ctxval.campaign.storage.store import Store
 from ctxval.certificates.prediction_tests import TESTS
-from ctxval.core.model import Model
 from ctxval.core.rollout import rollout
 from ctxval.core.trial import CONVERGED, UNSTEADY, Trial
 from ctxval.core.validation import Validation
@@ -64,13 +63,13 @@ class Steadiness:
 
         After too many tests it is false, and the task does not count as rejected.
         """
-        key = point.tobytes()
-        if self.planner.validation.space.members is not None:
+        key, space = point.tobytes(), self.planner.validation.space
+        if space.members is not None:
             return True  # there are no tasks next to it
         if key not in self._tested:
             if len(self._tested) >= 24:
                 return False
-            rounded = self.planner.validation.space.rounded(point)
+            rounded = space.rounded(point)
             beside = np.where(rounded > 0.5, rounded - 1e-9, rounded + 1e-9)
             with stage("testing a task", unit="designs"):
                 self._tested[key] = self._alike(np.stack([point, rounded, beside]))
@@ -107,17 +106,16 @@ class Steadiness:
         for planned in self.planner.plan(points):
             ranges = np.ptp(planned.promised.states.reshape(-1, planned.promised.states.shape[-1]), axis=0)
             ranges = np.maximum(ranges, 1e-3 * ranges.max())
-            step = partial(_pushed_step, model, 0.01 * ranges)
+
+            def step(x: Array, u: Array, push: Array = 0.01 * ranges) -> Array:
+                return np.asarray(model.step(x, u) + push)
+
             loops = rollout(step, planned.controller, planned.task)
             pushed.append((planned.rows, (loops.states / ranges).reshape(len(planned.rows), -1)))
         shares = np.full((len(points), max((states.shape[1] for _, states in pushed), default=1)), np.nan)
         for rows, states in pushed:
             shares[rows] = states
         return shares
-
-
-def _pushed_step(model: Model, push: Array, x: Array, u: Array) -> Array:
-    return np.asarray(model.step(x, u) + push)
 
 
 class Proposals:
@@ -127,20 +125,31 @@ class Proposals:
         self._validation, self._search, self._dynamics = validation, search, dynamics
 
     def next(self, trials: Sequence[Trial], rejected: int = 0) -> tuple[Array, dict[str, Any] | None]:
-        """Return the search's next point ``(d,)`` and its note."""
-        steady = Steadiness(self._dynamics.planner)
-        if not self._search.uses_prediction:
-            return self._executable(self._asked(), trials, steady, rejected)
-        with stage("choosing a task", unit="designs"):
-            prediction = self._dynamics.prediction(trials, pending=True)
-            if prediction is not None:
-                expected = prediction.expected
-                steady = Steadiness(self._dynamics.planner, lambda points: expected(points)[0])
-                costs = partial(costs_of, prediction, self._validation, trials)
-                left = remaining_tasks(self._validation, trials)
-                prediction = replace(prediction, costs=costs, steady=steady, candidates=left)
-            self._search.use_prediction(prediction)
-            return self._executable(self._asked(), trials, steady, rejected)
+        """Return the search's next point ``(d,)``, tested and rounded, and its note.
+
+        The point of an earlier trial stays, and independent draws are only rounded.
+        """
+        search, steady = self._search, Steadiness(self._dynamics.planner)
+        with stage("choosing a task", unit="designs") if search.uses_prediction else nullcontext():
+            if search.uses_prediction:
+                prediction = self._dynamics.prediction(trials, pending=True)
+                if prediction is not None:
+                    expected = prediction.expected
+                    steady = Steadiness(self._dynamics.planner, lambda points: expected(points)[0])
+                    costs = partial(costs_of, prediction, self._validation, trials)
+                    left = remaining_tasks(self._validation, trials)
+                    prediction = replace(prediction, costs=costs, steady=steady, candidates=left)
+                search.use_prediction(prediction)
+            point, note = self._asked(), _plain_note(search.note())
+            repeats = self._validation.space.members is None
+            if repeats and any(point.tobytes() == trial.unit_point.tobytes() for trial in trials):
+                return point, note
+            if not search.iid:
+                point = self._steady(point, trials, steady)
+            rounded = self._allowed(point, trials)
+            if isinstance(search, SequentialSearch):
+                search.amend(rounded)
+            return rounded, _with_rejected(note, rejected + steady.rejected)
 
     def spread(self, trials: Sequence[Trial]) -> Array | None:
         """Return a task far from all that are being executed, a point ``(d,)``, if nothing at all is known yet.
@@ -183,24 +192,6 @@ class Proposals:
             )
         return np.asarray(point[0])
 
-    def _executable(
-        self, point: Array, trials: Sequence[Trial], steady: Steadiness, rejected: int
-    ) -> tuple[Array, dict[str, Any] | None]:
-        """Return a point that the search proposes, tested and rounded, and its note; tell the search the difference.
-
-        The point of an earlier trial stays, and independent draws are only rounded.
-        """
-        note = _plain_note(self._search.note())
-        repeats = self._validation.space.members is None
-        if repeats and any(point.tobytes() == trial.unit_point.tobytes() for trial in trials):
-            return point, note
-        if not self._search.iid:
-            point = self._steady(point, trials, steady)
-        rounded = self._allowed(point, trials)
-        if isinstance(self._search, SequentialSearch):
-            self._search.amend(rounded)
-        return rounded, _with_rejected(note, rejected + steady.rejected)
-
     def _allowed(self, point: Array, trials: Sequence[Trial]) -> Array:
         """Return the task to execute for a point ``(d,)``: the point, rounded, or the nearest task left of a suite."""
         remaining = remaining_tasks(self._validation, trials)
@@ -209,7 +200,6 @@ class Proposals:
         return np.asarray(remaining[np.linalg.norm(remaining - point, axis=1).argmin()])
 
     def _steady(self, point: Array, trials: Sequence[Trial], steady: Steadiness) -> Array:
-        """Return a steady point: the given one, or one next to it."""
         if self._validation.is_on_model or self._validation.space.members is not None:
             return point  # no distance depends on how a controller would react to errors of M; a suite has no others
         return point if steady(point) else steady.moved(point, np.random.default_rng([len(trials), _MOVED]))

@@ -1,4 +1,4 @@
-"""The process that reads a file of a stranger; :mod:`ctxval.campaign.recording_file` starts this file as a program.
+"""The process that reads a file of a stranger; :mod:`ctxval.campaign.telling` starts this file as a program.
 
 Its argument is the folder of the request, which is a pickle of the process that started this one. Its output is the
 trajectory as NPZ, or the reason why there is none: whoever took over this process could not make it more than that.
@@ -19,15 +19,15 @@ def main() -> None:
     os.environ.clear()
     os.environ |= home | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "ARROW_DEFAULT_MEMORY_POOL": "system"}
     sys.path.append(str(Path(__file__).resolve().parents[2]))
-    from ctxval._util.confinement import limit, read_only
-    from ctxval.campaign.recording_file import REFUSED
+    from ctxval._util.cores import limit, read_only
+    from ctxval.campaign.telling import REFUSED
     from ctxval.errors import CtxvalError
 
-    request, seconds = pickle.loads(Path(sys.argv[1], "request").read_bytes())
+    told, (path, *names), seconds = pickle.loads(Path(sys.argv[1], "request").read_bytes())
     limit(seconds)
-    read_only([request.path])
+    read_only([path])
     try:
-        content, status = request.read().to_npz(), 0
+        content, status = told.read_file(path, *names).to_npz(), 0
     except CtxvalError as error:
         content, status = str(error).encode(errors="replace"), REFUSED
     sys.stdout.buffer.write(content)

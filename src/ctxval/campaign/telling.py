@@ -1,22 +1,36 @@
-"""What a person reports of a trial: a recording, a distance or a failure, as a file and plain values."""
+"""What a person reports of a trial: a recording (read here or in a confined process), a distance or a failure."""
 
 from __future__ import annotations
 
+import os
+import pickle
+import re
+import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-from ctxval.campaign.campaign import Campaign
-from ctxval.campaign.choices import OpenTrial
-from ctxval.campaign.recording_file import RecordingFile
+import numpy as np
+
+from ctxval._util.arrays import Array
+from ctxval._util.columns import sentinels
+from ctxval._util.cores import MOST_MEMORY
+from ctxval._util.files import temporary_folder
 from ctxval.core.experiment import Experiment
+from ctxval.core.labels import labels_of
 from ctxval.core.plan import Plan
-from ctxval.core.preflight import StartOffset
-from ctxval.core.trajectory import Trajectory
-from ctxval.core.trial import Trial
-from ctxval.data import LogMapping, is_log
-from ctxval.errors import InputError
+from ctxval.core.trajectory import COMPLETE, Trajectory
+from ctxval.data import LogMapping, is_log, read_recordings
+from ctxval.errors import ExecutionError, InputError
+from ctxval.systems.subprocess import run_supervised
+
+_PROGRAM = Path(__file__).absolute().with_name("recording_process.py")
+
+REFUSED = 3
+"""Exit status of the confined process if the file cannot be used; its output is the reason."""
+
+Names = Mapping[str, str]
+"""The names of states or inputs with their units."""
 
 
 @dataclass(frozen=True)
@@ -55,41 +69,85 @@ class ToldResult:
                 "trial has the recorded states, or outputs, of the experiment."
             )
         names = experiment.names(plan.model_trajectory.states.shape[-1], plan.model_trajectory.inputs.shape[-1])
-        times, npz, resample = plan.task.times, self.npz, self.resample
-        file = RecordingFile(self.recording, *names, times, npz, resample, self.mapping, self.uploaded)
         # Where libraries in C read the file, or a stranger may have made it.
-        return file.read_confined() if self.uploaded or is_log(self.recording) else file.read()
+        read = self.read_confined if self.uploaded or is_log(self.recording) else self.read_file
+        return read(self.recording, *names, plan.task.times)
+
+    def read_file(self, path: Path, states: Names, inputs: Names, times: Array) -> Trajectory:
+        """Return the recording in a file, of a task with these times ``(H + 1,)``."""
+        if is_log(path) or (self.mapping is not None and self.npz is not True and path.is_file()):
+            dt = float(times[1] - times[0])
+            recordings = read_recordings([path], self.mapping, states=states, inputs=inputs, dt=dt)
+            if len(recordings.runs) > 1 or recordings.breaks:
+                why = f"; it was split: {recordings.breaks[0]}" if recordings.breaks else ""
+                raise InputError(f"{path} must be one recording without gaps, and has {len(recordings.runs)}{why}.")
+            logged = recordings.runs[0].trajectory
+            return logged.resampled(times) if self.resample else logged
+        require_file(path)
+        if path.suffix == ".npz" if self.npz is None else self.npz:
+            recording = Trajectory.from_npz(path)
+        else:
+            recording = Trajectory.from_csv(path, states=labels_of(states), inputs=labels_of(inputs))
+            if inputs and not recording.inputs.shape[-1]:
+                raise InputError(f"{path} must have the columns of the inputs, {', '.join(inputs)}.")
+        if recording.states.ndim != 2:
+            raise InputError(f"{path} must be one recording, got a batch of shape {recording.states.shape}.")
+        _require_finite(path, recording, states, inputs)
+        return recording.resampled(times) if self.resample else recording
+
+    def read_confined(self, path: Path, states: Names, inputs: Names, times: Array) -> Trajectory:
+        """Return the recording as a process without rights reads it; see :mod:`ctxval._util.cores`."""
+        seconds = 60 if self.uploaded else 3600
+        with temporary_folder() as folder:
+            (folder / "request").write_bytes(pickle.dumps((self, (path, dict(states), dict(inputs), times), seconds)))
+            with (folder / "answer").open("w+b") as answer, open(os.devnull, "wb") as nothing:
+                command = [sys.executable, "-P", str(_PROGRAM), str(folder)]
+                try:
+                    status = run_supervised(command, None, answer, nothing, 2 * seconds)
+                except ExecutionError as error:
+                    raise InputError(f"{path} cannot be read: {error}.") from error
+                answer.seek(0)
+                content = answer.read()
+        if status == 0:
+            return Trajectory.from_npz(content)
+        if status != REFUSED:
+            raise InputError(f"{path} cannot be read within {seconds} s and {MOST_MEMORY} bytes of memory.")
+        sentence = content.decode(errors="replace")
+        if self.uploaded:  # the place of the mistake, and what would be right, without anything that is in the file
+            place = re.search(r", line \d{1,9}", sentence)
+            needed = ", ".join(labels_of({"t": "s", **states, **inputs}))
+            sentence = (
+                f"{path}{'' if place is None else place[0]}: it is not a recording of this trial. The columns or "
+                f"fields {needed} are needed, with a finite number for each time from 0 to {times[-1]:g} s."
+            )
+        raise InputError(sentence)
 
 
-def tell_result(campaign: Campaign, experiment: Experiment, trial: OpenTrial | int, told: ToldResult) -> Trial:
-    """Check and store the result of an open trial."""
-    recording = None
-    if told.recording is not None:
-        trial = trial if isinstance(trial, OpenTrial) else campaign.reopen(trial, ended=told.replace is not None)
-        recording = told.read(experiment, trial.plan)
-    return campaign.tell(
-        trial,
-        recording,
-        distance=told.distance,
-        failed=told.failed,
-        start_tolerance=told.start_tolerance,
-        replace=told.replace,
-    )
+def _require_finite(path: Path, recording: Trajectory, states: Names, inputs: Names) -> None:
+    """Refuse a complete recording with a number that is missing, infinite or a mark; the message says where."""
+    if recording.ended != COMPLETE:
+        return  # the reason why it ended is reported instead
+    advice = "If the execution has no usable recording, report it with --failed."
+    for names, values in ((list(states), recording.states), (list(inputs), recording.inputs)):
+        wrong = np.argwhere(~np.isfinite(values[:, : len(names)]))
+        if len(wrong):
+            row, column = wrong[0]
+            where = f"{names[column]} is {values[row, column]} at {recording.times[row]:g} s"
+            raise InputError(f"{path} is not finite: {where}. {advice}")
+        for name, column in zip(names, values.T, strict=False):
+            if marks := sentinels(column):
+                at = recording.times[int(np.argmax(column == marks[0]))]
+                raise InputError(
+                    f"{path}: {name} is {marks[0]:g} at {at:g} s, far from all other values, which stands "
+                    f"for a missing one. {advice}"
+                )
 
 
-def result_sentence(trial: Trial, units: str = "", start: StartOffset | None = None) -> str:
-    """Return the result of a trial that has ended, in one sentence without its full stop."""
-    if trial.state == "unmeasured":
-        return f"trial {trial.number} is stored without a distance: {trial.failure}"
-    if trial.distance is None:
-        return f"trial {trial.number} failed: {trial.failure}"
-    sentence = f"trial {trial.number} has the distance {trial.distance:.4g} {units}".rstrip()
-    return sentence if start is None or not start.size else f"{sentence}; its start was off by {start.text}"
-
-
-def parameters_of_trial(campaign: Campaign, number: int) -> Mapping[str, Any]:
-    """Return the parameters of the task of a trial."""
-    known = {trial.number: trial.parameters for trial in campaign.trials}
-    if number not in known:
-        raise InputError(f"there is no trial {number}; there are {len(known)}, numbered from 0.")
-    return known[number]
+def require_file(path: Path) -> None:
+    """Refuse a path that is not a readable file, with a clearer message than that of a reader."""
+    try:
+        is_file, is_folder = path.is_file(), path.is_dir()
+    except OSError as error:
+        raise InputError(f"{path} cannot be read: {error.strerror}.") from error
+    if not is_file:
+        raise InputError(f"{path} cannot be read: it is a folder." if is_folder else f"there is no file {path}.")

@@ -24,8 +24,7 @@ from ctxval.campaign.storage.store import Store
 from ctxval.certificates import PLANNED
 from ctxval.core.controller import converged_of
 from ctxval.core.distance import Distance
-from ctxval.core.plan import Plan
-from ctxval.core.preflight import StartOffset, start_offset, try_distance
+from ctxval.core.plan import Plan, StartOffset, start_offset, try_distance
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import CONVERGED, Origin, Trial
 from ctxval.core.validation import Validation
@@ -85,6 +84,12 @@ class TrialRecorder:
         begun = (trial for trial in self._trials if trial.state == "open" and trial.attempts)
         return next((trial for trial in begun if trial.number not in self._executing), None)
 
+    @property
+    def has_tasks(self) -> bool:
+        """Whether there is a task that may be executed; each task of a suite is executed once."""
+        remaining = remaining_tasks(self.validation, self._trials)
+        return remaining is None or len(remaining) > 0
+
     def trial(self, number: int, *, told: bool = False) -> Trial:
         """Return an open trial, or with ``told`` one whose result a person has told; refuse other trials."""
         if not 0 <= number < len(self._trials):
@@ -111,12 +116,6 @@ class TrialRecorder:
         if self.validation.space.members is not None:
             raise CertificateError("a suite of tasks has no independent draws: `ctxval run` executes each task once.")
         return self.draws.point(self._trials)
-
-    @property
-    def has_tasks(self) -> bool:
-        """Whether there is a task that may be executed; each task of a suite is executed once."""
-        remaining = remaining_tasks(self.validation, self._trials)
-        return remaining is None or len(remaining) > 0
 
     # Consistency with the store
 
@@ -158,7 +157,6 @@ class TrialRecorder:
         return changed
 
     def _redefine(self, validation: Validation, description: dict[str, Any]) -> None:
-        """Continue with another distance, after its values were stored."""
         self.validation, self.description, self._distance_tried = validation, description, False
         elsewhere = self.dynamics.elsewhere
         self.dynamics = CampaignDynamics(validation, self.store, self._seed, description)
@@ -170,26 +168,18 @@ class TrialRecorder:
 
     def open(self, choice: Choice) -> OpenTrial:
         """Store a new trial that people execute."""
-        return self._open([choice], attempts=0)[0]
+        return self.open_all([choice], attempts=0)[0]
 
     def start(self, chosen: Choice | Trial) -> OpenTrial:
         """Store that an execution starts: the first one of a new trial, or a repetition of an interrupted trial."""
         if isinstance(chosen, Choice):
-            return self._open([chosen], attempts=1)[0]
+            return self.open_all([chosen], attempts=1)[0]
         try:
             plan = self.plan(chosen)
         except CtxvalError as error:
             self.close(chosen, Execution(failed=text_of(error)), executed=False)
             raise
         return self.repeat(OpenTrial(chosen, plan))
-
-    def start_together(self, choices: Iterable[Choice]) -> list[OpenTrial]:
-        """Store in one transaction that the first executions of new trials start.
-
-        Each choice is made when the trials before it are known. If a task cannot be planned, the trials end before it;
-        if it is the first one, the error is raised.
-        """
-        return self._open(choices, attempts=1)
 
     def repeat(self, opened: OpenTrial) -> OpenTrial:
         """Store that another execution of an open trial starts."""
@@ -199,7 +189,12 @@ class TrialRecorder:
         self._executing.add(begun.number)
         return OpenTrial(begun, opened.plan)
 
-    def _open(self, choices: Iterable[Choice], attempts: int) -> list[OpenTrial]:
+    def open_all(self, choices: Iterable[Choice], attempts: int) -> list[OpenTrial]:
+        """Store new trials in one transaction, with the number of attempts that start at once.
+
+        Each choice is made when the trials before it are known. If a task cannot be planned, the trials end before it;
+        if it is the first one, the error is raised.
+        """
         opened, executing, unplanned = list[OpenTrial](), set(self._executing), False
         try:
             for choice in choices:
@@ -240,36 +235,39 @@ class TrialRecorder:
 
     def _next_trial(self, choice: Choice, attempts: int) -> Trial:
         """Return the trial of a choice, and tell the search that its point has no value yet."""
-        note = None
+        space, trials, note = self.validation.space, self._trials, None
         if not self.has_tasks and choice.parameters is None:
             raise InputError("each task of the suite is executed, or is being executed; state one to execute it again.")
-        if choice.unit_point is None and self.search.iid and self.validation.space.distribution is not None:
-            # The points of such a search are uniform, and the tasks are not.
-            choice = replace(choice, unit_point=self.draw(), origin="iid")
-        if choice.unit_point is None and self.search.iid and self.validation.space.members is not None:
-            choice = replace(choice, unit_point=self.draws.left(self._trials), origin="initial")
-        if choice.unit_point is None and (spread := self._proposals.spread(self._trials)) is not None:
-            choice = replace(choice, unit_point=spread, origin="initial")
         if choice.unit_point is None:
-            first = len(self._trials) < self.search.initial
+            if self.search.iid and space.distribution is not None:
+                # The points of such a search are uniform, and the tasks are not.
+                choice = replace(choice, unit_point=self.draw(), origin="iid")
+            elif self.search.iid and space.members is not None:
+                choice = replace(choice, unit_point=self.draws.left(trials), origin="initial")
+            elif (spread := self._proposals.spread(trials)) is not None:
+                choice = replace(choice, unit_point=spread, origin="initial")
+        if choice.unit_point is None:
+            first = len(trials) < self.search.initial
             origin: Origin = "iid" if self.search.iid else "initial" if first else "acquisition"
             if not isinstance(self.search, SequentialSearch):
                 self.replay()  # such a search may still know the point that it proposed, and not the rounded one
-            unit_point, note = self._proposals.next(self._trials, choice.rejected or 0)
+                trials = self._trials
+            unit_point, note = self._proposals.next(trials, choice.rejected or 0)
             note = {**(note or {}), **choice.note} if choice.note else note
         else:
             origin = choice.origin
-            unit_point, note = self._proposals.tested(choice, self._trials)
+            unit_point, note = self._proposals.tested(choice, trials)
             self.search.tell(unit_point[None], [np.nan])
         if origin == "iid" and choice.planned_draws is not None:
             note = {**(note or {}), PLANNED: choice.planned_draws}
-        if self.predicts and (predicted := self.dynamics.predict(self._trials, unit_point)) is not None:
+        if self.predicts and (predicted := self.dynamics.predict(trials, unit_point)) is not None:
             note = {**(note or {}), **self.dynamics.to_note(predicted)}
-        space, number = self.validation.space, len(self._trials)
         key = unit_point.tobytes()
-        same = (trial.parameters for trial in self._trials if trial.unit_point.tobytes() == key)
+        same = (trial.parameters for trial in trials if trial.unit_point.tobytes() == key)
         parameters = choice.parameters or next(same, None) or space.describe_point(space.from_unit(unit_point))
-        return Trial(number, origin, "open", unit_point, dict(parameters), attempts, note=note, because=choice.because)
+        return Trial(
+            *(len(trials), origin, "open", unit_point, dict(parameters), attempts), note=note, because=choice.because
+        )
 
     # Closing
 
@@ -359,11 +357,11 @@ class TrialRecorder:
     @contextmanager
     def not_executing(self, trial: Trial) -> Iterator[None]:
         """Refuse the result of a trial that a process is executing: that process records the result."""
-        refusal = (
+        refusal = InputError(
             f"trial {trial.number} is being executed: its result cannot be recorded before the execution has ended."
         )
         if trial.number in self._executing:
-            raise InputError(refusal)
+            raise refusal
         if not trial.attempts:
             yield  # a person opened it, and no process executes it
             return
@@ -371,6 +369,6 @@ class TrialRecorder:
             try:
                 stack.enter_context(self.store.sole_writer())
             except StoreAccessError as error:
-                raise InputError(refusal) from error
+                raise refusal from error
             self.refresh()
             yield

@@ -22,8 +22,7 @@ if TYPE_CHECKING:
 FALSE_ALARMS = 1e-3
 """Usual rate of false alarms: one in 1,000 executions."""
 
-_MOST = 24
-"""Certified executions that are predicted from the others, the latest ones: each is learned from anew."""
+_MOST = 24  # certified executions that are predicted from the others, the latest ones: each is learned from anew
 
 
 class Watch:
@@ -38,7 +37,6 @@ class Watch:
     Raises:
         CertificateError: if the campaign has too few executions with trajectories, or if nothing can be learned from
             them.
-        InputError: if a state belongs to another watch.
     """
 
     def __init__(
@@ -68,9 +66,10 @@ class Watch:
             raise CertificateError("the executions in the store cannot be predicted from each other.")
         self._states = list(names(learned.study, len(learned.posterior.data.sizes)))
         named = {name: [each[name] for each in known if name in each] for name in max(known, key=len)}
-        noise = self._statistics.has_noise
-        channels = tuple(_channel(name, of_runs, noise) for name, of_runs in named.items() if len(of_runs) >= FEWEST)
-        self.state = WatchState(threshold, false_alarms, channels)
+        channels = [
+            _channel(name, runs, self._statistics.has_noise) for name, runs in named.items() if len(runs) >= FEWEST
+        ]
+        self.state = WatchState(threshold, false_alarms, tuple(channels))
         if state is not None:
             if not _is_same_watch(state, self.state):
                 raise InputError("the state belongs to a watch of another campaign, threshold or rate of false alarms.")
@@ -93,36 +92,32 @@ class Watch:
             start_tolerance: replaces the start tolerance of the validation.
 
         Raises:
-            InputError: if the trajectory does not belong to the task.
-            ExecutionError: if it is not a complete execution of the task.
+            ExecutionError: if the trajectory is not a complete execution of the task.
         """
         execution = Execution(run) if isinstance(run, Trajectory) else run
-        trajectory, validation, study = execution.trajectory, self.campaign.validation, self._statistics.learned.study
-        name = str(len(self.state.runs) + 1) if name is None else name
+        trajectory, distance, validation = execution.trajectory, execution.distance, self.campaign.validation
         if trajectory is None:
             raise InputError(
                 "a watch needs the trajectory of an execution; a distance or a failure alone says nothing."
             )
-        point, distance = None, execution.distance
-        if parameters is not None:
+        point = None
+        if parameters is None:
+            self._require_states(trajectory)
+        else:
             place = validation.space.point(parameters)
             point = validation.space.to_unit(place)
             if distance is None:
                 distance = execution.measured(validation, validation.plan(place), start_tolerance).distance
-            extended = study.with_states(self._executed, point, trajectory)
+            extended = self._statistics.learned.study.with_states(self._executed, point, trajectory)
             if extended is None:
                 raise InputError("the states of the model cannot be estimated along the run.")
             trajectory = extended
-        else:
-            self._require_states(trajectory)
+        name = str(len(self.state.runs) + 1) if name is None else name
         statistics = self._statistics.later(trajectory, point, distance)
         if not all(0 < each.value < np.inf for each in statistics.values()):
             raise InputError(f"the run {name} has values that are missing, or too large for a comparison.")
-        self.state = self.state.after(
-            name,
-            {key: Statistic(each.value, each.gradient, each.information) for key, each in statistics.items()},
-            distance,
-        )
+        plain = {key: Statistic(each.value, each.gradient, each.information) for key, each in statistics.items()}
+        self.state = self.state.after(name, plain, distance)
         return self.state
 
     def again(self, count: int = 3) -> list[Trial]:
@@ -148,13 +143,13 @@ class Watch:
 
     def _require_states(self, trajectory: Trajectory) -> None:
         """Refuse a recording without a task that cannot be compared with predictions."""
-        validation, data = self.campaign.validation, self._statistics.learned.posterior.data
-        if self._statistics.learned.study.given.physical or validation.outputs is not None:
+        learned = self._statistics.learned
+        if learned.study.given.physical or self.campaign.validation.outputs is not None:
             raise InputError(
                 "a recording needs the parameters of its task: the learned dynamics depend on a task parameter, or "
                 "only outputs are recorded."
             )
-        wanted = len(data.sizes), data.inputs
+        wanted = len(learned.posterior.data.sizes), learned.posterior.data.inputs
         if (trajectory.states.shape[-1], trajectory.inputs.shape[-1]) != wanted or trajectory.ended != COMPLETE:
             raise InputError(
                 f"a recording must have {wanted[0]} states and {wanted[1]} inputs of complete runs, got "
@@ -175,12 +170,10 @@ def _channel(name: str, certified: Sequence[RunStatistic], has_noise: bool) -> C
 
 def _is_same_watch(state: WatchState, begun: WatchState) -> bool:
     """Return whether a state follows from the beginning of a watch, up to the rounding of another processor."""
-    pairs = list(zip(state.channels, begun.channels, strict=False))
-    same = all(
-        one.name == other.name
-        and len(one.certified) == len(other.certified)
-        and np.allclose(one.certified, other.certified, rtol=1e-4)
-        for one, other in pairs
+    settings = len(state.channels), state.threshold, state.false_alarms
+    return settings == (len(begun.channels), begun.threshold, begun.false_alarms) and all(
+        known.name == channel.name
+        and len(known.certified) == len(channel.certified)
+        and np.allclose(known.certified, channel.certified, rtol=1e-4)
+        for known, channel in zip(state.channels, begun.channels, strict=True)
     )
-    lengths = len(state.channels) == len(begun.channels)
-    return same and lengths and (state.threshold, state.false_alarms) == (begun.threshold, begun.false_alarms)

@@ -20,8 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from ctxval._util.cores import can_fork, forking
-from ctxval._util.interrupts import allow_exits, exits_as_exceptions, raised_by_signal
+from ctxval._util.cores import allow_exits, can_fork, exits_as_exceptions, forking, raised_by_signal
 from ctxval._util.progress import mute
 from ctxval._util.texts import reason_of
 from ctxval.campaign.choices import Execution
@@ -32,17 +31,13 @@ from ctxval.core.task import Task
 from ctxval.core.trajectory import COMPLETE, Trajectory
 from ctxval.errors import CampaignError, InputError
 
-_GRACE_PERIOD = 2.0
-"""Seconds that a worker has to clean up before it is killed."""
+_GRACE_PERIOD = 2.0  # seconds that a worker has to clean up before it is killed
 
 AHEAD = 0.5
 """Seconds of work that is begun before its turn, if its choice depends on no result; Ctrl-C waits for it."""
 
-_BATCH = 128
-"""Largest number of tasks that are executed in one call."""
-
-_TERMINATED = 143
-"""Exit status of a worker that ended after SIGTERM, as in shells."""
+_BATCH = 128  # largest number of tasks that are executed in one call
+_TERMINATED = 143  # exit status of a worker that ended after SIGTERM, as in shells
 
 
 def execute_task(system: System, controller: Controller, task: Task) -> Execution:
@@ -99,7 +94,7 @@ class WorkerPool(ABC):
 
     @abstractmethod
     def wait(self) -> list[tuple[int, Execution]]:
-        """Wait for the next execution that ends; return the numbers and results of all trials that have ended."""
+        """Wait for the next execution that ends or takes too long; return the numbers and results of all that ended."""
 
     @abstractmethod
     def close(self) -> None:
@@ -119,16 +114,13 @@ class SerialPool(WorkerPool):
 
     @property
     def ahead(self) -> int:
-        """The number of further plans that are executed in one call with the next one: half a second of work."""
         exact = getattr(self.system, "exact_batches", False)
         return min(_BATCH - 1, int(AHEAD / max(self._seconds, 1e-9))) if exact else 0
 
     def start(self, number: int, plan: Plan) -> None:
-        """Take a plan, which :meth:`wait` executes."""
         self._next.append((number, plan))
 
     def wait(self) -> list[tuple[int, Execution]]:
-        """Execute the plans; return the numbers of their trials, and what the executions gave."""
         taken, self._next = self._next, []
         started = time.perf_counter()
         together = _executed_batch(self.system, [plan for _, plan in taken])
@@ -146,12 +138,9 @@ class SerialPool(WorkerPool):
         """Do nothing: no execution is running any more."""
 
 
-# Processes of this computer
-
-
 @dataclass(eq=False)
 class _Worker:
-    """A process, the number of the trial that it executes, None if it is free, and the start time of the execution."""
+    """A process, and the number of the trial that it has executed since a time; None if it is free."""
 
     process: Any
     pipe: Connection
@@ -177,13 +166,11 @@ class ProcessPool(WorkerPool):
         self._workers: list[_Worker] = []
 
     def start(self, number: int, plan: Plan) -> None:
-        """Start the execution of a trial on a free worker."""
         free = (worker for worker in self._workers if worker.number is None)
         worker = next(free, None) or self._start_worker()
         try:
             message = pickle.dumps((plan.controller, plan.task))
-        except Exception as error:
-            # A user's object may raise any exception.
+        except Exception as error:  # a user's object may raise any exception
             raise InputError(
                 f"the controller cannot be sent to a worker: {reason_of(error)}; a policy must be a function of a "
                 "module, not a lambda or a function in a function."
@@ -211,7 +198,6 @@ class ProcessPool(WorkerPool):
         return worker
 
     def wait(self) -> list[tuple[int, Execution]]:
-        """Wait for the next execution that ends, or that takes too long."""
         while True:
             busy = [worker for worker in self._workers if worker.number is not None]
             remaining = None
@@ -219,21 +205,26 @@ class ProcessPool(WorkerPool):
                 remaining = max(0.0, min(worker.started for worker in busy) + self.timeout - time.monotonic())
             ready = wait_for([worker.pipe for worker in busy], remaining)
             if ready:
-                return [self._received(worker) for worker in busy if worker.pipe in ready]
+                return [(worker.release(), self._received(worker)) for worker in busy if worker.pipe in ready]
             for worker in busy:
                 elapsed = time.monotonic() - worker.started
                 if self.timeout is not None and elapsed >= self.timeout:
                     self._stop([worker])
                     return [(worker.release(), timed_out(self.timeout, elapsed))]
 
-    def _received(self, worker: _Worker) -> tuple[int, Execution]:
-        number = worker.release()
+    def _received(self, worker: _Worker) -> Execution:
+        """Return what an execution gave: if its process has ended, a failure if the system ended it, else a loss."""
         try:
             execution: Execution = pickle.loads(worker.pipe.recv_bytes())
+            return execution
         except (EOFError, OSError, pickle.UnpicklingError):
             self._stop([worker])
-            return number, _result_of_exit(worker.process.exitcode)
-        return number, execution
+        status = worker.process.exitcode
+        if status is None:
+            return Execution(lost="the worker ended for no known reason")
+        if status < 0 or status == _TERMINATED:
+            return Execution(lost=f"the worker ended by signal {-status if status < 0 else signal.SIGTERM:d}")
+        return Execution(failed=f"the system ended its process with status {status}")
 
     def _stop(self, workers: Sequence[_Worker]) -> None:
         """End workers, with some time to clean up, because they must end the process of a command too."""
@@ -248,7 +239,6 @@ class ProcessPool(WorkerPool):
             self._workers.remove(worker)
 
     def close(self) -> None:
-        """End all workers and their executions at once."""
         self._stop(list(self._workers))
 
 
@@ -276,15 +266,6 @@ def _run_worker(system: System, pipe: Connection, others: list[Connection], pare
             pipe.send_bytes(pickle.dumps(execution))
     finally:
         _leave_once()
-
-
-def _result_of_exit(status: int | None) -> Execution:
-    """Return what an execution gave whose process has ended: it failed if the system ended it, else it is lost."""
-    if status is None:
-        return Execution(lost="the worker ended for no known reason")
-    if status < 0 or status == _TERMINATED:
-        return Execution(lost=f"the worker ended by signal {-status if status < 0 else signal.SIGTERM:d}")
-    return Execution(failed=f"the system ended its process with status {status}")
 
 
 _leaving = False

@@ -60,14 +60,7 @@ class AnytimeAudit(CertificateKind):
 
 @checked
 def certify_anytime(sample: Sample, threshold: PositiveFloat, confidence: Probability = 0.95) -> Certificate:
-    """Bound the volume of the tasks above a threshold that was fixed before the draws were known.
-
-    Only independent draws count, in their order. One without a distance counts as a violation, so that failures cannot
-    help.
-
-    Raises:
-        CertificateError: if there is no independent draw.
-    """
+    """Bound the volume above a threshold, fixed before the draws were known; a draw without a distance violates it."""
     drawn = sample.only("iid")
     if not len(drawn):
         raise CertificateError("an anytime audit needs independent draws of tasks, and there is none; use --audit N.")
@@ -105,24 +98,18 @@ def anytime_volume(violating: Mask, beta: float) -> float:
 
     The true volume is rejected at any time with probability at most beta.
     """
-    counts = np.cumsum(violating)
+
+    def excess(volume: float, n: int, violations: int) -> float:
+        return float(log_e_value(n, violations, np.array(volume)) + np.log(beta))
+
+    least, high, counts = 1.0, 1 - 1e-9, np.cumsum(violating)
     # Between violations more draws only lower the volume, so that the last moment before each of them is enough.
-    ends = np.flatnonzero(np.append(violating[1:], True))
-    return min((_rejected_from(end + 1, int(counts[end]), beta) for end in ends.tolist()), default=1.0)
-
-
-def _rejected_from(n: int, violations: int, beta: float) -> float:
-    """Return the volume from which on n draws with so many violations reject; 1 if they reject none."""
-    target = -np.log(beta)
-
-    def excess(volume: float) -> float:
-        return float(log_e_value(n, violations, np.array(volume)) - target)
-
-    low, high = max(violations / n, 1e-12), 1 - 1e-9
-    if violations == n or excess(high) < 0:
-        return 1.0
-    root: float = brentq(excess, low, high, xtol=1e-12)
-    return min(1.0, root * (1 + 1e-9))
+    for end in np.flatnonzero(np.append(violating[1:], True)).tolist():
+        n, violations = end + 1, int(counts[end])
+        if violations < n and excess(high, n, violations) >= 0:
+            root = brentq(excess, max(violations / n, 1e-12), high, args=(n, violations), xtol=1e-12)
+            least = min(least, root * (1 + 1e-9))
+    return least
 
 
 def log_e_value(n: int, violations: int, volume: Array) -> Array:

@@ -10,7 +10,7 @@ import numpy as np
 
 from ctxval._util.checked import NonNegativeInt, PositiveFloat, Probability
 from ctxval._util.registry import part
-from ctxval.certificates.base import Certificate, CertificateKind
+from ctxval.certificates.base import Certificate, CertificateKind, certified
 from ctxval.certificates.covering import RESOLUTION
 from ctxval.certificates.dynamics import Dynamics
 from ctxval.certificates.dynamics_diagnostics import FEWEST
@@ -58,36 +58,30 @@ class Automatic(CertificateKind):
         """The posterior bound with these options."""
         return Posterior(self.stochastic, self.resolution)
 
-    def uses_dynamics(self, sample: Sample) -> bool:
-        """Return whether the dynamics bound can be tried. A resolution of one's own asks for the posterior bound."""
-        usual = not self.stochastic and self.resolution == RESOLUTION
-        return usual and sample.learned is not None and len(sample) >= FEWEST and not sample.failed
-
     def certify(self, sample: Sample, confidence: float = 0.95) -> Certificate:
         """Return the dynamics bound or, if it is withdrawn or refused, the posterior bound."""
-        return self._first(sample, None, confidence)[0]
+        return self.certify_against(sample, None, confidence)[0]
 
-    def certify_against(
-        self, sample: Sample, threshold: float, confidence: float = 0.95
-    ) -> tuple[Certificate, Forecast | None]:
+    def certify_against(self, sample: Sample, threshold: float | None, confidence: float = 0.95) -> _Outcome:
         """Return the first certificate that keeps the threshold, or else the one that is nearer to a decision."""
-        return self._first(sample, threshold, confidence)
-
-    def _first(self, sample: Sample, threshold: float | None, confidence: float) -> _Outcome:
-        if sample.suite is not None and (not sample.not_executed or not self.uses_dynamics(sample)):
-            return _certified(WholeSuite(), sample, threshold, confidence)
+        # A resolution of one's own asks for the posterior bound.
+        usual = not self.stochastic and self.resolution == RESOLUTION and sample.learned is not None
+        uses_dynamics = usual and len(sample) >= FEWEST and not sample.failed
+        if sample.suite is not None and (not sample.not_executed or not uses_dynamics):
+            return certified(WholeSuite(), sample, threshold, confidence)
         by_dynamics = None
-        if self.uses_dynamics(sample):
+        if uses_dynamics:
             with suppress(CertificateError):
-                by_dynamics = _certified(
-                    Dynamics(tests=self.tests, quantile=self.quantile), sample, threshold, confidence
-                )
-        if by_dynamics is not None and (_decides(by_dynamics[0], threshold) or _is_noisy(by_dynamics[0])):
-            return by_dynamics  # the posterior bound of the distance is about systems without noise
+                dynamics = Dynamics(tests=self.tests, quantile=self.quantile)
+                by_dynamics = certified(dynamics, sample, threshold, confidence)
+        if by_dynamics is not None:
+            is_noisy = by_dynamics[0].details.get("quantile") is not None
+            if is_noisy or _decides(by_dynamics[0], threshold):
+                return by_dynamics  # the posterior bound of the distance is about systems without noise
         if sample.suite is not None:
-            return by_dynamics or _certified(WholeSuite(), sample, threshold, confidence)
+            return by_dynamics or certified(WholeSuite(), sample, threshold, confidence)
         try:
-            by_distance = self._tested(_certified(self.posterior, sample, threshold, confidence), sample)
+            by_distance = self._tested(certified(self.posterior, sample, threshold, confidence), sample)
         except CertificateError:
             if by_dynamics is None:
                 raise
@@ -103,41 +97,27 @@ class Automatic(CertificateKind):
 
     def missing_tests(self, sample: Sample) -> int:
         """Return the number of executions after which the posterior bound has seen tasks of the whole space."""
-        known = np.isfinite(sample.distances)
-        drawn = sum(origin in DRAWN for origin, is_known in zip(sample.origins, known, strict=True) if is_known)
-        return max(self.tests - drawn, 0)
+        drawn = [origin in DRAWN for origin in sample.origins]
+        return max(self.tests - int((np.isfinite(sample.distances) & drawn).sum()), 0)
 
     def _tested(self, outcome: _Outcome, sample: Sample) -> _Outcome:
-        """Return the posterior bound, withdrawn if tasks of the whole space have not been executed."""
-        certificate, expected = outcome
+        (certificate, expected), dimension = outcome, sample.points.shape[1]
         origins = [origin for origin in sample.origins if self.tests and origin in DRAWN]
-        dimension = sample.points.shape[1]
         shown = shown_by_tests(origins, dimension, certificate.confidence, uniform=sample.is_uniform)
-        tests = {**shown, "largest_error": None}
         doubt, missing = certificate.doubt, self.missing_tests(sample)
         if doubt is None and missing:
             doubt = (
                 f"at least {missing} more {'task' if missing == 1 else 'tasks'} drawn over the whole task space must "
                 "be executed (`ctxval run` executes them; --tests 0 leaves them out)"
             )
-        return replace(certificate, details={**certificate.details, "tests": tests}, doubt=doubt), expected
-
-
-def _certified(kind: CertificateKind, sample: Sample, threshold: float | None, confidence: float) -> _Outcome:
-    if threshold is None:
-        return kind.certify(sample, confidence), None
-    return kind.certify_against(sample, threshold, confidence)
+        tests = {"tests": {**shown, "largest_error": None}}
+        return replace(certificate, details={**certificate.details, **tests}, doubt=doubt), expected
 
 
 def _decides(certificate: Certificate, threshold: float | None) -> bool:
-    """Return whether a certificate keeps a threshold; if there is none, whether it is sound."""
     return _is_sound(certificate) if threshold is None else certificate.covers(threshold)
 
 
 def _is_sound(certificate: Certificate) -> bool:
     """Return whether a certificate is not withdrawn, and no prediction failed that raises its bound."""
     return certificate.doubt is None and certificate.details.get("raised_from") is None
-
-
-def _is_noisy(certificate: Certificate) -> bool:
-    return certificate.details.get("quantile") is not None

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields, replace
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import asdict, dataclass, field, fields
 from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeVar
 
 from ctxval._util.registry import Registry
@@ -58,14 +58,9 @@ class Certificate:
     def covers(self, threshold: float, volume: float = 0.0) -> bool:
         """Return whether it bounds the distance by the threshold, except on at most this share of the task space.
 
-        A withdrawn certificate covers nothing. A bound that is computed from random draws must stay below the
-        threshold by two of its standard errors.
+        A bound that is computed from random draws must stay below the threshold by two of its standard errors.
         """
         return self.doubt is None and self.volume <= volume and self.upper_bound + ERRORS * self.error <= threshold
-
-    def with_remarks(self, remarks: Sequence[str]) -> Certificate:
-        """Return the certificate with more assumptions, such as changes of the system that the user has accepted."""
-        return replace(self, assumptions=(*self.assumptions, *remarks))
 
     def to_json(self) -> dict[str, Any]:
         """Return all attributes, ready for JSON."""
@@ -78,17 +73,16 @@ class Certificate:
         return {**shown, "trials": self.trials, "version": self.version}
 
     def __str__(self) -> str:
-        # Further lines of a text are indented, so that none looks like a line of the certificate.
-        return "\n".join(text.replace("\r\n", "\n").replace("\n", "\n  ") for text in self._lines())
-
-    def _lines(self) -> Iterator[str]:
-        yield f"{self.kind}: {self.statement}"
-        if self.doubt is not None:
-            yield f"withdrawn: {self.doubt}."
-        yield "It assumes that"
-        yield from (f"- {assumption};" for assumption in self.assumptions)
         width = max(map(len, self.numbers))
-        yield from (f"{name.replace('_', ' '):{width}}  {as_text(value)}" for name, value in self.numbers.items())
+        texts = [
+            f"{self.kind}: {self.statement}",
+            *([] if self.doubt is None else [f"withdrawn: {self.doubt}."]),
+            "It assumes that",
+            *(f"- {assumption};" for assumption in self.assumptions),
+            *(f"{name.replace('_', ' '):{width}}  {as_text(value)}" for name, value in self.numbers.items()),
+        ]
+        # Further lines of a text are indented, so that none looks like a line of the certificate.
+        return "\n".join(text.replace("\r\n", "\n").replace("\n", "\n  ") for text in texts)
 
     def __repr__(self) -> str:
         bound, volume = Shown(with_error(self.upper_bound, self.error)), Shown(at_most(self.volume, 3))
@@ -115,9 +109,8 @@ class Certificate:
 class CertificateKind(ShortRepr, ABC):
     """A kind of certificate. Its fields are its options: its inputs besides the trials and the confidence.
 
-    A kind is a frozen dataclass with a name and a method that computes a certificate from trials. The defaults of all
-    else suit a bound on d* that is computed from the distances alone. If a kind uses what the experiment's model
-    predicts, it sets ``needs_model`` and reads :attr:`Sample.learned`.
+    The defaults suit a bound on d* that is computed from the distances alone. If a kind uses what the experiment's
+    model predicts, it sets ``needs_model`` and reads :attr:`Sample.learned`.
     """
 
     name: ClassVar[str]
@@ -136,8 +129,8 @@ class CertificateKind(ShortRepr, ABC):
     """Whether it uses what the experiment's model predicts, so that the experiment must be loaded."""
 
     sorts_draws: ClassVar[bool] = False
-    """Whether it sorts out independent draws whose number depended on results; else these are no draws in its sample.
-    """
+    """Whether its sample has all independent draws; else only those whose number did not depend on results, and the
+    others are like trials of a search."""
 
     takes_suites: ClassVar[bool] = False
     """Whether it certifies suites of tasks, of which each is executed once and none is drawn at random."""
@@ -145,30 +138,22 @@ class CertificateKind(ShortRepr, ABC):
     @classmethod
     def options(cls) -> tuple[str, ...]:
         """Return the names of its options: its fields, and ``volume`` if it validates but for a share of the tasks."""
-        names = tuple(option.name for option in fields(cls))
-        return names if cls.bounds_maximum else (*names, "volume")
+        return (*(option.name for option in fields(cls)), *(() if cls.bounds_maximum else ("volume",)))
 
     @classmethod
     def of(cls, stated: Mapping[str, Any]) -> Self:
         """Return an instance from those of the options that are its own; an option that is None keeps its default."""
-        names = [option.name for option in fields(cls)]
-        return cls(**{name: stated[name] for name in names if stated.get(name) is not None})
+        known = ((option.name, stated.get(option.name)) for option in fields(cls))
+        return cls(**{name: value for name, value in known if value is not None})
 
     @abstractmethod
     def certify(self, sample: Sample, confidence: float = 0.95) -> Certificate:
-        """Return the certificate of trials, whose statement must hold with the confidence.
-
-        Raises:
-            CertificateError: if its theory does not allow these trials, or an option that it needs is missing.
-        """
+        """Return the certificate of trials; a CertificateError if they or the options do not allow one."""
 
     def certify_against(
         self, sample: Sample, threshold: float, confidence: float = 0.95
     ) -> tuple[Certificate, Forecast | None]:
-        """Return a certificate that is precise enough for a threshold, and a forecast of further executions.
-
-        The forecast is None if the certificate keeps the threshold, or if nothing can be predicted.
-        """
+        """Return a certificate that is precise enough for a threshold, and a forecast of executions if there is one."""
         return self.certify(sample, confidence), None
 
     def require_audit_helps(self, origins: Iterable[Origin]) -> None:
@@ -179,10 +164,7 @@ class CertificateKind(ShortRepr, ABC):
 
     @classmethod
     def rests_on(cls, certificate: Certificate, space: TaskSpace | None = None) -> list[str]:
-        """Return what a validation by a certificate rests on: each entry completes a sentence "It rests on ...".
-
-        The task space states lengths in its units; it is None if it is not known.
-        """
+        """Return what a validation rests on, each as the end of "It rests on ..."; the space gives units."""
         return sentences.conditions(certificate, space)
 
 
@@ -200,7 +182,7 @@ class KindRegistry(Registry[CertificateKind]):
         self._registered: dict[str, type[CertificateKind]] = {}
 
     def register(self, kind: Kind) -> Kind:
-        """Add a kind; it is used as a decorator of the class."""
+        """Add a kind; a decorator of its class."""
         name = _required(kind).name
         known = self.find(name) if name in self.built_in else self._registered.get(name, kind)
         if (known.__module__, known.__qualname__) != (kind.__module__, kind.__qualname__):
@@ -218,7 +200,7 @@ class KindRegistry(Registry[CertificateKind]):
 
     @property
     def imported(self) -> tuple[str, ...]:
-        """The names of the kinds that are imported: built-in and registered ones."""
+        """The names of built-in and registered kinds."""
         return (*self.built_in, *self._registered)
 
     def of(self, certificate: Certificate) -> type[CertificateKind]:
@@ -236,13 +218,22 @@ class KindRegistry(Registry[CertificateKind]):
         return iter(dict.fromkeys((*self.imported, *self.installed)))
 
     def __len__(self) -> int:
-        return len(list(iter(self)))
+        return sum(1 for _ in self)
 
 
 def _required(kind: Any) -> type[CertificateKind]:
     if isinstance(kind, type) and issubclass(kind, CertificateKind) and isinstance(getattr(kind, "name", None), str):
         return kind
     raise InputError(f"a kind of certificate must be a subclass of CertificateKind with a name, got {kind!r}.")
+
+
+def certified(
+    kind: CertificateKind, sample: Sample, threshold: float | None, confidence: float
+) -> tuple[Certificate, Forecast | None]:
+    """Return a certificate, precise enough for a threshold if there is one, and a forecast."""
+    if threshold is None:
+        return kind.certify(sample, confidence), None
+    return kind.certify_against(sample, threshold, confidence)
 
 
 KINDS = KindRegistry()

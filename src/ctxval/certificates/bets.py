@@ -67,16 +67,13 @@ def _prediction(trial: Trial) -> dict[str, object]:
 
 
 def _predicted_chance(trial: Trial, threshold: float) -> float:
-    """Return the probability of an excess that was predicted before an execution."""
     stored = _prediction(trial)
-    noise = stored.get("noise")
     try:
-        if isinstance(noise, dict):
+        if isinstance(noise := stored.get("noise"), dict):
             quantiles = [np.inf if each is None else float(each) for each in noise["distances"]]
             return chance_of_more(quantiles, threshold, int(noise["runs"]))
-        listed = stored.get("quantiles")
-        if isinstance(listed, list):
+        if isinstance(listed := stored.get("quantiles"), list):
             return float(np.mean([each is None or float(each) > threshold for each in listed]))
-    except (KeyError, TypeError, ValueError):
+    except (KeyError, TypeError, ValueError):  # the note of a store
         pass
     return _UNKNOWN

@@ -59,7 +59,6 @@ class KnownStatistics:
     freedom: float | None
 
     def _log_evidence(self) -> Array:
-        """Return the logarithm of the evidence of each m, ``(..., m)``."""
         a, K, k = 0.5 * _FREEDOMS, self.count, 0.0
         prior = np.zeros(len(a))
         if self.freedom is not None:
@@ -122,13 +121,11 @@ class ScaleBets:
         )
 
     def _with_start(self, known: KnownStatistics) -> KnownStatistics:
-        """Return what is known for each start, with a start at the next run."""
         sums, logs = _appended(known.sums, self.base.sums), _appended(known.logs, self.base.logs)
         return KnownStatistics(sums, logs, self.base.count, self.base.freedom)
 
 
 def _appended(array: Array, value: float | Array) -> Array:
-    """Return an array ``(c, j)`` of the latest starts with a column of one value."""
     return np.concatenate([array, np.full((len(array), 1), value)], axis=1)[:, -_WINDOW:]
 
 

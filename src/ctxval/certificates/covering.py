@@ -28,18 +28,12 @@ def resolved_volume(resolution: float, dimension: int) -> float:
 
 
 def farthest_task(X: Array) -> float:
-    """Return the largest distance from a point of the cube to its nearest row of X ``(n, d)``, in diagonals.
-
-    It is computed on many random points and corners.
-    """
+    """Return the largest distance from points of the cube to the nearest row of X ``(n, d)``, in diagonals."""
     return float(_gaps(X, _probes(X.shape[1])).max())
 
 
 def bare_corners(X: Array, resolution: float) -> Array:
-    """Return the corners ``(k, d)`` of the cube that no trial is at or next to; none if d > 4, as there are 2^d.
-
-    "Next to" is an eighth of the resolution, in diagonals; if that is 1 or more, no corner is returned.
-    """
+    """Return the corners ``(k, d)`` of the cube that no trial is at or next to; none if d > 4, as there are 2^d."""
     d = X.shape[1]
     if d > 4 or resolution >= 1:
         return np.empty((0, d))
@@ -50,8 +44,8 @@ def bare_corners(X: Array, resolution: float) -> Array:
 def covering(X: Array, resolution: float, most: int) -> Array | None:
     """Return points ``(k, d)`` whose execution would cover the task space; None if more than ``most`` are needed.
 
-    The corners without a trial come first. Each further point is the task that is farthest from the trials ``(n, d)``
-    and the points before it, until all tasks are within the resolution, in diagonals.
+    The corners without a trial come first. Each further point is the task that is farthest from all others, until all
+    tasks are within the resolution, in diagonals.
     """
     probes = _probes(X.shape[1])
     points: list[Array] = list(bare_corners(X, resolution))
@@ -67,10 +61,7 @@ def covering(X: Array, resolution: float, most: int) -> Array | None:
 
 
 def most_contested(points: Array, X: Array, resolution: float) -> Array | None:
-    """Return the point that is near many others and far from every trial; None if each of them is next to a trial.
-
-    The points ``(k, d)`` are maximisers of the largest draws of d*; the resolution is in diagonals.
-    """
+    """Return which of the points ``(k, d)`` is near many others and far from every trial; None if none is."""
     gaps = _gaps(X, points)
     near = (cdist(points, points) / np.sqrt(X.shape[1]) <= resolution / 2).sum(axis=1)
     best = int((gaps * near).argmax())

@@ -54,18 +54,12 @@ class PairedDifferences:
     @property
     def corrected(self) -> Array:
         """The differences X_i with the prediction as control variate, shape ``(N,)``."""
-        return np.asarray(self.values - self._weights * self.predicted)
-
-    @property
-    def _weights(self) -> Array:
-        """The slope of differences against predictions among the recent earlier tasks, from 0 to 1, ``(N,)``."""
-        return _weights_so_far(self.values, self.predicted)
+        return np.asarray(self.values - _weights_so_far(self.values, self.predicted) * self.predicted)
 
     def log_wealth(self, mean: Array, *, above: bool) -> Array:
-        """Return the logarithm of the largest wealth so far, of bets that the mean is not the given one ``(...)``.
+        """Return the logarithm of the largest wealth so far, of bets that the true mean is above or below ``(...)``.
 
-        The bets are that the true mean is above, or else below. The shape is ``(..., N)``; it never decreases along
-        the last axis.
+        The shape is ``(..., N)``; it never decreases along the last axis.
         """
         sign = 1.0 if above else -1.0
         against = sign * np.asarray(mean, dtype=np.float64)[..., None]
@@ -73,11 +67,11 @@ class PairedDifferences:
             # Predictions improve from task to task; without any, all earlier tasks show the scale.
             wealth = _by_symmetry(sign * self.corrected - against, recent=bool(np.any(self.predicted)))
         else:
-            centred = self._weights * self.predicted
+            weights = _weights_so_far(self.values, self.predicted)
             plain = _by_bound(sign * self.values, against, -self.most * np.ones(len(self.values)), self.most)
             # The prediction minus its mean lies within +- 2 most, whatever the mean is.
-            lowest = -self.most * (1 + 2 * self._weights)
-            powered = _by_bound(sign * (self.values - centred), against, lowest, self.most)
+            lowest = -self.most * (1 + 2 * weights)
+            powered = _by_bound(sign * (self.values - weights * self.predicted), against, lowest, self.most)
             wealth = np.logaddexp(plain, powered) - np.log(2)
         return np.asarray(np.maximum.accumulate(np.maximum(wealth, 0.0), axis=-1))
 
@@ -106,10 +100,7 @@ class MeanDifference:
 
 
 def mean_difference(differences: PairedDifferences, beta: float) -> MeanDifference:
-    """Return the expected difference, with an interval and a decision that hold together at all numbers of tasks.
-
-    They are ever wrong with probability beta.
-    """
+    """Return the expected difference; its interval and decision are ever wrong with probability beta."""
     count = len(differences.values)
     if not count:
         return MeanDifference(None, -np.inf, np.inf, 0, None, 0, None)
@@ -118,30 +109,21 @@ def mean_difference(differences: PairedDifferences, beta: float) -> MeanDifferen
     crossed = [int(rows[0]) + 1 if len(rows) else None for rows in reached]
     after = min((count for count in crossed if count is not None), default=None)
     sign = 0 if after is None else -1 if crossed[1] == after else 1
-    centre = _centre(corrected)
+    # Each difference counts by the inverse size of the earlier deviations.
+    middle = np.concatenate([[corrected[0]], (np.cumsum(corrected) / np.arange(1, count + 1))[:-1]])
+    size = _recent_size(corrected - middle)
+    weights = np.where(np.isfinite(size) & (size > 0), 1 / np.where(size > 0, size, 1.0), 0.0)
+    weights[:2] = 0.0  # nothing is known of the deviations yet
+    centre = float(np.average(corrected, weights=weights) if weights.any() else corrected.mean())
     low, high = (_end(differences, centre, level, above=above) for above in (True, False))
     spread = float(differences.values.var())
-    recent = corrected[count // 2 :]
-    left = min(1.0, float(recent.var()) / spread) if count > _FEW and spread > 0 else None
+    left = min(1.0, float(corrected[count // 2 :].var()) / spread) if count > _FEW and spread > 0 else None
     estimate = float(np.clip(centre, low, high))
     return MeanDifference(estimate, low, high, sign, after, count, left)
 
 
-def _centre(corrected: Array) -> float:
-    """Return the mean of the corrected differences, each weighted by the inverse size of the earlier deviations."""
-    middle = np.concatenate([[corrected[0]], (np.cumsum(corrected) / np.arange(1, len(corrected) + 1))[:-1]])
-    size = _recent_size(corrected - middle)
-    weights = np.where(np.isfinite(size) & (size > 0), 1 / np.where(size > 0, size, 1.0), 0.0)
-    weights[:2] = 0.0  # nothing is known of the deviations yet
-    return float(np.average(corrected, weights=weights) if weights.any() else corrected.mean())
-
-
 def _by_symmetry(centred: Array, *, recent: bool) -> Array:
-    """Return the log wealth of bets on values that are symmetric about 0 or lower, ``(..., N)``.
-
-    A bet is measured in root mean squares of the earlier values, or of the recent ones among them. The first value only
-    sets this scale.
-    """
+    """Return the log wealth of bets on values that are symmetric about 0 or lower; the first sets the scale."""
     before = np.arange(centred.shape[-1])
     with np.errstate(invalid="ignore", divide="ignore"):
         of_all = np.sqrt((np.cumsum(centred**2, axis=-1) - centred**2) / before)
@@ -152,10 +134,7 @@ def _by_symmetry(centred: Array, *, recent: bool) -> Array:
 
 
 def _recent_sum(values: Array) -> Array:
-    """Return for each task the sum over the later half of the earlier tasks, ``(..., N)``; over all if they are few.
-
-    Predictions improve from task to task, so the latest tasks show best what the next one will be like.
-    """
+    """Return for each task the sum over the later half of the earlier tasks, ``(..., N)``; over all if they are few."""
     ends = np.arange(values.shape[-1])
     starts = np.where(ends >= _FEW, ends // 2, 0)
     sums = np.concatenate([np.zeros((*values.shape[:-1], 1)), np.cumsum(values, axis=-1)], axis=-1)
@@ -190,10 +169,7 @@ def _by_bound(values: Array, mean: Array, lowest: Array, most: float) -> Array:
 
 
 def _log_wealth_of_bets(gains: Array, wanted: Array, room: Array) -> Array:
-    """Return the logarithm of the wealth after each draw, of bets on values that are bounded on one side, ``(..., N)``.
-
-    A bet of 1 gains ``gains`` with each draw and can lose ``room`` at most, which limits the bets that are wanted.
-    """
+    """Return the log wealth of bets that win ``gains`` with each draw and can lose ``room`` at most, ``(..., N)``."""
     # A bet is at most 3/4 of that with which one draw could lose everything; without room no draw can lose.
     won = np.minimum(wanted, 0.75 / np.maximum(room, 1e-300)) * gains
     return np.asarray(np.cumsum(np.log1p(np.maximum(won, -0.75)), axis=-1))

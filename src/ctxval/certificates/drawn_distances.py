@@ -8,8 +8,7 @@ import numpy as np
 
 from ctxval._util.arrays import Array, Mask
 from ctxval._util.representation import ShortRepr
-from ctxval.certificates.bounds import rank_of
-from ctxval.errors import CertificateError
+from ctxval.certificates.bounds import rank_within
 
 FLOOR = 0.005  # least spread, as a share of the threshold
 LARGEST = 2.0  # multiple of the threshold up to which bounds are told apart
@@ -38,32 +37,20 @@ class DrawnDistances(ShortRepr):
     @property
     def mean(self) -> Array:
         """The means over the draws ``(K,)``; infinity if a distance is not known."""
-        return np.where(self.known, self._finite.mean(axis=0), np.inf)
+        return np.where(self.known, np.where(self.known, self.draws, 0.0).mean(axis=0), np.inf)
 
     def spread(self, threshold: float) -> Array:
         """Return the standard deviations over the draws ``(K,)``, at least a share of the threshold."""
-        return np.asarray(np.maximum(self._finite.std(axis=0), FLOOR * threshold))
-
-    @property
-    def _finite(self) -> Array:
-        return np.where(self.known, self.draws, 0.0)
+        return np.asarray(np.maximum(np.where(self.known, self.draws, 0.0).std(axis=0), FLOOR * threshold))
 
     def factor(self, threshold: float, confidence: float) -> float:
-        """Return k: the order statistic of the largest standardised excesses of the draws; at least 1.
+        """Return k: the order statistic of the largest standardised excesses of the draws.
 
-        At least 1, because nothing is claimed to be known better than the least spread.
-
-        Raises:
-            CertificateError: if the confidence is too high for the number of draws.
+        It is at least 1, because nothing is claimed to be known better than the least spread.
         """
         known, spread = self.known, self.spread(threshold)
         excess = ((self.draws - self.mean)[:, known] / spread[known]).max(axis=1, initial=0.0)
-        rank = rank_of(confidence, len(excess))
-        if rank > len(excess):
-            raise CertificateError(
-                f"a confidence of {confidence:g} needs more than {len(excess)} posterior samples of the dynamics."
-            )
-        return max(1.0, float(np.sort(excess)[rank - 1]))
+        return max(1.0, float(np.sort(excess)[rank_within(confidence, len(excess)) - 1]))
 
     def and_others(self, others: DrawnDistances) -> DrawnDistances:
         """Return these tasks together with others on the same draws."""

@@ -22,7 +22,7 @@ import numpy as np
 from ctxval._util.checked import NonNegativeInt, Probability, checked
 from ctxval._util.registry import part
 from ctxval.certificates.base import Certificate, CertificateKind
-from ctxval.certificates.bounds import rank_of
+from ctxval.certificates.bounds import rank_within
 from ctxval.certificates.dynamics_diagnostics import (
     ACCURATE,
     PREDICTIONS,
@@ -61,9 +61,6 @@ class Dynamics(CertificateKind):
         stochastic: whether two executions of one task may differ; it must be False.
         tests: the number of executions that must have been predicted beforehand at tasks drawn over the task space.
         quantile: the share of the executions of each task that the bound is about, if they differ by noise.
-
-    Raises:
-        CertificateError: if the system is declared stochastic.
     """
 
     name: ClassVar[str] = "dynamics"
@@ -83,7 +80,7 @@ class Dynamics(CertificateKind):
 
     def require_usable(self, confidence: float, executions: int) -> None:
         """Refuse a confidence that needs too many draws of the dynamics."""
-        _require_draws(MOST_DRAWS, confidence)
+        rank_within(confidence, MOST_DRAWS)
 
     def certify(self, sample: Sample, confidence: float = 0.95) -> Certificate:
         """Return :func:`certify_dynamics` of the trials and of what is learned from their trajectories."""
@@ -105,7 +102,17 @@ class Dynamics(CertificateKind):
 
     def _evidence(self, sample: Sample, confidence: float) -> DynamicsEvidence:
         learned = require_learned(sample, self.name)
-        _require_distances(sample)
+        unknown = [sample.numbers[row] for row in np.flatnonzero(np.isnan(sample.distances)).tolist()]
+        if unknown:
+            raise CertificateError(
+                f"{listed(unknown)} failed or has no distance, so d* is not bounded there; execute the task again, or "
+                f"audit.{advice_to_remeasure(sample)}"
+            )
+        if not sample.best > 0:
+            raise CertificateError(
+                "all distances are 0, so no prediction of a distance was tested. Check that the distance compares what "
+                "differs; an audit bounds how many tasks are worse."
+            )
         evidence = learned.dynamics(confidence, self.quantile)
         if evidence is None:
             raise CertificateError(
@@ -120,28 +127,10 @@ def draws_for(confidence: float) -> int:
     return min(MOST_DRAWS, int(np.ceil(confidence / (1 - confidence))))
 
 
-def _require_distances(sample: Sample) -> None:
-    unknown = [number for number, distance in zip(sample.numbers, sample.distances, strict=True) if np.isnan(distance)]
-    if unknown:
-        raise CertificateError(
-            f"{listed(unknown)} failed or has no distance, so d* is not bounded there; execute the task again, or "
-            f"audit.{advice_to_remeasure(sample)}"
-        )
-    if not sample.best > 0:
-        raise CertificateError(
-            "all distances are 0, so no prediction of a distance was tested. Check that the distance compares what "
-            "differs; an audit bounds how many tasks are worse."
-        )
-
-
 @checked
 def certify_dynamics(sample: Sample, evidence: DynamicsEvidence, confidence: Probability = 0.95) -> Certificate:
-    """Return the bound that d* stays below with the confidence, from evidence of the same trials.
-
-    Raises:
-        CertificateError: if the confidence is too high for the number of draws, or draws diverge.
-    """
-    _require_draws(len(evidence.maxima), confidence)
+    """Return the bound that d* stays below with the confidence, from evidence of the same trials."""
+    rank_within(confidence, len(evidence.maxima))
     bound, error = bound_of(evidence, sample.best, confidence), evidence.error(confidence)
     upper = raised(evidence, bound)
     if not np.isfinite(upper + error):
@@ -150,10 +139,16 @@ def certify_dynamics(sample: Sample, evidence: DynamicsEvidence, confidence: Pro
             "be predicted. More executions narrow them."
         )
     finite, last = evidence.maxima[np.isfinite(evidence.maxima)], counted(evidence, bound)[-PREDICTIONS:]
-    drawn = [test for test in tested(evidence.predictions, evidence.tests) if test.origin in DRAWN]
-    origins = [test.origin for test in drawn]
+    tests = [test for test in tested(evidence.predictions, evidence.tests) if test.origin in DRAWN]
+    drawn = [test.origin for test in tests]
     coverage, worst = evidence.coverage, failed(evidence, bound)
-    differing = sample.differing(1e-6 * bound)
+    doubt, differing = both_outcomes(sample, stochastic=False), sample.differing(1e-6 * bound)
+    # Two executions of one task must not differ by more than a prediction may be wrong.
+    if doubt is None and evidence.quantile is None and (rows := sample.differing(ACCURATE * bound)) is not None:
+        doubt = (
+            f"{two_distances(sample, rows)} in the recorded state, or was changed in between, so the bound is "
+            "withdrawn; record more states, use --kind posterior with --stochastic, or use a new store after a change"
+        )
     return Certificate(
         kind="dynamics",
         statement=dynamics_statement(upper, error, confidence, evidence.quantile),
@@ -181,8 +176,8 @@ def certify_dynamics(sample: Sample, evidence: DynamicsEvidence, confidence: Pro
                 "held": sum(held(prediction, bound) for prediction in last),
             },
             "tests": {
-                **shown_by_tests(origins, sample.points.shape[1], confidence, uniform=sample.is_uniform),
-                "largest_error": max((test.error for test in drawn), default=None),
+                **shown_by_tests(drawn, sample.points.shape[1], confidence, uniform=sample.is_uniform),
+                "largest_error": max((test.error for test in tests), default=None),
             },
             "checked": [{**each.to_json(), "held": bool(held(each, bound))} for each in evidence.predictions],
             "coverage_gap": coverage.marginal.size,
@@ -209,36 +204,13 @@ def certify_dynamics(sample: Sample, evidence: DynamicsEvidence, confidence: Pro
             "failures": sample.failures,
             "differing": None if differing is None else [sample.numbers[row] for row in differing],
         },
-        doubt=both_outcomes(sample, stochastic=False)
-        or (None if evidence.quantile is not None else _undeclared_noise(sample, bound))
-        or doubt_of(evidence, sample.best, bound),
+        doubt=doubt or doubt_of(evidence, sample.best, bound),
         error=error,
     )
 
 
-def _undeclared_noise(sample: Sample, bound: float) -> str | None:
-    """Return that two executions of one task differ by more than a prediction may be wrong; None if none do."""
-    differing = sample.differing(ACCURATE * bound)
-    if differing is None:
-        return None
-    return (
-        f"{two_distances(sample, differing)} in the recorded state, or was changed in between, so the bound is "
-        "withdrawn; record more states, use --kind posterior with --stochastic, or use a new store after a change"
-    )
-
-
-def _require_draws(draws: int, confidence: float) -> None:
-    if rank_of(confidence, draws) > draws:
-        raise CertificateError(
-            f"a confidence of {confidence:g} needs more than {draws} posterior samples of the dynamics."
-        )
-
-
 def bound_of(evidence: DynamicsEvidence, best: float, confidence: float) -> float:
-    """Return the order statistic of the maxima, raised by what searches and predictions have missed.
-
-    If predictions failed, the bound is much higher: see :func:`~ctxval.certificates.dynamics_diagnostics.raised`.
-    """
+    """Return the order statistic of the maxima, raised by what searches and predictions have missed."""
     excess = max((prediction.excess for prediction in evidence.predictions[-PREDICTIONS:]), default=0.0)
     upper = evidence.upper(confidence) * evidence.missed
     # A noisy execution may exceed the quantile that is bounded.

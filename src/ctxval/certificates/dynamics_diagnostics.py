@@ -1,6 +1,6 @@
 """Diagnostics that withdraw the bound from learned dynamics: they do not believe the prior on the dynamics.
 
-Each diagnostic yields a sentence, which says what is wrong and what would help; the first one withdraws the bound. The
+Each diagnostic gives a sentence, which says what is wrong and what would help; the first one withdraws the bound. The
 limits were chosen on development systems. Those of the posterior bound are in
 :func:`ctxval.certificates.posterior.diagnose`.
 """
@@ -8,7 +8,6 @@ limits were chosen on development systems. Those of the posterior bound are in
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from itertools import chain
 
 import numpy as np
 
@@ -46,78 +45,7 @@ EVIDENCE_OF = 6  # number of these predictions
 AGREE = 0.05  # share by which two deeper searches may differ, and by which they may exceed the usual one
 
 
-def doubt_of(evidence: DynamicsEvidence, best: float, bound: float) -> str | None:
-    """Return why the bound is withdrawn, and what would help; None if it is not.
-
-    ``best`` is the largest executed distance, ``bound`` the bound before failed predictions raise it.
-    """
-    return next(doubts(evidence, best, bound), None)
-
-
-def doubts(evidence: DynamicsEvidence, best: float, bound: float) -> Iterator[str]:
-    """Yield all reasons to withdraw the bound, as :func:`doubt_of` returns the first one."""
-    yield from _unlearned(evidence, bound)
-    yield from _uncovered(evidence)
-    yield from _untested(evidence, best, bound, raised(evidence, bound))
-    yield from _missing(evidence)
-    yield from _unsearched(evidence, bound)
-
-
-def uncovered(evidence: DynamicsEvidence) -> str | None:
-    """Return what the records and executions do not cover; None if nothing."""
-    return next(_uncovered(evidence), None)
-
-
-def unlearned(evidence: DynamicsEvidence, bound: float) -> str | None:
-    """Return that too little is known of the dynamics; None if enough is."""
-    return next(_unlearned(evidence, bound), None)
-
-
-def untried_parameter(evidence: DynamicsEvidence) -> str | None:
-    """Return that values of a parameter which the loops of M do not depend on were not tried; None if they were."""
-    return next(_untried(evidence), None)
-
-
-def untested(evidence: DynamicsEvidence, best: float, bound: float) -> str | None:
-    """Return that the bound is not tested where distances are large; None if it is."""
-    # Executions are chosen for predictions that hold, not for a bound that their errors raise.
-    return next(_untested(evidence, best, bound, bound), None)
-
-
-def only_tests_missing(evidence: DynamicsEvidence, best: float, bound: float) -> bool:
-    """Return whether tests are missing, and executions of other tasks would not help."""
-    needed = evidence.executions >= fewest_executions(evidence) and tests_missing(evidence) is not None
-    return needed and uncovered(evidence) is None and untested(evidence, best, bound) is None
-
-
-def only_a_failed_test(evidence: DynamicsEvidence, best: float, bound: float, limit: float) -> bool:
-    """Return whether an earlier test that failed is all that raises the bound above a limit: later tests outlive it."""
-    worst = failed(evidence, bound)
-    recent = all(held(prediction, bound) for prediction in counted(evidence, bound)[-PREDICTIONS:])
-    outlived = worst is not None and worst.origin in DRAWN and is_explained(worst, bound)
-    outlived = outlived and recent and raised(evidence, bound) > limit
-    return outlived and uncovered(evidence) is None and untested(evidence, best, bound) is None
-
-
-def fewest_executions(evidence: DynamicsEvidence) -> int:
-    """Return the fewest executions for a bound."""
-    return FEWEST if evidence.quantile is None else NOISY_FEWEST
-
-
-def tests_missing(evidence: DynamicsEvidence) -> str | None:
-    """Return that predictions must be tested at drawn tasks; None if they were."""
-    return next(_missing(evidence), None)
-
-
-def fewest_missing(evidence: DynamicsEvidence, best: float, bound: float) -> int:
-    """Return the fewest executions after which nothing could withdraw or raise the bound any more, at least 1."""
-    checked = counted(evidence, bound)
-    in_a_row = next((k for k, last in enumerate(reversed(checked)) if not held(last, bound)), len(checked))
-    each_takes_one = chain(_uncovered(evidence), _untested(evidence, best, bound, raised(evidence, bound)))
-    tests = missing_tests(evidence.predictions, evidence.tests)
-    return max(
-        fewest_executions(evidence) - evidence.executions, PREDICTIONS - in_a_row, len(list(each_takes_one)), tests, 1
-    )
+# Whether predictions held
 
 
 def agrees(distance: float, predicted: float, bound: float) -> bool:
@@ -129,10 +57,7 @@ def agrees(distance: float, predicted: float, bound: float) -> bool:
 
 
 def held(prediction: CheckedPrediction, bound: float) -> bool:
-    """Return whether an execution agrees with its prediction; see :func:`agrees`.
-
-    If the system is noisy, the distance must not be improbably large.
-    """
+    """Return whether an execution agrees with its prediction; with noise, whether it is not improbably large."""
     if prediction.is_noisy:
         return prediction.chance_of_more(prediction.distance - TOLERATED * bound) >= UNLIKELY
     return agrees(prediction.distance, prediction.median, bound)
@@ -141,8 +66,7 @@ def held(prediction: CheckedPrediction, bound: float) -> bool:
 def counted(evidence: DynamicsEvidence, bound: float) -> list[CheckedPrediction]:
     """Return the predictions that count: those that failed, and those that held where they could have failed.
 
-    A prediction of a task like an earlier one tells nothing. Nor does one of a run that a person chose to import, if it
-    was made afterwards.
+    A prediction of a task like an earlier one tells nothing, nor does a later one of a run that a person imported.
     """
     return [
         prediction
@@ -152,10 +76,7 @@ def counted(evidence: DynamicsEvidence, bound: float) -> list[CheckedPrediction]
 
 
 def tested(predictions: Sequence[CheckedPrediction], tests: int) -> list[CheckedPrediction]:
-    """Return the latest predictions that complete the tests, or all that were stored beforehand if none complete them.
-
-    So a test that failed matters until later tests are complete without it.
-    """
+    """Return the latest predictions that complete the tests, or all that were stored beforehand if none do."""
     stored = [prediction for prediction in predictions if prediction.stored and prediction.point]
     first = range(len(stored) - 1, -1, -1) if tests else ()
     return next((stored[k:] for k in first if not missing_tests(stored[k:], tests)), stored if tests else [])
@@ -205,9 +126,8 @@ def e_value(evidence: DynamicsEvidence) -> float:
     Each prediction has p-values of the distance and of statistics of the trajectory. The mean of ``p^-1/2 / 2`` over
     them is an e-value (Vovk and Wang 2021), so it is large with a small probability if the predictions are right.
     """
-    noisy = [prediction for prediction in evidence.predictions if prediction.is_noisy][-EVIDENCE_OF:]
     product = 1.0
-    for prediction in noisy:
+    for prediction in [each for each in evidence.predictions if each.is_noisy][-EVIDENCE_OF:]:
         p = np.array([prediction.chance_of_more(prediction.distance), *prediction.p_values])
         product *= float((0.5 / np.sqrt(p)).mean())
     return product
@@ -218,10 +138,74 @@ def jumps(evidence: DynamicsEvidence, bound: float) -> bool:
     return evidence.sharpness > SHARP or evidence.jump > JUMP * bound
 
 
+# Which executions would help
+
+
+def fewest_executions(evidence: DynamicsEvidence) -> int:
+    """Return the fewest executions for a bound."""
+    return FEWEST if evidence.quantile is None else NOISY_FEWEST
+
+
+def fewest_missing(evidence: DynamicsEvidence, best: float, bound: float) -> int:
+    """Return the fewest executions after which nothing could withdraw or raise the bound any more, at least 1."""
+    checked = counted(evidence, bound)
+    in_a_row = next((k for k, last in enumerate(reversed(checked)) if not held(last, bound)), len(checked))
+    each_takes_one = [*uncovered(evidence), *untested(evidence, best, bound, raised(evidence, bound))]
+    tests = missing_tests(evidence.predictions, evidence.tests)
+    executions = fewest_executions(evidence) - evidence.executions
+    return max(executions, PREDICTIONS - in_a_row, len(each_takes_one), tests, 1)
+
+
+def only_tests_missing(evidence: DynamicsEvidence, best: float, bound: float) -> bool:
+    """Return whether tests are missing, and executions of other tasks would not help."""
+    needed = evidence.executions >= fewest_executions(evidence) and tests_missing(evidence) is not None
+    return needed and not uncovered(evidence) and not untested(evidence, best, bound)
+
+
+def only_a_failed_test(evidence: DynamicsEvidence, best: float, bound: float, limit: float) -> bool:
+    """Return whether an earlier test that failed is all that raises the bound above a limit: later tests outlive it."""
+    worst = failed(evidence, bound)
+    if worst is None or worst.origin not in DRAWN or not is_explained(worst, bound):
+        return False
+    recent = all(held(prediction, bound) for prediction in counted(evidence, bound)[-PREDICTIONS:])
+    outlived = recent and raised(evidence, bound) > limit
+    return outlived and not uncovered(evidence) and not untested(evidence, best, bound)
+
+
 # Reasons to withdraw the bound, each beside its test
 
 
-def _unlearned(evidence: DynamicsEvidence, bound: float) -> Iterator[str]:
+def doubt_of(evidence: DynamicsEvidence, best: float, bound: float) -> str | None:
+    """Return why the bound is withdrawn, before failed predictions raise it; ``best`` is the largest distance."""
+    return next(doubts(evidence, best, bound), None)
+
+
+def doubts(evidence: DynamicsEvidence, best: float, bound: float) -> Iterator[str]:
+    """Yield all reasons to withdraw the bound, as :func:`doubt_of` returns the first one."""
+    yield from unlearned(evidence, bound)
+    yield from uncovered(evidence)
+    yield from untested(evidence, best, bound, raised(evidence, bound))
+    if (missing := tests_missing(evidence)) is not None:
+        yield missing
+    if not evidence.dense and jumps(evidence, bound):
+        what = f"the predicted distance jumps by up to {100 * evidence.jump / bound:.2g} % of the bound"
+        if evidence.sharpness > SHARP:
+            what = f"one of the largest predicted distances falls by {100 * evidence.sharpness:.0f} %"
+        yield (
+            f"{what} if a task changes by a thousandth of its ranges, so a search may miss the largest distance: the "
+            "controllers change abruptly from task to task, as those of a model with kinks do, or the closed loop "
+            "does; use a smoother model, or an audit"
+        )
+    share = max(evidence.missed - 1, evidence.disagreement)
+    if share > AGREE:
+        yield (
+            f"searches of the learned dynamics find largest distances that differ by {100 * share:.0f} %, because the "
+            "controllers or the closed loop change abruptly from task to task; an execution of the task of the largest "
+            "one helps (`ctxval run` executes it), or use a smoother model, or an audit"
+        )
+
+
+def unlearned(evidence: DynamicsEvidence, bound: float) -> Iterator[str]:
     """Yield why too little is known of the dynamics."""
     fewest = fewest_executions(evidence)
     if evidence.executions < fewest:
@@ -259,43 +243,48 @@ def _unlearned(evidence: DynamicsEvidence, bound: float) -> Iterator[str]:
         )
 
 
-def _uncovered(evidence: DynamicsEvidence) -> Iterator[str]:
-    """Yield what the records and executions do not cover."""
-    coverage, pair = evidence.coverage, evidence.coverage.pair
-    goes_there = "`ctxval run` executes a task that goes there"
-    if coverage.beyond.size > (GAP if pair is None else BEYOND if evidence.quantile is None else NOISY_BEYOND):
-        yield f"predicted runs leave the recorded range of {_at(coverage.beyond)}; {goes_there}"
+def uncovered(evidence: DynamicsEvidence) -> list[str]:
+    """Return what the records and executions do not cover."""
+
+    def at(gap: StateInputGap) -> str:
+        coordinates, place = " and ".join(gap.coordinates), with_units(gap.place)
+        return f"{coordinates} by {100 * gap.size:.2g} % (at {place}); `ctxval run` executes a task that goes there"
+
+    coverage, pair, missing = evidence.coverage, evidence.coverage.pair, []
+    if coverage.beyond.size > most_beyond(evidence):
+        missing.append(f"predicted runs leave the recorded range of {at(coverage.beyond)}")
     if coverage.marginal.size > GAP:
-        yield f"predicted runs enter a gap in the records of {_at(coverage.marginal)}; {goes_there}"
+        missing.append(f"predicted runs enter a gap in the records of {at(coverage.marginal)}")
     if pair is not None and pair.size > PAIR_GAP:
-        yield f"predicted runs enter a gap in the joint records of {_at(pair)}; {goes_there}"
-    yield from _untried(evidence)
+        missing.append(f"predicted runs enter a gap in the joint records of {at(pair)}")
+    untried = untried_parameter(evidence)
+    return missing if untried is None else [*missing, untried]
 
 
-def _untried(evidence: DynamicsEvidence) -> Iterator[str]:
-    """Yield that a parameter which the loops of M do not depend on was not tried."""
+def most_beyond(evidence: DynamicsEvidence) -> float:
+    """Return by how much closed loops may leave the records, as a share of the visited range."""
+    return GAP if evidence.coverage.pair is None else BEYOND if evidence.quantile is None else NOISY_BEYOND
+
+
+def untried_parameter(evidence: DynamicsEvidence) -> str | None:
+    """Return that values of a parameter which the loops of M do not depend on were not tried; None if they were."""
     untried = evidence.untried
-    if untried is not None and untried.gap > GAP:
-        yield (
-            f"the parameter {untried.name} hardly changes the closed loops of the model, so what it changes in the "
-            "system cannot be learned from states and inputs, and some of its values are "
-            f"{100 * untried.gap:.0f} % of its range away from every executed one; an execution there helps "
-            "(`ctxval run` executes it)"
-        )
+    if untried is None or untried.gap <= GAP:
+        return None
+    return (
+        f"the parameter {untried.name} hardly changes the closed loops of the model, so what it changes in the system "
+        f"cannot be learned from states and inputs, and some of its values are {100 * untried.gap:.0f} % of its range "
+        "away from every executed one; an execution there helps (`ctxval run` executes it)"
+    )
 
 
-def _at(gap: StateInputGap) -> str:
-    """Return the coordinates of a gap, its size as a share of the visited range, and its place."""
-    return f"{' and '.join(gap.coordinates)} by {100 * gap.size:.2g} % (at {with_units(gap.place)})"
-
-
-def _untested(evidence: DynamicsEvidence, best: float, bound: float, allowed: float) -> Iterator[str]:
-    """Yield why predictions are not tested where they matter, with errors as a bound of ``allowed`` permits."""
-    least = TESTED * evidence.highest
+def untested(evidence: DynamicsEvidence, best: float, bound: float, allowed: float | None = None) -> list[str]:
+    """Return why predictions are not tested at large distances; errors may be those of a bound ``allowed``."""
+    least, reasons = TESTED * evidence.highest, []
     if evidence.quantile is not None:
         least = NOISY_TESTED * min(evidence.highest, float(np.median(evidence.maxima)))
     if best < least:
-        yield (
+        reasons.append(
             f"the largest distance is predicted to be {evidence.highest:.4g}, but the largest executed one is "
             f"{best:.4g}: the prediction is not tested where it matters; an execution of that task helps "
             "(`ctxval run` executes it)"
@@ -303,38 +292,20 @@ def _untested(evidence: DynamicsEvidence, best: float, bound: float, allowed: fl
     # Most executions of a noisy task are far below the bound on a quantile, however well it is known.
     size, what = (bound, "bound") if evidence.quantile is None else (evidence.highest, "largest predicted distance")
     large = [prediction for prediction in counted(evidence, bound) if prediction.distance >= MATTERS * size]
-    if not any(held(prediction, allowed) for prediction in large):
-        yield (
+    if not any(held(prediction, bound if allowed is None else allowed) for prediction in large):
+        reasons.append(
             f"no prediction held at a distance of at least {100 * MATTERS:g} % of the {what}: small distances hardly "
             "test it; an execution of another task with a large distance helps (`ctxval run` executes it)"
         )
+    return reasons
 
 
-def _missing(evidence: DynamicsEvidence) -> Iterator[str]:
-    """Yield that predictions must be tested at drawn tasks."""
+def tests_missing(evidence: DynamicsEvidence) -> str | None:
+    """Return that predictions must be tested at drawn tasks; None if they were."""
     missing = missing_tests(evidence.predictions, evidence.tests)
-    if missing:
-        yield (
-            f"at least {missing} more {'execution' if missing == 1 else 'executions'} must be predicted beforehand, at "
-            "tasks drawn over the whole task space (`ctxval run` executes them; --tests 0 leaves them out)"
-        )
-
-
-def _unsearched(evidence: DynamicsEvidence, bound: float) -> Iterator[str]:
-    """Yield why a search may miss the largest distance; many closed loops are run to know it, if all else is well."""
-    if not evidence.dense and jumps(evidence, bound):
-        what = f"the predicted distance jumps by up to {100 * evidence.jump / bound:.2g} % of the bound"
-        if evidence.sharpness > SHARP:
-            what = f"one of the largest predicted distances falls by {100 * evidence.sharpness:.0f} %"
-        yield (
-            f"{what} if a task changes by a thousandth of its ranges, so a search may miss the largest distance: the "
-            "controllers change abruptly from task to task, as those of a model with kinks do, or the closed loop "
-            "does; use a smoother model, or an audit"
-        )
-    share = max(evidence.missed - 1, evidence.disagreement)
-    if share > AGREE:
-        yield (
-            f"searches of the learned dynamics find largest distances that differ by {100 * share:.0f} %, because the "
-            "controllers or the closed loop change abruptly from task to task; an execution of the task of the largest "
-            "one helps (`ctxval run` executes it), or use a smoother model, or an audit"
-        )
+    if not missing:
+        return None
+    return (
+        f"at least {missing} more {'execution' if missing == 1 else 'executions'} must be predicted beforehand, at "
+        "tasks drawn over the whole task space (`ctxval run` executes them; --tests 0 leaves them out)"
+    )

@@ -63,10 +63,7 @@ class CheckedPrediction(ShortRepr):
 
     @property
     def excess(self) -> float:
-        """How far the distance exceeds the prediction's median, or its 0.9 quantile if the system is noisy.
-
-        It is infinity if nothing was predicted.
-        """
+        """How far the distance exceeds the median, or the 0.9 quantile with noise; infinity without a prediction."""
         if self.is_noisy:
             return max(self.distance - float(np.interp(0.9, LEVELS, self.quantiles)), 0.0)
         return max(self.distance - self.median, 0.0) if np.isfinite(self.median) else np.inf
@@ -77,13 +74,12 @@ class CheckedPrediction(ShortRepr):
         return abs(self.distance - self.median) if np.isfinite(self.median) else np.inf
 
     def to_json(self) -> dict[str, Any]:
-        """Return all attributes, ready for JSON: numbers that are not finite are None."""
-        plain = {
+        """Return all attributes but the quantiles, ready for JSON: numbers that are not finite are None."""
+        plain = {name: value for name, value in asdict(self).items() if name not in ("quantiles", "runs")}
+        return {
             name: None if isinstance(value, float) and not np.isfinite(value) else value
-            for name, value in asdict(self).items()
+            for name, value in plain.items()
         }
-        del plain["quantiles"], plain["runs"]
-        return plain
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,10 +186,11 @@ class PushedDistances(ShortRepr):
 
     def to_json(self) -> dict[str, Any]:
         """Return all attributes, ready for JSON: distances that are not finite are None."""
-        rows = [distances.tolist() for distances in (self.everywhere, self.away)]
-        finite = [[[d if np.isfinite(d) else None for d in row] for row in each] for each in rows]
-        names = ("residuals", "levels", "everywhere", "away")
-        return dict(zip(names, (self.residuals, self.levels.tolist(), *finite), strict=True))
+        everywhere, away = (
+            [[d if np.isfinite(d) else None for d in row] for row in distances.tolist()]
+            for distances in (self.everywhere, self.away)
+        )
+        return {"residuals": self.residuals, "levels": self.levels.tolist(), "everywhere": everywhere, "away": away}
 
     @classmethod
     def from_json(cls, values: dict[str, Any]) -> Self:
@@ -203,20 +200,19 @@ class PushedDistances(ShortRepr):
 
     def tolerance(self, threshold: float, *, away: bool = False) -> Tolerance:
         """Return the smallest push that brings a task above the threshold, interpolated between the sizes."""
-        ratios = [self._ratio(row, threshold) for row in (self.away if away else self.everywhere)]
-        (state, residual), ratio = min(zip(self.residuals.items(), ratios, strict=True), key=lambda pair: pair[1])
-        return Tolerance(state, ratio * residual, residual)
 
-    def _ratio(self, distances: Array, threshold: float) -> float:
-        k = int(np.searchsorted(distances > threshold, True))
-        if k == len(distances):
-            return np.inf
-        if k == 0:
-            return 0.0
-        low, below = self.levels[k - 1], distances[k - 1]
-        rise = distances[k] - below
-        share = (threshold - below) / rise if np.isfinite(rise) else 0.0
-        return float(low + share * (self.levels[k] - low))
+        def ratio(distances: Array) -> float:
+            k = int(np.searchsorted(distances > threshold, True))
+            if k in (0, len(distances)):
+                return np.inf if k else 0.0
+            low, below = self.levels[k - 1], distances[k - 1]
+            rise = distances[k] - below
+            share = (threshold - below) / rise if np.isfinite(rise) else 0.0
+            return float(low + share * (self.levels[k] - low))
+
+        ratios = map(ratio, self.away if away else self.everywhere)
+        (state, residual), least = min(zip(self.residuals.items(), ratios, strict=True), key=lambda pair: pair[1])
+        return Tolerance(state, least * residual, residual)
 
 
 @dataclass(frozen=True, eq=False)
@@ -312,12 +308,17 @@ class DynamicsEvidence(ShortRepr):
     def from_json(cls, values: Any) -> Self | None:
         """Return the evidence that :meth:`to_json` returned; None if these are not its values."""
         try:
-            coverage, untried = values["coverage"], values["untried"]
-            gaps = {name: _gap(coverage[name]) for name in ("marginal", "beyond", "pair")}
-            arrays = {name: np.array(values[name], dtype=np.float64) for name in ("maxima", "points", "elites")}
+            coverage, untried, tuples = values["coverage"], values["untried"], ("point", "quantiles", "p_values")
+            gaps = {
+                name: gap and StateInputGap(**{**gap, "coordinates": tuple(gap["coordinates"])})
+                for name, gap in coverage.items()
+                if name in ("marginal", "beyond", "pair")
+            }
             parts = {
+                **{name: np.array(values[name], dtype=np.float64) for name in ("maxima", "points", "elites")},
+                **{name: values[name] and tuple(values[name]) for name in ("actuator", "suspect")},
                 "predictions": tuple(
-                    CheckedPrediction(**{**each, **{name: tuple(each[name]) for name in _TUPLES}})
+                    CheckedPrediction(**{**each, **{name: tuple(each[name]) for name in tuples}})
                     for each in values["predictions"]
                 ),
                 "coverage": StateInputCoverage(**{**coverage, **gaps, "task": np.array(coverage["task"])}),
@@ -325,19 +326,10 @@ class DynamicsEvidence(ShortRepr):
                 "pushed": values["pushed"] and PushedDistances.from_json(values["pushed"]),
                 "pocket": values["pocket"] and StatePocket(**values["pocket"]),
                 "physical": tuple(values["physical"]),
-                "actuator": values["actuator"] and tuple(values["actuator"]),
-                "suspect": values["suspect"] and tuple(values["suspect"]),
             }
-            return cls(**{**values, **arrays, **parts})
+            return cls(**{**values, **parts})
         except (KeyError, TypeError, ValueError):
             return None
-
-
-_TUPLES = ("point", "quantiles", "p_values")
-
-
-def _gap(values: Any) -> Any:
-    return values and StateInputGap(**{**values, "coordinates": tuple(values["coordinates"])})
 
 
 @runtime_checkable
@@ -345,20 +337,13 @@ class LearnedDistance(Protocol):
     """Predictions of the distance that are learned from trials and from the data that the model was made from."""
 
     def expected(self, points: Array, before: int) -> Array:
-        """Return predicted distances ``(m,)`` at points ``(m, d)`` of the unit cube; NaN if nothing can be predicted.
-
-        They are learned from trials with numbers below ``before`` only.
-        """
+        """Return distances ``(m,)``, or NaN, at points ``(m, d)`` of the unit cube, predicted from earlier trials."""
 
     def dynamics(self, confidence: float, quantile: float = QUANTILE) -> DynamicsEvidence | None:
         """Return what the dynamics learned from all trials say about d*; None if nothing can be learned.
 
-        If the system is noisy, it is about a quantile of the distance. The confidence
-        sets the least number of posterior samples. Users' code raises a CertificateError.
+        The confidence sets the least number of posterior samples. Users' code raises a CertificateError.
         """
 
     def tasks(self, count: int, seed: int) -> Array:
-        """Return independent draws from the distribution of tasks: points of the unit cube ``(count, d)``.
-
-        They have nothing to do with the draws of any trial.
-        """
+        """Return draws from the distribution of tasks, independent of trials: points ``(count, d)``."""

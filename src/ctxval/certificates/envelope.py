@@ -31,15 +31,22 @@ from ctxval._util.boxes import separated_rows
 from ctxval._util.files import write_text
 from ctxval._util.representation import ShortRepr
 from ctxval._util.texts import enumerated
-from ctxval.certificates.bounds import at_most, percent
-from ctxval.certificates.drawn_distances import LARGEST, DrawnDistances
+from ctxval.certificates.drawn_distances import FLOOR, LARGEST, DrawnDistances
+from ctxval.certificates.dynamics_diagnostics import (
+    PREDICTIONS,
+    agrees,
+    counted,
+    missing_tests,
+    most_beyond,
+    tested,
+    unlearned,
+    untried_parameter,
+)
 from ctxval.certificates.dynamics_evidence import CheckedPrediction, DynamicsEvidence
-from ctxval.certificates.envelope_diagnostics import most_beyond, rises_of
-from ctxval.certificates.envelope_onnx import write_onnx
-from ctxval.certificates.envelope_surface import Surfaces, exported
+from ctxval.certificates.envelope_surface import Surfaces, exported, write_onnx
 from ctxval.certificates.envelope_words import Region, regions_inside
 from ctxval.certificates.prediction_tests import DRAWN
-from ctxval.certificates.sentences import dynamics_assumptions
+from ctxval.certificates.sentences import dynamics_assumptions, envelope_statement
 from ctxval.core.space import TaskSpace
 from ctxval.core.task_suite import TaskSuite
 from ctxval.errors import InputError
@@ -140,33 +147,17 @@ class Envelope(ShortRepr):
 
     def to_json(self) -> dict[str, Any]:
         """Return the statement and its numbers, ready for JSON."""
+        first = "threshold confidence units statement words share regions tasks factor raised_by margin evaluated"
+        names = f"{first} checks uncovered executions tests quantile assumptions doubt".split()
+        plain = {name: getattr(self, name) for name in names}
+        lists = {name: list(value) for name, value in plain.items() if isinstance(value, tuple)}
+        lists["regions"] = [region.to_json() for region in self.regions]
         return {
-            "threshold": self.threshold,
-            "confidence": self.confidence,
-            "units": self.units,
-            "statement": self.statement,
-            "words": self.words,
-            "share": self.share,
-            "regions": [region.to_json() for region in self.regions],
-            "tasks": None if self.tasks is None else list(self.tasks),
-            "factor": self.factor,
-            "raised_by_trial": self.raised_by,
-            "margin": self.margin,
-            "evaluated": self.evaluated,
-            "checks": self.checks,
-            "uncovered": self.uncovered,
-            "executions": self.executions,
-            "tests": self.tests,
-            "quantile": self.quantile,
-            "assumptions": list(self.assumptions),
-            "doubt": self.doubt,
+            "raised_by_trial" if name == "raised_by" else name: lists.get(name, value) for name, value in plain.items()
         }
 
     def save(self, path: str | Path) -> Path:
-        """Write the function ``trusted(task) -> bool, bound`` to a file, which needs nothing of this package.
-
-        It is the same function as :meth:`trusted` and :meth:`bound`. A Python file needs NumPy alone. A file that ends
-        with ``.onnx`` is written by :meth:`to_onnx`.
+        """Write the function ``trusted(task) -> bool, bound`` to a file ``.py``, which needs NumPy alone, or ``.onnx``.
 
         Raises:
             InputError: if the path has another suffix, nothing is trusted, or the task space is a suite.
@@ -175,26 +166,13 @@ class Envelope(ShortRepr):
             return self.to_onnx(path)
         if Path(path).suffix != ".py":
             raise InputError(f"the envelope is written to a file such as envelope.py or .onnx, got {str(path)!r}.")
-        text = exported(
-            self._written,
-            title=self.statement,
-            labels=list(self.space.labels),
-            names=list(self.space.names),
-            low=self.space.low.tolist(),
-            high=self.space.high.tolist(),
-            threshold=self.threshold,
-            confidence=self.confidence,
-        )
+        text = exported(self._written, self.space, self.statement, self.threshold, self.confidence)
         return write_text(path, text)
 
     def to_onnx(self, path: str | Path) -> Path:
         """Write an ONNX file with the input ``task`` ``(N, d)`` and the outputs ``trusted`` and ``bound`` ``(N,)``.
 
-        It is the same function as :meth:`trusted` and :meth:`bound`, up to rounding. The package onnx is needed to
-        write it (extra ``fit``).
-
-        Raises:
-            InputError: if onnx is not installed, nothing is trusted, or the task space is a suite.
+        The package onnx is needed to write it (extra ``fit``).
         """
         return write_onnx(path, self._written, self.space, self.threshold)
 
@@ -209,6 +187,31 @@ class Envelope(ShortRepr):
 def withdrawn(space: TaskSpace, threshold: float, confidence: float, doubt: str) -> Envelope:
     """Return an envelope that is not stated, for a reason."""
     return Envelope(space, threshold, confidence, "No envelope is stated.", doubt=doubt.rstrip("."))
+
+
+def doubt_of_envelope(evidence: DynamicsEvidence, threshold: float) -> str | None:
+    """Return why no envelope can be stated, and what would help; None if one can."""
+    # Tasks that cannot be planned are no part of the envelope.
+    for doubt in (*unlearned(replace(evidence, unplanned=0.0), threshold), untried_parameter(evidence)):
+        if doubt is not None:
+            return doubt
+    for test in evidence.predictions:
+        known = test.explained  # smaller differences raise the factor of the envelope
+        if known is None or test.is_noisy or agrees(test.distance, known, threshold):
+            continue
+        if known <= threshold < test.distance:
+            return (
+                f"trial {test.trial} has the distance {test.distance:.4g}, and {known:.4g} on the learned dynamics, "
+                "which is below the threshold: the next state is no function of what is recorded, or the dynamics "
+                "depend on the task; record more states"
+            )
+    missing = missing_tests(evidence.predictions, evidence.tests)
+    if missing:
+        return (
+            f"{missing} more {'execution' if missing == 1 else 'executions'} must be predicted beforehand, at tasks "
+            "drawn over the whole task space (`ctxval run --envelope` executes them)"
+        )
+    return None
 
 
 def boundary_tasks(
@@ -227,38 +230,38 @@ def _raised(
     """Return k, and the trial that raised it; None if it is that of the draws.
 
     It is at least the largest standardised excess of the predictions that count, and the largest standardised error of
-    the draws at the tasks that they were learned from.
+    the draws at the tasks that they were learned from. They hardly miss any if the next state is a function of what is
+    recorded. Stiff contacts and hidden states are missed in both directions, so a distance that is too small counts as
+    well: it is too large elsewhere. Nothing is claimed of tasks that the draws have above the threshold.
     """
-    factor = drawn.factor(threshold, confidence)
-    rises = [*rises_of(evidence, threshold), *_unexplained(drawn, evidence, threshold)]
+    factor, rises = drawn.factor(threshold, confidence), rises_of(evidence, threshold)
+    if evidence.quantile is None:  # else noise explains the differences
+        mean, spread = drawn.mean, drawn.spread(threshold)
+        for each in (each for each in evidence.predictions if each.point):
+            apart = np.abs(drawn.points - np.array(each.point)).max(axis=1)
+            row = int(apart.argmin())
+            if apart[row] <= _SAME_TASK and mean[row] <= threshold:
+                rises.append((float(abs(each.distance - mean[row]) / spread[row]), each))
     largest, which = max(rises, key=lambda rise: rise[0], default=(0.0, None))
     return (factor, None) if which is None or largest <= factor else (largest, which.trial)
 
 
-def _unexplained(
-    drawn: DrawnDistances, evidence: DynamicsEvidence, threshold: float
-) -> list[tuple[float, CheckedPrediction]]:
-    """Return by how many spreads the draws miss the distances of executed tasks, with the predictions of these tasks.
-
-    They hardly miss any if the next state is a function of what is recorded. Stiff contacts and hidden states are
-    missed in both directions, so a distance that is too small counts as well: it is too large elsewhere. Nothing is
-    claimed of tasks that the draws have above the threshold.
-    """
-    if evidence.quantile is not None:
-        return []  # noise explains the differences
-    mean, spread, missed = drawn.mean, drawn.spread(threshold), []
-    for each in (each for each in evidence.predictions if each.point):
-        apart = np.abs(drawn.points - np.array(each.point)).max(axis=1)
-        row = int(apart.argmin())
-        if apart[row] <= _SAME_TASK and mean[row] <= threshold:
-            missed.append((float(abs(each.distance - mean[row]) / spread[row]), each))
-    return missed
+def rises_of(evidence: DynamicsEvidence, threshold: float) -> list[tuple[float, CheckedPrediction]]:
+    """Return the standardised excesses of tests that count and of the last other predictions, with the predictions."""
+    drawn = [test for test in tested(evidence.predictions, evidence.tests) if test.origin in DRAWN]
+    last = {each.trial: each for each in [*drawn, *counted(evidence, threshold)[-PREDICTIONS:]]}.values()
+    rises = []
+    for each in last:
+        if min(each.distance, each.median) <= threshold:
+            spread = (each.upper - each.median) / 1.645  # the 0.95 quantile of a normal distribution
+            rise = each.excess / max(spread, 2 * FLOOR * threshold) if np.isfinite(each.upper) else 0.0
+            rises.append((rise, each))
+    return rises
 
 
 def must_outlive_a_test(drawn: DrawnDistances, evidence: DynamicsEvidence, threshold: float) -> bool:
     """Return whether a drawn test raises k by so much that the tests of another hypercube are worth while."""
-    rises = (rise for rise, test in rises_of(evidence, threshold) if test.origin in DRAWN)
-    largest = max(rises, default=0.0)
+    largest = max((rise for rise, test in rises_of(evidence, threshold) if test.origin in DRAWN), default=0.0)
     kept = drawn.mean + largest * drawn.spread(threshold) <= threshold
     return bool(kept.sum() < _WORTH * (drawn.mean <= threshold).sum())
 
@@ -271,15 +274,14 @@ def _interpolated(
     executed: Sequence[tuple[Array, float]],
 ) -> Surfaces:
     """Return the surfaces of the bounds and, if loops of trusted tasks leave the records, of by how much."""
-    bounds = drawn.upper(factor, threshold)
     beyond = np.minimum(drawn.beyond / most_beyond(evidence), LARGEST)
-    points, values = drawn.points, np.stack([bounds, beyond], axis=1)
-    excesses = [(point, d / threshold) for point, d in executed if d > threshold and evidence.quantile is None]
-    for point, ratio in excesses:
-        near = np.abs(points - point).max(axis=1) <= _SAME_TASK
-        points, values = points[~near], values[~near]
-        points = np.concatenate([points, point[None]])
-        values = np.concatenate([values, [[float(np.clip(ratio, _EXCEEDED, LARGEST)), 0.0]]])
+    points, values = drawn.points, np.stack([drawn.upper(factor, threshold), beyond], axis=1)
+    for point, distance in executed:
+        if distance > threshold and evidence.quantile is None:
+            far = np.abs(points - point).max(axis=1) > _SAME_TASK
+            ratio = float(np.clip(distance / threshold, _EXCEEDED, LARGEST))
+            points = np.concatenate([points[far], point[None]])
+            values = np.concatenate([values[far], [[ratio, 0.0]]])
     _, rows = np.unique(points.round(9), axis=0, return_index=True)
     points, values = points[np.sort(rows)], values[np.sort(rows)]
     if not ((values[:, 1] > 1) & (values[:, 0] <= 1)).any():
@@ -338,7 +340,7 @@ def envelope_of(
         regions = regions_inside(space, tasks, inside, lambda unit: np.isfinite(envelope.bound_at(unit)))
         uncovered = float(((surfaces(tasks)[:, 0] <= 1) & ~inside).mean())
         envelope = replace(envelope, share=float(inside.mean()), regions=regions, uncovered=uncovered)
-    return replace(envelope, statement=_statement(envelope))
+    return replace(envelope, statement=envelope_statement(envelope))
 
 
 def _of_suite(
@@ -348,40 +350,15 @@ def _of_suite(
     most: float,
     executed: Sequence[tuple[Array, float]],
 ) -> Envelope:
-    """Return the envelope of the members of a suite, of which executed ones are known."""
     threshold, bounds = envelope.threshold, np.full(len(suite), np.inf)
     uncovered = np.zeros(len(suite), dtype=np.bool_)
     upper = threshold * drawn.upper(envelope.factor or 0.0, threshold)
     rows = suite.rows_at(drawn.points)
     bounds[rows] = np.where((upper <= threshold) & (drawn.beyond <= most), upper, np.inf)
     uncovered[rows] = (upper <= threshold) & (drawn.beyond > most)
-    if envelope.quantile is None:
-        for point, distance in executed:
-            row = int(suite.rows_at(point))
-            bounds[row], uncovered[row] = distance if distance <= threshold else np.inf, False
+    for point, distance in executed if envelope.quantile is None else ():
+        row = int(suite.rows_at(point))
+        bounds[row], uncovered[row] = distance if distance <= threshold else np.inf, False
     names = tuple(name for name, bound in zip(suite.task_names, bounds, strict=True) if np.isfinite(bound))
     share = len(names) / len(suite)
     return replace(envelope, tasks=names, share=share, uncovered=float(uncovered.mean()), _bounds=bounds)
-
-
-def _statement(envelope: Envelope) -> str:
-    """Return what an envelope says, why it is not larger, and what nothing has checked."""
-    limit, share = f"{at_most(envelope.threshold)} {envelope.units}".rstrip(), 100 * envelope.share
-    what = "d" if envelope.quantile is None else f"the {envelope.quantile:g} quantile of d"
-    tasks = f"all tasks of a set of {share:.3g} % of the tasks"
-    if envelope.tasks is not None:
-        tasks = f"all tasks of a set of {len(envelope.tasks)} tasks"
-    if not envelope.share:
-        tasks = "no task that can be named"
-    sentences = [f"With {percent(envelope.confidence)} confidence, {what} stays below {limit} on {tasks}."]
-    if envelope.uncovered >= 0.005:
-        sentences.append(
-            f"Another {100 * envelope.uncovered:.2g} % of the tasks are predicted to stay below it, but their runs "
-            "leave what was recorded, so they are not trusted, however accurate the model is there."
-        )
-    if envelope.share and envelope.tasks is None and not envelope.checks:
-        sentences.append(
-            f"Between the {envelope.evaluated} tasks whose closed loops were run, it is interpolated, and no further "
-            "task checks this, because the planner designs one task at a time."
-        )
-    return " ".join(sentences)

@@ -11,13 +11,15 @@ import base64
 import inspect
 import io
 from dataclasses import dataclass, replace
-from typing import Any
+from pathlib import Path
 
 import numpy as np
 from scipy.spatial.distance import cdist
 
 from ctxval._util.arrays import Array
 from ctxval._util.files import MADE_BY
+from ctxval._util.onnx_network import GraphValue
+from ctxval.core.space import TaskSpace
 
 ENOUGH = 1.2  # multiple of the limit up to which an error of what exceeds it matters
 FALSE = 0.005  # share of the checked points that may be below the limit falsely
@@ -75,11 +77,9 @@ class Surfaces:
         return cls(points, weights, left_out, errors)
 
     def without(self, outside: Array, checked: int) -> Surfaces:
-        """Return these surfaces with larger errors, so that hardly any point known to be above its limit is below it.
+        """Return these surfaces with larger errors, so that hardly any of the points ``(n, d)`` outside is inside.
 
-        Args:
-            outside: the points ``(n, d)`` above a limit, of all that were checked.
-            checked: the number of points that were checked, all of them below the limits by these surfaces.
+        These are the points above a limit, of all that were checked and were below the limits by these surfaces.
         """
         for multiple in _MULTIPLES:
             raised = replace(self, errors=multiple * self.errors)
@@ -147,21 +147,50 @@ ERRORS = _array(
 '''
 
 
-def exported(surfaces: Surfaces, **values: Any) -> str:
+def exported(surfaces: Surfaces, space: TaskSpace, statement: str, threshold: float, confidence: float) -> str:
     """Return the source of a Python module with a function ``trusted``, which needs NumPy alone."""
+
+    def literal(array: Array) -> str:
+        buffer = io.BytesIO()
+        np.save(buffer, np.ascontiguousarray(array), allow_pickle=False)
+        text = base64.b64encode(buffer.getvalue()).decode("ascii")
+        return "\n    ".join(repr(text[first : first + 100]) for first in range(0, len(text), 100))
+
     return _EXPORTED.format(
         made_by=MADE_BY,
         source=inspect.getsource(upper_at),
-        centres=_as_text(surfaces.centres),
-        weights=_as_text(surfaces.weights),
-        errors=_as_text(surfaces.errors),
-        **values,
+        title=statement,
+        labels=list(space.labels),
+        names=list(space.names),
+        low=space.low.tolist(),
+        high=space.high.tolist(),
+        threshold=threshold,
+        confidence=confidence,
+        centres=literal(surfaces.centres),
+        weights=literal(surfaces.weights),
+        errors=literal(surfaces.errors),
     )
 
 
-def _as_text(array: Array) -> str:
-    """Return the bytes of an array as a literal of Python over several lines."""
-    buffer = io.BytesIO()
-    np.save(buffer, np.ascontiguousarray(array), allow_pickle=False)
-    text = base64.b64encode(buffer.getvalue()).decode("ascii")
-    return "\n    ".join(repr(text[first : first + 100]) for first in range(0, len(text), 100))
+def write_onnx(path: str | Path, surfaces: Surfaces, space: TaskSpace, threshold: float) -> Path:
+    """Write a graph that computes what the exported Python does, up to rounding, for planners in other languages."""
+    task, d = GraphValue.first("task"), space.dimension
+    width = space.high - space.low
+    unit = task.affine(np.diag(1 / width), -space.low / width)
+    outermost = unit.node("Sub", np.array(0.5)).node("Abs").node("ReduceMax", axes=[1], keepdims=0)
+    inside = outermost.node("LessOrEqual", np.array(0.5 + 1e-9))
+
+    limited = unit.node("Min", np.array(1.0)).node("Max", np.array(0.0))
+    squares = limited.squared_distances(surfaces.centres, np.ones(d))
+    K, c = surfaces.errors.shape
+    smooth = (squares * squares.node("Sqrt")).affine(surfaces.weights[:K], surfaces.weights[K])
+    smooth += limited.affine(surfaces.weights[K + 1 :], np.zeros(c))
+    nearest = squares.node("TopK", np.array([min(2 * (d + 1), K)]), output=1, axis=1, largest=0)
+    errors = nearest.constant(surfaces.errors).node("Gather", nearest, axis=0)
+    upper = smooth + errors.node("ReduceMax", axes=[1], keepdims=0)
+
+    below = upper.node("ReduceMax", axes=[1], keepdims=0).node("LessOrEqual", np.array(1.0))
+    trusted = inside.node("And", below)
+    first = upper.affine(threshold * np.eye(c)[:, :1], np.zeros(1)).node("ReduceMax", axes=[1], keepdims=0)
+    bound = trusted.node("Where", first.node("Max", np.array(0.0)), np.array(np.inf))
+    return task.write(path, "envelope", d, {"trusted": (trusted, "BOOL", ["N"]), "bound": (bound, "DOUBLE", ["N"])})

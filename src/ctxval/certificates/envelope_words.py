@@ -42,22 +42,23 @@ class Region:
     @property
     def text(self) -> str:
         """The limits in words."""
-        return " and ".join(_worded(label, *ends) for label, ends in self.limits.items()) or "all tasks"
+        texts = []
+        for label, (low, high) in self.limits.items():
+            name, unit = parted(label)
+            if low is None:
+                text = f"{name} below {high:g} {unit}"
+            elif high is None:
+                text = f"{name} above {low:g} {unit}"
+            elif low == -high:
+                text = f"|{name}| below {high:g} {unit}"
+            else:
+                text = f"{name} from {low:g} to {high:g} {unit}"
+            texts.append(text.rstrip())
+        return " and ".join(texts) or "all tasks"
 
     def to_json(self) -> dict[str, Any]:
         """Return the limits and the share, ready for JSON."""
         return {"limits": {label: list(ends) for label, ends in self.limits.items()}, "share": self.share}
-
-
-def _worded(label: str, low: float | None, high: float | None) -> str:
-    name, unit = parted(label)
-    if low is None:
-        return f"{name} below {high:g} {unit}".rstrip()
-    if high is None:
-        return f"{name} above {low:g} {unit}".rstrip()
-    if low == -high:
-        return f"|{name}| below {high:g} {unit}".rstrip()
-    return f"{name} from {low:g} to {high:g} {unit}".rstrip()
 
 
 def regions_inside(
@@ -75,7 +76,8 @@ def regions_inside(
     labels, sides = _sides(space)
     rng = np.random.default_rng(0)
     values = space.from_unit(unit) @ sides.T
-    ends = _corners(space, sides)
+    corners = np.sort([sides * space.low, sides * space.high], axis=0)
+    ends = corners.sum(axis=2)  # the smallest and the largest value of each side in the task space, (2, m)
     outside, left, regions = values[~inside], inside.copy(), []
     for _ in range(REGIONS):
         seeds = np.flatnonzero(left)
@@ -100,7 +102,12 @@ def regions_inside(
         held = _within(values, box)
         if (held & left).sum() < LEAST * len(unit):
             break
-        regions.append(Region(_limits(labels, box, ends), float(held.mean())))
+        limits = {}
+        for label, (low, high), (first, last) in zip(labels, box.T, ends.T, strict=True):
+            if low > first or high < last:  # the limits that are not those of the task space
+                below = float(f"{low:.9g}") if low > first else None
+                limits[label] = (below, float(f"{high:.9g}") if high < last else None)
+        regions.append(Region(limits, float(held.mean())))
         left &= ~held
     return tuple(sorted(regions, key=lambda region: -region.share))
 
@@ -116,12 +123,6 @@ def _sides(space: TaskSpace) -> tuple[list[str], Array]:
                 labels.append(f"{second} {'-' if sign < 0 else '+'} {first} [{unit}]")
                 rows.append(np.eye(d)[j] + sign * np.eye(d)[i])
     return labels, np.array(rows)
-
-
-def _corners(space: TaskSpace, sides: Array) -> Array:
-    """Return the smallest and the largest value of each side in the task space, ``(2, m)``."""
-    low, high = np.minimum(sides * space.low, sides * space.high), np.maximum(sides * space.low, sides * space.high)
-    return np.stack([low.sum(axis=1), high.sum(axis=1)])
 
 
 def _grown(start: Array, outside: Array, ends: Array, speeds: Array, reach: float) -> Array:
@@ -152,7 +153,6 @@ def _within(values: Array, box: Array) -> Mask:
 
 
 def _rounded(box: Array, ends: Array) -> Array:
-    """Return limits rounded inwards to a few digits of their ranges; those of the task space stay."""
     step = 10.0 ** np.floor(np.log10(ends[1] - ends[0]) - _DIGITS + 1)
     low = np.where(box[0] > ends[0], np.ceil(box[0] / step) * step, ends[0])
     high = np.where(box[1] < ends[1], np.floor(box[1] / step) * step, ends[1])
@@ -169,14 +169,3 @@ def _tasks_within(space: TaskSpace, sides: Array, box: Array, rng: np.random.Gen
     points = low + np.where(on_sides, np.round(shares), shares) * (high - low)
     kept = points[_within(points @ sides.T, box)][:_CHECKED]
     return np.clip(space.to_unit(kept), 0, 1)
-
-
-def _limits(labels: list[str], box: Array, ends: Array) -> dict[str, tuple[float | None, float | None]]:
-    """Return the limits that are not those of the task space, by label."""
-    limits: dict[str, tuple[float | None, float | None]] = {}
-    for j, label in enumerate(labels):
-        low = float(f"{box[0, j]:.9g}") if box[0, j] > ends[0, j] else None
-        high = float(f"{box[1, j]:.9g}") if box[1, j] < ends[1, j] else None
-        if low is not None or high is not None:
-            limits[label] = (low, high)
-    return limits

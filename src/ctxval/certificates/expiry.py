@@ -8,6 +8,7 @@ as the assumed law of the statistics; ``docs/how-to/watch.md`` shows measured ra
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -163,73 +164,50 @@ class WatchState(ShortRepr):
 
     def to_json(self) -> dict[str, Any]:
         """Return all attributes and the sentence, ready for JSON."""
-        own = {
-            name: getattr(self, name)
-            for name in ("threshold", "false_alarms", "evidence", "alarm", "since", "cause", "ratio")
-        }
+        names = ("threshold", "false_alarms", "evidence", "alarm", "since", "cause", "ratio")
         channels = [
             {
-                "name": channel.name,
-                "certified": list(channel.certified),
-                "freedom": channel.freedom,
-                "information": _listed(channel.information),
-                "later": [
-                    statistic
-                    and {
-                        "value": statistic.value,
-                        "gradient": _listed(statistic.gradient),
-                        "information": _listed(statistic.information),
-                    }
-                    for statistic in channel.later
-                ],
+                **{name: getattr(channel, name) for name in ("name", "certified", "freedom", "information")},
+                "later": [statistic and vars(statistic) for statistic in channel.later],
             }
             for channel in self.channels
         ]
-        return {
-            **own,
-            "channels": channels,
+        plain: dict[str, Any] = {
+            **{name: getattr(self, name) for name in names},
+            "channels": json.loads(json.dumps(channels, default=lambda array: array.tolist())),
             "runs": list(self.runs),
             "distances": list(self.distances),
             "expired": self.expired,
             "sentence": self.sentence,
         }
+        return plain
 
     @classmethod
     def from_json(cls, values: Mapping[str, Any]) -> Self:
-        """Return the state that :meth:`to_json` returned.
+        """Return the state that :meth:`to_json` returned; an InputError if these are not its values."""
 
-        Raises:
-            InputError: if these are not its values.
-        """
+        def array(listed: Any) -> Array | None:
+            return None if listed is None else np.array(listed, dtype=np.float64)
+
         try:
-            listed = values["channels"]
             channels = tuple(
                 Channel(
                     str(each["name"]),
                     tuple(float(value) for value in each["certified"]),
                     None if each["freedom"] is None else float(each["freedom"]),
-                    _array(each["information"]),
+                    array(each["information"]),
                 )
-                for each in listed
+                for each in values["channels"]
             )
             state = cls(float(values["threshold"]), float(values["false_alarms"]), channels)
             for number, run in enumerate(values["runs"]):
-                later = ((str(each["name"]), each["later"][number]) for each in listed)
                 statistics = {
-                    name: Statistic(float(one["value"]), _array(one["gradient"]), _array(one["information"]))
-                    for name, one in later
-                    if one is not None
+                    str(each["name"]): Statistic(float(s["value"]), array(s["gradient"]), array(s["information"]))
+                    for each in values["channels"]
+                    if (s := each["later"][number]) is not None
                 }
                 distance = values["distances"][number]
                 state = state.after(str(run), statistics, None if distance is None else float(distance))
         except (KeyError, TypeError, ValueError, IndexError) as error:
             raise InputError(f"the state of a watch must be what to_json returned ({error!r}).") from error
         return state
-
-
-def _listed(array: Array | None) -> list[Any] | None:
-    return None if array is None else array.tolist()
-
-
-def _array(listed: Any) -> Array | None:
-    return None if listed is None else np.array(listed, dtype=np.float64)

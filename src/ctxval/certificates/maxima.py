@@ -15,13 +15,12 @@ from ctxval._util.arrays import Array, Rows, single_threaded
 from ctxval._util.checked import Probability, checked
 from ctxval._util.progress import advance, stage
 from ctxval._util.representation import ShortRepr
-from ctxval.certificates.bounds import ERRORS, rank_of
+from ctxval.certificates.bounds import ERRORS, rank_within
 from ctxval.certificates.sample import Sample, advice_to_remeasure, listed
 from ctxval.certificates.sentences import two_distances
 from ctxval.errors import CertificateError
-from ctxval.gp.hyperposterior import EXACT, Conditioned, Prior, draw_hyperparameters
-from ctxval.gp.sample_paths import draw_paths, maxima
-from ctxval.gp.subset import kept_rows
+from ctxval.gp.hyperposterior import EXACT, Conditioned, Prior, draw_hyperparameters, draw_paths, maxima
+from ctxval.gp.surrogate import kept_rows
 
 FEWEST = 4  # trials for a bound
 MOST = 160  # trials that a process is conditioned on; the effort of a draw grows with its cube
@@ -49,19 +48,14 @@ class Maxima(ShortRepr):
     @checked
     def upper(self, confidence: Probability) -> float:
         """Return the bound on d* that holds with this probability; a CertificateError if that needs more draws."""
-        rank = rank_of(confidence, len(self.draws))
-        if rank > len(self.draws):
-            raise CertificateError(
-                f"a confidence of {confidence:g} needs more than the {len(self.draws)} draws of d* that were made."
-            )
-        return float(self.draws[rank - 1])
+        made = f"the {len(self.draws)} draws of d* that were made"
+        return float(self.draws[rank_within(confidence, len(self.draws), made) - 1])
 
     @checked
     def error(self, confidence: Probability) -> float:
-        """Return the standard error of the bound: its standard deviation over seeds of the draws.
+        """Return the standard error of the bound over seeds of the draws, by a block bootstrap over their chain.
 
-        A block bootstrap over the chain of hyperparameters is used, because successive draws are correlated, and so are
-        draws that share hyperparameters. If the confidence is high, few draws are above the bound and their spread may
+        Successive draws are correlated. If the confidence is high, few draws are above the bound and their spread may
         be too small; the error of the bound with fewer draws below it is then returned, if it is larger.
         """
         blocks = min(32, len(self.conditioned))
@@ -95,14 +89,14 @@ def draw_maxima(
     """Return draws of d* given the trials: of hyperparameters, and of so many paths for each.
 
     If the system is stochastic, d* is the largest expected distance. ``prior`` is that of the hyperparameters.
-
-    Raises:
-        CertificateError: if an execution failed, there are too few trials, their distances are all equal or too
-            extreme, or two executions of one task differ although the system is not declared stochastic.
     """
-    if not stochastic:
-        _require_one_distance_each(sample)
-    X, y = _required_data(representative(sample))
+    if not stochastic and (rows := sample.differing(1e-6 * float(np.ptp(sample.distances)))) is not None:
+        raise CertificateError(
+            f"{two_distances(sample, rows)}; say --stochastic to bound the largest expected distance."
+        )
+    used = representative(sample)
+    _require_bounding(used)
+    X, y = used.points, used.distances
     rng = np.random.default_rng(seed)
     # No logarithm with noise: the exponential of an expected logarithm is not the expected distance.
     # No second chain on well-spread trials: only all trials together can separate noise from roughness.
@@ -126,21 +120,14 @@ def draw_maxima(
 
 
 def representative(sample: Sample) -> Sample:
-    """Return the trials that the process is conditioned on: of many trials, the largest, latest and well-spread ones.
-
-    The smallest distances are left out, which does not lower the bound.
-    """
+    """Return the trials that the process is conditioned on: of many, the largest, latest and well-spread ones."""
     return sample.rows(kept_rows(sample.points, sample.distances, MOST, MOST + 1).tolist())
 
 
 def settle_maxima(
     sample: Sample, threshold: float, confidence: float, *, seed: int = 0, stochastic: bool = False
 ) -> Maxima:
-    """Return draws of d*, enough of them to tell on which side of a threshold the bound is, if that is possible.
-
-    The draws of :func:`draw_maxima` are doubled while the threshold is within two standard errors of the bound, up to
-    four times as many. The additional draws come from separate chains.
-    """
+    """Return draws of d*, up to four times as many while the threshold is within two standard errors of the bound."""
     pooled = draw_maxima(sample, seed=seed, stochastic=stochastic)
     chains = [pooled]
     while len(chains) < _MOST and abs(pooled.upper(confidence) - threshold) < ERRORS * pooled.error(confidence):
@@ -151,7 +138,6 @@ def settle_maxima(
 
 
 def _pooled(chains: list[Maxima]) -> Maxima:
-    """Return the draws of all chains as one."""
     draws, points = (np.concatenate([getattr(chain, name) for chain in chains]) for name in ("draws", "points"))
     before = np.cumsum([0, *(len(chain.conditioned) for chain in chains[:-1])])
     owners = np.concatenate([chain.owners + first for chain, first in zip(chains, before, strict=True)])
@@ -160,8 +146,7 @@ def _pooled(chains: list[Maxima]) -> Maxima:
     return Maxima(draws[order], points[order], conditioned, owners[order])
 
 
-def _required_data(sample: Sample) -> tuple[Array, Array]:
-    """Return points ``(n, d)`` and distances ``(n,)`` of trials that allow a bound."""
+def _require_bounding(sample: Sample) -> None:
     failed = sample.failed - len(sample.numbers_of("unmeasured"))
     if failed:
         raise CertificateError(
@@ -187,14 +172,4 @@ def _required_data(sample: Sample) -> tuple[Array, Array]:
         raise CertificateError(
             f"the largest distance is {largest:g} and they differ by {spread:g}: a posterior bound needs numbers "
             f"between {1 / _EXTREME:g} and {_EXTREME:g}; take other units."
-        )
-    return sample.points, sample.distances
-
-
-def _require_one_distance_each(sample: Sample) -> None:
-    """Refuse trials of a stochastic system."""
-    differing = sample.differing(1e-6 * float(np.ptp(sample.distances)))
-    if differing is not None:
-        raise CertificateError(
-            f"{two_distances(sample, differing)}; say --stochastic to bound the largest expected distance."
         )

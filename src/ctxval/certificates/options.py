@@ -26,10 +26,8 @@ class CertificateOptions(ShortRepr):
     Attributes:
         kind: the kind of certificate, with its own options.
         confidence: confidence level of the certificate, at least 0.5.
-        volume: the share of the task space that may exceed the threshold; if it is 0, only bounds on d* validate.
-
-    Raises:
-        InputError: if the confidence is below 0.5, or the volume is above 0.5.
+        volume: the share of the task space that may exceed the threshold, at most 0.5; if it is 0, only bounds on d*
+            validate.
     """
 
     kind: CertificateKind = field(default_factory=Automatic)

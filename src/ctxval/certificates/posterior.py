@@ -82,24 +82,15 @@ def certify_posterior(
 ) -> Certificate:
     """Return the bound that d* stays below with the confidence, under the prior and given the trials.
 
-    If the system is stochastic, the largest expected distance is bounded; ``resolution`` is that of :class:`Posterior`,
-    and ``found`` are draws of d* from the same trials, if they were made before.
-
-    Raises:
-        CertificateError: if an execution failed, the trials do not allow a bound (see :func:`draw_maxima`), the
-            confidence is too high for the number of draws, or more trials than are used do not cover the tasks.
+    ``resolution`` is that of :class:`Posterior`; ``found`` are draws of d* from the same trials, made before.
     """
     used = representative(sample)
     _require_covered(sample, resolution)
     drawn = draw_maxima(sample, stochastic=stochastic, seed=seed) if found is None else found
     upper, error = drawn.upper(confidence), drawn.error(confidence)
     unordered, d = np.array([origin == "manual" for origin in used.origins]), sample.points.shape[1]
-    diagnosis = diagnose(
-        *(drawn.conditioned, used.points, used.numbers),
-        unordered=unordered,
-        resolution=resolution,
-        covered=sample.points,
-    )
+    limits: Any = {"unordered": unordered, "resolution": resolution, "covered": sample.points}
+    diagnosis = diagnose(drawn.conditioned, used.points, used.numbers, **limits)
     hyperparameters = [process.hyperparameters for process in drawn.conditioned]
     rough = float(np.mean([each.nu == 1.5 for each in hyperparameters]))
     return Certificate(
@@ -150,8 +141,7 @@ def _require_covered(sample: Sample, resolution: float) -> None:
 def instantaneous_bound(sample: Sample, beta: float = 2.0) -> dict[str, float] | None:
     """Return the largest UCB of the paper's GP with estimated hyperparameters, and its gap to the best distance found.
 
-    It is below d* about as often as above, and costs a fortieth of a posterior bound. Returns None if fewer than two
-    distances are known.
+    It is below d* about as often as above. It is None if fewer than two distances are known.
     """
     try:
         surrogate = fit_surrogate(sample.points, sample.distances)
@@ -163,8 +153,6 @@ def instantaneous_bound(sample: Sample, beta: float = 2.0) -> dict[str, float] |
     largest = surrogate.shift + surrogate.scale * float(bound(point[None])[0])
     return {"max_ucb": largest, "gap": largest - float(sample.distances.max()), "beta": beta}
 
-
-# Diagnostics that withdraw the bound
 
 LEVEL = 0.01
 """Significance level: a surprise that is less probable than this withdraws the bound."""
@@ -206,8 +194,7 @@ def diagnose(
     """Return how well the values agree with the process, and how well the trials cover the tasks.
 
     Args:
-        conditioned: processes conditioned on the values in the order of the trials, one for each draw of the
-            hyperparameters.
+        conditioned: the processes of all draws of the hyperparameters, with the values in the order of the trials.
         X: the trials' points ``(n, d)``, with ``numbers``; 0, 1, ... by default.
         unordered: which trials have an order without meaning, shape ``(n,)``; none by default.
         resolution: a task that is farther than this from every trial withdraws the bound, in diagonals.

@@ -36,13 +36,12 @@ DRAWN: tuple[Origin, ...] = ("iid", "spread")  # origins of tests: independent d
 
 
 def share_missed(spread: int, independent: int, dimension: int, confidence: float) -> float:
-    """Return the share of tasks that so many tests meet with a probability of at least ``confidence``.
+    """Return the share of tasks that so many tests meet with a probability of at least ``confidence``, at any time.
 
     Args:
         spread: the number of points of hypercubes, one after the other, of which only the last may be incomplete.
         independent: the number of independent draws.
         dimension: the number of task parameters, which are uniform.
-        confidence: the probability that a larger share is met. It holds at any time.
     """
     low, high = 0.0, 1.0  # shares of the tasks that are not missed with certainty, and with this probability
     for _ in range(60):
@@ -53,10 +52,7 @@ def share_missed(spread: int, independent: int, dimension: int, confidence: floa
 
 
 def probability_missed(kept: float, dimension: int, points: int = TESTS) -> float:
-    """Return G^(d-1) of the share of tasks outside of a set.
-
-    The first m points of a hypercube miss the set with at most its m-th power.
-    """
+    """Return G^(d-1) of the share of tasks outside of a set, which m points miss with at most its m-th power."""
     roots = np.array([0.0, *(math.factorial(r) ** (1 / r) for r in range(1, points + 1))])
     for _ in range(dimension - 1):
         kept = float(np.interp(points * kept, np.arange(points + 1), roots) / roots[-1])
@@ -68,8 +64,7 @@ def shown_by_tests(
 ) -> dict[str, int | float | None]:
     """Return the number of tests with these origins, and which share of the tasks exceeds what no test exceeds.
 
-    Points of hypercubes show nothing of tasks with a distribution, because they are uniform. The share is None if no
-    test shows anything.
+    Points of hypercubes show nothing of tasks with a distribution, because they are uniform.
     """
     independent = origins.count("iid")
     spread = origins.count("spread") if uniform else 0

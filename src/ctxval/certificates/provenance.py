@@ -10,9 +10,9 @@ from typing import Any
 from ctxval._util.representation import ShortRepr
 from ctxval.certificates import verdict_sentences as sentences
 from ctxval.certificates.base import Certificate
+from ctxval.certificates.bounds import Quantities
 from ctxval.certificates.dynamics_evidence import LearnedDistance
 from ctxval.certificates.sample import Sample
-from ctxval.certificates.verdict_sentences import Quantities
 from ctxval.core.space import DISTRIBUTION, TaskSpace
 from ctxval.core.task_distribution import distribution_text
 from ctxval.core.task_suite import SUITE, TaskSuite
@@ -66,8 +66,13 @@ class Provenance(ShortRepr):
         beside: Iterable[Neighbour] = (),
     ) -> Provenance:
         """Return the provenance from what a store says of its experiment, and from the stores beside it."""
-        validation = _table(description, "validation")
-        described, refined = _table(validation, "space"), _table(validation, "model").get("type") == "Refined"
+
+        def table(of: Mapping[str, Any], name: str) -> Mapping[str, Any]:
+            part = of.get(name)
+            return part if isinstance(part, dict) else {}
+
+        validation = table(description, "validation")
+        described, refined = table(validation, "space"), table(validation, "model").get("type") == "Refined"
         distribution = described.get(DISTRIBUTION)
         return cls(
             space=_space_of(described),
@@ -78,11 +83,7 @@ class Provenance(ShortRepr):
         )
 
     def caution(self, threshold: float) -> str:
-        """Return what speaks against any answer, each as a sentence after a space; empty if nothing does.
-
-        These are an execution that started farther from its task than the threshold, and distances above the threshold
-        in other stores of the same experiment.
-        """
+        """Return what speaks against any answer, each as a sentence after a space; empty if nothing does."""
         above = [(other.path.name, other.worst) for other in self.beside if other.worst and other.falsifies(threshold)]
         caution = sentences.falsified_beside(above, threshold, self.quantities)
         if self.start is not None and self.start[0] > threshold:
@@ -91,20 +92,14 @@ class Provenance(ShortRepr):
         return caution
 
     def known_before(self, threshold: float, trials: Sequence[Trial]) -> int:
-        """Return how many distances were known when a threshold was first stated.
-
-        These are all distances of the trials if it was not stated before. It is 0 if no thresholds were recorded.
-        """
+        """Return how many distances were known when a threshold was first stated; 0 if no thresholds were recorded."""
         if self.thresholds is None:
             return 0
         first = (stated.distances for stated in self.thresholds if stated.threshold == threshold)
         return next(first, sum(trial.distance is not None for trial in trials))
 
     def looked(self, certificate: Certificate, threshold: float, trials: Sequence[Trial], volume: float = 0.0) -> str:
-        """Return, as the end of a sentence, whether a validated threshold was chosen after looking; empty if not.
-
-        It names the smaller thresholds that were stated before and that are falsified, or not validated either.
-        """
+        """Return, as the end of a sentence, whether a validated threshold was chosen after looking; empty if not."""
         stated = [each.threshold for each in self.thresholds or ()]
         before = stated[: stated.index(threshold)] if threshold in stated else stated
         smaller = sorted(each for each in before if each < threshold and not certificate.covers(each, volume))
@@ -158,12 +153,6 @@ REFINED = (
     "so only executions under its own controllers are counted"
 )
 """What a certificate says of a model that was refined."""
-
-
-def _table(description: Mapping[str, Any], name: str) -> Mapping[str, Any]:
-    """Return a part of a description; empty if it has none that can be read."""
-    part = description.get(name)
-    return part if isinstance(part, dict) else {}
 
 
 def _space_of(described: Mapping[str, Any]) -> TaskSpace | None:

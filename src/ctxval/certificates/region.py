@@ -28,7 +28,7 @@ from ctxval.certificates.base import Certificate, CertificateKind
 from ctxval.certificates.bounds import at_most, of_tasks
 from ctxval.certificates.forecast import Forecast
 from ctxval.certificates.sample import Sample, advice_to_remeasure, require_learned
-from ctxval.certificates.scenario import countable_draws, volume_bound
+from ctxval.certificates.scenario import countable_draws, require_more, volume_bound
 from ctxval.certificates.sentences import ABOUT_DRAWS, FROZEN, ONE_CAMPAIGN, how_drawn, margin_and_map
 from ctxval.errors import CertificateError
 
@@ -67,7 +67,7 @@ class Region(CertificateKind):
 
     def require_usable(self, confidence: float, executions: int) -> None:
         """Require more trials than are discarded."""
-        _require_fewer(self.discard, executions)
+        require_more(executions, self.discard, "draws")
 
 
 @checked
@@ -82,9 +82,7 @@ def certify_region(
     With a threshold, the bound is the threshold, and the volume left out is that of the draws plus that of the tasks at
     which the prediction plus the margin exceeds the threshold. Without one, the bound is the largest predicted one.
 
-    Raises:
-        CertificateError: if the experiment is not loaded, nothing can be predicted, there is no countable draw, or more
-            draws lack a distance or a prediction than are discarded.
+    More draws than are discarded must have a distance and a prediction; else a CertificateError is raised.
     """
     chosen, beta = options or Region(), 1 - confidence
     learned, drawn = require_learned(sample, "region"), countable_draws(sample, "a region bound")
@@ -151,7 +149,7 @@ def _margin(drawn: Sample, predicted: Array, before: int, discard: int) -> tuple
             f"nothing can be predicted from the trials before trial {before}, the first of these draws: execute tasks "
             "of a search before the audit, or say --kind audit, which needs no prediction."
         )
-    _require_fewer(discard, len(drawn))
+    require_more(len(drawn), discard, "draws")
     excess = np.sort(np.nan_to_num(drawn.distances - predicted, nan=np.inf))
     unpredicted = int((np.isnan(predicted) & ~np.isnan(drawn.distances)).sum())
     if not np.isfinite(excess[-1 - discard]):
@@ -160,8 +158,3 @@ def _margin(drawn: Sample, predicted: Array, before: int, discard: int) -> tuple
             f"the {discard} discarded; nothing bounds the distance there.{advice_to_remeasure(drawn)}"
         )
     return float(excess[-1 - discard]), unpredicted
-
-
-def _require_fewer(discard: int, draws: int) -> None:
-    if discard >= draws:
-        raise CertificateError(f"of {draws} draws, from 0 to {draws - 1} can be discarded, not {discard}.")

@@ -53,9 +53,6 @@ class Sample(ShortRepr):
         learned: what the experiment's model predicts; None if the experiment is not loaded.
         distribution: the distribution of tasks as a text; None if it is uniform.
         suite: the tasks of a suite, points of the unit cube ``(N, d)``; None if tasks fill the box.
-
-    Raises:
-        CertificateError: if the lengths differ, or a trial is still open.
     """
 
     points: Array
@@ -75,14 +72,14 @@ class Sample(ShortRepr):
         if not len(self.planned):
             object.__setattr__(self, "planned", [None] * len(self.points))
         parts = (self.points, self.distances, self.origins, self.states, self.numbers, self.planned)
-        if len({len(part) for part in parts}) != 1:
+        if len(lengths := {len(part) for part in parts}) != 1:
             raise CertificateError(
                 "points, distances, origins, states, numbers and planned must be equally many, got lengths "
-                f"{sorted({len(part) for part in parts})}."
+                f"{sorted(lengths)}."
             )
-        if "open" in self.states:
-            waiting = [str(n) for n, state in zip(self.numbers, self.states, strict=True) if state == "open"]
-            raise CertificateError(f"trials are open: {', '.join(waiting)}; tell how they ended before certifying.")
+        if waiting := self.numbers_of("open"):
+            numbers = ", ".join(map(str, waiting))
+            raise CertificateError(f"trials are open: {numbers}; tell how they ended before certifying.")
 
     def __len__(self) -> int:
         return len(self.distances)
@@ -93,22 +90,29 @@ class Sample(ShortRepr):
 
         A failure is left out if the same task was executed with success later, unless it is an independent draw. The
         order of trials that people chose or imported has no meaning, so they are sorted by their tasks.
-
-        Raises:
-            CertificateError: if there is no trial, or one is still open.
         """
         if not trials:
             raise CertificateError("nothing was executed yet, so nothing can be certified.")
         made_good = _made_good(trials)
-        left_out = {failure.trial for failure in made_good} | _measured_later(trials)
-        counted = _in_order([trial for trial in trials if trial.number not in left_out])
+        # A distance that was told alone under another definition does not matter if the task was executed again.
+        told = [trial for trial in trials if trial.failure == TOLD_ALONE and trial.origin != "iid"]
+        left_out = {failure.trial for failure in made_good} | {t.number for t in told if executions_of(t, trials)}
+        counted = [trial for trial in trials if trial.number not in left_out]
+        places = [place for place, trial in enumerate(counted) if trial.origin == "manual"]
+        manual = sorted(
+            (counted[place] for place in places),
+            key=lambda trial: (trial.unit_point.tolist(), np.inf if trial.distance is None else trial.distance),
+        )
+        for place, trial in zip(places, manual, strict=True):
+            counted[place] = trial
+        planned = [(trial.note or {}).get(PLANNED) if trial.origin == "iid" else None for trial in counted]
         return cls(
             np.array([trial.unit_point for trial in counted]),
             np.array([np.nan if trial.distance is None else trial.distance for trial in counted]),
             [trial.origin for trial in counted],
             [trial.state for trial in counted],
             [trial.number for trial in counted],
-            [_planned(trial) for trial in counted],
+            [each if isinstance(each, int) else None for each in planned],
             made_good,
             learned,
         )
@@ -119,15 +123,9 @@ class Sample(ShortRepr):
 
     def rows(self, rows: Sequence[int]) -> Sample:
         """Return some of the trials."""
-        return replace(
-            self,
-            points=self.points[list(rows)],
-            distances=self.distances[list(rows)],
-            origins=[self.origins[row] for row in rows],
-            states=[self.states[row] for row in rows],
-            numbers=[self.numbers[row] for row in rows],
-            planned=[self.planned[row] for row in rows],
-        )
+        names = ("origins", "states", "numbers", "planned")
+        lists: dict[str, Any] = {name: [getattr(self, name)[row] for row in rows] for name in names}
+        return replace(self, points=self.points[list(rows)], distances=self.distances[list(rows)], **lists)
 
     @property
     def countable(self) -> list[int]:
@@ -141,10 +139,11 @@ class Sample(ShortRepr):
 
     def with_countable_draws(self) -> Sample:
         """Return the sample in which only the countable draws are independent draws, and the others like a search's."""
-        kept = self.countable
-        others = [origin == "iid" and row not in kept for row, origin in enumerate(self.origins)]
-        origins = ["acquisition" if is_other else each for each, is_other in zip(self.origins, others, strict=True)]
-        return replace(self, origins=origins) if any(others) else self
+        kept, origins = set(self.countable), list(self.origins)
+        for row, origin in enumerate(origins):
+            if origin == "iid" and row not in kept:
+                origins[row] = "acquisition"
+        return replace(self, origins=origins)
 
     @property
     def tasks(self) -> int | None:
@@ -179,9 +178,9 @@ class Sample(ShortRepr):
         return [number for number, each in zip(self.numbers, self.states, strict=True) if each == state]
 
     def differing(self, tolerance: float) -> tuple[int, int] | None:
-        """Return the rows of two executions of one task whose distances differ by more than a tolerance.
+        """Return the rows of two executions of one task whose distances differ by more than a tolerance, or None.
 
-        These are the first execution of a task, and the one that differs most from it. It is None if there are none.
+        These are the first execution of a task, and the one that differs most from it.
         """
         _, firsts, tasks = np.unique(self.points, axis=0, return_index=True, return_inverse=True)
         first_of = firsts[tasks.ravel()]
@@ -192,10 +191,11 @@ class Sample(ShortRepr):
     @property
     def failures(self) -> dict[str, list[Any]]:
         """The trials that failed, that could not be measured and that were made good, ready for JSON."""
+        made_good = [asdict(failure) for failure in self.made_good]
         return {
             "failed": self.numbers_of("failed"),
             "unmeasured": self.numbers_of("unmeasured"),
-            "made_good": [asdict(failure) for failure in self.made_good],
+            "made_good": made_good,
         }
 
     @property
@@ -203,10 +203,8 @@ class Sample(ShortRepr):
         """Sentences on the trials that failed, that could not be measured and that were made good."""
         failed, unmeasured = self.numbers_of("failed"), self.numbers_of("unmeasured")
         remarks = [f"{listed(failed)} failed, and no distance is known there"] if failed else []
-        if unmeasured:
-            remarks.append(_unmeasured(unmeasured))
-        causes = dict.fromkeys((failure.by, failure.because) for failure in self.made_good)
-        for by, because in causes:
+        remarks += [_unmeasured(unmeasured)] if unmeasured else []
+        for by, because in dict.fromkeys((failure.by, failure.because) for failure in self.made_good):
             which = listed([failure.trial for failure in self.made_good if failure.by == by])
             why = "nobody stated why" if because is None else f"you state why: {because!r}"
             remarks.append(f"{which} failed, and trial {by} executed the same task with success; {why}")
@@ -246,43 +244,13 @@ def advice_to_remeasure(sample: Sample) -> str:
     )
 
 
-def _planned(trial: Trial) -> int | None:
-    """Return the planned number of independent draws when a trial was drawn; 0 if the verdict was to end them."""
-    planned = (trial.note or {}).get(PLANNED) if trial.origin == "iid" else None
-    return planned if isinstance(planned, int) else None
-
-
-def _in_order(trials: list[Trial]) -> list[Trial]:
-    """Return the trials, with those that people chose or imported sorted among their own places."""
-    places = [place for place, trial in enumerate(trials) if trial.origin == "manual"]
-    ordered = sorted(
-        (trials[place] for place in places),
-        key=lambda trial: (trial.unit_point.tolist(), np.inf if trial.distance is None else trial.distance),
-    )
-    in_order = list(trials)
-    for place, trial in zip(places, ordered, strict=True):
-        in_order[place] = trial
-    return in_order
-
-
 def executions_of(trial: Trial, trials: Sequence[Trial]) -> list[Trial]:
     """Return the trials with a distance that executed the task of a trial; scaling rounds their unit-cube points."""
     known = [other for other in trials if other.distance is not None]
-    gaps = (np.abs(other.unit_point - trial.unit_point).max() for other in known)
-    return [other for other, gap in zip(known, gaps, strict=True) if gap <= 1e-9]
-
-
-def _measured_later(trials: Sequence[Trial]) -> set[int]:
-    """Return the trials that were executed again since, and whose distance was told alone under another definition."""
-    waiting = [trial for trial in trials if trial.failure == TOLD_ALONE and trial.origin != "iid"]
-    return {trial.number for trial in waiting if executions_of(trial, trials)}
+    return [other for other in known if np.abs(other.unit_point - trial.unit_point).max() <= SAME]
 
 
 def _made_good(trials: Sequence[Trial]) -> tuple[MadeGood, ...]:
-    """Return the trials that failed, but whose tasks were executed with success later.
-
-    If there are several successes, the first one with a stated reason counts, or else the first one.
-    """
     made_good = []
     for trial in trials:
         if trial.state == "failed" and trial.origin != "iid":

@@ -40,35 +40,38 @@ from ctxval.core.trial import Origin
 from ctxval.errors import CertificateError
 
 
-class _ByDraws(CertificateKind):
-    """A bound from independent draws alone."""
+@part("scenario")
+@dataclass(frozen=True, repr=False)
+class Scenario(CertificateKind):
+    """Bound on all tasks except a share of the task space, from independent draws alone (scenario optimisation, SC)."""
 
+    name: ClassVar[str] = "scenario"
     bounds_maximum: ClassVar[bool] = False
     sorts_draws: ClassVar[bool] = True
 
+    def certify(self, sample: Sample, confidence: float = 0.95) -> Certificate:
+        """Return :func:`certify_scenario` of the trials."""
+        return certify_scenario(sample, confidence, self._discarded)
+
     def require_audit_helps(self, origins: Iterable[Origin]) -> None:
-        """Refuse trials that are no independent draws."""
-        if any(origin != "iid" for origin in origins):
+        """Refuse trials that are no independent draws, and require the number to discard."""
+        if self._discarded >= 0 and any(origin != "iid" for origin in origins):
             raise CertificateError(
                 f"a {self.name} bound takes independent draws alone, but there are others; say --kind audit."
             )
 
+    def require_usable(self, confidence: float, executions: int) -> None:
+        """Require the number to discard, and more trials than that."""
+        require_more(executions, self._discarded)
 
-@part("scenario")
-@dataclass(frozen=True, repr=False)
-class Scenario(_ByDraws):
-    """Bound on all tasks except a share of the task space, from independent draws alone (scenario optimisation, SC)."""
-
-    name: ClassVar[str] = "scenario"
-
-    def certify(self, sample: Sample, confidence: float = 0.95) -> Certificate:
-        """Return :func:`certify_scenario` of the trials."""
-        return certify_scenario(sample, confidence)
+    @property
+    def _discarded(self) -> int:
+        return 0
 
 
 @part("sampling-discarding")
 @dataclass(frozen=True, repr=False)
-class SamplingDiscarding(_ByDraws):
+class SamplingDiscarding(Scenario):
     """The scenario bound after the largest distances are discarded (sampling and discarding, SD).
 
     Attributes:
@@ -79,20 +82,8 @@ class SamplingDiscarding(_ByDraws):
 
     discard: PositiveInt | None = None
 
-    def certify(self, sample: Sample, confidence: float = 0.95) -> Certificate:
-        """Return :func:`certify_scenario` of the trials."""
-        return certify_scenario(sample, confidence, self._require_discard())
-
-    def require_audit_helps(self, origins: Iterable[Origin]) -> None:
-        """Refuse trials that are no independent draws, and require the number to discard."""
-        self._require_discard()
-        super().require_audit_helps(origins)
-
-    def require_usable(self, confidence: float, executions: int) -> None:
-        """Require the number to discard, and more trials than that."""
-        _require_counts(executions, self._require_discard())
-
-    def _require_discard(self) -> int:
+    @property
+    def _discarded(self) -> int:
         if not self.discard:
             raise CertificateError("sampling and discarding needs to know how many to discard, at least 1.")
         return self.discard
@@ -101,14 +92,14 @@ class SamplingDiscarding(_ByDraws):
 @checked
 def tail(n: int, discarded: int, volume: Probability) -> float:
     """Return Pr(V > volume) after n draws of which the k largest are discarded."""
-    _require_counts(n, discarded)
+    require_more(n, discarded)
     return float(bdtr(discarded, n, volume))
 
 
 @checked
 def volume_bound(n: int, discarded: int, beta: Probability) -> float:
     """Return the least eps with ``Pr(V > eps) <= beta``."""
-    _require_counts(n, discarded)
+    require_more(n, discarded)
     return float(betaincinv(discarded + 1, n - discarded, 1 - beta))
 
 
@@ -130,12 +121,9 @@ def samples_needed(volume: Probability, beta: Probability, discarded: NonNegativ
 def certify_scenario(sample: Sample, confidence: Probability = 0.95, discarded: NonNegativeInt = 0) -> Certificate:
     """Return a bound on the volume of the tasks whose distance exceeds the largest one left after discarding k.
 
-    k = 0 is scenario optimisation. k must be chosen before the distances are known. A failed execution counts as a
-    violation, larger than any distance, so it must be among the discarded ones.
-
-    Raises:
-        CertificateError: if a trial is no independent draw, the number of draws depended on their distances, k is
-            not below the number of draws, or more executions failed than are discarded.
+    k must be chosen before the distances are known. A failed execution counts as a violation, larger than any distance,
+    so it must be among the discarded ones. A CertificateError is raised if a trial is no independent draw, or if the
+    number of draws depended on their distances.
     """
     kind = "sampling-discarding" if discarded else "scenario"
     foreign = [origin for origin in sample.origins if origin != "iid"]
@@ -144,8 +132,18 @@ def certify_scenario(sample: Sample, confidence: Probability = 0.95, discarded: 
             f"a {kind} bound takes independent draws alone, but {len(foreign)} of {len(sample)} trials were chosen "
             f"otherwise ({', '.join(sorted(set(foreign)))}); run --search random, or say --kind audit."
         )
-    _require_counts(len(sample), discarded)
-    _require_one_number(sample, kind)
+    require_more(len(sample), discarded)
+    plans = list(dict.fromkeys(planned for planned in sample.planned if planned is not None))
+    if 0 in plans:
+        raise CertificateError(
+            "the draws ended with the verdict, so their number depended on their distances, which a "
+            f"{kind} bound does not allow; certify --audit N counts draws that are made from now on."
+        )
+    if len(plans) > 1:
+        raise CertificateError(
+            f"the number of draws was changed from {plans[-2]} to {plans[-1]} after the first were known, which a "
+            f"{kind} bound does not allow; say --kind audit, which counts the last ones alone."
+        )
     if sample.failed > discarded:
         raise CertificateError(
             f"{violations(sample)}, more than the {discarded} discarded; nothing bounds them."
@@ -175,35 +173,17 @@ def certify_scenario(sample: Sample, confidence: Probability = 0.95, discarded: 
     )
 
 
-def _require_one_number(sample: Sample, kind: str) -> None:
-    """Refuse draws whose number depended on their distances."""
-    plans = list(dict.fromkeys(planned for planned in sample.planned if planned is not None))
-    if 0 in plans:
-        raise CertificateError(
-            "the draws ended with the verdict, so their number depended on their distances, which a "
-            f"{kind} bound does not allow; certify --audit N counts draws that are made from now on."
-        )
-    if len(plans) > 1:
-        raise CertificateError(
-            f"the number of draws was changed from {plans[-2]} to {plans[-1]} after the first were known, which a "
-            f"{kind} bound does not allow; say --kind audit, which counts the last ones alone."
-        )
-
-
-def _require_counts(n: int, discarded: int) -> None:
+def require_more(n: int, discarded: int, what: str = "trials") -> None:
+    """Require more trials than are discarded."""
     if not 0 <= discarded < n:
-        raise CertificateError(f"of {n} trials, from 0 to {max(n - 1, 0)} can be discarded, not {discarded}.")
+        raise CertificateError(f"of {n} {what}, from 0 to {max(n - 1, 0)} can be discarded, not {discarded}.")
 
 
 # Independent draws among trials of any origin
 
 
 def countable_draws(sample: Sample, kind: str) -> Sample:
-    """Return the independent draws whose number was chosen before they were executed; ``kind`` is for messages.
-
-    Raises:
-        CertificateError: if there is none.
-    """
+    """Return the independent draws whose number was chosen before they were executed; ``kind`` is for messages."""
     everything, drawn = len(sample.only("iid")), sample.rows(sample.countable)
     if not everything:
         raise CertificateError(f"{kind} needs independent draws of tasks, but there is none; run certify --audit N.")
@@ -236,10 +216,8 @@ def certify_audit(sample: Sample, confidence: Probability = 0.95) -> Certificate
 
     Let h be the largest of N independent distances. The volume of tasks above h is bounded for any distance function.
     The largest distance of all trials is at least h, so the volume above it is not larger, however those trials were
-    chosen. Only draws count whose number was chosen before they were executed (:attr:`Sample.countable`).
-
-    Raises:
-        CertificateError: if no independent draw counts, or the execution of a draw failed.
+    chosen. Only draws count whose number was chosen before they were executed (:attr:`Sample.countable`), and none may
+    have failed.
     """
     drawn = countable_draws(sample, "an audit")
     if drawn.failed:

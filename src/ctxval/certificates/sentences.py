@@ -6,10 +6,15 @@ stands beside the test that withdraws it, in the diagnostics.
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 from ctxval._util.representation import counted
 from ctxval.certificates.bounds import at_most, except_for, late, of_tasks, percent, state_of, with_error, with_units
 from ctxval.certificates.dynamics_evidence import DynamicsEvidence
 from ctxval.certificates.sample import Sample, listed
+
+if TYPE_CHECKING:
+    from ctxval.certificates.envelope import Envelope
 
 ONE_CAMPAIGN = (
     "this campaign was fixed beforehand and not chosen among several: the best of several is wrong more often than "
@@ -249,3 +254,26 @@ def dynamics_assumptions(evidence: DynamicsEvidence) -> tuple[str, ...]:
         "posterior sample",
         ANY_ORDER,
     )
+
+
+def envelope_statement(envelope: Envelope) -> str:
+    """Return what an envelope says, why it is not larger, and what nothing has checked."""
+    limit, share = f"{at_most(envelope.threshold)} {envelope.units}".rstrip(), 100 * envelope.share
+    what = "d" if envelope.quantile is None else f"the {envelope.quantile:g} quantile of d"
+    tasks = f"all tasks of a set of {share:.3g} % of the tasks"
+    if envelope.tasks is not None:
+        tasks = f"all tasks of a set of {len(envelope.tasks)} tasks"
+    if not envelope.share:
+        tasks = "no task that can be named"
+    sentences = [f"With {percent(envelope.confidence)} confidence, {what} stays below {limit} on {tasks}."]
+    if envelope.uncovered >= 0.005:
+        sentences.append(
+            f"Another {100 * envelope.uncovered:.2g} % of the tasks are predicted to stay below it, but their runs "
+            "leave what was recorded, so they are not trusted, however accurate the model is there."
+        )
+    if envelope.share and envelope.tasks is None and not envelope.checks:
+        sentences.append(
+            f"Between the {envelope.evaluated} tasks whose closed loops were run, it is interpolated, and no further "
+            "task checks this, because the planner designs one task at a time."
+        )
+    return " ".join(sentences)

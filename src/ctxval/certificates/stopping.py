@@ -68,32 +68,28 @@ class StoppingRule(ShortRepr):
     def decide(self, trials: Sequence[Trial], left: int) -> StoppingDecision:
         """Return whether a campaign with so many executions left stops and, if not, which task must be executed next.
 
-        While the bound is far above the threshold, this costs much less than the verdict. Open trials count for the
-        coverage of the task space, but their distances are not waited for.
+        Open trials count for the coverage of the task space, but their distances are not waited for.
         """
         if counterexample(trials, self.threshold) is not None:
             return StoppingDecision(decided=True)
         try:
-            return self._by_the_bound(trials, left)
+            sample, points = _ended(trials), np.array([trial.unit_point for trial in trials])
+            missing = covering(points, self._posterior.resolution, left)
+            if missing is None or self._is_surely_too_high(sample):
+                return StoppingDecision()
+            if len(missing):
+                return StoppingDecision(next_point=missing[0])
+            # The trials cover the task space, open ones included, so only the threshold is left to check.
+            drawn, kept = self._is_kept(sample)
+            if not kept:
+                return StoppingDecision()
+            contested = None
+            if left and not self._has_stood(trials[: -self.confirmations or None]):
+                highest = drawn.points[-max(1, round((1 - self.options.confidence) * len(drawn.points))) :]
+                contested = most_contested(highest, points, self._posterior.resolution)
+            return StoppingDecision(decided=contested is None, next_point=contested)
         except CertificateError:
             return StoppingDecision()
-
-    def _by_the_bound(self, trials: Sequence[Trial], left: int) -> StoppingDecision:
-        sample, points = _ended(trials), np.array([trial.unit_point for trial in trials])
-        missing = covering(points, self._posterior.resolution, left)
-        if missing is None or self._is_surely_too_high(sample):
-            return StoppingDecision()
-        if len(missing):
-            return StoppingDecision(next_point=missing[0])
-        # The trials cover the task space, open ones included, so only the threshold is left to check.
-        drawn, kept = self._is_kept(sample)
-        if not kept:
-            return StoppingDecision()
-        contested = None
-        if left and not self._has_stood(trials[: -self.confirmations or None]):
-            highest = drawn.points[-max(1, round((1 - self.options.confidence) * len(drawn.points))) :]
-            contested = most_contested(highest, points, self._posterior.resolution)
-        return StoppingDecision(decided=contested is None, next_point=contested)
 
     @property
     def _posterior(self) -> Posterior:
@@ -110,14 +106,14 @@ class StoppingRule(ShortRepr):
             return False
 
     def _is_kept(self, sample: Sample) -> tuple[Maxima, bool]:
-        """Return draws of d*, and whether their bound keeps the threshold if coverage is left aside."""
         stochastic, confidence = self._posterior.stochastic, self.options.confidence
         drawn = settle_maxima(sample, self.threshold, confidence, stochastic=stochastic)
+        # Coverage is left aside: its resolution is the whole task space.
         certificate = certify_posterior(sample, confidence, stochastic=stochastic, resolution=1.0, found=drawn)
         return drawn, certificate.covers(self.threshold)
 
     def _is_surely_too_high(self, sample: Sample) -> bool:
-        """Return whether the posterior bound is clearly above the threshold, by tests that cost less than the bound."""
+        """Return whether the bound is clearly above the threshold, by tests that cost less than the bound."""
         stochastic = self._posterior.stochastic
         instantaneous = None if stochastic else instantaneous_bound(sample)
         if instantaneous is not None and instantaneous["max_ucb"] > self.threshold:

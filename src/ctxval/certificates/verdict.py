@@ -11,12 +11,12 @@ import numpy as np
 from ctxval._util.checked import PositiveFloat, checked
 from ctxval._util.representation import ShortRepr, call, line, lines, shown, table
 from ctxval.certificates import verdict_sentences as sentences
-from ctxval.certificates.base import KINDS, Certificate, CertificateKind
+from ctxval.certificates.base import KINDS, Certificate, CertificateKind, certified
 from ctxval.certificates.bets import bets_against
+from ctxval.certificates.bounds import NO_UNITS, Quantities
 from ctxval.certificates.forecast import Forecast
 from ctxval.certificates.options import CONFIDENCE, CertificateOptions, require_confidence, require_volume
 from ctxval.certificates.provenance import Provenance
-from ctxval.certificates.verdict_sentences import Quantities
 from ctxval.core.quantiles import QUANTILE
 from ctxval.core.trial import Trial, designs_sentence
 from ctxval.errors import CertificateError
@@ -34,13 +34,11 @@ class Verdict:
             confidence, else "undecided".
         threshold: tau, in the distance's units.
         reason: the reason for the answer, in one or two sentences.
-        witness: the executed trial with d(p) > tau; None if the answer is not "falsified".
+        witness: the executed trial with d(p) > tau of a falsification; else None.
         certificate: the certificate that validates or does not suffice; None if there is none.
         expected: a forecast of further executions; None if the answer is decided or nothing can be predicted.
-        rests_on: the evidence for a validation, its conditions, and what holds without them; None if the answer is not
-            "validated".
-        next_task: the parameters of the task to execute next, if the answer is "undecided" and learned dynamics choose
-            it; else None.
+        rests_on: the evidence for a validation, its conditions, and what holds without them; else None.
+        next_task: the parameters of the task to execute next, if learned dynamics choose it to decide; else None.
     """
 
     answer: Answer
@@ -75,13 +73,8 @@ class Verdict:
 
     def to_json(self) -> dict[str, Any]:
         """Return the answer and its reasons, ready for JSON; the certificate has its own."""
-        return {
-            "verdict": self.answer,
-            "reason": self.reason,
-            "rests_on": self.rests_on,
-            "threshold": self.threshold,
-            "next_task": self.next_task,
-        }
+        names = ("reason", "rests_on", "threshold", "next_task")
+        return {"verdict": self.answer, **{name: getattr(self, name) for name in names}}
 
 
 def quantile_of(kind: object) -> float:
@@ -100,14 +93,13 @@ def usable_bound(certificate: Certificate | None) -> float | None:
 def counterexample(
     trials: Sequence[Trial],
     threshold: PositiveFloat,
-    quantities: Quantities = sentences.NO_UNITS,
+    quantities: Quantities = NO_UNITS,
     confidence: float = CONFIDENCE,
     quantile: float = QUANTILE,
 ) -> Verdict | None:
     """Return the verdict "falsified" by the largest distance above the threshold; None if no distance is above it.
 
-    If executions were predicted to be noisy, a single one above it does not suffice: see
-    :mod:`ctxval.certificates.bets`. It suffices for a task of a suite, which is executed once.
+    With noise, a single one does not suffice (:mod:`ctxval.certificates.bets`), except in a suite, executed once.
     """
     once = quantities.space is not None and quantities.space.members is not None
     tau, bets = float(threshold), None if once else bets_against(trials, float(threshold), quantile)
@@ -129,13 +121,7 @@ def judge_by(
     volume: float = 0.0,
     provenance: Provenance | None = None,
 ) -> Verdict:
-    """Return the verdict by the trials and a certificate of any kind.
-
-    If the share ``volume`` of the task space that may exceed the threshold is 0, only bounds on d* validate.
-
-    Raises:
-        InputError: if the volume is negative or above 0.5, or the certificate's confidence is below 0.5.
-    """
+    """Return the verdict by a certificate of any kind; only bounds on d* validate if the acceptable ``volume`` is 0."""
     tau, known = float(threshold), provenance or Provenance()
     require_confidence(certificate.confidence)
     kind, quantities = KINDS.of(certificate), known.quantities
@@ -170,25 +156,21 @@ def judge(
         provenance: what is known besides the trials.
     """
     known, chosen = provenance or Provenance(), options or CertificateOptions()
-    verdict = _judged(trials, threshold, chosen, known)
+    quantile = quantile_of(chosen.kind)
+    verdict = counterexample(trials, threshold, known.quantities, chosen.confidence, quantile)
+    if verdict is None:
+        try:
+            certificate, expected = _certified(trials, chosen, known, threshold)
+            verdict = judge_by(certificate, trials, threshold, volume=chosen.volume, provenance=known)
+            verdict = replace(verdict, expected=expected)
+        except CertificateError as error:
+            verdict = Verdict("undecided", float(threshold), str(error))
     parts = [verdict.reason.removesuffix("."), verdict.expected, designs_sentence(trials)]
-    bets = bets_against(trials, float(threshold), quantile_of(chosen.kind))
+    bets = bets_against(trials, float(threshold), quantile)
     if verdict.answer != "falsified" and bets is not None and bets.above:
         parts.append(sentences.noise_may_explain(bets, float(threshold), known.quantities))
     reason = "; ".join(str(part) for part in parts if part is not None)
     return replace(verdict, reason=f"{reason}.{known.caution(threshold)}")
-
-
-def _judged(trials: Sequence[Trial], threshold: float, options: CertificateOptions, known: Provenance) -> Verdict:
-    falsified = counterexample(trials, threshold, known.quantities, options.confidence, quantile_of(options.kind))
-    if falsified is not None:
-        return falsified
-    try:
-        certificate, expected = _certified(trials, options, known, threshold)
-    except CertificateError as error:
-        return Verdict("undecided", float(threshold), str(error))
-    verdict = judge_by(certificate, trials, threshold, volume=options.volume, provenance=known)
-    return replace(verdict, expected=expected)
 
 
 def _certified(
@@ -198,12 +180,10 @@ def _certified(
     kind, sample = options.kind, known.sample(trials)
     if sample.suite is not None:
         require_suite(kind)
+    # No statement may count draws whose number depended on their distances.
     sample = sample if kind.sorts_draws else sample.with_countable_draws()
-    if threshold is None:
-        certificate, expected = kind.certify(sample, options.confidence), None
-    else:
-        certificate, expected = kind.certify_against(sample, threshold, options.confidence)
-    return certificate.with_remarks(known.remarks), expected
+    certificate, expected = certified(kind, sample, threshold, options.confidence)
+    return replace(certificate, assumptions=(*certificate.assumptions, *known.remarks)), expected
 
 
 def require_suite(kind: CertificateKind) -> None:
@@ -234,12 +214,11 @@ class Assessment(ShortRepr):
 
     def to_json(self) -> dict[str, Any]:
         """Return the certificate, the verdict and the forecast as one flat table, ready for JSON."""
-        verdict = {} if self.verdict is None else self.verdict.to_json()
+        certificate = None if self.certificate is None else self.certificate.to_json()
         expected = None if self.verdict is None or self.verdict.expected is None else asdict(self.verdict.expected)
-        refused = {"kind": self.kind, "refused": self.refusal}
         return {
-            **verdict,
-            **(refused if self.certificate is None else self.certificate.to_json()),
+            **({} if self.verdict is None else self.verdict.to_json()),
+            **(certificate or {"kind": self.kind, "refused": self.refusal}),
             "expected": expected,
         }
 
@@ -252,12 +231,8 @@ def assess(
 ) -> Assessment:
     """Return a certificate of the trials and, if there is a threshold, a verdict; arguments as in :func:`judge`.
 
-    A trial whose distance exceeds the threshold falsifies it without a certificate. The certificate is computed all
-    the same, if its theory allows the trials.
-
     Raises:
         CertificateError: if the certificate's theory refuses the trials and none of them exceeds the threshold.
-        InputError: if the threshold is not a positive number.
     """
     known, kind = provenance or Provenance(), options.kind
     falsified = None

@@ -3,16 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from itertools import islice
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ctxval._util.representation import counted, shown
+from ctxval._util.representation import counted
 from ctxval._util.texts import enumerated, parted, quoted
 from ctxval.certificates.bets import Bets
-from ctxval.certificates.bounds import at_most, except_for, late, of_tasks, percent, state_of, with_error, with_units
+from ctxval.certificates.bounds import (
+    NO_UNITS,
+    Quantities,
+    at_most,
+    distinguishable,
+    except_for,
+    late,
+    of_tasks,
+    percent,
+    state_of,
+    with_error,
+    with_units,
+)
 from ctxval.certificates.covering import RESOLUTION
 from ctxval.certificates.dynamics_evidence import PushedDistances, Tolerance
 from ctxval.certificates.sample import executions_of
@@ -23,88 +33,30 @@ if TYPE_CHECKING:
     from ctxval.certificates.base import Certificate
     from ctxval.certificates.forecast import Forecast
 
-_NAMED = 3  # most task parameters that a sentence names
-
-
-@dataclass(frozen=True)
-class Quantities:
-    """What gives numbers their units, and tasks their names.
-
-    Attributes:
-        units: the units of the distance.
-        space: the task space; None if it is not known.
-    """
-
-    units: str = ""
-    space: TaskSpace | None = None
-
-    def of(self, text: str) -> str:
-        """Return a distance as text with its units."""
-        return f"{text} {self.units}".rstrip()
-
-    @property
-    def ranges(self) -> str:
-        """The tasks, such as `` (start 0 to 0.4 m, goal 0.2 to 1.2 m)``; empty if they are not known or too many."""
-        if self.space is None:
-            return ""
-        if self.space.members is not None:
-            return f" of the suite of {len(self.space.members)}"
-        if self.space.dimension > _NAMED:
-            return ""
-        ends = zip(self.space.labels, self.space.low.tolist(), self.space.high.tolist(), strict=True)
-        ranges = ((*parted(label), low, high) for label, low, high in ends)
-        return f" ({', '.join(f'{name} {low:.4g} to {high:.4g} {unit}'.rstrip() for name, unit, low, high in ranges)})"
-
-    def task(self, trial: Trial) -> str:
-        """Return the task of a trial by its parameters, at most six of them."""
-        space, at = self.space, trial.unit_point
-        if space is None or at.shape != (space.dimension,):
-            return shown(trial.parameters)
-        values = space.labelled(space.from_unit(at))
-        return with_units(dict(islice(values.items(), 6)), digits=4) + (", ..." if len(values) > 6 else "")
-
-    def lengths(self, share: float) -> str:
-        """Return a share of each range in the units of the task parameters, if they are few and known."""
-        space = self.space
-        if space is None or space.members is not None or space.dimension > _NAMED:
-            return f"{share:.2g} of each parameter's range"
-        widths = zip(space.labels, (space.high - space.low).tolist(), strict=True)
-        lengths = {label: f"{share * width:.2g} {parted(label)[1]}".rstrip() for label, width in widths}
-        return " and ".join(f"{length} in {parted(label)[0]}" for label, length in lengths.items())
-
-
-NO_UNITS = Quantities()
-
 # Falsified
 
 
 def falsified(
     worst: Trial, trials: Sequence[Trial], tau: float, quantities: Quantities, bets: Bets | None = None
 ) -> str:
-    """Return which executed task exceeds a threshold, and how often an execution of the same task reproduced it.
-
-    ``bets`` are those of a noisy system.
-    """
+    """Return which executed task exceeds a threshold, and how often an execution of the same task reproduced it."""
     distance, limit = distinguishable(worst.distance or 0.0, tau)
     again = [(trial.distance or 0.0) > tau for trial in executions_of(worst, trials) if trial is not worst]
     reproduced = ""
-    if again:
+    if any(again):
         times = {1: "once", 2: "twice"}.get(sum(again), f"{sum(again)} times")
-        reproduced = f", reproduced {times}" if any(again) else ""
-        if not all(again):
-            reproduced += f" ({len(again) - sum(again)} of {len(again)} repetitions of the task did not exceed it)"
+        reproduced = f", reproduced {times}"
+    if not all(again):
+        reproduced += f" ({len(again) - sum(again)} of {len(again)} repetitions of the task did not exceed it)"
+    noise = ""
+    if bets is not None:
+        noise = (
+            f"; {bets.above} of {counted(bets.executions, 'execution')} exceed it, more than noise explains if a share "
+            f"of the executions as stated stays below in every task (evidence {bets.wealth:.3g})"
+        )
     return (
         f"trial {worst.number} was executed and its distance {quantities.of(distance)} exceeds {quantities.of(limit)}, "
-        f"at {quantities.task(worst)}{reproduced}{_beyond_noise(bets)}."
-    )
-
-
-def _beyond_noise(bets: Bets | None) -> str:
-    if bets is None:
-        return ""
-    return (
-        f"; {bets.above} of {counted(bets.executions, 'execution')} exceed it, more than noise explains if a share of "
-        f"the executions as stated stays below in every task (evidence {bets.wealth:.3g})"
+        f"at {quantities.task(worst)}{reproduced}{noise}."
     )
 
 
@@ -115,205 +67,6 @@ def noise_may_explain(bets: Bets, tau: float, quantities: Quantities) -> str:
         f"{bets.above} of {counted(bets.executions, 'execution')} {exceed} {quantities.of(f'{tau:.6g}')}, which noise "
         f"may explain (evidence {bets.wealth:.3g} against the threshold)"
     )
-
-
-def distinguishable(value: float, tau: float) -> tuple[str, str]:
-    """Return two numbers as texts, with enough digits to show which one is larger."""
-    for digits in range(4, 17):
-        texts = at_most(value, digits) if value <= tau else f"{value:.{digits}g}", f"{tau:.{max(digits, 6)}g}"
-        if np.sign(float(texts[0]) - float(texts[1])) == np.sign(value - tau):
-            return texts
-    return repr(value), repr(tau)
-
-
-def _bound_and_limit(certificate: Certificate, tau: float, quantities: Quantities) -> tuple[str, str]:
-    """Return a bound and the threshold as texts, the bound with its error if it has one."""
-    upper, limit = with_error(certificate.upper_bound, certificate.error), f"{tau:.6g}"
-    if "±" not in upper:
-        upper, limit = distinguishable(certificate.upper_bound, tau)
-    return quantities.of(upper), quantities.of(limit)
-
-
-# Validated
-
-
-def validated(certificate: Certificate, tau: float, quantities: Quantities) -> str:
-    """Return what is validated in one sentence: which tasks stay below the threshold, by which bound, if what holds."""
-    upper, limit = _bound_and_limit(certificate, tau, quantities)
-    level, tests = percent(certificate.confidence), certificate.details.get("tests")
-    untested = "" if tests is None or tests["drawn"] else f"{_UNTESTED}; "
-    if certificate.kind == "suite":
-        return (
-            f"all {certificate.details['tasks']} tasks of the suite were executed, and no distance exceeds {limit}: "
-            f"the largest is {upper}."
-        )
-    if certificate.volume:
-        return (
-            f"{untested}with {level} confidence, at most {at_most(100 * certificate.volume, 3)} % "
-            f"{of_tasks(certificate.distribution)}{quantities.ranges} exceed {limit}: the {certificate.kind} bound is "
-            f"{upper}, from {counted(certificate.trials, 'independent draw')}."
-        )
-    return (
-        f"{untested}every task{quantities.ranges} stays at or below {limit}{_which(certificate)}: the "
-        f"{certificate.kind} bound is {upper}, "
-        f"with {level} {_condition(certificate, quantities)}."
-    )
-
-
-def evidence(certificate: Certificate, tau: float, quantities: Quantities) -> str:
-    """Return what speaks for a bound on d*: executions, tests of predictions, and what the bound survives."""
-    if certificate.volume or certificate.kind == "suite":
-        return ""
-    best = certificate.details.get("best")
-    largest = "" if best is None else f", the largest distance {quantities.of(f'{best:.4g}')}"
-    executions = counted(certificate.trials, "execution")
-    left = certificate.details.get("not_executed")
-    missing = f"; {left} of the {certificate.details['tasks']} tasks were not executed" if left else ""
-    shown = f"{executions}{largest}{_tested(certificate, tau)}{missing}"
-    return f"{shown}.{_survives(certificate, tau)}{_not_entered(certificate)} "
-
-
-_UNTESTED = "no prediction was tested at drawn tasks (tests = 0)"
-
-
-def _condition(certificate: Certificate, quantities: Quantities) -> str:
-    """Return what the confidence of a bound on d* is, and the condition under which it holds."""
-    if certificate.kind == "dynamics":
-        physical = certificate.details.get("physical") or []  # stores of earlier versions do not have it
-        state = state_of(certificate.details.get("estimated"))
-        states, acting = state.replace("state", "states", 1), late(certificate.details.get("actuator"))
-        acting = f" ({acting})" if acting else ""
-        if certificate.details["quantile"] is not None:
-            of = enumerated([f"{states} and inputs{_of_lags(certificate)}{acting}", *physical], 10)
-            return (
-                "probability under a Gaussian process with noise, if what M misses is a smooth function of "
-                f"{of}, the same in every task and over time, and noise is "
-                "independent from step to step"
-            )
-        missed = "the system" if certificate.details["without_model"] else "what M misses"
-        recorded = [f"{states} and inputs{_of_lags(certificate)}{acting}"]
-        if not certificate.details["lags"]:
-            recorded = [state, f"input{acting}"] if physical else [f"{state} and input{acting}"]
-        return (
-            f"probability under a Gaussian process, if {missed} is one smooth function of "
-            f"{enumerated([*recorded, *physical], 10)}, "
-            "the same in every task and over time"
-        )
-    if certificate.kind == "posterior":
-        what = "expected distance" if certificate.details.get("stochastic") else "distance"
-        return (
-            f"probability under a Gaussian process, if the {what} is as smooth between the trials as at "
-            f"them{_unusual(certificate, quantities)}"
-        )
-    return "confidence, if its assumptions hold"
-
-
-def _which(certificate: Certificate) -> str:
-    """Return in how many executions of a task a bound holds; empty if all of them are alike."""
-    quantile = certificate.details.get("quantile")
-    return "" if quantile is None else f" in at least {100 * quantile:g} % of its executions"
-
-
-def _of_lags(certificate: Certificate) -> str:
-    lags = certificate.details["lags"]
-    return "" if not lags else f" of the last {lags + 1} steps"
-
-
-def _unusual(certificate: Certificate, quantities: Quantities) -> str:
-    """Return a resolution other than the default; empty if it is the default."""
-    resolution = certificate.details.get("resolution")
-    if resolution is None or resolution["diagonals"] == RESOLUTION:
-        return ""
-    diagonals = f"{resolution['diagonals']:g} diagonals; usual: {RESOLUTION:g}"
-    return f"{_gaps(resolution, quantities)} ({diagonals})"
-
-
-def _gaps(resolution: Mapping[str, float], quantities: Quantities) -> str:
-    """Return how large the gaps between trials may be, in the units of the tasks and as a share of the task space."""
-    share = 100 * resolution["of_the_space"]
-    if resolution["of_each_range"] >= 1:
-        return ", also in whole regions without a trial"
-    volume = f"{share:.0f}" if share >= 10 else f"{share:.2g}"
-    return f", in gaps of up to {quantities.lengths(resolution['of_each_range'])}, {volume} % of the task space"
-
-
-def _tested(certificate: Certificate, tau: float) -> str:
-    """Return what tests of predictions have shown, as the end of a sentence on the trials."""
-    tests = certificate.details.get("tests")
-    if tests is None or not tests["drawn"]:
-        return ""
-    if tests["largest_error"] is None:
-        return f"; {tests['drawn']} of them at tasks drawn over the whole task space"
-    within = at_most(100 * tests["largest_error"] / tau, 2)
-    return (
-        f"; {tests['drawn']} of them at tasks drawn over the whole task space, where the predictions made beforehand "
-        f"erred by at most {within} % of the threshold"
-    )
-
-
-def tolerances(certificate: Certificate, tau: float) -> tuple[Tolerance, Tolerance] | None:
-    """Return the smallest pushes, everywhere and away from all records, that bring a task above a threshold.
-
-    Returns None if the certificate does not know them.
-    """
-    pushed = certificate.details.get("pushed")
-    if pushed is None:
-        return None
-    distances = PushedDistances.from_json(pushed)
-    return distances.tolerance(tau), distances.tolerance(tau, away=True)
-
-
-def _survives(certificate: Certificate, tau: float) -> str:
-    """Return what a validation survives: how large an unmodelled push may be, beside the largest residual."""
-    known = tolerances(certificate, tau)
-    if known is None:
-        return ""
-    everywhere, away = known
-    largest = _rate(everywhere.state, everywhere.residual)
-    return (
-        f" The verdict holds even if something unknown pushes by {_push(everywhere)} at every step, or by "
-        f"{_push(away)} where no record is near; what M misses, and was learned, is up to {largest}."
-    )
-
-
-def _not_entered(certificate: Certificate) -> str:
-    """Return, as a sentence after a space, the largest region of two states that loops enter and no execution has."""
-    pocket = certificate.details.get("pocket")
-    if pocket is None:
-        return ""
-    radii = [(*parted(label), radius) for label, radius in pocket["within"].items()]
-    within = " and ".join(f"{f'{radius:.2g} {unit}'.rstrip()} in {name}" for name, unit, radius in radii)
-    if len({(unit, radius) for _, unit, radius in radii}) == 1:
-        _, unit, radius = radii[0]
-        within = f"{radius:.2g} {unit}".rstrip()
-    return (
-        f" The least tested place is {with_units(pocket['place'])}: predicted runs lead there, and no execution came "
-        f"within {within}."
-    )
-
-
-def _push(tolerance: Tolerance) -> str:
-    if np.isfinite(tolerance.push):
-        return _rate(tolerance.state, tolerance.push)
-    return "more than 8 times the largest residual"
-
-
-def _rate(label: str, value: float) -> str:
-    name, unit = parted(label)
-    return f"{f'{value:.2g} {unit}'.rstrip()} in {name}"
-
-
-def looked(known: int, smaller: Sequence[float], largest: float, quantities: Quantities) -> str:
-    """Return that a threshold was stated after distances were known, and which smaller ones before it do not hold."""
-    known_ones = "1 distance was" if known == 1 else f"{known} distances were"
-    parts = [f"the threshold was stated after {known_ones} known"] if known else []
-    falsified_ones = [each for each in smaller if each < largest]
-    for group, how in ((falsified_ones, "falsified"), (smaller[len(falsified_ones) :], "left undecided")):
-        if group:
-            limits = enumerated((quantities.of(f"{each:.6g}") for each in group), 5)
-            word, were, are = ("threshold", "was", "is") if len(group) == 1 else ("thresholds", "were", "are")
-            parts.append(f"the smaller {word} {limits}, which {were} stated before, {are} {how}")
-    return "".join(f"; {part}" for part in parts)
 
 
 def falsified_beside(executed: Sequence[tuple[str, Trial]], tau: float, quantities: Quantities) -> str:
@@ -331,63 +84,86 @@ def falsified_beside(executed: Sequence[tuple[str, Trial]], tau: float, quantiti
     return f" {first} {quantities.of(f'{tau:.6g}')}: {'; '.join(trials)}{'; ...' if len(executed) > 3 else ''}."
 
 
-# What it rests on
+# Validated
 
 
-def conditions(certificate: Certificate, space: TaskSpace | None) -> list[str]:
-    """Return what a validation by a built-in kind rests on: each entry completes a sentence "It rests on ..."."""
-    details = certificate.details
-    match certificate.kind:
-        case "dynamics":
-            gaps, again = with_units(details["resolution"]), details.get("differing")
-            noise = "" if again is None else f" (trials {again[0]} and {again[1]} of one task differ a little)"
-            changing = f"changing neither with time nor with the task{except_for(details.get('physical') or ())}"
-            lags = details["lags"]
-            steps = f"the last {lags + 1} records and inputs" if lags else "the last record and input"
-            if details["quantile"] is not None:
-                complete = f"{steps} determining the next record up to noise"
-                alike = (
-                    "noise being independent from step to step and like that of the records, and the system's dynamics "
-                    f"{changing}"
-                )
-            else:
-                complete = f"{steps} determining the next record"
-                if not details["lags"]:
-                    estimated = details.get("estimated")
-                    complete = f"{'' if estimated else 'the '}{state_of(estimated)} being complete"
-                alike = f"the system being deterministic{noise}, and its dynamics {changing}"
-            acting = late(details.get("actuator"))
-            return [
-                complete,
-                *([f"the inputs {acting} in every task, as in the executions"] if acting else []),
-                alike,
-                f"its dynamics being, in gaps of the records of up to {gaps}, like what was seen",
-            ]
-        case "posterior":
-            return _posterior_conditions(details, Quantities(space=space))
-        case "suite":
-            return ["an execution of a task again giving the distance that was recorded"]
-        case "audit" | "anytime" | "scenario" | "sampling-discarding" | "region":
-            draws = (
-                "tasks that were drawn independently, and from which M was not learned (how large the distance is in "
-                f"the {at_most(100 * certificate.volume, 3)} % that are left out is not known)"
-            )
-            fixed = ["a prediction that was fixed before these tasks were drawn"]
-            return [draws, *(fixed if certificate.kind == "region" else [])]
-    return ["what its certificate assumes"]
+def validated(certificate: Certificate, tau: float, quantities: Quantities) -> str:
+    """Return what is validated in one sentence: which tasks stay below the threshold, by which bound, if what holds."""
+    upper, limit = _bound_and_limit(certificate, tau, quantities)
+    kind, details, level = certificate.kind, certificate.details, percent(certificate.confidence)
+    if kind == "suite":
+        return (
+            f"all {details['tasks']} tasks of the suite were executed, and no distance exceeds {limit}: the largest is "
+            f"{upper}."
+        )
+    tests, quantile = details.get("tests"), details.get("quantile")
+    untested = "" if tests is None or tests["drawn"] else "no prediction was tested at drawn tasks (tests = 0); "
+    if certificate.volume:
+        return (
+            f"{untested}with {level} confidence, at most {at_most(100 * certificate.volume, 3)} % "
+            f"{of_tasks(certificate.distribution)}{quantities.ranges} exceed {limit}: the {kind} bound is "
+            f"{upper}, from {counted(certificate.trials, 'independent draw')}."
+        )
+    which = "" if quantile is None else f" in at least {100 * quantile:g} % of its executions"
+    condition = "confidence, if its assumptions hold"
+    if kind == "dynamics":
+        condition = f"probability under a Gaussian process{_condition_on_dynamics(details)}"
+    elif kind == "posterior":
+        what = "expected distance" if details.get("stochastic") else "distance"
+        condition = (
+            f"probability under a Gaussian process, if the {what} is as smooth between the trials as at "
+            f"them{_unusual(details.get('resolution'), quantities)}"
+        )
+    return (
+        f"{untested}every task{quantities.ranges} stays at or below {limit}{which}: the {kind} bound is {upper}, with "
+        f"{level} {condition}."
+    )
 
 
-def _posterior_conditions(details: Mapping[str, Any], quantities: Quantities) -> list[str]:
-    resolution = details.get("resolution")
-    where = "" if resolution is None else f"{_gaps(resolution, quantities)} (a peak inside one may be missed)"
-    smooth = f"the distance being as smooth between the trials as at them{where}"
-    if details.get("stochastic"):
-        return [
-            smooth,
-            "the noise that you declared being normal and alike everywhere (it is the expected distance that is "
-            "bounded: single executions may exceed it)",
-        ]
-    return [smooth, "each task having one distance, however often it is executed"]
+def _bound_and_limit(certificate: Certificate, tau: float, quantities: Quantities) -> tuple[str, str]:
+    upper, limit = with_error(certificate.upper_bound, certificate.error), f"{tau:.6g}"
+    if "±" not in upper:
+        upper, limit = distinguishable(certificate.upper_bound, tau)
+    return quantities.of(upper), quantities.of(limit)
+
+
+def _condition_on_dynamics(details: Mapping[str, Any]) -> str:
+    physical = details.get("physical") or []  # stores of earlier versions do not have it
+    state, acting = state_of(details.get("estimated")), late(details.get("actuator"))
+    acting = f" ({acting})" if acting else ""
+    lags = f" of the last {details['lags'] + 1} steps" if details["lags"] else ""
+    recorded = [f"{state.replace('state', 'states', 1)} and inputs{lags}{acting}"]
+    if details["quantile"] is not None:
+        return (
+            f" with noise, if what M misses is a smooth function of {enumerated([*recorded, *physical], 10)}, the same "
+            "in every task and over time, and noise is independent from step to step"
+        )
+    if not lags:
+        recorded = [state, f"input{acting}"] if physical else [f"{state} and input{acting}"]
+    missed = "the system" if details["without_model"] else "what M misses"
+    return (
+        f", if {missed} is one smooth function of {enumerated([*recorded, *physical], 10)}, the same in every task and "
+        "over time"
+    )
+
+
+def _unusual(resolution: Mapping[str, float] | None, quantities: Quantities) -> str:
+    if resolution is None or resolution["diagonals"] == RESOLUTION:
+        return ""
+    diagonals = f"{resolution['diagonals']:g} diagonals; usual: {RESOLUTION:g}"
+    return f"{_gaps(resolution, quantities)} ({diagonals})"
+
+
+def _gaps(resolution: Mapping[str, float], quantities: Quantities) -> str:
+    """Return how large the gaps between trials may be, in the units of the tasks and as a share of the task space."""
+    share = 100 * resolution["of_the_space"]
+    if resolution["of_each_range"] >= 1:
+        return ", also in whole regions without a trial"
+    volume = f"{share:.0f}" if share >= 10 else f"{share:.2g}"
+    return f", in gaps of up to {quantities.lengths(resolution['of_each_range'])}, {volume} % of the task space"
+
+
+# What a validation rests on
 
 
 def rests_on(
@@ -404,18 +180,143 @@ def rests_on(
     if made_good:
         numbers = ", ".join(str(failure["trial"]) for failure in made_good)
         parts.append(f"your word that what made trial {numbers} fail is removed for good")
-    parts += [f"your word that {remark}" for remark in remarks]
-    parts += alone
+    parts += [*(f"your word that {remark}" for remark in remarks), *alone]
     trials = evidence(certificate, tau, quantities)
     return f"{trials}It rests on {'; on '.join(parts)}.{_without_assumptions(certificate, tau, quantities)}"
 
 
+def evidence(certificate: Certificate, tau: float, quantities: Quantities) -> str:
+    """Return what speaks for a bound on d*: executions, tests of predictions, and what the bound survives."""
+    if certificate.volume or certificate.kind == "suite":
+        return ""
+    details = certificate.details
+    best, tests, left = details.get("best"), details.get("tests"), details.get("not_executed")
+    largest = "" if best is None else f", the largest distance {quantities.of(f'{best:.4g}')}"
+    tested = ""
+    if tests is not None and tests["drawn"]:
+        tested = f"; {tests['drawn']} of them at tasks drawn over the whole task space"
+        if tests["largest_error"] is not None:
+            within = at_most(100 * tests["largest_error"] / tau, 2)
+            tested += f", where the predictions made beforehand erred by at most {within} % of the threshold"
+    missing = f"; {left} of the {details['tasks']} tasks were not executed" if left else ""
+    survives = ""
+    if (known := tolerances(certificate, tau)) is not None:
+        everywhere, away = known
+        survives = (
+            f" The verdict holds even if something unknown pushes by {_push(everywhere)} at every step, or by "
+            f"{_push(away)} where no record is near; what M misses, and was learned, is up to "
+            f"{_rate(everywhere.state, everywhere.residual)}."
+        )
+    executions = counted(certificate.trials, "execution")
+    return f"{executions}{largest}{tested}{missing}.{survives}{_not_entered(details.get('pocket'))} "
+
+
+def tolerances(certificate: Certificate, tau: float) -> tuple[Tolerance, Tolerance] | None:
+    """Return the smallest pushes, everywhere and away from all records, that bring a task above a threshold."""
+    pushed = certificate.details.get("pushed")
+    if pushed is None:
+        return None
+    distances = PushedDistances.from_json(pushed)
+    return distances.tolerance(tau), distances.tolerance(tau, away=True)
+
+
+def _push(tolerance: Tolerance) -> str:
+    if np.isfinite(tolerance.push):
+        return _rate(tolerance.state, tolerance.push)
+    return "more than 8 times the largest residual"
+
+
+def _rate(label: str, value: float) -> str:
+    name, unit = parted(label)
+    return f"{f'{value:.2g} {unit}'.rstrip()} in {name}"
+
+
+def _not_entered(pocket: Mapping[str, Any] | None) -> str:
+    """Return, as a sentence after a space, the largest region of two states that loops enter and no execution has."""
+    if pocket is None:
+        return ""
+    radii = [(*parted(label), radius) for label, radius in pocket["within"].items()]
+    within = " and ".join(f"{f'{radius:.2g} {unit}'.rstrip()} in {name}" for name, unit, radius in radii)
+    if len({(unit, radius) for _, unit, radius in radii}) == 1:
+        _, unit, radius = radii[0]
+        within = f"{radius:.2g} {unit}".rstrip()
+    return (
+        f" The least tested place is {with_units(pocket['place'])}: predicted runs lead there, and no execution came "
+        f"within {within}."
+    )
+
+
+def conditions(certificate: Certificate, space: TaskSpace | None) -> list[str]:
+    """Return what a validation by a built-in kind rests on: each entry completes a sentence "It rests on ..."."""
+    details = certificate.details
+    match certificate.kind:
+        case "dynamics":
+            return _conditions_on_dynamics(details)
+        case "posterior":
+            resolution, quantities = details.get("resolution"), Quantities(space=space)
+            where = "" if resolution is None else f"{_gaps(resolution, quantities)} (a peak inside one may be missed)"
+            once = "each task having one distance, however often it is executed"
+            if details.get("stochastic"):
+                once = (
+                    "the noise that you declared being normal and alike everywhere (it is the expected distance that "
+                    "is bounded: single executions may exceed it)"
+                )
+            return [f"the distance being as smooth between the trials as at them{where}", once]
+        case "suite":
+            return ["an execution of a task again giving the distance that was recorded"]
+        case "audit" | "anytime" | "scenario" | "sampling-discarding" | "region":
+            draws = (
+                "tasks that were drawn independently, and from which M was not learned (how large the distance is in "
+                f"the {at_most(100 * certificate.volume, 3)} % that are left out is not known)"
+            )
+            fixed = ["a prediction that was fixed before these tasks were drawn"]
+            return [draws, *(fixed if certificate.kind == "region" else [])]
+    return ["what its certificate assumes"]
+
+
+def _conditions_on_dynamics(details: Mapping[str, Any]) -> list[str]:
+    again, lags, estimated = details.get("differing"), details["lags"], details.get("estimated")
+    changing = f"changing neither with time nor with the task{except_for(details.get('physical') or ())}"
+    steps = f"the last {lags + 1} records and inputs" if lags else "the last record and input"
+    complete = f"{steps} determining the next record"
+    if details["quantile"] is not None:
+        complete += " up to noise"
+        alike = (
+            "noise being independent from step to step and like that of the records, and the system's dynamics "
+            f"{changing}"
+        )
+    else:
+        if not lags:
+            complete = f"{'' if estimated else 'the '}{state_of(estimated)} being complete"
+        noise = "" if again is None else f" (trials {again[0]} and {again[1]} of one task differ a little)"
+        alike = f"the system being deterministic{noise}, and its dynamics {changing}"
+    acting = late(details.get("actuator"))
+    return [
+        complete,
+        *([f"the inputs {acting} in every task, as in the executions"] if acting else []),
+        alike,
+        f"its dynamics being, in gaps of the records of up to {with_units(details['resolution'])}, like what was seen",
+    ]
+
+
+def looked(known: int, smaller: Sequence[float], largest: float, quantities: Quantities) -> str:
+    """Return that a threshold was stated after distances were known, and which smaller ones before it do not hold."""
+    known_ones = "1 distance was" if known == 1 else f"{known} distances were"
+    parts = [f"the threshold was stated after {known_ones} known"] if known else []
+    falsified_ones = [each for each in smaller if each < largest]
+    for group, how in ((falsified_ones, "falsified"), (smaller[len(falsified_ones) :], "left undecided")):
+        if group:
+            limits = enumerated((quantities.of(f"{each:.6g}") for each in group), 5)
+            word, were, are = ("threshold", "was", "is") if len(group) == 1 else ("thresholds", "were", "are")
+            parts.append(f"the smaller {word} {limits}, which {were} stated before, {are} {how}")
+    return "".join(f"; {part}" for part in parts)
+
+
 def not_fitted(known: int) -> list[str]:
     """Return that a threshold was not chosen to suit the distances that were known; nothing if none were."""
-    if not known:
-        return []
     which = "distance that was" if known == 1 else "distances that were"
-    return [f"the threshold not being chosen to suit the {known} {which} known when it was stated"]
+    sentence = f"the threshold not being chosen to suit the {known} {which} known when it was stated"
+    return [sentence] if known else []
 
 
 def not_selected(others: int, falsifying: Sequence[str]) -> str:
@@ -433,10 +334,6 @@ def not_selected(others: int, falsifying: Sequence[str]) -> str:
 
 
 def _without_assumptions(certificate: Certificate, tau: float, quantities: Quantities) -> str:
-    """Return what drawn tests say whatever the system is: none of them exceeds the threshold.
-
-    This holds at any time: see :func:`~ctxval.certificates.prediction_tests.share_missed`.
-    """
     tests = certificate.details.get("tests", {})
     if tests.get("share_missed") is None:
         return ""
@@ -460,30 +357,28 @@ def undecided(certificate: Certificate, tau: float, volume: float, quantities: Q
             f" The dynamics seem to depend on {suspect[0]}: with it, executions are predicted from the others "
             f'{suspect[1]:.2g} times as well. State it as physical = ["{suspect[0]}"].'
         )
-    return f"{_undecided(certificate, tau, volume, quantities)}{suspicion}"
-
-
-def _undecided(certificate: Certificate, tau: float, volume: float, quantities: Quantities) -> str:
-    """Return :func:`undecided` without the suspicion."""
     if certificate.doubt is not None:
         support = supported(certificate, tau, quantities)
-        return f"{support}; but {certificate.doubt}." if support else f"{certificate.doubt}."
+        return f"{f'{support}; but ' if support else ''}{certificate.doubt}.{suspicion}"
     upper, limit = _bound_and_limit(certificate, tau, quantities)
-    if certificate.upper_bound > tau and certificate.details.get("quantile") is not None:
-        share = f"{100 * certificate.details['quantile']:g} % of the executions of a task"
-        return f"{share} may have distances of up to {upper}, and the threshold is {limit}{_shortfall(certificate)}."
     if certificate.upper_bound > tau:
-        return f"no distance above {limit} was executed, but d* may be up to {upper}{_shortfall(certificate)}."
-    if not certificate.covers(tau, certificate.volume):
-        return (
+        why = f"no distance above {limit} was executed, but d* may be up to {upper}"
+        if (quantile := certificate.details.get("quantile")) is not None:
+            share = f"{100 * quantile:g} % of the executions of a task"
+            why = f"{share} may have distances of up to {upper}, and the threshold is {limit}"
+        why += f"{_shortfall(certificate)}."
+    elif not certificate.covers(tau, certificate.volume):
+        why = (
             f"the {certificate.kind} bound is {upper}, and {limit} is too near to it for the random draws that it is "
             "computed from; more executions tighten it."
         )
-    return (
-        f"the {certificate.kind} bound of {counted(certificate.trials, 'trial')} leaves out "
-        f"{at_most(100 * certificate.volume, 3)} % {of_tasks(certificate.distribution)}, more than the "
-        f"{100 * volume:.3g} % that are acceptable{_shortfall(certificate)}; it is no bound on d*."
-    )
+    else:
+        why = (
+            f"the {certificate.kind} bound of {counted(certificate.trials, 'trial')} leaves out "
+            f"{at_most(100 * certificate.volume, 3)} % {of_tasks(certificate.distribution)}, more than the "
+            f"{100 * volume:.3g} % that are acceptable{_shortfall(certificate)}; it is no bound on d*."
+        )
+    return f"{why}{suspicion}"
 
 
 def supported(certificate: Certificate, tau: float, quantities: Quantities = NO_UNITS) -> str:
@@ -502,7 +397,6 @@ def supported(certificate: Certificate, tau: float, quantities: Quantities = NO_
 
 
 def _shortfall(certificate: Certificate) -> str:
-    """Return why the bound or the volume left out is not smaller, as the end of a sentence; empty if unknown."""
     details = certificate.details
     if details.get("raised_from") is not None:
         worst = next(checked for checked in details["checked"] if checked["trial"] == details["raised_by_trial"])

@@ -17,7 +17,7 @@ import typer
 from rich.table import Table
 
 from ctxval._util.describe import describe
-from ctxval._util.progress_display import progress_shown
+from ctxval._util.progress import progress_shown
 from ctxval._util.texts import reason_of, shortened
 from ctxval.campaign.goals_of_model import GoalWarning
 from ctxval.campaign.storage.disks import StoreWarning
@@ -27,7 +27,7 @@ from ctxval.certificates.verdict import Verdict
 from ctxval.cli.commands import TEXTS, app
 from ctxval.cli.screen import Screen, line
 from ctxval.core.experiment import UnitsWarning
-from ctxval.core.preflight import DistanceWarning
+from ctxval.core.plan import DistanceWarning
 from ctxval.core.trial import Trial
 from ctxval.core.validation import CostWarning
 from ctxval.errors import CertificateError, CtxvalError, InputError, StoreError

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import importlib
 import shlex
 from pathlib import Path
@@ -11,13 +10,20 @@ from typing import Any
 from ctxval._util.checked import NonNegativeFloat, require
 from ctxval._util.progress import advance, stage
 from ctxval._util.texts import enumerated
-from ctxval.campaign.by_hand import TRIAL_FILES, parameters_from, read_runs, write_files
+from ctxval.campaign.by_hand import (
+    TRIAL_FILES,
+    parameters_from,
+    parameters_of_trial,
+    read_runs,
+    result_sentence,
+    tell_result,
+    write_files,
+)
 from ctxval.campaign.choices import Execution
 from ctxval.campaign.storage.other_stores import STORE_SUFFIXES
 from ctxval.campaign.storage.store import Store
-from ctxval.campaign.telling import ToldResult, parameters_of_trial, result_sentence, tell_result
+from ctxval.campaign.telling import ToldResult
 from ctxval.cli.base import command, out, print_verdict, status_of
-from ctxval.cli.config.settings import Settings
 from ctxval.cli.config.stored_settings import Opened, budget_of, limit_of, open_store, open_target, trusted_settings
 from ctxval.cli.options import Allowed, named_values, require_folder
 from ctxval.core.exchange import TASK_FORMAT
@@ -167,12 +173,9 @@ def import_runs(
     checked = list[tuple[Plan, Execution]]()
     with stage("checking", len(runs), "runs"):
         for run in runs:  # all of them before any is stored
-            try:
-                checked.append(run.checked(campaign.validation, experiment))
-            except InputError as error:
-                raise InputError(f"{run.where}: {error}") from error
+            checked.append(run.checked(campaign.validation, experiment))
             advance(1)
-    ended = campaign.add_known(checked, _WAIT)
+    ended = campaign.recorder.add(checked, _WAIT)
     new = [trial for trial in ended if trial is not None]
     known = len(ended) - len(new)
     for trial in new[:10]:
@@ -210,8 +213,22 @@ def serve(
     web = web_server()
     settings = trusted_settings(Store.existing(store), experiment=allowed.experiment, trust=allowed.trust)
 
+    def served(opened: Opened) -> ServedCampaign:
+        limit = limit_of(opened.experiment, opened.settings, threshold)
+        if limit is not None:
+            opened.campaign.state_threshold(limit)
+        total = budget_of(opened.experiment, opened.settings, budget)
+        certificate = opened.settings.certificate_options
+        return ServedCampaign(opened.experiment, opened.campaign, limit, certificate, total)
+
     def first() -> ServedCampaign:
-        return _served(open_store(store, allowed), threshold, budget)
+        return served(open_store(store, allowed))
+
+    def again() -> ServedCampaign:
+        # By the settings that the user has allowed to run here: those in the store may have been changed since.
+        experiment = settings.load()
+        campaign = settings.campaign(experiment, Store.existing(store))
+        return served(Opened(settings, experiment, campaign, store))
 
     def say_started(place: str, secret: str | None) -> None:
         out.say(f"the page is at {place}" + ("" if secret is None else f"?token={secret}"))
@@ -219,23 +236,7 @@ def serve(
             out.say("everybody who has this address can record results. It is sent without encryption.")
         out.say("Ctrl-C stops the server; all results are stored.")
 
-    again = functools.partial(_reopened, settings, store, threshold, budget)
     web.serve(first, again, say_started, host=host, port=port, token=token, names=allow_host or ())
-
-
-def _reopened(settings: Settings, path: Path, threshold: float | None, budget: int | None) -> ServedCampaign:
-    """Open a store by settings that the user has allowed to run here: those in it may have been changed since."""
-    experiment = settings.load()
-    campaign = settings.campaign(experiment, Store.existing(path))
-    return _served(Opened(settings, experiment, campaign, path), threshold, budget)
-
-
-def _served(opened: Opened, threshold: float | None, budget: int | None) -> ServedCampaign:
-    experiment, settings = opened.experiment, opened.settings
-    limit, total = limit_of(experiment, settings, threshold), budget_of(experiment, settings, budget)
-    if limit is not None:
-        opened.campaign.state_threshold(limit)
-    return ServedCampaign(experiment, opened.campaign, limit, settings.certificate_options, total)
 
 
 def web_server() -> Any:

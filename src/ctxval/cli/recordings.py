@@ -50,7 +50,15 @@ class Logs:
                 raise InputError("--mapping cannot be combined with --state and --input.")
             if not self.state:
                 raise InputError("--input needs --state: name the fields of all states too.")
-            return replace(LogMapping(_fields(self.state), _fields(self.input_ or ())), **self.changes)
+            fields: tuple[dict[str, Field], dict[str, Field]] = {}, {}
+            for kind, given in zip(fields, (self.state, self.input_ or ()), strict=True):
+                for text in given:
+                    name, equals, path = map(str.strip, text.partition("="))
+                    if not name or (equals and not path) or name in kind:
+                        wanted = "each state and input must be given once, as NAME=FIELD"
+                        raise InputError(f"{wanted}, got {text!r}.")
+                    kind[name] = Field(path if equals else name)
+            return replace(LogMapping(*fields), **self.changes)
         if self.mapping is None:
             return None
         mapping = replace(LogMapping.from_toml(self.mapping), **self.changes)
@@ -337,17 +345,6 @@ def collect(
     out.say(f"{len(recorded)} executions recorded in {out_}, {known} were there before, {len(failed)} failed.")
     report = {"recorded": recorded, "known": known, "failed": failed, "folder": str(out_)}
     return (report, CANNOT_GO_ON) if failed and not recorded and not known else report
-
-
-def _fields(given: Sequence[str]) -> dict[str, Field]:
-    fields: dict[str, Field] = {}
-    for text in given:
-        name, equals, path = text.partition("=")
-        name, path = (name.strip(), path.strip()) if equals else (text.strip(), text.strip())
-        if not name or not path or name in fields:
-            raise InputError(f"each state and input must be given once, as NAME=FIELD, got {text!r}.")
-        fields[name] = Field(path)
-    return fields
 
 
 def numbers(text: str) -> list[int]:

@@ -32,12 +32,11 @@ from ctxval.cli.base import (
     status_of,
     worst_of,
 )
-from ctxval.cli.certify import page_path
 from ctxval.cli.config.settings import Settings, read_settings
 from ctxval.cli.config.stored_settings import budget_of, limit_of
-from ctxval.cli.envelope import print_envelope
 from ctxval.cli.hand import web_server
 from ctxval.cli.options import named_values
+from ctxval.cli.stores import page_path, print_envelope
 from ctxval.core.trajectory import Transitions
 from ctxval.core.trial import designs_sentence
 from ctxval.errors import CertificateError, InputError

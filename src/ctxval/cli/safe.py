@@ -31,7 +31,6 @@ def safe(
     timeout: float | None = None,
     accept_change: str | None = None,
 ) -> Any:
-    """``ctxval safe``."""
     require("margin", PositiveFloat | None, margin)
     require("audit", PositiveInt | None, audit)
     given = read_settings(target, {"budget": budget, "confidence": confidence, "seed": seed})
@@ -43,7 +42,9 @@ def safe(
         asked["certificate"] = given.certificate.model_copy(update={"kind": "dynamics"})
     settings = given.model_copy(update=asked)
     experiment = settings.load()
-    path = _store_path(settings, experiment.name, store)
+    usual = settings.store_path(experiment.name)
+    # It is not the store of a campaign of the experiment's own distance.
+    path = usual.with_name(f"{usual.stem}.safe{usual.suffix}") if store is None else store
     if audit is not None:
         require_box(experiment.validation)
     share = require_safe_tasks(experiment.validation)
@@ -68,14 +69,6 @@ def safe(
     out.say(f"store: {path}")
     found = {**report.to_dict(), "drawn": drawn and vars(drawn), "budget": total, "failures": failures}
     return {**found, "store": str(path)}, FALSIFIED if report.answer == "falsified" else 0
-
-
-def _store_path(settings: Settings, name: str, given: Path | None) -> Path:
-    """Return the path of the store, which is not that of a campaign of the experiment's own distance."""
-    if given is not None:
-        return given
-    usual = settings.store_path(name)
-    return usual.with_name(f"{usual.stem}.safe{usual.suffix}")
 
 
 def _has_another_margin(path: Path, settings: Settings) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+import sys
 import warnings
 from dataclasses import asdict
 from pathlib import Path
@@ -21,20 +22,29 @@ from ctxval.cli.options import named_values
 from ctxval.core.experiment import UnitsWarning
 from ctxval.errors import InputError
 from ctxval.studies import aspect1 as model_alone
+from ctxval.studies.safety.margins import spec_distance
 
 
 @command()
-def init(file: Path = Path("experiment.toml")) -> Any:
+def init(file: Path = Path("experiment.toml"), hardware: bool = False) -> Any:
     if file.suffix != ".toml":
         raise InputError(f"an experiment file ends in .toml, got {str(file)!r}.")
-    module = "".join(c if c.isascii() and c.isalnum() else "_" for c in file.stem) + "_system"
-    paths = {"experiment.toml": file, "system.py.txt": file.with_name(f"{module}.py")}
+    kind = "rig" if hardware else "system"
+    module = "".join(c if c.isascii() and c.isalnum() else "_" for c in file.stem) + f"_{kind}"
+    paths = {"experiment.toml": file, f"{kind}.py.txt": file.with_name(f"{module}.py")}
+    if hardware:
+        about = f"here a program that executes one task on a rig: {module}.py"
+        program = f"{Path(sys.executable).name} {module}.py"
+        system = f'type = "Subprocess"\ncommand = "{program}"\ntimeout = 60            # seconds'
+    else:
+        about = f"here a step function in {module}.py"
+        system = f'type = "Simulated"\nstep = {{ ref = "{module}:step" }}'
     for path in paths.values():
         if path.exists():
             raise InputError(f"{path} already exists and was not changed.")
     for example, path in paths.items():
         text = (Path(__file__).parent / "example" / example).read_text("utf-8")
-        write_text(path, Template(text).substitute(name=file.name, module=module))
+        write_text(path, Template(text).substitute(name=file.name, about=about, system=system))
     quoted = shlex.quote(str(file))
     written = [str(path) for path in paths.values()]
     out.say(" and ".join(written))
@@ -60,7 +70,8 @@ def check(
         experiment = settings.load()
     _ = settings.certificate_options  # which refuses a kind or an option that does not exist
     settings.search.build(settings.folder)
-    findings = check_experiment(experiment, execute=execute, seed=settings.seed)
+    spec = None if settings.spec is None else spec_distance(settings.spec.on(experiment).validation).spec
+    findings = check_experiment(experiment, execute=execute, seed=settings.seed, spec=spec)
     failed = any(finding.state == "failed" for finding in findings)
     status, simulated = BAD_INPUT if failed else 0, None
     if aspect1 and not failed:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shlex
 from pathlib import Path
+from string import Template
 from typing import Any
 
 import numpy as np
@@ -71,88 +72,51 @@ def _print(result: Survey) -> None:
 
 def mapping_text(mapping: LogMapping, dt: float) -> str:
     """Return a mapping as a TOML file to edit."""
+    usual = vars(Field("x"))
+
+    def text_of(field: Field) -> str:
+        changed = {name: value for name, value in vars(field).items() if value != usual[name] and value != ""}
+        if set(changed) == {"path"}:
+            return json.dumps(field.path)
+        return f"{{ {', '.join(f'{name} = {json.dumps(value)}' for name, value in changed.items())} }}"
+
     lines = [f"dt = {dt!r}  # time step of the model, seconds"]
     for name in ("time", "time_unit", "delay", "longest_gap", "lags", "valid"):
         if value := getattr(mapping, name):
             lines.append(f"{name} = {json.dumps(value)}")
     for kind in ("states", "inputs"):
-        lines += [
-            "",
-            f"[{kind}]",
-            *(f"{json.dumps(name)} = {_field(at)}" for name, at in getattr(mapping, kind).items()),
-        ]
+        fields = getattr(mapping, kind).items()
+        lines += ["", f"[{kind}]", *(f"{json.dumps(name)} = {text_of(field)}" for name, field in fields)]
     if isinstance(mapping.observer, Observer):
         named = ", ".join(f"{json.dumps(name)} = {json.dumps(unit)}" for name, unit in mapping.observer.states.items())
         lines += ["", "[observer]", f"function = {json.dumps(mapping.observer.reference)}", f"states = {{ {named} }}"]
     return "\n".join(lines) + "\n"
 
 
-def _field(field: Field) -> str:
-    usual = vars(Field("x"))
-    changed = {name: value for name, value in vars(field).items() if value != usual[name] and value != ""}
-    if set(changed) == {"path"}:
-        return json.dumps(field.path)
-    return f"{{ {', '.join(f'{name} = {json.dumps(value)}' for name, value in changed.items())} }}"
-
-
 def experiment_text(result: Survey) -> str:
     """Return an experiment file to edit: goals within the recorded range of the first state, and LQR on the model."""
     recordings = result.recordings
-    states, inputs = list(recordings.states), list(recordings.inputs)
+    states, inputs = recordings.states, recordings.inputs
     x = np.concatenate([run.trajectory.states for run in recordings.runs])
     u = np.concatenate([run.trajectory.inputs for run in recordings.runs])
-    low, high = np.quantile(x[:, 0], [0.05, 0.95])
-    start = np.median([run.trajectory.states[0] for run in recordings.runs], axis=0)
-    horizon = min(max(result.reach[1], 10), 200)
+    first, unit = next(iter(states.items()))
 
-    def numbers(values: Any) -> str:
-        return json.dumps([float(f"{value:.3g}") for value in values])
+    def numbers(values: Any) -> list[float]:
+        return [float(f"{value:.3g}") for value in values]
 
-    def named(names: dict[str, str]) -> str:
-        return "\n".join(f"{json.dumps(name)} = {json.dumps(unit)}" for name, unit in names.items())
-
-    goal = json.dumps(["goal", *(0.0 for _ in states[1:])])
-    unit = recordings.states[states[0]]
-    bounds = [float(f"{low:.3g}"), float(f"{high:.3g}"), *([unit] if unit else [])]
-    return f"""\
-# Made by `ctxval start` from recordings. Edit the tasks, the controller and the distance, and say
-# `ctxval check` and then `ctxval ask` of this file: people execute the tasks (type = "Manual").
-name = "start"
-budget = 20
-units = {json.dumps(unit)}
-# threshold = 0.1  # the largest distance that you accept
-
-[space]
-goal = {json.dumps(bounds)}  # goals of {states[0]}: 90 % of its recorded range
-
-[task]
-initial_state = {numbers(start)}  # {", ".join(states)}
-goal = {goal}
-horizon = {horizon}
-dt = {recordings.dt!r}
-
-[system]
-type = "Manual"
-states = {{ {", ".join(f"{json.dumps(n)} = {json.dumps(of)}" for n, of in recordings.states.items())} }}
-inputs = {{ {", ".join(f"{json.dumps(n)} = {json.dumps(of)}" for n, of in recordings.inputs.items())} }}
-dt = {recordings.dt!r}
-
-[model]
-type = "Saved"
-source = "model.npz"
-
-[synthesizer]
-type = "LQR"
-Q = {numbers(1 / np.maximum(x.var(axis=0), 1e-12))}
-R = {numbers(1 / np.maximum(u.var(axis=0), 1e-12))}  # inputs: {", ".join(inputs)}
-
-[distance]
-type = "MaximumDeviation"
-components = [0]
-
-[states]
-{named(recordings.states)}
-
-[inputs]
-{named(recordings.inputs)}
-"""
+    values = {
+        "unit": unit,
+        "goals": numbers(np.quantile(x[:, 0], [0.05, 0.95])) + ([unit] if unit else []),
+        "start": numbers(np.median([run.trajectory.states[0] for run in recordings.runs], axis=0)),
+        "goal": ["goal", *[0.0] * (len(states) - 1)],
+        "horizon": min(max(result.reach[1], 10), 200),
+        "dt": recordings.dt,
+        "Q": numbers(1 / np.maximum(x.var(axis=0), 1e-12)),
+        "R": numbers(1 / np.maximum(u.var(axis=0), 1e-12)),
+    }
+    texts = {name: json.dumps(value) for name, value in values.items()}
+    for kind, units in (("state", states), ("input", inputs)):
+        rows = [f"{json.dumps(name)} = {json.dumps(unit)}" for name, unit in units.items()]
+        texts |= {f"{kind}s": ", ".join(units), f"{kind}_units": ", ".join(rows), f"{kind}_rows": "\n".join(rows)}
+    template = (Path(__file__).parent / "example" / "start.toml.txt").read_text("utf-8")
+    return Template(template).substitute(texts, first=first)

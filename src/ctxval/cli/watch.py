@@ -6,16 +6,15 @@ import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from ctxval._util.checked import NonNegativeFloat, require
-from ctxval._util.csv_table import CsvTable
+from ctxval._util.columns import CsvTable
 from ctxval._util.progress import advance, stage
 from ctxval._util.representation import task_text
 from ctxval.campaign.by_hand import parameters_from, read_runs
 from ctxval.campaign.choices import Execution
-from ctxval.campaign.watching import FALSE_ALARMS, Watch
-from ctxval.certificates.expiry import WatchState
+from ctxval.campaign.watching import FALSE_ALARMS
 from ctxval.cli.base import FALSIFIED, command, notes, out
 from ctxval.cli.config.stored_settings import Opened, limit_of, open_store
 from ctxval.cli.options import Allowed
@@ -36,7 +35,6 @@ def watch(
     resample: bool = False,
     start_tolerance: float | None = None,
 ) -> Any:
-    """``ctxval watch``."""
     require("start tolerance", NonNegativeFloat | None, start_tolerance)
     opened = open_store(store, allowed)
     limit = limit_of(opened.experiment, opened.settings, threshold)
@@ -49,13 +47,18 @@ def watch(
     watching = opened.campaign.watch(limit, false_alarms)
     judged, skipped = list[dict[str, Any]](), list[dict[str, str]]()
     with stage("judging", len(runs), "runs"):
-        for run in runs:
+        for name, execution, task in runs:
             try:
-                state = run.judged_by(watching)
+                if execution.trajectory is None:
+                    raise ExecutionError(execution.failed or "it has no trajectory")
+                state = watching.update(execution, task, name=name)
             except ExecutionError as error:
-                skipped.append({"run": run.name, "reason": str(error)})
-            else:
-                judged.append(_judged(state))
+                skipped.append({"run": name, "reason": str(error)})
+            else:  # the statistic of this run that differs most from those certified
+                ratios = {of.name: of.ratio(len(state.runs)) for of in state.channels if of.later[-1] is not None}
+                most = max(ratios, key=ratios.__getitem__)
+                latest = {"run": name, "distance": state.distances[-1], "statistic": most, "ratio": ratios[most]}
+                judged.append({**latest, "evidence": state.evidence})
             advance(1)
     for each in judged:
         distance = "" if each["distance"] is None else f"distance {each['distance']:.4g}, "
@@ -82,17 +85,8 @@ def watch(
     return report, FALSIFIED if state.expired else 0
 
 
-class _Run(NamedTuple):
-    """A recording in a file, with its task if it is known, or the reason why it cannot be judged."""
-
-    name: str
-    execution: Execution
-    parameters: Mapping[str, Any] | None
-
-    def judged_by(self, watching: Watch) -> WatchState:
-        if self.execution.trajectory is None:
-            raise ExecutionError(self.execution.failed or "it has no trajectory")
-        return watching.update(self.execution, self.parameters, name=self.name)
+_Run = tuple[str, Execution, Mapping[str, Any] | None]
+"""The name of a recording, the recording or the reason why it cannot be judged, and its task if that is known."""
 
 
 def _runs(
@@ -108,22 +102,17 @@ def _runs(
     if given is not None and len(logs) != 1:
         raise InputError(f"--set gives the parameters of one trajectory, got {len(logs)} files.")
     for path in logs:
-        if given is None and not _is_table(path):
+        # A table of runs names their trajectories.
+        is_table = path.suffix == ".csv" and path.is_file() and "trajectory" in CsvTable(path, 16 * 2**20).names
+        if given is None and not is_table:
             yield from _without_task(opened, path, reading)
             continue
         for run in read_runs([path], given, space, mapping=mapping, **how):
             try:
                 _, execution = run.checked(validation, experiment)
-            except InputError as error:
-                raise InputError(f"{run.where}: {error}") from error
             except ExecutionError as error:
                 execution = Execution(failed=str(error))
-            yield _Run(run.where, execution, run.parameters)
-
-
-def _is_table(path: Path) -> bool:
-    """Return whether a file is a table of runs, which names their trajectories."""
-    return path.suffix == ".csv" and path.is_file() and "trajectory" in CsvTable(path, 16 * 2**20).names
+            yield run.where, execution, run.parameters
 
 
 def _without_task(opened: Opened, path: Path, reading: Logs) -> Iterator[_Run]:
@@ -137,17 +126,9 @@ def _without_task(opened: Opened, path: Path, reading: Logs) -> Iterator[_Run]:
         pieces = max(1, whole.horizon // task.horizon)
         if 2 * whole.horizon < task.horizon:
             short = f"it has {whole.horizon} steps, and a task has {task.horizon}"
-            yield _Run(name, Execution(failed=short), None)
+            yield name, Execution(failed=short), None
             continue
         for piece in range(pieces):
             first, last = piece * task.horizon, min((piece + 1) * task.horizon, whole.horizon)
             part = Trajectory(whole.times[first : last + 1], whole.states[first : last + 1], whole.inputs[first:last])
-            yield _Run(name if pieces == 1 else f"{name}, part {piece + 1}", Execution(part), None)
-
-
-def _judged(state: WatchState) -> dict[str, Any]:
-    """Return the statistic of the latest run that differs most from those certified."""
-    ratios = {each.name: each.ratio(len(state.runs)) for each in state.channels if each.later[-1] is not None}
-    name = max(ratios, key=lambda key: ratios[key])
-    latest = {"run": state.runs[-1], "distance": state.distances[-1]}
-    return {**latest, "statistic": name, "ratio": ratios[name], "evidence": state.evidence}
+            yield name if pieces == 1 else f"{name}, part {piece + 1}", Execution(part), None

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ctxval._util.arrays import Array
-from ctxval.controllers.cost import QuadraticCost, linear_gains
+from ctxval.controllers.lqr import QuadraticCost, linear_gains
 from ctxval.core.controller import Limits
 
 

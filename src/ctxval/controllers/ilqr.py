@@ -12,7 +12,7 @@ from ctxval._util.checked import PositiveFloat, PositiveInt
 from ctxval._util.registry import part
 from ctxval._util.representation import ShortRepr
 from ctxval.controllers.backward_pass import Expansion, InputStep, minimise
-from ctxval.controllers.cost import QuadraticCost, QuadraticSynthesizer
+from ctxval.controllers.lqr import QuadraticCost, QuadraticSynthesizer
 from ctxval.core.controller import AffineFeedback, LimitsLike, fed_back
 from ctxval.core.model import Model, linearize
 from ctxval.core.task import Task

@@ -12,7 +12,7 @@ from ctxval._util.checked import PositiveFloat, PositiveInt
 from ctxval._util.extras import require_extra
 from ctxval._util.registry import part
 from ctxval._util.representation import ShortRepr
-from ctxval.controllers.cost import QuadraticCost
+from ctxval.controllers.lqr import QuadraticCost
 from ctxval.core.controller import Limits, LimitsLike
 from ctxval.core.model import Model, linearize
 from ctxval.core.task import Task

@@ -13,7 +13,7 @@ from ctxval._util.representation import ShortRepr
 from ctxval.core.controller import Controller, Limits, Synthesizer, memory_of, stepped
 from ctxval.core.kalman import Estimate, corrected, predicted
 from ctxval.core.model import Model
-from ctxval.core.outputs import Outputs, OutputsLike
+from ctxval.core.system import Outputs, OutputsLike
 from ctxval.core.task import Task
 from ctxval.errors import InputError, ShapeError
 

@@ -151,11 +151,7 @@ class Limits(ShortRepr):
     def __init__(self, low: ArrayLike, high: ArrayLike) -> None:
         for name, bound in (("low", low), ("high", high)):
             object.__setattr__(self, name, as_floats(f"{name} of the limits", bound))
-        try:
-            fits = len(np.broadcast_shapes(self.low.shape, self.high.shape)) <= 1
-        except ValueError:
-            fits = False
-        if not fits:
+        if max(self.low.ndim, self.high.ndim) > 1 or len({self.low.size, self.high.size} - {1}) > 1:
             got = f"shapes {self.low.shape} and {self.high.shape}"
             raise ShapeError(f"low and high of the limits must be numbers, or one for each input, got {got}.")
         if not (self.low < self.high).all():
@@ -169,39 +165,13 @@ class Limits(ShortRepr):
         It is one number h for ``-h`` to ``h`` of every input; ``Limits(low=, high=)`` or a mapping of low and high,
         numbers or ``(m,)``; or rows ``[low, high]``, one for each input.
         """
-        box = limits if isinstance(limits, Limits) else cls._read(limits)
+        box = limits if isinstance(limits, Limits) else cls(*_ends(limits))
         if inputs is None:
             return box
         if any(bound.shape not in ((), (inputs,)) for bound in (box.low, box.high)):
             got = f"{box.low.shape} and {box.high.shape}"
             raise ShapeError(f"limits must be numbers or have shape ({inputs},), got {got}.")
         return cls(*(np.array(np.broadcast_to(bound, (inputs,))) for bound in (box.low, box.high)))
-
-    @classmethod
-    def _read(cls, limits: Any) -> Limits:
-        spellings = (
-            "write one number h for -h to h of every input, { low = 0.0, high = 8.0 } (in Python also Limits(low=0.0, "
-            "high=8.0)) with numbers or one for each input, or rows [[low, high], ...], one for each input"
-        )
-        if isinstance(limits, Mapping):
-            if set(limits) != {"low", "high"}:
-                given = ", ".join(map(str, limits)) or "neither"
-                raise InputError(
-                    f"limits must have low and high, of which one may be infinite, got {given}; {spellings}."
-                )
-            return cls(limits["low"], limits["high"])
-        try:
-            array = as_floats("limits", limits)
-        except InputError as error:
-            raise InputError(f"{str(error).removesuffix('.')}; {spellings}.") from error
-        if array.ndim == 0:
-            return cls(-array, array)
-        if array.ndim == 1 and array.size:
-            # It could be the lower and the upper limit, or the upper limits of several inputs.
-            raise InputError(f"limits must not be a flat list, got {array.tolist()}: {spellings}.")
-        if array.ndim != 2 or array.shape[1] != 2:
-            raise ShapeError(f"limits must not have shape {array.shape}; {spellings}.")
-        return cls(array[:, 0], array[:, 1])
 
     def describe(self) -> dict[str, Any]:
         """Return what identifies these limits in a store."""
@@ -210,6 +180,28 @@ class Limits(ShortRepr):
     def clip(self, u: Array) -> Array:
         """Return inputs ``(..., m)`` clipped to the limits; NaN stays NaN."""
         return np.asarray(np.clip(u, self.low, self.high))
+
+
+def _ends(limits: Any) -> tuple[ArrayLike, ArrayLike]:
+    spellings = (
+        "write one number h for -h to h of every input, { low = 0.0, high = 8.0 } (in Python also Limits(low=0.0, "
+        "high=8.0)) with numbers or one for each input, or rows [[low, high], ...], one for each input"
+    )
+    if isinstance(limits, Mapping):
+        if set(limits) != {"low", "high"}:
+            given = ", ".join(map(str, limits)) or "neither"
+            raise InputError(f"limits must have low and high, of which one may be infinite, got {given}; {spellings}.")
+        return limits["low"], limits["high"]
+    try:
+        array = as_floats("limits", limits)
+    except InputError as error:
+        raise InputError(f"{str(error).removesuffix('.')}; {spellings}.") from error
+    if array.ndim == 1 and array.size:
+        # It could be the lower and the upper limit, or the upper limits of several inputs.
+        raise InputError(f"limits must not be a flat list, got {array.tolist()}: {spellings}.")
+    if array.ndim and array.shape[1:] != (2,):
+        raise ShapeError(f"limits must not have shape {array.shape}; {spellings}.")
+    return (array[:, 0], array[:, 1]) if array.ndim else (-array, array)
 
 
 LimitsLike = float | Limits | Mapping[str, ArrayLike] | ArrayLike

@@ -7,16 +7,17 @@ bit for bit. Nothing in such a file is ever run, and a damaged or forged file ra
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
 from ctxval._util.arrays import Array, as_finite, as_floats
-from ctxval._util.files import read_bytes, read_json, written_whole
-from ctxval._util.npz import Archive
+from ctxval._util.checked import Seconds, require
+from ctxval._util.files import Archive, read_bytes, read_json, written_whole
 from ctxval._util.representation import ShortRepr, shown
 from ctxval.core.controller import AffineFeedback, ControllerWithMemory, Limits
 from ctxval.core.task import Task
@@ -24,8 +25,6 @@ from ctxval.errors import InputError, ShapeError
 
 CONTROLLER_FORMAT, TASK_FORMAT, VERSION = "ctxval controller", "ctxval task", 1
 LAW = "u = min(max(inputs[t] + gains[t] (x - states[t]), low), high) at the steps t = 0, ..., horizon - 1"
-
-Content = TypeVar("Content")
 
 Names = Mapping[str, str]
 """The names of states or inputs, and their units."""
@@ -56,7 +55,13 @@ def write_controller(
     if controller.gains.ndim != 3 or controller.inputs.ndim != 2:
         raise ShapeError(f"the controller must be for one task, with gains (H, m, n), got {controller.gains.shape}.")
     horizon, m, n = controller.gains.shape
-    about = {"format": CONTROLLER_FORMAT, "version": VERSION, "law": LAW, "dt": _seconds(dt), "horizon": horizon}
+    about = {
+        "format": CONTROLLER_FORMAT,
+        "version": VERSION,
+        "law": LAW,
+        "dt": require("dt", Seconds, dt),
+        "horizon": horizon,
+    }
     about |= _named("state", states, n) | _named("input", inputs, m)
     known = {"gains": controller.gains, "inputs": controller.inputs, "states": controller.states[:horizon]}
     arrays = {name: as_finite(f"the controller's {name}", array) for name, array in known.items()}
@@ -68,7 +73,22 @@ def write_controller(
 
 def read_controller(path: str | Path) -> ControllerFile:
     """Read a controller from a ``.json`` or ``.npz`` file."""
-    return _read(Path(path), CONTROLLER_FORMAT, _controller)
+    with _reading(Path(path), CONTROLLER_FORMAT) as content:
+        gains, inputs, states = (as_finite(name, content[name]) for name in ("gains", "inputs", "states"))
+        if gains.ndim != 3 or inputs.shape != gains.shape[:2] or states.shape != (len(gains), gains.shape[2]):
+            got = f"{gains.shape}, {inputs.shape} and {states.shape}"
+            raise ShapeError(f"it needs gains (H, m, n), inputs (H, m) and states (H, n), got {got}.")
+        horizon, m, n = gains.shape
+        if content["horizon"] != horizon:
+            got = str(content["horizon"])[:40]
+            raise InputError(f"its horizon must be the number of its gains, {horizon}, got {got}.")
+        limits = None
+        if content.get("low") is not None or content.get("high") is not None:
+            low = [-np.inf if value is None else value for value in content["low"]]
+            high = [np.inf if value is None else value for value in content["high"]]
+            limits = Limits.of(Limits(as_floats("limits", low), as_floats("limits", high)), m)
+        dt, names = require("dt", Seconds, content["dt"]), (_names("state", content, n), _names("input", content, m))
+        return ControllerFile(AffineFeedback(gains, inputs, states, limits), float(dt), *names)
 
 
 def write_task(path: str | Path, task: Task, *, states: Names | None = None) -> None:
@@ -85,16 +105,10 @@ def write_task(path: str | Path, task: Task, *, states: Names | None = None) -> 
 
 def read_task(path: str | Path) -> Task:
     """Read one task from a JSON file."""
-
-    def build(content: Mapping[str, Any]) -> Task:
+    with _reading(Path(path), TASK_FORMAT) as content:
         start = as_finite("initial_state", content["initial_state"])
-        more: dict[str, Any] = {
-            "name": str(content.get("name", "")),
-            "environment": dict(content.get("environment", {})),
-        }
+        more: dict[str, Any] = {"name": str(content.get("name", "")), "environment": content.get("environment", {})}
         return Task(start, horizon=content["horizon"], dt=content["dt"], reference=content["reference"], **more)
-
-    return _read(Path(path), TASK_FORMAT, build)
 
 
 def _write(path: Path, about: dict[str, Any], arrays: Mapping[str, Array]) -> None:
@@ -111,7 +125,8 @@ def _write(path: Path, about: dict[str, Any], arrays: Mapping[str, Array]) -> No
             file.write(f"{{\n{lines}\n}}\n".encode())
 
 
-def _read(path: Path, expected: str, build: Callable[[Mapping[str, Any]], Content]) -> Content:
+@contextmanager
+def _reading(path: Path, expected: str) -> Iterator[Mapping[str, Any]]:
     try:
         if path.suffix == ".npz":
             arrays = Archive(read_bytes(path))
@@ -125,33 +140,10 @@ def _read(path: Path, expected: str, build: Callable[[Mapping[str, Any]], Conten
             raise InputError(f"its format must be {expected!r}, got {str(content['format'])[:40]!r}.")
         if content["version"] != VERSION:
             raise InputError(f"this version of ctxval reads version {VERSION}, got {str(content['version'])[:40]}.")
-        return build(content)
+        yield content
     except (ValueError, TypeError, LookupError, AttributeError, ArithmeticError, MemoryError, RecursionError) as error:
         reason = str(error) if isinstance(error, InputError) else f"{type(error).__name__}: {str(error)[:100]}"
         raise InputError(f"{path} cannot be read as a {expected}: {reason.removesuffix('.')}.") from error
-
-
-def _controller(content: Mapping[str, Any]) -> ControllerFile:
-    gains, inputs, states = (as_finite(name, content[name]) for name in ("gains", "inputs", "states"))
-    if gains.ndim != 3 or inputs.shape != gains.shape[:2] or states.shape != (len(gains), gains.shape[2]):
-        got = f"{gains.shape}, {inputs.shape} and {states.shape}"
-        raise ShapeError(f"it needs gains (H, m, n), inputs (H, m) and states (H, n), got {got}.")
-    horizon, m, n = gains.shape
-    if content["horizon"] != horizon:
-        raise InputError(f"its horizon must be the number of its gains, {horizon}, got {str(content['horizon'])[:40]}.")
-    limits = None
-    if content.get("low") is not None or content.get("high") is not None:
-        low = [-np.inf if value is None else value for value in content["low"]]
-        high = [np.inf if value is None else value for value in content["high"]]
-        limits = Limits.of(Limits(as_floats("limits", low), as_floats("limits", high)), m)
-    feedback = AffineFeedback(gains, inputs, states, limits)
-    return ControllerFile(feedback, _seconds(content["dt"]), _names("state", content, n), _names("input", content, m))
-
-
-def _seconds(dt: Any) -> float:
-    if not isinstance(dt, int | float | np.number) or isinstance(dt, bool) or not (np.isfinite(dt) and dt > 0):
-        raise InputError(f"dt must be a positive number of seconds, got {str(dt)[:40]}.")
-    return float(dt)
 
 
 def _named(kind: str, names: Names | None, count: int) -> dict[str, list[str]]:

@@ -49,7 +49,7 @@ class Experiment:
         for name in ("states", "inputs", "units"):
             object.__setattr__(self, name, getattr(labels, name))
         if labels != given:
-            object.__setattr__(self, "validation", self.validation.with_labels(labels))
+            object.__setattr__(self, "validation", self.validation.with_parts(labels=labels))
         if self.mixed_units:
             warnings.warn(mixed_units_sentence(self.mixed_units), UnitsWarning, stacklevel=3)
 

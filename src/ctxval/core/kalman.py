@@ -8,7 +8,7 @@ import numpy as np
 
 from ctxval._util.arrays import Array
 from ctxval.core.model import Model, linearize
-from ctxval.core.outputs import Outputs
+from ctxval.core.system import Outputs
 
 
 class Estimate(NamedTuple):

@@ -35,14 +35,6 @@ class Labels(ShortRepr):
             _named(self.inputs, names_of(system, "inputs"), "u", inputs),
         )
 
-    def state_names(self, system: object) -> tuple[str, ...]:
-        """Return the names of the states by these labels, else by the system; empty if neither names them."""
-        return tuple(parted(label)[0] for label in self.states or names_of(system, "states"))
-
-    def require_readable(self, system: object) -> None:
-        """Refuse a system whose own names make a recording unreadable, if these labels do not replace them."""
-        require_names(self.states or names_of(system, "states"), self.inputs or names_of(system, "inputs"))
-
 
 def require_names(states: Iterable[str], inputs: Iterable[str]) -> None:
     """Refuse labels of states and inputs that make a recording unreadable."""

@@ -54,9 +54,9 @@ def paired(x: Array, u: Array) -> tuple[Array, Array]:
     return np.broadcast_to(x, (*batch, x.shape[-1])), np.broadcast_to(u, (*batch, u.shape[-1]))
 
 
-def as_model(model: Model | Step) -> Model:
+def as_model(model: Model | Step, *, vectorized: bool = False) -> Model:
     """Return a model unchanged, and a plain function as a model."""
-    return model if isinstance(model, Model) else Function(model)
+    return model if isinstance(model, Model) else Function(model, vectorized=vectorized)
 
 
 def require_time_step(model: object, dt: float, whose: str) -> None:
@@ -80,10 +80,10 @@ def linearize(model: Model, x: Array, u: Array) -> tuple[Array, Array]:
 
 
 def central_differences(step: Step, x: Array, u: Array, precision: float | None = None) -> tuple[Array, Array]:
-    """Return A ``(..., n, n)`` and B ``(..., n, m)`` at states ``(..., n)`` and inputs ``(..., m)`` by differences.
+    """Return A ``(..., p, n)`` and B ``(..., p, m)`` at states ``(..., n)`` and inputs ``(..., m)`` by differences.
 
-    The steps suit the precision of the model, which is found out if it is not given: 6e-6 in double precision, 5e-3 in
-    single precision. All differences are taken in one batch, in blocks that fit into the processor's cache. Complex
+    The steps suit the precision of the function, which is found out if it is not given: 6e-6 in double precision, 5e-3
+    in single precision. All differences are taken in one batch, in blocks that fit into the processor's cache. Complex
     steps would be silently wrong wherever a model uses ``abs``, ``maximum`` or a branch.
     """
     n, width, batch = x.shape[-1], x.shape[-1] + u.shape[-1], x.shape[:-1]
@@ -100,9 +100,10 @@ def central_differences(step: Step, x: Array, u: Array, precision: float | None 
         moved[1, columns, :, columns] -= steps
         points = moved.reshape(-1, width)
         states, inputs = np.ascontiguousarray(points[:, :n]), np.ascontiguousarray(points[:, n:])
-        up, down = np.asarray(step(states, inputs)).reshape(2, width, len(rows), n)
+        reached = np.asarray(step(states, inputs))
+        up, down = reached.reshape(2, width, len(rows), reached.shape[-1])
         derivatives.append(np.swapaxes((up - down) / (2 * steps)[:, :, None], 0, 1))
-    whole = np.swapaxes(np.concatenate(derivatives), -1, -2).reshape(*batch, n, width)
+    whole = np.swapaxes(np.concatenate(derivatives), -1, -2).reshape(*batch, reached.shape[-1], width)
     return whole[..., :n], whole[..., n:]
 
 
@@ -116,7 +117,7 @@ def _precision(step: Step, z: Array, n: int) -> float:
     # A change that single precision hardly resolves, and one that it does.
     size, little, much = np.maximum(1.0, np.abs(some)), 2.0**-27, 2.0**-17
     moved = np.concatenate([some, some + little * size, some - much * size, some + much * size])
-    still, fine, down, up = np.asarray(step(moved[:, :n], moved[:, n:])).reshape(4, -1, n)
+    still, fine, down, up = np.split(np.asarray(step(moved[:, :n], moved[:, n:])), 4)
     with np.errstate(all="ignore"):  # a model that is not finite is refused later
         expected = (up - down) * (0.5 * little / much)
         margin = 1e-3 * np.abs(expected) + 1e-5 * little * np.abs(still).max(initial=0.0)

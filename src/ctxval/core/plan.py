@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ctxval._util.arrays import ArrayLike
 from ctxval._util.representation import ShortRepr
 from ctxval.core.controller import Controller, started
 from ctxval.core.space import Parameters
 from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory, require_times
 from ctxval.errors import InputError, ShapeError
+
+if TYPE_CHECKING:
+    from ctxval.core.validation import Validation
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,8 +87,51 @@ def gives_inputs(plan: Plan, trajectory: Trajectory, tolerance: float) -> bool:
     try:
         with np.errstate(all="ignore"):
             pi = started(plan.controller, plan.task)
-            return all(
-                bool((np.abs(np.asarray(pi(t, states[t])) - inputs[t]) <= nearest).all()) for t in range(len(inputs))
-            )
+            gaps = (np.asarray(pi(t, states[t])) - u for t, u in enumerate(inputs))
+            return all(bool((np.abs(gap) <= nearest).all()) for gap in gaps)
     except Exception:  # the user's controller, at states that it never reached by itself
         return False
+
+
+class DistanceWarning(UserWarning):
+    """The distance between a trajectory and itself is not 0."""
+
+
+def try_distance(validation: Validation, plan: Plan) -> None:
+    """Measure the model's trajectory of a plan against itself; warn if the distance is not 0.
+
+    A distance to the task has the attribute ``to_task = True``.
+    """
+    value = validation.measure(plan, plan.model_trajectory.copy())
+    if value > 1e-9 and not (validation.is_on_model or getattr(validation.distance, "to_task", False)):
+        where = validation.space.describe_point(plan.parameters.points)
+        warnings.warn(
+            f"the distance between the trajectory of the model and itself is {value:.3g}, not 0, for the task {where}. "
+            "If it measures how S completes its task, give it the attribute to_task = True; otherwise correct it.",
+            DistanceWarning,
+            stacklevel=2,
+        )
+
+
+@dataclass(frozen=True)
+class StartOffset:
+    """How far an execution starts from the initial state of its task.
+
+    The size is as the distance measures differences of states, or the largest of all states if that is unknown. The
+    text names the state whose offset is largest.
+    """
+
+    size: float
+    text: str
+
+
+def start_offset(validation: Validation, point: ArrayLike, trajectory: Trajectory) -> StartOffset:
+    """Return how far an execution of the task at ``(d,)`` starts from the initial state of the task."""
+    start = validation.recorded(validation.task(validation.space.parameters(point)).initial_state)
+    gap = np.abs(trajectory.states[0] - start)
+    size, state = float(gap.max()), int(gap.argmax())
+    if hasattr(validation.distance, "difference"):
+        compared = validation.distance.difference(trajectory.states[0], start)
+        size = float(np.linalg.norm(compared, getattr(validation.distance, "norm", 1), axis=-1))
+    name, unit = list(validation.names(len(gap), trajectory.inputs.shape[-1])[0].items())[state]
+    return StartOffset(size, f"{gap[state]:.2g} {unit}".rstrip() + f" in {name}")

@@ -86,11 +86,9 @@ def saturation(inputs: Sequence[Array], synthesizer: Synthesizer | None) -> Satu
         at_limit = (together <= limits.low + 1e-6 * spans) | (together >= limits.high - 1e-6 * spans)
         return Saturation(at_limit.mean(axis=0), True)
     low, high = together.min(axis=0) + 1e-9 * spans, together.max(axis=0) - 1e-9 * spans
-    parts = []
-    for signal in signals:
-        at_ends = signal <= low, signal >= high
-        parts.append(np.logical_or(*(at & (at.sum(axis=0) >= 3) for at in at_ends)) & (low < high))
-    return Saturation(np.concatenate(parts).mean(axis=0), False)
+    ends = [(signal <= low, signal >= high) for signal in signals]
+    held = [np.logical_or(*(at & (at.sum(axis=0) >= 3) for at in at_ends)) & (low < high) for at_ends in ends]
+    return Saturation(np.concatenate(held).mean(axis=0), False)
 
 
 @dataclass(frozen=True, eq=False)

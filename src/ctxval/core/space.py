@@ -69,12 +69,13 @@ class TaskSpace:
         if not bounds:
             raise InputError("a task space needs at least one parameter, such as TaskSpace(goal=(-1, 1)).")
         self._columns: dict[str, int | slice] = {}
-        self._units: dict[str, str] = {}
+        self.units: dict[str, str] = {}
+        """The unit of each parameter by its name; empty if it has no unit."""
         names, lows, highs = list[str](), list[Array](), list[Array]()
         for name, bound in bounds.items():
             if name == "points" or name.startswith("_"):
                 raise InputError(f"a task parameter must not be called 'points' or begin with _, got {name!r}.")
-            low, high, self._units[name] = _bounds(name, bound)
+            low, high, self.units[name] = _bounds(name, bound)
             scalar, start = low.ndim == 0, len(names)
             self._columns[name] = start if scalar else slice(start, start + low.size)
             names += [name] if scalar else [f"{name}[{i}]" for i in range(low.size)]
@@ -89,17 +90,13 @@ class TaskSpace:
         chosen = np.minimum(9 - extent, 15 - magnitude)
         # Powers of ten that are exact as floats.
         self._chosen, self._decimals = 10.0 ** np.clip([chosen, np.maximum(chosen, 12 - magnitude)], 0, 22)
-        self._distribution: TaskDistribution | None = None
+        self.distribution: TaskDistribution | None = None
+        """The distribution of tasks; None if it is uniform."""
 
     @property
     def dimension(self) -> int:
         """The number of scalar parameters; the paper writes it as the cardinality of P."""
         return len(self.names)
-
-    @property
-    def units(self) -> dict[str, str]:
-        """The unit of each parameter by its name; empty if it has no unit."""
-        return dict(self._units)
 
     @property
     def labels(self) -> tuple[str, ...]:
@@ -108,16 +105,16 @@ class TaskSpace:
         return tuple(f"{name} [{unit}]" if unit else name for name, unit in units)
 
     def _scalar_units(self) -> list[str]:
-        return [shortened(self._units[name]) for name, at in self._columns.items() for _ in np.atleast_1d(self.low[at])]
+        return [shortened(self.units[name]) for name, at in self._columns.items() for _ in np.atleast_1d(self.low[at])]
 
     def __repr__(self) -> str:
         bounds = {name: (self.low[at], self.high[at]) for name, at in self._columns.items()}
-        ends = named({name: (*ends, *filter(None, [self._units[name]])) for name, ends in bounds.items()})
-        return call(self, ends, distribution=self._distribution)
+        ends = named({name: (*ends, *filter(None, [self.units[name]])) for name, ends in bounds.items()})
+        return call(self, ends, distribution=self.distribution)
 
     def describe(self) -> dict[str, Any]:
         """Return what identifies this space in a store, by scalar names, with a distribution if there is one."""
-        distribution = {} if self._distribution is None else {DISTRIBUTION: self._distribution.describe()}
+        distribution = {} if self.distribution is None else {DISTRIBUTION: self.distribution.describe()}
         return distribution | {
             name: [float(low), float(high), *([unit] if unit else [])]
             for name, low, high, unit in zip(self.names, self.low, self.high, self._scalar_units(), strict=True)
@@ -211,11 +208,6 @@ class TaskSpace:
 
     # The distribution of tasks
 
-    @property
-    def distribution(self) -> TaskDistribution | None:
-        """The distribution of tasks; None if it is uniform."""
-        return self._distribution
-
     def distributed(self, **by_name: Continuous) -> TaskSpace:
         """Return this space with a distribution of tasks: independent parameters, all others uniform.
 
@@ -243,13 +235,13 @@ class TaskSpace:
 
     def unit_draws(self, n: int, rng: np.random.Generator) -> Array:
         """Return n independent draws from the distribution of tasks, points of the unit cube ``(n, d)``."""
-        if self._distribution is None:
+        if self.distribution is None:
             return rng.random((n, self.dimension))
-        return np.clip(self.to_unit(self._distribution.draw(n, rng)), 0.0, 1.0)
+        return np.clip(self.to_unit(self.distribution.draw(n, rng)), 0.0, 1.0)
 
     def _with(self, distribution: TaskDistribution) -> TaskSpace:
         space = copy.copy(self)
-        space._distribution = distribution
+        space.distribution = distribution
         return space
 
     # Sets of points

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ctxval._util.arrays import Array, as_floats
+from ctxval._util.arrays import Array, as_finite, as_floats
 from ctxval._util.checked import PositiveInt, Seconds, checked
 from ctxval._util.representation import call
 from ctxval.errors import InputError, ShapeError
@@ -60,8 +60,7 @@ class Task:
             raise InputError("a task must have a finite initial_state and a finite goal or reference.")
         around = {key: _components(f"environment {key!r}", given) for key, given in (environment or {}).items()}
         for key, given in around.items():
-            if not np.isfinite(given).all():
-                raise InputError(f"environment {key!r} must be finite, got {given.tolist()}.")
+            as_finite(f"environment {key!r}", given)
         shapes = [given.shape[:-1] for given in around.values()]
         try:
             self.batch_shape: tuple[int, ...] = np.broadcast_shapes(state.shape[:-1], target.shape[:-2], *shapes)
@@ -103,9 +102,11 @@ class Task:
     @staticmethod
     def stacked(tasks: Sequence[Task]) -> Task:
         """Return single tasks with one horizon and one time step as a batch."""
-        first, names = tasks[0], [one.name for one in tasks]
-        starts, references = np.stack([one.initial_state for one in tasks]), np.stack([one.reference for one in tasks])
-        around = {key: np.stack([one.environment[key] for one in tasks]) for key in first.environment}
+        first, names = tasks[0], [task.name for task in tasks]
+        starts, references = (
+            np.stack([getattr(task, part) for task in tasks]) for part in ("initial_state", "reference")
+        )
+        around = {key: np.stack([task.environment[key] for task in tasks]) for key in first.environment}
         return first._like(starts, references, np.array(names) if any(names) else "", around)
 
     def __getitem__(self, index: int | slice) -> Task:
@@ -129,19 +130,17 @@ class Task:
 
     def describe(self) -> dict[str, Any]:
         """Return what identifies one task in a store."""
-        start, named = self.initial_state.tolist(), {"name": self.name} if self.name else {}
-        about = {"horizon": self.horizon, "dt": self.dt, "initial_state": start, "reference": self.reference}
-        return about | named | ({"environment": self.environment} if self.environment else {})
+        about = {"horizon": self.horizon, "dt": self.dt, "initial_state": self.initial_state.tolist()}
+        more = {"name": self.name, "environment": self.environment}
+        return about | {"reference": self.reference} | {key: value for key, value in more.items() if value}
 
     def __repr__(self) -> str:
         if self.batch_shape:
             sizes = {"batch": self.batch_shape, "states": self.initial_state.shape[-1]}
             return call(self, **sizes, horizon=self.horizon, dt=self.dt)
-        constant = bool((self.reference == self.goal).all())
-        aim = {"goal": self.goal} if constant else {"reference": self.reference}
-        named = {"name": self.name} if self.name else {}
-        around = {"environment": self.environment} if self.environment else {}
-        return call(self, **named, initial_state=self.initial_state, **aim, **around, horizon=self.horizon, dt=self.dt)
+        aim = {"goal": self.goal} if (self.reference == self.goal).all() else {"reference": self.reference}
+        about = {"initial_state": self.initial_state, **aim, "environment": self.environment or None}
+        return call(self, name=self.name or None, **about, horizon=self.horizon, dt=self.dt)
 
 
 def _components(name: str, value: Any) -> Array:

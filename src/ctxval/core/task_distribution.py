@@ -54,11 +54,11 @@ class Normal(ShortRepr):
 
     def cdf(self, x: ArrayLike) -> Array:
         """Return the probability of values up to x."""
-        return np.asarray(scipy.special.ndtr(self._standard(x)))
+        return np.asarray(scipy.special.ndtr((np.asarray(x) - np.asarray(self.mean)) / np.asarray(self.deviation)))
 
     def sf(self, x: ArrayLike) -> Array:
         """Return the probability of values above x."""
-        return np.asarray(scipy.special.ndtr(-self._standard(x)))
+        return np.asarray(scipy.special.ndtr((np.asarray(self.mean) - np.asarray(x)) / np.asarray(self.deviation)))
 
     def ppf(self, q: ArrayLike) -> Array:
         """Return the value that is exceeded with probability 1 - q."""
@@ -67,9 +67,6 @@ class Normal(ShortRepr):
     def isf(self, q: ArrayLike) -> Array:
         """Return the value that is exceeded with probability q."""
         return np.asarray(self.mean - np.asarray(self.deviation) * scipy.special.ndtri(q))
-
-    def _standard(self, x: ArrayLike) -> Array:
-        return np.asarray((np.asarray(x) - np.asarray(self.mean)) / np.asarray(self.deviation))
 
     def describe(self) -> dict[str, Any]:
         """Return what identifies the distribution in a store."""
@@ -118,17 +115,16 @@ class ByParameter:
 
     def describe(self) -> dict[str, Any]:
         """Return the distribution of each parameter that has one, by name: what identifies it in a store."""
-        described = {}
-        for name, marginal in self.distributions.items():
+
+        def described(marginal: Any) -> dict[str, Any]:
             if isinstance(marginal, Normal):
-                described[name] = {"type": "normal", **marginal.describe()}
-            elif _of_scipy(marginal):
-                frozen: Any = marginal
-                settings = describe({"arguments": list(frozen.args), "options": dict(frozen.kwds)})
-                described[name] = {"type": f"scipy.stats.{frozen.dist.name}", **settings}
-            else:
-                described[name] = dict(describe(marginal))
-        return described
+                return {"type": "normal", **marginal.describe()}
+            if not _of_scipy(marginal):
+                return dict(describe(marginal))
+            settings = describe({"arguments": list(marginal.args), "options": dict(marginal.kwds)})
+            return {"type": f"scipy.stats.{marginal.dist.name}", **settings}
+
+        return {name: described(marginal) for name, marginal in self.distributions.items()}
 
 
 @dataclass(frozen=True, eq=False)

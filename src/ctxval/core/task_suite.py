@@ -50,20 +50,15 @@ class TaskSuite(TaskSpace):
     def __init__(
         self, tasks: Mapping[str, Mapping[str, float | str]] | Sequence[str], units: Mapping[str, str] | None = None
     ) -> None:
-        by_name = _by_name(tasks)
-        self._tasks = by_name
-        self.task_names: tuple[str, ...] = tuple(by_name)
-        names = list(next(iter(by_name.values())))
+        self._tasks = _by_name(tasks)
+        self.task_names: tuple[str, ...] = tuple(self._tasks)
+        names, units = list(next(iter(self._tasks.values()))), units or {}
         self._categories: dict[str, list[str]] = {}
-        columns = [self._numbers(name, [values[name] for values in by_name.values()]) for name in names]
+        columns = [self._numbers(name, [values[name] for values in self._tasks.values()]) for name in names]
         rows = np.stack(columns, axis=-1)
-        super().__init__(
-            **{
-                name: (rows[:, j].min(), rows[:, j].max(), *([units[name]] if units and name in units else []))
-                for j, name in enumerate(names)
-            }
-        )
-        for name in units or {}:
+        ends = zip(names, rows.min(axis=0), rows.max(axis=0), strict=True)
+        super().__init__(**{name: (low, high, units.get(name, "")) for name, low, high in ends})
+        for name in units:
             self.columns(name)  # refuses units of unknown parameters
         self._rows = rows
         self.members: Array = super().to_unit(rows)

@@ -11,13 +11,20 @@ from pathlib import Path
 import numpy as np
 
 from ctxval._util.arrays import Array, Mask, Rows, as_floats, held_means, rows_of
-from ctxval._util.columns import EPISODES, FAR, column_of, in_seconds, time_column, unit_advice
-from ctxval._util.csv_table import CsvTable
-from ctxval._util.files import MOST_BYTES, read_bytes, written_whole
-from ctxval._util.npz import Archive
+from ctxval._util.columns import (
+    EPISODES,
+    FAR,
+    CsvTable,
+    column_of,
+    conversion,
+    in_seconds,
+    named_unit,
+    time_column,
+    unit_advice,
+)
+from ctxval._util.files import MOST_BYTES, Archive, read_bytes, written_whole
 from ctxval._util.representation import ShortRepr, Shown, call, counted, number
 from ctxval._util.texts import enumerated, guarded, parted, visible
-from ctxval._util.units import conversion, named_unit
 from ctxval.errors import InputError, ShapeError
 
 COMPLETE = "complete"
@@ -160,8 +167,7 @@ class Trajectory:
         if self.batch_shape:
             raise ShapeError(f"a CSV file must hold one trajectory, got a batch of shape {self.batch_shape}.")
         header = ["t"]
-        for letter, names, array in (("x", states, self.states), ("u", inputs, self.inputs)):
-            count = array.shape[-1]
+        for letter, names, count in (("x", states, self.states.shape[-1]), ("u", inputs, self.inputs.shape[-1])):
             columns = [f"{letter}{i}" for i in range(count)] if names is None else list(names)
             if len(columns) != count:
                 raise ShapeError(f"there must be {count} names of columns, got {', '.join(columns) or 'none'}.")
@@ -218,11 +224,12 @@ class Trajectory:
         if self.batch_shape or not (np.diff(recorded) > 0).all():
             raise InputError("only a single trajectory with increasing times can be resampled.")
         dt, period = float(wanted[1] - wanted[0]), float(np.median(np.diff(recorded)))
+        advice = f"; {text}" if (text := unit_advice(period, dt)) else ""
         if period > FAR * dt:
-            raise InputError(f"the recording has steps of {period:g} s instead of {dt:g} s{_advice(period, dt)}.")
+            raise InputError(f"the recording has steps of {period:g} s instead of {dt:g} s{advice}.")
         if not recorded[-1] >= wanted[-1] - _TIMES * dt:
             ends = f"the recording ends after {recorded[-1]:g} s, and {wanted[-1]:g} s are needed"
-            raise InputError(f"{ends}{_advice(period, dt)}.")
+            raise InputError(f"{ends}{advice}.")
         states = np.stack([np.interp(wanted, recorded, column) for column in self.states.T], axis=-1)
         # A sample that belongs to a time may have been recorded just after it.
         inputs = held_means(recorded[:-1], self.inputs, wanted, 1e-6 * dt)
@@ -240,7 +247,7 @@ def require_times(trajectory: Trajectory, times: Array) -> None:
     """Check that a trajectory has these times ``(H + 1,)``, counted from its first time."""
     dt, recorded = times[1] - times[0], trajectory.times - trajectory.times[0]
     period = float(np.median(np.diff(recorded)))
-    advice = _advice(period, dt) or "; --resample interpolates a recording to these times"
+    advice = f"; {unit_advice(period, dt) or '--resample interpolates a recording to these times'}"
     if len(recorded) != len(times):
         got = f"{len(recorded)} with steps of {period:g} s{advice}"
         raise InputError(f"the trajectory must have {len(times)} times, {len(times) - 1} steps of {dt:g} s, got {got}.")
@@ -252,9 +259,8 @@ def require_times(trajectory: Trajectory, times: Array) -> None:
         raise InputError(f"the trajectory must have steps of {dt:g} s: {first}. {largest}.")
 
 
-def _advice(period: float, dt: float) -> str:
-    advice = unit_advice(period, dt)
-    return f"; {advice}" if advice else ""
+def _listed(names: Sequence[str]) -> str:
+    return enumerated((name[:60] for name in names), 20)
 
 
 def _require_fitting(times: tuple[int, ...], states: tuple[int, ...], inputs: tuple[int, ...]) -> None:
@@ -262,10 +268,6 @@ def _require_fitting(times: tuple[int, ...], states: tuple[int, ...], inputs: tu
     if not axes or states[-2] != times[0] or inputs[-2] != times[0] - 1:
         got = f"{times}, {states} and {inputs}"
         raise ShapeError(f"a trajectory needs times (H+1,), states (..., H+1, n) and inputs (..., H, m), got {got}.")
-
-
-def _listed(names: Sequence[str]) -> str:
-    return enumerated((name[:60] for name in names), 20)
 
 
 def _chosen(table: CsvTable, letter: str, names: Sequence[str] | None) -> dict[str, float]:

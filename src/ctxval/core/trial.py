@@ -85,18 +85,13 @@ def designs_sentence(trials: Sequence[Trial]) -> str | None:
     worst = max(executed, key=lambda trial: -1.0 if trial.distance is None else trial.distance, default=None)
     among = worst is not None and (worst.note or {}).get(CONVERGED) is False
     parts = []
-    if designs.count(False):
-        which = ", among them the worst one" if among else ""
-        parts.append(
-            f"the design of the controller did not converge at {designs.count(False)} of {len(designs)} executed "
-            f"tasks{which}"
-        )
+    if failed := designs.count(False):
+        where = f"{failed} of {len(designs)} executed tasks{', among them the worst one' if among else ''}"
+        parts.append(f"the design of the controller did not converge at {where}")
     rejected = sum(count for trial in trials if isinstance(count := (trial.note or {}).get(UNSTEADY), int))
     if rejected:
-        parts.append(
-            f"{counted(rejected, 'task')} {'was' if rejected == 1 else 'were'} not executed, because the controller "
-            "jumps if the task changes by 1e-9 of its range"
-        )
+        tasks = f"{counted(rejected, 'task')} {'was' if rejected == 1 else 'were'} not executed"
+        parts.append(f"{tasks}, because the controller jumps if the task changes by 1e-9 of its range")
     return "; ".join(parts) or None
 
 

@@ -90,41 +90,33 @@ def search_truth(
         generations: largest number of generations in one repeat.
         climbs: climbs from random starts in one repeat; each starts at the best of sixteen random points.
     """
-    search = _TruthSearch(validation, population, generations, climbs)
-    maxima: list[tuple[float, Array]] = []
-    with stage("searching the largest distance", unit="executions"):
-        while len(maxima) < repeats and not _gap(maxima) <= agreement:
-            maxima.append(search.repeat(np.random.default_rng([seed, len(maxima)])))
-    distance, unit_point = max(maxima, key=lambda maximum: maximum[0])
-    if not math.isfinite(distance):
-        raise InputError("the truth is unknown: every execution of the search failed.")
-    doubt = "" if _gap(maxima) <= agreement else ", so the maximum may well be larger"
-    method = (
-        f"best known value of {search.evaluations:,} evaluations: differential evolution and {climbs} climbs from "
-        f"elsewhere, {len(maxima)} repeats, of which the two best differ by {_gap(maxima):.2%}{doubt}"
-    )
-    return Truth(distance, validation.space.parameters(validation.space.from_unit(unit_point)), method)
+    space, d, evaluations = validation.space, validation.space.dimension, 0
 
+    def values(unit_points: Array) -> Array:
+        nonlocal evaluations
+        evaluations += len(unit_points)
+        distances = validation.distances(space.from_unit(unit_points))
+        return np.where(np.isnan(distances), -np.inf, distances)
 
-class _TruthSearch:
-    """Maximises d over the unit cube, a whole generation in one batch."""
+    def climbed(value: float, point: Array) -> Array:
+        scale = value if 0 < value < np.inf else 1.0  # L-BFGS-B's tolerances suit values about 1
 
-    def __init__(self, validation: Validation, population: int, generations: int, climbs: int) -> None:
-        self.validation, self.dimension = validation, validation.space.dimension
-        self.population, self.generations, self.climbs = population, generations, climbs
-        self.evaluations = 0
+        def sloped(points: Array) -> tuple[Array, Array]:
+            up, down = (np.clip(points + moves, 0, 1) for moves in (1e-6 * np.eye(d), -1e-6 * np.eye(d)))
+            heights = values(np.concatenate([points, up, down])) / scale
+            slope = (heights[1 : d + 1] - heights[d + 1 :]) / (np.diagonal(up) - np.diagonal(down))
+            return heights[:1], np.where(np.isfinite(slope), slope, 0.0)[None]
 
-    def values(self, unit_points: Array) -> Array:
-        self.evaluations += len(unit_points)
-        values = self.validation.distances(self.validation.space.from_unit(unit_points))
-        return np.where(np.isnan(values), -np.inf, values)
+        with np.errstate(all="ignore"):
+            end, top = climb(sloped, point[None], np.zeros(d), np.ones(d))
+        return end[0] if top * scale > value else point
 
-    def repeat(self, rng: np.random.Generator) -> tuple[float, Array]:
+    def repeat(rng: np.random.Generator) -> tuple[float, Array]:
         evolved = scipy.optimize.differential_evolution(
-            lambda columns: -self.values(columns.T),
-            scipy.optimize.Bounds(np.zeros(self.dimension), np.ones(self.dimension)),
-            popsize=self.population,
-            maxiter=self.generations,
+            lambda columns: -values(columns.T),
+            scipy.optimize.Bounds(np.zeros(d), np.ones(d)),
+            popsize=population,
+            maxiter=generations,
             tol=1e-4,
             polish=False,
             updating="deferred",
@@ -132,29 +124,28 @@ class _TruthSearch:
             rng=rng,
         )
         tops = [(-float(evolved.fun), np.asarray(evolved.x))]
-        for _ in range(self.climbs):
-            starts = rng.random((16, self.dimension))
-            values = self.values(starts)
-            tops.append((float(values.max()), starts[np.argmax(values)]))
-        points = np.array([self._climb(*top) for top in tops])
+        for _ in range(climbs):
+            starts = rng.random((16, d))
+            heights = values(starts)
+            tops.append((float(heights.max()), starts[np.argmax(heights)]))
+        points = np.array([climbed(*top) for top in tops])
         # A diverging loop amplifies the rounding of a batch, so the distance of the task executed alone counts.
-        alone = np.array([self.values(point[None])[0] for point in points])
+        alone = np.array([values(point[None])[0] for point in points])
         return float(alone.max()), points[np.argmax(alone)]
 
-    def _climb(self, value: float, point: Array) -> Array:
-        scale = value if 0 < value < np.inf else 1.0  # L-BFGS-B's tolerances suit values about 1
-
-        def sloped(points: Array) -> tuple[Array, Array]:
-            moves = 1e-6 * np.eye(self.dimension)
-            up, down = np.clip(points + moves, 0, 1), np.clip(points - moves, 0, 1)
-            values = self.values(np.concatenate([points, up, down])) / scale
-            widths = np.diagonal(up) - np.diagonal(down)
-            slope = (values[1 : self.dimension + 1] - values[self.dimension + 1 :]) / widths
-            return values[:1], np.where(np.isfinite(slope), slope, 0.0)[None]
-
-        with np.errstate(all="ignore"):
-            climbed, top = climb(sloped, point[None], np.zeros(self.dimension), np.ones(self.dimension))
-        return climbed[0] if top * scale > value else point
+    maxima: list[tuple[float, Array]] = []
+    with stage("searching the largest distance", unit="executions"):
+        while len(maxima) < repeats and not _gap(maxima) <= agreement:
+            maxima.append(repeat(np.random.default_rng([seed, len(maxima)])))
+    distance, unit_point = max(maxima, key=lambda maximum: maximum[0])
+    if not math.isfinite(distance):
+        raise InputError("the truth is unknown: every execution of the search failed.")
+    doubt = "" if _gap(maxima) <= agreement else ", so the maximum may well be larger"
+    method = (
+        f"best known value of {evaluations:,} evaluations: differential evolution and {climbs} climbs from "
+        f"elsewhere, {len(maxima)} repeats, of which the two best differ by {_gap(maxima):.2%}{doubt}"
+    )
+    return Truth(distance, space.parameters(space.from_unit(unit_point)), method)
 
 
 def _gap(maxima: list[tuple[float, Array]]) -> float:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from copy import copy
 from dataclasses import replace
 from typing import Any, NoReturn
@@ -14,20 +15,19 @@ import numpy as np
 
 from ctxval._util.arrays import Array, ArrayLike, as_floats, require_shape
 from ctxval._util.checked import NonNegativeFloat, PositiveInt, checked
+from ctxval._util.cores import raised_by_signal
 from ctxval._util.describe import describe, without_numbers
-from ctxval._util.interrupts import raised_by_signal
 from ctxval._util.progress import advance
 from ctxval._util.representation import call, lines, shown
-from ctxval._util.texts import reason_of, text_of
+from ctxval._util.texts import parted, reason_of, text_of
 from ctxval.core.controller import Controller, Synthesizer, is_controller
 from ctxval.core.distance import Distance
-from ctxval.core.labels import Labels
+from ctxval.core.labels import Labels, names_of, require_names
 from ctxval.core.model import Model, Step, as_model, require_time_step
-from ctxval.core.outputs import OutputsLike, as_outputs
 from ctxval.core.plan import Measurement, Outcome, Plan, require_execution
 from ctxval.core.rollout import rollout
 from ctxval.core.space import Parameters, TaskSpace
-from ctxval.core.system import Simulated, System, WithOutputs
+from ctxval.core.system import OutputsLike, Simulated, System, WithOutputs, as_outputs
 from ctxval.core.task import Task
 from ctxval.core.trajectory import COMPLETE, Trajectory
 from ctxval.errors import CtxvalError, DesignError, DistanceError, ExecutionError, InputError, ModelError, ShapeError
@@ -88,9 +88,10 @@ class Validation:
         self.model = as_model(model)
         self.synthesizer = synthesizer
         self.labels = Labels() if labels is None else labels
-        self.labels.require_readable(system)
+        states = self.labels.states or tuple(names_of(system, "states"))
+        require_names(states, self.labels.inputs or names_of(system, "inputs"))
         named = getattr(distance, "with_states", None)
-        self.distance: Distance = named(self.labels.state_names(system)) if callable(named) else distance
+        self.distance: Distance = named(tuple(parted(label)[0] for label in states)) if callable(named) else distance
         self.start_tolerance = float(start_tolerance)
         self.longest = int(longest)
         self.physical = tuple(dict.fromkeys(physical))
@@ -142,21 +143,13 @@ class Validation:
 
     def require_goal(self, task: Task) -> None:
         """Refuse a task whose goal or reference has other components than what is recorded."""
-        try:
+        with _failing_as(InputError, "the outputs h(x)"):
             width = self.recorded(task.initial_state).shape[-1]
-        except CtxvalError:
-            raise
-        except Exception as error:  # the user's function
-            raise InputError(f"the outputs h(x) failed: {reason_of(error)}.") from error
         task.require_width(width)
 
     def recorded_task(self, task: Task) -> Task:
         """Return a task as who executes it knows it: with the outputs of its initial state, if there are any."""
-        if self.outputs is None:
-            return task
-        reference = task.reference if task.has_goal else None
-        start, more = self.recorded(task.initial_state), {"name": task.name, "environment": task.environment}
-        return Task(start, horizon=task.horizon, dt=task.dt, reference=reference, **more)
+        return task if self.outputs is None else task.starting_at(self.recorded(task.initial_state))
 
     def closed_loop(self, controller: Controller, task: Task) -> Trajectory:
         """Return the closed loop of a controller with M, as it is recorded."""
@@ -167,18 +160,6 @@ class Validation:
     def with_space(self, space: TaskSpace) -> Validation:
         """Return this validation with another task space of the same parameters, for example with a distribution."""
         return self.with_parts(space=space)
-
-    def with_labels(self, labels: Labels) -> Validation:
-        """Return this validation with other names and units."""
-        return self.with_parts(labels=labels)
-
-    def with_longest(self, longest: int) -> Validation:
-        """Return this validation with another largest horizon that is planned."""
-        return self.with_parts(longest=longest)
-
-    def with_physical(self, names: Sequence[str]) -> Validation:
-        """Return this validation with other task parameters that change the dynamics of S."""
-        return self.with_parts(physical=names)
 
     def with_system(self, system: System) -> Validation:
         """Return the validation of another system with the same model, controllers and tasks."""
@@ -276,21 +257,17 @@ class Validation:
         return list(self._planned(require_shape("points", as_floats("points", points), (self.space.dimension,))))
 
     def _planned(self, points: Array) -> Iterator[Plan]:
+        together = getattr(self.synthesizer, "batched", False)
         for chunk in (points[first : first + 256] for first in range(0, len(points), 256)):  # more is hardly faster
-            yield from self._planned_together(chunk) or map(self.plan, chunk)
-
-    def _planned_together(self, points: Array) -> list[Plan] | None:
-        if len(points) == 1 or not getattr(self.synthesizer, "batched", False):
-            return None
-        try:
-            parameters = self.space.parameters(points)
-            whole = self.plan_of(parameters, self.task_at(parameters))
-            if whole.task.batch_shape != (len(points),) or not whole.model_trajectory.finite.all():
-                return None
-            plans = [whole.of(k, self.space.parameters(point)) for k, point in enumerate(points)]
-        except Exception:  # the user's own parts, which need not take a batch
-            return None
-        return plans if all(is_controller(plan.controller) for plan in plans) else None
+            plans = list[Plan]()
+            with suppress(Exception):  # the user's own parts, which need not take a batch
+                if together and len(chunk) > 1:
+                    parameters = self.space.parameters(chunk)
+                    whole = self.plan_of(parameters, self.task_at(parameters))
+                    if whole.task.batch_shape == (len(chunk),) and whole.model_trajectory.finite.all():
+                        plans = [whole.of(k, self.space.parameters(point)) for k, point in enumerate(chunk)]
+            divisible = bool(plans) and all(is_controller(plan.controller) for plan in plans)
+            yield from plans if divisible else map(self.plan, chunk)
 
     def distances(self, points: ArrayLike) -> Array:
         """Return d at points ``(N, d)``, shape ``(N,)``; NaN if the execution fails. Executes S N times.
@@ -346,30 +323,18 @@ class Validation:
     def plan_of(self, parameters: Parameters, task: Task) -> Plan:
         """Return the plan of a task, or of a batch, that is made already; :meth:`plan` checks more."""
         self.require_goal(task)
-        try:
+        with _failing_as(DesignError, "the synthesizer"):
             controller = self.synthesizer.design(task, self.model)
-        except CtxvalError:
-            raise
-        except (Exception, SystemExit) as error:
-            raise DesignError(f"the synthesizer failed: {reason_of(error)}.") from error
         if isinstance(controller, Synthesizer):  # its next design would change this one, before it is executed
             controller = copy(controller)
-        try:
+        with _failing_as(ModelError, "the closed loop on the model"):
             trajectory = self.closed_loop(controller, task)
-        except CtxvalError:
-            raise
-        except (Exception, SystemExit) as error:
-            raise ModelError(f"the closed loop on the model failed: {reason_of(error)}.") from error
         return Plan(parameters, task, controller, trajectory)
 
     def task_at(self, parameters: Parameters) -> Task:
         """Return the task that the task function makes, or a batch of them, after a check of what it returns."""
-        try:
+        with _failing_as(InputError, "the task function"):
             task = self.task(parameters)
-        except CtxvalError:
-            raise
-        except (Exception, SystemExit) as error:
-            raise InputError(f"the task function failed: {reason_of(error)}.") from error
         if not isinstance(task, Task):
             raise InputError(f"the task function's result must be a Task, got {task!r}.")
         require_time_step(self.model, task.dt, "the task")
@@ -418,6 +383,17 @@ class Validation:
             f"synthesizer: {shown(self.synthesizer)}",
             f"distance: {shown(self.distance)}, task: {shown(self.task)}",
         )
+
+
+@contextmanager
+def _failing_as(kind: type[CtxvalError], part: str) -> Iterator[None]:
+    """Report any exception of a user's part as one of ctxval."""
+    try:
+        yield
+    except CtxvalError:
+        raise
+    except (Exception, SystemExit) as error:
+        raise kind(f"{part} failed: {reason_of(error)}.") from error
 
 
 _stated: WeakSet[Validation] = WeakSet()

@@ -3,8 +3,7 @@
 from ctxval.data.log import Clock, Log, MemoryTable, Signal, Table
 from ctxval.data.mapping import Field, LogMapping, Observer
 from ctxval.data.readers import READERS, is_log, read_logs
-from ctxval.data.recorded import Recorded
-from ctxval.data.recordings import Recording, Recordings, component_names, read_recordings, recordings_of
+from ctxval.data.recordings import Recorded, Recording, Recordings, component_names, read_recordings, recordings_of
 from ctxval.data.sampling import Break, Channel
 from ctxval.data.topics import Message, TopicLog
 

@@ -9,14 +9,12 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from ctxval._util.arrays import Array
 from ctxval._util.columns import column_of, in_seconds
-from ctxval._util.representation import ShortRepr
 from ctxval.data.log import Clock, Log, Signal
 from ctxval.errors import InputError
 
@@ -26,38 +24,25 @@ X_FIELDS, Y_FIELDS = ("Data", "Raster", "Unit"), ("Name", "Data", "Unit", "XInde
 _NONE = {"", "-", "1", "[-]", "none", "n/a"}  # what stands in the place of a unit
 
 
-@dataclass(frozen=True, eq=False)
-class Axis(ShortRepr):
-    """The times of a raster, shape ``(N,)``, in a unit that may be empty."""
-
-    raster: str
-    unit: str
-    times: Array
-
-
-@dataclass(frozen=True, eq=False)
-class Measured(ShortRepr):
-    """A signal on one of the time axes: its name, its unit, which may be empty, and its numbers."""
-
-    name: str
-    unit: str
-    axis: int
-    values: Array
-
-
 class ControlDeskLog(Log):
-    """A recording whose signals have time axes of their own.
+    """A recording whose signals have time axes of their own; ``structure`` is one that :func:`is_control_desk` accepts.
 
     A field is the last part of a signal's path, such as ``angle`` of ``Model Root/Plant/angle``, or as much of the path
     as distinguishes it from the others; the whole path is a field too.
     """
 
-    def __init__(self, source: str, axes: Sequence[Axis], measured: Sequence[Measured]) -> None:
-        self.source, self._axes = source, axes
-        whole = _distinct([_plain(one.name) for one in measured], [axes[one.axis].raster for one in measured])
-        self._known = dict(zip(_short(whole), measured, strict=True))
-        self._whole = dict(zip(whole, measured, strict=True))
-        self._times = dict[int, Array]()
+    def __init__(self, source: str, structure: Mapping[str, Any]) -> None:
+        self.source, self._axes = source, _elements(structure, "X")
+        rasters = [_text(x, "Raster") for x in self._axes]
+        signals = [(y, _axis_of(source, y, rasters)) for y in _named(structure)]
+        # Signals that several rasters record begin with their raster, or else with a number.
+        paths = [_path(_text(y, "Name")) for y, _ in signals]
+        on = [rasters[axis] for _, axis in signals]
+        paths = _distinct(paths, [f"{raster}/{path}" for raster, path in zip(on, paths, strict=True)])
+        paths = _distinct(paths, [f"{number}/{path}" for number, path in enumerate(paths, 1)])
+        last = [path.rsplit("/", 1)[-1] or path for path in paths]
+        self._known = dict(zip(_distinct(last, paths), signals, strict=True))
+        self._whole = dict(zip(paths, signals, strict=True))
 
     def fields(self) -> tuple[str, ...]:
         """Return the names of the signals."""
@@ -70,41 +55,34 @@ class ControlDeskLog(Log):
                 f"{self.source} is a recording of ControlDesk, whose signals have times of their own: the mapping must "
                 f"not name {clock.field!r} as its time."
             )
-        return {field: self._signal(field) for field in fields}
+        located = {field: self._located(field, self._signal) for field in fields}
+        times = {axis: self._times(axis) for (_, axis), _ in located.values()}
+        signals = {}
+        for field, ((element, axis), index) in located.items():
+            values, rows = _numbers(element), len(times[axis])
+            array = values[:, None] if values.ndim == 1 else values
+            array = array if len(array) == rows else array.T
+            if len(array) != rows:
+                raise InputError(
+                    f"{self.source}: {field} must have {rows} values, as its times X({axis + 1}) have, got "
+                    f"{values.shape}."
+                )
+            unit = _text(element, "Unit")
+            signals[field] = Signal(times[axis], self._component(field, array, index), 0, "sample", unit)
+        return signals
 
-    def _signal(self, field: str) -> Signal:
-        one, index = self._measured(field), None
-        if one is None and (matched := re.fullmatch(r"(.+?)\[(\d{1,6})\]", field)) is not None:
-            one, index = self._measured(matched[1]), int(matched[2])
-        if one is None:
-            raise self.missing(field)
-        times = self._times_of(one.axis)
-        values = one.values[:, None] if one.values.ndim == 1 else one.values
-        if len(values) != len(times) and values.shape[1] == len(times):
-            values = values.T
-        if len(values) != len(times):
-            raise InputError(
-                f"{self.source}: {field} must have {len(times)} values, as its times X({one.axis + 1}) have, got "
-                f"{one.values.shape}."
-            )
-        if index is not None and index >= values.shape[1]:
-            raise InputError(f"{self.source}: {field} has {values.shape[1]} components, so there is no {field}.")
-        return Signal(times, values if index is None else values[:, [index]], 0, "sample", one.unit)
-
-    def _measured(self, field: str) -> Measured | None:
+    def _signal(self, field: str) -> tuple[Mapping[str, Any], int] | None:
+        """Return the element of a signal, and the number of its time axis."""
         if field in self._whole:
             return self._whole[field]
         column = column_of(self.source, self.fields(), field)
         return None if column is None else self._known[column[0]]
 
-    def _times_of(self, number: int) -> Array:
-        """Return the times of an axis in seconds, in one array for all of its signals."""
-        if number not in self._times:
-            axis = self._axes[number]
-            if not np.isfinite(axis.times).all():
-                raise InputError(f"{self.source}: the times X({number + 1}) must be finite numbers.")
-            self._times[number] = in_seconds(self.source, axis.times, axis.unit)
-        return self._times[number]
+    def _times(self, axis: int) -> Array:
+        times = _numbers(self._axes[axis]).ravel()
+        if not np.isfinite(times).all():
+            raise InputError(f"{self.source}: the times X({axis + 1}) must be finite numbers.")
+        return in_seconds(self.source, times, _text(self._axes[axis], "Unit"))
 
 
 def is_control_desk(structure: Any) -> bool:
@@ -116,15 +94,6 @@ def is_control_desk(structure: Any) -> bool:
     if not isinstance(structure, Mapping):
         return False
     return any(_numbers(x).size for x in _elements(structure, "X")) and bool(_named(structure))
-
-
-def control_desk_log(source: str, structure: Mapping[str, Any]) -> ControlDeskLog:
-    """Return the recording in a structure; see :func:`is_control_desk`."""
-    axes = [Axis(_text(x, "Raster"), _text(x, "Unit"), _numbers(x).ravel()) for x in _elements(structure, "X")]
-    measured = [
-        Measured(_text(y, "Name"), _text(y, "Unit"), _axis_of(source, y, axes), _numbers(y)) for y in _named(structure)
-    ]
-    return ControlDeskLog(source, axes, measured)
 
 
 def _named(structure: Mapping[str, Any]) -> list[Mapping[str, Any]]:
@@ -149,35 +118,27 @@ def _numbers(element: Mapping[str, Any]) -> Array:
     return np.asarray(np.atleast_1d(np.squeeze(value)) if usable else (), dtype=np.float64)
 
 
-def _axis_of(source: str, element: Mapping[str, Any], axes: Sequence[Axis]) -> int:
+def _axis_of(source: str, element: Mapping[str, Any], rasters: Sequence[str]) -> int:
     """Return the number of the time axis of a signal, from 0 on: that of its index, or else of its raster."""
     stated = element.get("XIndex")
     if stated is not None and np.size(stated) == 1:
         number = float(np.asarray(stated, dtype=np.float64).item())
-        if not number.is_integer() or not 1 <= number <= len(axes):
+        if not number.is_integer() or not 1 <= number <= len(rasters):
             raise InputError(
-                f"{source}: XIndex of {_text(element, 'Name')} must be a number from 1 to {len(axes)}, got {number:g}."
+                f"{source}: XIndex of {_text(element, 'Name')} must be a number from 1 to {len(rasters)}, got "
+                f"{number:g}."
             )
         return int(number) - 1
     raster = _text(element, "Raster")
-    return next((k for k, axis in enumerate(axes) if axis.raster == raster), 0)
+    return rasters.index(raster) if raster in rasters else 0
 
 
-def _plain(name: str) -> str:
+def _path(name: str) -> str:
     """Return the path of a signal without quotes around its parts, and without a mark such as ``{SubArray1}``."""
     return "/".join(part.strip().strip('"').strip() for part in re.sub(r"\s*\{[^}]*\}$", "", name).split("/"))
 
 
-def _distinct(names: list[str], rasters: list[str]) -> list[str]:
-    """Return names that differ: signals that several rasters record begin with their raster, or else with a number."""
+def _distinct(names: list[str], longer: list[str]) -> list[str]:
+    """Return the names, and the longer ones in the place of those that several signals have."""
     count = Counter(names)
-    by_raster = [f"{raster}/{name}" if count[name] > 1 else name for name, raster in zip(names, rasters, strict=True)]
-    count = Counter(by_raster)
-    return [f"{k + 1}/{name}" if count[name] > 1 else name for k, name in enumerate(by_raster)]
-
-
-def _short(names: list[str]) -> list[str]:
-    """Return the last part of each path; the whole path if another one has the same last part."""
-    last = [name.rsplit("/", 1)[-1] or name for name in names]
-    count = Counter(last)
-    return [end if count[end] == 1 else name for end, name in zip(last, names, strict=True)]
+    return [name if count[name] == 1 else other for name, other in zip(names, longer, strict=True)]

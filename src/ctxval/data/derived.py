@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ctxval._util.arrays import Array, Mask
+from ctxval._util.arrays import Mask
 from ctxval._util.texts import enumerated, reason_of
 from ctxval.core.trajectory import Trajectory
 from ctxval.data.mapping import LogMapping, Observer
@@ -41,36 +40,29 @@ def _with_derivatives(recordings: Recordings, mapping: LogMapping) -> Recordings
                 f"component; these are {', '.join(known)}."
             )
     # Components of vectors have names of their own, and stay where their field is.
-    order = [label for name in mapping.states for label in ([name] if name in derived else _components(name, known))]
-
-    def states(run: Trajectory) -> Array:
-        columns = dict(zip(known, run.states.T, strict=True))
-        for name, field in derived.items():
-            base = columns[field.derivative_of]
-            columns[name] = savgol_filter(base, field.window, 2, deriv=1, delta=dt)
-        return np.stack([columns[label] for label in order], axis=-1)
-
+    order = []
+    for name in mapping.states:
+        components = [label for label in known if label.startswith(name) and label[len(name) :].isdecimal()]
+        order += [name] if name in derived or name in known else components
     window = max(field.window for field in derived.values())
     kept, breaks = _long_enough(recordings, window, f"the {window} records of a derivative")
-    runs = tuple(replace(run, trajectory=_with_states(run.trajectory, states(run.trajectory))) for run in kept)
-    units = dict(recordings.states)
+    runs = []
+    for run in kept:
+        columns = dict(zip(known, run.trajectory.states.T, strict=True))
+        for name, field in derived.items():
+            columns[name] = savgol_filter(columns[field.derivative_of], field.window, 2, deriv=1, delta=dt)
+        states = np.stack([columns[label] for label in order], axis=-1)
+        runs.append(replace(run, trajectory=Trajectory(run.trajectory.times, states, run.trajectory.inputs)))
+    units, notes = dict(recordings.states), list(recordings.notes)
     for name, field in derived.items():
         base_unit = recordings.states[field.derivative_of]
         units[name] = field.unit or (f"{base_unit}/s" if base_unit else "")
-    notes = [
-        f"{name} is the derivative of {field.derivative_of}, that of a parabola through {field.window} records around "
-        f"each: it looks {field.window // 2 * dt:.3g} s ahead, so a controller would have it that much later"
-        for name, field in derived.items()
-    ]
+        notes.append(
+            f"{name} is the derivative of {field.derivative_of}, that of a parabola through {field.window} records "
+            f"around each: it looks {field.window // 2 * dt:.3g} s ahead, so a controller would have it that much later"
+        )
     named = {label: units[label] for label in order}
-    return replace(recordings, runs=runs, breaks=breaks, states=named, notes=(*recordings.notes, *notes))
-
-
-def _components(name: str, known: Sequence[str]) -> list[str]:
-    """Return the labels of a field: its name, or those of its components."""
-    if name in known:
-        return [name]
-    return [label for label in known if label.startswith(name) and label[len(name) :].isdecimal()]
+    return replace(recordings, runs=tuple(runs), breaks=breaks, states=named, notes=tuple(notes))
 
 
 def _with_observer(recordings: Recordings, observer: Observer) -> Recordings:
@@ -83,7 +75,14 @@ def _with_observer(recordings: Recordings, observer: Observer) -> Recordings:
     runs: list[Recording] = []
     breaks, widths = list(recordings.breaks), set[int]()
     for run in recordings.runs:
-        x, old = _estimated(observer.function, name, run, recordings.dt), run.trajectory
+        old = run.trajectory
+        try:
+            x = np.asarray(observer.function(old.states.copy(), old.inputs.copy(), recordings.dt), dtype=np.float64)
+        except Exception as error:  # the user's function
+            raise InputError(f"the observer {name} failed on {run.source}: {reason_of(error)}.") from error
+        if x.ndim != 2 or len(x) != len(old.states) or not x.shape[1]:
+            wanted = f"states of shape ({len(old.states)}, n)"
+            raise InputError(f"the observer {name} must return {wanted}, got {x.shape}.")
         widths.add(x.shape[1])
         finite: Mask = np.asarray(np.isfinite(x).all(axis=1))
         first = int(finite.argmax()) if finite.any() else len(x)
@@ -111,18 +110,6 @@ def _with_observer(recordings: Recordings, observer: Observer) -> Recordings:
     return replace(recordings, runs=tuple(runs), breaks=tuple(breaks), states=states, notes=notes)
 
 
-def _estimated(function: Callable[[Array, Array, float], Array], name: str, run: Recording, dt: float) -> Array:
-    """Return the states ``(H + 1, n)`` that a user's function returns for a recording."""
-    y, u = run.trajectory.states, run.trajectory.inputs
-    try:
-        x = np.asarray(function(y.copy(), u.copy(), dt), dtype=np.float64)
-    except Exception as error:  # the user's function
-        raise InputError(f"the observer {name} failed on {run.source}: {reason_of(error)}.") from error
-    if x.ndim != 2 or len(x) != len(y) or not x.shape[1]:
-        raise InputError(f"the observer {name} must return states of shape ({len(y)}, n), got {x.shape}.")
-    return x
-
-
 def _with_lags(recordings: Recordings, lags: int) -> Recordings:
     """Return recordings whose states have those of so many earlier steps beside them, and the inputs of these."""
     if not lags:
@@ -136,29 +123,23 @@ def _with_lags(recordings: Recordings, lags: int) -> Recordings:
         later = Trajectory(run.trajectory.times[: horizon + 1 - lags], np.hstack([*states, *inputs]), u[lags:])
         runs.append(replace(run, start=run.start + lags * recordings.dt, trajectory=later))
     named = dict(recordings.states)
-    for k in range(1, lags + 1):
-        named |= {f"{name} {_ago(k)}": unit for name, unit in recordings.states.items()}
-    for k in range(1, lags + 1):
-        named |= {f"{name} {_ago(k)}": unit for name, unit in recordings.inputs.items()}
+    for units in (recordings.states, recordings.inputs):
+        for k in range(1, lags + 1):
+            ago = "a step before" if k == 1 else f"{k} steps before"
+            named |= {f"{name} {ago}": unit for name, unit in units.items()}
     return replace(recordings, runs=tuple(runs), breaks=breaks, states=named)
-
-
-def _ago(steps: int) -> str:
-    return "a step before" if steps == 1 else f"{steps} steps before"
 
 
 def _long_enough(recordings: Recordings, records: int, what: str) -> tuple[list[Recording], tuple[Break, ...]]:
     """Return the recordings with so many records, and the breaks with those that are left out."""
-    kept = [run for run in recordings.runs if len(run.trajectory.states) >= max(records, 2)]
-    short = [run for run in recordings.runs if len(run.trajectory.states) < max(records, 2)]
+    kept: list[Recording] = []
+    left: list[Break] = []
+    for run in recordings.runs:
+        if len(run.trajectory.states) >= max(records, 2):
+            kept.append(run)
+        else:
+            length = run.trajectory.horizon * recordings.dt
+            left.append(Break(run.source, run.start, length, "a part", f"is too short for {what}"))
     if not kept:
         raise InputError(f"no recording has {what}.")
-    left = [
-        Break(run.source, run.start, run.trajectory.horizon * recordings.dt, "a part", f"is too short for {what}")
-        for run in short
-    ]
     return kept, (*recordings.breaks, *left)
-
-
-def _with_states(run: Trajectory, states: Array) -> Trajectory:
-    return Trajectory(run.times, states, run.inputs)

@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
+from typing import TypeVar
 
 import numpy as np
 
@@ -23,6 +24,8 @@ from ctxval.errors import InputError
 
 LISTED = 24
 """Largest number of fields that a message names."""
+
+Located = TypeVar("Located")
 
 
 @contextmanager
@@ -104,6 +107,23 @@ class Log(ShortRepr, ABC):
         """Return the error that there is no such field; its message lists those that there are."""
         return InputError(f"{self.source} has no field {field!r}; it has {enumerated(self.fields(), LISTED)}.")
 
+    def _located(self, field: str, find: Callable[[str], Located | None]) -> tuple[Located, int | None]:
+        """Return the column that a field means, and the number of its component if only one is meant."""
+        if (column := find(field)) is not None:
+            return column, None
+        matched = re.fullmatch(r"(.+?)\[(\d{1,6})\]", field)
+        if matched is None or (column := find(matched[1])) is None:
+            raise self.missing(field)
+        return column, int(matched[2])
+
+    def _component(self, field: str, values: Array, index: int | None) -> Array:
+        if index is None:
+            return values
+        if index >= values.shape[1]:
+            name = field.rpartition("[")[0]
+            raise InputError(f"{self.source}: {name} has {values.shape[1]} components, so there is no {field}.")
+        return values[:, [index]]
+
 
 class Table(Log):
     """A log whose fields share one column of times.
@@ -140,13 +160,13 @@ class Table(Log):
     def signals(self, fields: Sequence[str], clock: Clock) -> dict[str, Signal]:
         """Return fields over time; see :meth:`Log.signals`."""
         require_distinct(self.source, self._names)
-        split = {field: self._split(field) for field in fields}
+        find = partial(column_of, self.source, self._names)
+        located = {field: self._located(field, find) for field in fields}
         time, time_unit = self._time(clock)
-        wanted = [*(name for name, _, _ in split.values()), *filter(None, [time])]
+        wanted = [*(name for (name, _), _ in located.values()), *filter(None, [time])]
         arrays = self._columns(list(dict.fromkeys(wanted)))
         if time is None:
-            rows = max(len(arrays[name]) for name, _, _ in split.values())
-            times = np.asarray(np.arange(rows) * float(clock.period or 0), dtype=np.float64)
+            times = np.asarray(np.arange(max(map(len, arrays.values()))) * float(clock.period or 0), dtype=np.float64)
         else:
             times = self._oriented(time, arrays[time], arrays[time].size)[:, 0]
             if not len(times) or not np.isfinite(times).all():
@@ -154,12 +174,9 @@ class Table(Log):
                 raise InputError(f"{self.source}, {self.word} {row}: the time {time} must be a number.")
             times = in_seconds(self.source, times, time_unit)
         signals = {}
-        for field, (name, unit, index) in split.items():
-            values = self._oriented(name, arrays[name], len(times))
-            if index is not None and index >= values.shape[1]:
-                raise InputError(f"{self.source}: {name} has {values.shape[1]} components, so there is no {field}.")
-            chosen = values if index is None else values[:, [index]]
-            signals[field] = Signal(times, chosen, self.first, self.word, unit)
+        for field, ((name, unit), index) in located.items():
+            values = self._component(field, self._oriented(name, arrays[name], len(times)), index)
+            signals[field] = Signal(times, values, self.first, self.word, unit)
         return signals
 
     def episodes(self, used: Sequence[str]) -> list[Log]:
@@ -188,16 +205,6 @@ class Table(Log):
             return Table(source, self._names, columns, word=self.word, first=self.first + start, period=self.period)
 
         return [episode(*ends) for ends in pairwise([0, *(np.flatnonzero(changed) + 1).tolist(), count])]
-
-    def _split(self, field: str) -> tuple[str, str, int | None]:
-        """Return the column of a field, its unit, and the number of the component, if only one is meant."""
-        if (column := column_of(self.source, self._names, field)) is not None:
-            return *column, None
-        matched = re.fullmatch(r"(.+?)\[(\d{1,6})\]", field)
-        column = None if matched is None else column_of(self.source, self._names, matched[1])
-        if matched is None or column is None:
-            raise self.missing(field)
-        return *column, int(matched[2])
 
     def _time(self, clock: Clock) -> tuple[str | None, str]:
         """Return the column of the times and its unit; None if rows have equal steps."""

@@ -11,11 +11,10 @@ from typing import Any, Literal
 
 from ctxval._util.arrays import Array
 from ctxval._util.checked import FiniteFloat, NonNegativeInt, Seconds, checked, require
-from ctxval._util.columns import column_of
+from ctxval._util.columns import column_of, conversion, named_unit
 from ctxval._util.files import read_bytes
 from ctxval._util.representation import ShortRepr
 from ctxval._util.texts import enumerated
-from ctxval._util.units import conversion, named_unit
 from ctxval.data.log import LISTED, Clock, Log, reading
 from ctxval.errors import InputError, UnknownNameError
 
@@ -100,16 +99,6 @@ class Observer(ShortRepr):
             raise InputError(f"an observer must be a function (y, u, dt) -> x, got {self.function!r}.")
         require("states", Mapping[str, str], self.states)
 
-    @staticmethod
-    def from_table(described: Any) -> Observer:
-        """Return the observer that a mapping describes: ``module:attr``, or a table of ``function`` and ``states``."""
-        table: Any = {"function": described} if isinstance(described, str) else described
-        if not isinstance(table, Mapping) or not isinstance(table.get("function"), str):
-            raise InputError(f"an observer must name a function module:attr, got {described!r}.")
-        if unknown := [key for key in table if key not in ("function", "states")]:
-            raise UnknownNameError.among("entry of the observer", unknown[0], ["function", "states"])
-        return Observer(None, table.get("states", {}), table["function"])
-
 
 @dataclass(frozen=True)
 class LogMapping(ShortRepr):
@@ -145,9 +134,9 @@ class LogMapping(ShortRepr):
     def __post_init__(self) -> None:
         if self.observer is not None and not isinstance(self.observer, Observer):
             object.__setattr__(self, "observer", Observer(self.observer))
-        for name in ("states", "inputs"):
-            fields = {key: _field(key, item) for key, item in dict(getattr(self, name)).items()}
-            object.__setattr__(self, name, fields)
+        for kind in ("states", "inputs"):
+            fields = {name: _field(name, described) for name, described in getattr(self, kind).items()}
+            object.__setattr__(self, kind, fields)
         if not any(not field.derivative_of for field in self.states.values()):
             raise InputError("a mapping of a log needs at least one state.")
         if both := [name for name in self.states if name in self.inputs]:
@@ -155,14 +144,11 @@ class LogMapping(ShortRepr):
         conversion(self.time_unit or "s", "s")
         if self.valid is not None and _VALID.fullmatch(str(self.valid)) is None:
             raise InputError(f"valid must be a field and a number, such as 'status == 0', got {self.valid!r}.")
-        require("stamp", Stamp, self.stamp)
-        require("dt", Seconds | None, self.dt)
-        require("longest_gap", Seconds | None, self.longest_gap)
-        require("delay", FiniteFloat, self.delay)
-        require("lags", NonNegativeInt, self.lags)
-        for name, given in self.inputs.items():
-            if given.derivative_of:
-                raise InputError(f"the input {name} cannot be a derivative.")
+        ranges = {"dt": Seconds | None, "longest_gap": Seconds | None, "delay": FiniteFloat, "lags": NonNegativeInt}
+        for name, annotation in {"stamp": Stamp, **ranges}.items():
+            require(name, annotation, getattr(self, name))
+        if derived := [name for name, given in self.inputs.items() if given.derivative_of]:
+            raise InputError(f"the input {derived[0]} cannot be a derivative.")
 
     @property
     def fields(self) -> dict[str, Field]:
@@ -183,7 +169,15 @@ class LogMapping(ShortRepr):
 
     def in_units(self, states: Mapping[str, str], inputs: Mapping[str, str]) -> LogMapping:
         """Return this mapping with the units of an experiment, for fields that state none; by name, else by place."""
-        return replace(self, states=_in_units(self.states, states), inputs=_in_units(self.inputs, inputs))
+
+        def with_units(fields: Mapping[str, Field], units: Mapping[str, str]) -> dict[str, Field]:
+            by_place = units.values() if len(units) == len(fields) else [""] * len(fields)
+            return {
+                name: replace(field, unit=field.unit or units.get(name, unit)) if field.factor is None else field
+                for (name, field), unit in zip(fields.items(), by_place, strict=True)
+            }
+
+        return replace(self, states=with_units(self.states, states), inputs=with_units(self.inputs, inputs))
 
     @staticmethod
     def from_table(table: Mapping[str, Any]) -> LogMapping:
@@ -192,8 +186,8 @@ class LogMapping(ShortRepr):
         A field is a path, or a table with the attributes of :class:`Field`. ``states`` and ``inputs`` may also be lists
         of paths.
         """
-        _require_known("entry of the mapping of recordings", table, LogMapping)
-        parts = dict[str, dict[str, Field]]()
+        _require_known("entry of the mapping of recordings", table, [field.name for field in fields(LogMapping)])
+        parts = dict[str, Any]()
         for kind in ("states", "inputs"):
             named = table.get(kind, {})
             named = [named] if isinstance(named, str) else named
@@ -201,11 +195,17 @@ class LogMapping(ShortRepr):
                 named = {str(item.get("path") if isinstance(item, Mapping) else item): item for item in named}
             if not isinstance(named, Mapping):
                 raise InputError(f"{kind} must be a table of fields or a list of paths, got {named!r}.")
-            parts[kind] = {name: _field(name, item) for name, item in named.items()}
+            parts[kind] = named
         if "states" not in table:
             raise InputError("the mapping of recordings needs states.")
-        observer = {"observer": Observer.from_table(table["observer"])} if "observer" in table else {}
-        return LogMapping(**{**table, **parts, **observer})
+        if "observer" in table:  # module:attr, or a table
+            given = table["observer"]
+            observer: Any = {"function": given} if isinstance(given, str) else given
+            if not isinstance(observer, Mapping) or not isinstance(observer.get("function"), str):
+                raise InputError(f"an observer must name a function module:attr, got {given!r}.")
+            _require_known("entry of the observer", observer, ["function", "states"])
+            parts["observer"] = Observer(None, observer.get("states", {}), observer["function"])
+        return LogMapping(**{**table, **parts})
 
     @staticmethod
     def from_toml(path: str | Path) -> LogMapping:
@@ -229,10 +229,10 @@ class LogMapping(ShortRepr):
         their units, are looked for before these.
         """
         columns, states, inputs = log.fields(), states or {}, inputs or {}
-        wanted = {**states, **inputs}
+        wanted = {name: Field(name, unit) for name, unit in {**states, **inputs}.items()}
         if wanted and all(column_of(log.source, columns, name) for name in wanted):
-            outputs = {name: Field(name, unit) for name, unit in states.items() if name not in inputs}
-            return LogMapping(outputs, {name: Field(name, unit) for name, unit in inputs.items()}, dt=log.period)
+            outputs = {name: wanted[name] for name in states if name not in inputs}
+            return LogMapping(outputs, {name: wanted[name] for name in inputs}, dt=log.period)
         vectors = ("states", "x", "observation.state")
         usual = _usual(columns, vectors, "x"), _usual(columns, ("inputs", "u", "action"), "u")
         if not usual[0]:
@@ -241,14 +241,6 @@ class LogMapping(ShortRepr):
                 f"with --state and --input or in a mapping; the fields are {enumerated(columns, LISTED)}."
             )
         return LogMapping(*usual, dt=log.period)
-
-
-def _in_units(fields: Mapping[str, Field], units: Mapping[str, str]) -> dict[str, Field]:
-    by_place = units.values() if len(units) == len(fields) else [""] * len(fields)
-    return {
-        name: replace(field, unit=field.unit or units.get(name, unit)) if field.factor is None else field
-        for (name, field), unit in zip(fields.items(), by_place, strict=True)
-    }
 
 
 def _usual(known: Sequence[str], vectors: Sequence[str], letter: str) -> dict[str, Field]:
@@ -262,8 +254,7 @@ def _usual(known: Sequence[str], vectors: Sequence[str], letter: str) -> dict[st
     return columns
 
 
-def _require_known(what: str, table: Mapping[str, Any], of: type[Field | LogMapping]) -> None:
-    names = [field.name for field in fields(of)]
+def _require_known(what: str, table: Mapping[str, Any], names: Sequence[str]) -> None:
     for key in table:
         if key not in names:
             raise UnknownNameError.among(what, key, names)
@@ -277,7 +268,7 @@ def _field(name: str, described: Any) -> Field:
     if not isinstance(described, Mapping):
         raise InputError(f"the field {name} must be a path or a table, got {described!r}.")
     table = {("path" if key == "field" else key): value for key, value in described.items()}
-    _require_known(f"entry of the field {name}", table, Field)
+    _require_known(f"entry of the field {name}", table, [field.name for field in fields(Field)])
     try:
         return Field(**({} if "derivative_of" in table else {"path": name}) | table)
     except InputError as error:

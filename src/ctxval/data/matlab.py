@@ -17,7 +17,7 @@ from ctxval._util.arrays import Array
 from ctxval._util.extras import require_extra
 from ctxval._util.files import MOST_BYTES, open_regular
 from ctxval._util.texts import quoted
-from ctxval.data.control_desk import X_FIELDS, Y_FIELDS, control_desk_log, is_control_desk
+from ctxval.data.control_desk import X_FIELDS, Y_FIELDS, ControlDeskLog, is_control_desk
 from ctxval.data.log import Log, MemoryTable, reading
 from ctxval.errors import InputError
 
@@ -33,23 +33,22 @@ def read_mat(path: Path) -> list[Log]:
     with reading(path, "a MATLAB file"):
         with open_regular(path) as file:
             is_hdf5 = any(file.seek(start) == start and file.read(8) == b"\x89HDF\r\n\x1a\n" for start in (0, 512))
-        content = _version_7_3(path) if is_hdf5 else _version_5(path)
+        if is_hdf5:
+            content = _version_7_3(path)
+        else:
+            from scipy.io import loadmat, whosmat  # imported here: loading it takes longer than a command
+
+            _require_size(sum(8 * math.prod(shape) for _, shape, _ in whosmat(str(path))))
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # of objects of MATLAB's classes, which are not data
+                content = dict(loadmat(str(path), simplify_cells=True))
         if recordings := {name: value for name, value in content.items() if is_control_desk(value)}:
             sources = {name: f"{path}, {name}" if len(recordings) > 1 else str(path) for name in recordings}
-            return [control_desk_log(sources[name], structure) for name, structure in recordings.items()]
+            return [ControlDeskLog(sources[name], structure) for name, structure in recordings.items()]
         columns = dict(_numeric("", content, 6))
     if not columns:
         raise InputError(f"{path} has no numeric array.")
     return [MemoryTable(str(path), columns)]
-
-
-def _version_5(path: Path) -> dict[str, Any]:
-    from scipy.io import loadmat, whosmat  # imported here: loading it takes longer than a command
-
-    _require_size(sum(8 * math.prod(shape) for _, shape, _ in whosmat(str(path))))
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of objects of MATLAB's classes, which are not data
-        return dict(loadmat(str(path), simplify_cells=True))
 
 
 def _numeric(before: str, content: Mapping[str, Any], depth: int) -> Iterator[tuple[str, Array]]:
@@ -59,12 +58,11 @@ def _numeric(before: str, content: Mapping[str, Any], depth: int) -> Iterator[tu
         if str(name).startswith("__"):
             continue  # what the reader says of the file
         if isinstance(value, Mapping):
-            if depth:
-                yield from _numeric(path, value, depth - 1)
-            continue
-        array = np.asarray(value) if isinstance(value, np.ndarray | int | float) else np.array("")
-        if array.dtype.kind in "biuf" and array.ndim <= 2 and array.size:
-            yield path, array.astype(np.float64)
+            yield from _numeric(path, value, depth - 1) if depth else ()
+        elif isinstance(value, np.ndarray | int | float):
+            array = np.asarray(value)
+            if array.dtype.kind in "biuf" and array.ndim <= 2 and array.size:
+                yield path, array.astype(np.float64)
 
 
 def _version_7_3(path: Path) -> dict[str, Any]:
@@ -90,9 +88,7 @@ def _version_7_3(path: Path) -> dict[str, Any]:
             parts = {part: _elements(h5py, file, checked, f"{variable}.{part}") for part in _PARTS}
             if is_control_desk(parts):
                 recordings[variable] = parts
-        if recordings:
-            return recordings
-        return {name: _array(h5py, checked[name]) for name in numeric}
+        return recordings or {name: _array(h5py, checked[name]) for name in numeric}
 
 
 _PARTS = {"X": X_FIELDS, "Y": Y_FIELDS}
@@ -157,11 +153,9 @@ def _hdf5_size(h5py: Any, path: str, identifier: Any) -> int:
     if plan.get_layout() == h5d.VIRTUAL or plan.get_external_count():
         raise InputError(f"the values of {quoted(path)} are in another file")
     shape = identifier.shape  # only now: the shape of a virtual data set may depend on other files
-    if identifier.get_type().get_class() not in (h5t.INTEGER, h5t.FLOAT, h5t.ENUM) or math.prod(shape) == 0:
-        return 0
-    if h5py.h5a.exists(identifier, b"MATLAB_empty") or _is_text(h5py, identifier):
-        return 0
-    if sum(extent > 1 for extent in shape) > 2:
+    is_array = identifier.get_type().get_class() in (h5t.INTEGER, h5t.FLOAT, h5t.ENUM) and math.prod(shape) > 0
+    is_empty = not is_array or h5py.h5a.exists(identifier, b"MATLAB_empty") or _is_text(h5py, identifier)
+    if is_empty or sum(extent > 1 for extent in shape) > 2:
         return 0
     # The filters that MATLAB uses; others may be code in a library that a path in the environment names.
     usual = {h5z.FILTER_DEFLATE, h5z.FILTER_SHUFFLE, h5z.FILTER_FLETCHER32}

@@ -32,6 +32,9 @@ from ctxval.errors import InputError
 Decoder = Callable[[bytes], Any]
 """A function that decodes the bytes of one message."""
 
+Definition = tuple[Callable[[str, bytes], Decoder], str, bytes]
+"""A function that makes a decoder, and its arguments: the name of a type of messages, and the text that defines it."""
+
 _MOST_CHUNK = 128 * 2**20  # largest size of a record, and of a chunk of records after it is decompressed, in bytes
 
 _library = partial(require_extra, extra="logs", purpose="logs of messages")
@@ -49,24 +52,25 @@ class _FileOfMessages(TopicLog):
         """Return the names of the topics."""
         return tuple(self._topics)
 
-    def _decoded(self, channel: Any, decoder: Callable[[], Decoder], data: bytes, message: str) -> Any:
+    def _decoded(
+        self, channel: Any, topic: str, data: bytes, message: str, definition: Callable[[], Definition]
+    ) -> Any:
+        """Return the content of a message, decoded by the definition of its channel."""
         if channel not in self._decoders:
-            self._decoders[channel] = decoder()
+            make, name, text = definition()
+            try:
+                self._decoders[channel] = make(name, text)
+            except InputError:
+                raise
+            except Exception as error:  # the definition in a file may be anything
+                raise InputError(
+                    f"{self.source}: the definition of the messages of {topic}, {name}, cannot be read."
+                ) from error
         try:
             return self._decoders[channel](data)
         except Exception as error:  # decoders raise many kinds
             why = quoted(reason_of(error))
             raise InputError(f"{self.source}, message {message}: it cannot be decoded ({why}).") from error
-
-    def _decoder(self, topic: str, make: Callable[[str, bytes], Decoder], name: str, definition: bytes) -> Decoder:
-        try:
-            return make(name, definition)
-        except InputError:
-            raise
-        except Exception as error:  # the definition in a file may be anything
-            raise InputError(
-                f"{self.source}: the definition of the messages of {topic}, {name}, cannot be read."
-            ) from error
 
 
 class McapLog(_FileOfMessages):
@@ -117,19 +121,19 @@ class McapLog(_FileOfMessages):
                     case "Channel":
                         channels[record.id] = record
                     case "Message" if (channel := channels.get(record.channel_id)) and channel.topic in wanted:
-                        decoder = partial(self._decoder_of, schemas.get(channel.schema_id), channel)
+                        definition = partial(self._definition, schemas.get(channel.schema_id), channel)
                         message = f"{record.sequence} of {channel.topic}"
-                        content = self._decoded(channel.id, decoder, record.data, message)
+                        content = self._decoded(channel.id, channel.topic, record.data, message, definition)
                         yield Message(channel.topic, record.log_time, record.publish_time, content)
                     case "NoneType":
                         return
 
-    def _decoder_of(self, schema: Any, channel: Any) -> Decoder:
-        if channel.message_encoding == "json":
-            return lambda data: json.loads(data, object_pairs_hook=_distinct)
+    def _definition(self, schema: Any, channel: Any) -> Definition:
         encoding = getattr(schema, "encoding", None)
+        if channel.message_encoding == "json":
+            return json_decoder, "", b""
         if (make := _DECODERS.get((channel.message_encoding, encoding))) is not None:
-            return self._decoder(channel.topic, make, schema.name, schema.data)
+            return make, schema.name, schema.data
         of = f" with a schema in {encoding}" if schema is not None else ""
         raise InputError(
             f"{self.source}: the messages of {channel.topic} are in {channel.message_encoding}{of}; messages in json, "
@@ -171,10 +175,11 @@ class BagLog(_FileOfMessages):
                 if record is None:
                     return
                 connection, time, raw = record
-                message, decoder = f"{number}, of {connection.topic}", partial(self._decoder_of, connection)
-                yield Message(connection.topic, time, time, self._decoded(connection.topic, decoder, raw, message))
+                topic, definition = connection.topic, partial(self._definition, connection)
+                content = self._decoded(topic, topic, raw, f"{number}, of {topic}", definition)
+                yield Message(topic, time, time, content)
 
-    def _decoder_of(self, connection: Any) -> Decoder:
+    def _definition(self, connection: Any) -> Definition:
         definition, text = connection.msgdef, connection.msgdef.data
         if self._version == 2 and definition.format.name != "MSG":
             # Bags before ROS 2 Iron do not hold the definitions of their messages.
@@ -188,14 +193,7 @@ class BagLog(_FileOfMessages):
                     "not in the bag, and is not one of ROS 2 itself."
                 ) from error
         make = ros1_decoder if self._version == 1 else ros2_decoder
-        return self._decoder(connection.topic, make, connection.msgtype, text.encode())
-
-
-def _distinct(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    content = dict(pairs)
-    if len(content) != len(pairs):
-        raise ValueError("a name is there twice")
-    return content
+        return make, connection.msgtype, text.encode()
 
 
 def _decompressed(kind: str, data: bytes) -> bytes:
@@ -220,6 +218,18 @@ def _decompressed(kind: str, data: bytes) -> bytes:
 
 
 # Decoders
+
+
+def json_decoder(name: str, definition: bytes) -> Decoder:
+    """Return the decoder of messages in JSON, which need no definition."""
+
+    def distinct(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        content = dict(pairs)
+        if len(content) != len(pairs):
+            raise ValueError("a name is there twice")
+        return content
+
+    return lambda data: json.loads(data, object_pairs_hook=distinct)
 
 
 def ros2_decoder(name: str, definition: bytes) -> Decoder:
@@ -250,17 +260,6 @@ def _plain(value: Any) -> Any:
     return [_plain(item) for item in value]
 
 
-def ros1_decoder(name: str, definition: bytes) -> Decoder:
-    """Return the decoder of ROS 1 messages."""
-    parsed = _library("rosbags.typesys").get_types_from_msg(definition.decode("utf-8", "replace"), name)
-    types = {of: {field: _known(kind) for field, kind in fields} for of, (_, fields) in parsed.items()}
-    # The types that ROS 1 calls time and duration, by the names that rosbags gives them.
-    types.setdefault("builtin_interfaces/msg/Time", {"sec": "<u4", "nanosec": "<u4"})
-    types.setdefault("builtin_interfaces/msg/Duration", {"sec": "<i4", "nanosec": "<i4"})
-    root = name if name in types else name.replace("/", "/msg/", 1)
-    return lambda data: _Message(types, data).record(root, 0)
-
-
 # The format of each type of numbers.
 _NUMBERS = {
     **{"bool": "?", "byte": "i1", "char": "u1", "octet": "u1", "int8": "i1", "uint8": "u1", "int16": "<i2"},
@@ -269,53 +268,50 @@ _NUMBERS = {
 }
 
 
-def _known(kind: Any) -> Any:
-    """Return a parsed type as the format of a number, ``string``, ``(name,)``, or ``(elements, their count)``."""
-    form, inner = kind[0].name, kind[1]
-    if form == "BASE":
-        return "string" if inner[0] == "string" else _NUMBERS[inner[0]]
-    return (inner,) if form == "NAME" else (_known(inner[0]), inner[1] if form == "ARRAY" else None)
+def ros1_decoder(name: str, definition: bytes) -> Decoder:
+    """Return the decoder of ROS 1 messages."""
+    parse = _library("rosbags.typesys").get_types_from_msg
+    parsed = parse(definition.decode("utf-8", "replace"), name)
+    # The types that ROS 1 calls time and duration, by the names that rosbags gives them.
+    for of, kind in (("Time", "uint32"), ("Duration", "int32")):
+        parsed = {**parse(f"{kind} sec\n{kind} nanosec", f"builtin_interfaces/msg/{of}"), **parsed}
+    fields = {of: [(field, kind[0].name, kind[1]) for field, kind in kinds] for of, (_, kinds) in parsed.items()}
+    root = name if name in fields else name.replace("/", "/msg/", 1)
 
+    def decode(data: bytes) -> Any:
+        place = 0
 
-class _Message:
-    """The bytes of one message, read from the front, with the fields of each type."""
+        def numbers(kind: str, count: int) -> Array:
+            nonlocal place
+            start, format_ = place, np.dtype(_NUMBERS[kind])
+            place += count * format_.itemsize
+            if place > len(data):
+                raise ValueError("the message is shorter than its definition")
+            return np.frombuffer(data[start:place], dtype=format_)
 
-    def __init__(self, types: Mapping[str, Mapping[str, Any]], data: bytes) -> None:
-        self.types, self.data, self.place = types, data, 0
+        def length() -> int:
+            return int(numbers("uint32", 1)[0])
 
-    def record(self, name: str, depth: int) -> dict[str, Any]:
-        if depth > 32:
-            raise ValueError(f"{name} is nested too deeply")
-        return {field: self.value(kind, depth + 1) for field, kind in self.types[name].items()}
+        def value(form: str, inner: Any, depth: int) -> Any:
+            match form:
+                case "NAME" if depth > 32:
+                    raise ValueError(f"{inner} is nested too deeply")
+                case "NAME":
+                    return {field: value(of, kind, depth + 1) for field, of, kind in fields[inner]}
+                case "BASE" if inner[0] == "string":
+                    return numbers("uint8", length()).tobytes().decode("utf-8", "replace")
+                case "BASE":
+                    return numbers(inner[0], 1).item()
+            (of, element), count = inner[0], inner[1] if form == "ARRAY" else length()
+            if of.name == "BASE" and element[0] != "string":
+                return numbers(element[0], count)
+            if count > len(data):
+                raise ValueError(f"a list of {count} elements is longer than its message")
+            return [value(of.name, element, depth + 1) for _ in range(count)]
 
-    def value(self, kind: Any, depth: int) -> Any:
-        match kind:
-            case "string":
-                return self.taken(self.length()).decode("utf-8", "replace")
-            case str():
-                return self.numbers(kind, 1)[0].item()
-            case (name,):
-                return self.record(name, depth)
-        element, count = kind
-        count = self.length() if count is None else count
-        if isinstance(element, str) and element != "string":
-            return self.numbers(element, count)
-        if count > len(self.data):
-            raise ValueError(f"a list of {count} elements is longer than its message")
-        return [self.value(element, depth) for _ in range(count)]
+        return value("NAME", root, 0)
 
-    def length(self) -> int:
-        return int(self.numbers("<u4", 1)[0])
-
-    def numbers(self, kind: str, count: int) -> Array:
-        return np.frombuffer(self.taken(count * np.dtype(kind).itemsize), dtype=kind)
-
-    def taken(self, count: int) -> bytes:
-        part = self.data[self.place : self.place + count]
-        if len(part) != count:
-            raise ValueError("the message is shorter than its definition")
-        self.place += count
-        return part
+    return decode
 
 
 _DECODERS: dict[tuple[str, str | None], Callable[[str, bytes], Decoder]] = {

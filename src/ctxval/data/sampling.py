@@ -193,10 +193,10 @@ def _part(source: str, channels: Sequence[Channel], interval: Interval, dt: floa
 
 
 def _interpolated(channel: Channel, times: Array) -> Array:
-    good = np.isfinite(channel.values)
+    good, slack = np.isfinite(channel.values), _SLACK * channel.period
     at, values = channel.times[good], channel.values[good]
-    first = max(int(np.searchsorted(at, times[0] + _SLACK * channel.period, side="right")) - 1, 0)
-    last = int(np.searchsorted(at, times[-1] - _SLACK * channel.period)) + 1
+    first = max(int(np.searchsorted(at, times[0] + slack, side="right")) - 1, 0)
+    last = int(np.searchsorted(at, times[-1] - slack)) + 1
     at, values = at[first:last], values[first:last]
     if channel.angle:
         values = np.unwrap(values)
@@ -204,6 +204,6 @@ def _interpolated(channel: Channel, times: Array) -> Array:
     # Times of equal steps differ from recorded ones by rounding; the recorded value is then meant.
     after = np.clip(np.searchsorted(at, times), 0, len(at) - 1)
     for row in (after, np.maximum(after - 1, 0)):
-        same = np.abs(at[row] - times) <= _SLACK * channel.period
+        same = np.abs(at[row] - times) <= slack
         states[same] = values[row][same]
     return np.asarray(states)

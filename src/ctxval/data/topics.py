@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from ctxval._util.arrays import Array
+from ctxval._util.columns import named_unit
 from ctxval._util.representation import ShortRepr
-from ctxval._util.units import named_unit
 from ctxval.data.log import Clock, Log, Signal
 from ctxval.errors import InputError
 
@@ -56,46 +56,45 @@ class TopicLog(Log):
     def signals(self, fields: Sequence[str], clock: Clock) -> dict[str, Signal]:
         """Return fields over time; see :meth:`Log.signals`."""
         split = {field: self._split(field) for field in fields}
-        stamps: dict[str, list[dict[str, int | None]]] = {topic: [] for topic, _ in split.values()}
-        values: dict[str, list[Array]] = {field: [] for field in fields}
+        records: dict[str, list[tuple[dict[str, Any], dict[str, Array]]]] = {topic: [] for topic, _ in split.values()}
         size = 0
-        for message in self.messages(stamps):
-            number = len(stamps[message.topic])
-            stamp = {"log": message.logged, "publish": message.published, "header": _header(message.content)}
-            stamps[message.topic].append(stamp)
-            for field, (topic, path) in split.items():
-                if topic == message.topic:
-                    values[field].append(self._value(message, number, path))
-                    size += 256 + values[field][-1].nbytes
+        for message in self.messages(records):
+            of_topic = records[message.topic]
+            values = {
+                field: self._value(message, len(of_topic), path)
+                for field, (topic, path) in split.items()
+                if topic == message.topic
+            }
+            stamps = {"log": message.logged, "publish": message.published, "header": _header(message.content)}
+            of_topic.append((stamps, values))
+            size += sum(256 + value.nbytes for value in values.values())
             if size > _MOST_MEMORY:
                 raise InputError(f"{self.source} has too many numbers: {_MOST_MEMORY} bytes of memory may be used.")
-        orders = {
-            topic: sorted(range(len(unsorted)), key=[stamp["log"] or 0 for stamp in unsorted].__getitem__)
-            for topic, unsorted in stamps.items()
-        }
-        stamps = {topic: [stamps[topic][k] for k in order] for topic, order in orders.items()}
-        chosen = ("header" if _plausible(stamps) else "log") if clock.stamp == "auto" else clock.stamp
-        times: dict[str, list[Any]] = {topic: [stamp[chosen] for stamp in of] for topic, of in stamps.items()}
-        for topic, of_topic in times.items():
-            if None in of_topic:
+        for of_topic in records.values():
+            of_topic.sort(key=lambda record: record[0]["log"])
+        all_stamps = {topic: [stamps for stamps, _ in of_topic] for topic, of_topic in records.items()}
+        chosen = ("header" if _plausible(all_stamps) else "log") if clock.stamp == "auto" else clock.stamp
+        times = {topic: [stamps[chosen] for stamps in of_topic] for topic, of_topic in all_stamps.items()}
+        for topic, of in times.items():
+            if None in of:
                 raise InputError(
-                    f"{self.source}, message {of_topic.index(None)} of {topic}: it has no header.stamp or timestamp."
+                    f"{self.source}, message {of.index(None)} of {topic}: it has no header.stamp or timestamp."
                 )
-        origin = min((min(of_topic) for of_topic in times.values() if of_topic), default=0)
+        origin = min((min(of) for of in times.values() if of), default=0)
         signals = {}
         for field, (topic, _) in split.items():
             if not times[topic]:
                 raise InputError(f"{self.source} has no message with the field {field!r}.")
-            ordered = [values[field][k] for k in orders[topic]]
-            widths = [len(value) for value in ordered]
-            if len(set(widths)) > 1:
-                row = next(i for i, width in enumerate(widths) if width != widths[0])
+            column = [values[field] for _, values in records[topic]]
+            row = next((row for row, value in enumerate(column) if len(value) != len(column[0])), None)
+            if row is not None:
                 raise InputError(
-                    f"{self.source}, message {row} of {field}: it must have {widths[0]} numbers, got {widths[row]}."
+                    f"{self.source}, message {row} of {field}: it must have {len(column[0])} numbers, got "
+                    f"{len(column[row])}."
                 )
             seconds = np.array([1e-9 * (time - origin) for time in times[topic]])
             _, unit, weak = named_unit(field)
-            array = np.array(ordered).reshape(len(seconds), -1)
+            array = np.array(column).reshape(len(seconds), -1)
             signals[field] = Signal(seconds, array, 0, "message", "" if weak else unit, chosen)
         return signals
 

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 from ctxval._util.registry import Registry
 from ctxval.core.distance import ComposedDistance, Distance
-from ctxval.distances.base import StateNorm
-from ctxval.distances.crossing import AtCrossing, CrossingTime
 from ctxval.distances.deviations import (
+    AtCrossing,
     AtTimes,
+    CrossingTime,
     FinalState,
     GoalError,
     MaximumDeviation,
     MeanDeviation,
     RelativeDeviation,
+    StateNorm,
     TrackingError,
     WholeTrajectory,
 )

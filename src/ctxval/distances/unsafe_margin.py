@@ -12,7 +12,7 @@ from ctxval._util.arrays import Array
 from ctxval._util.checked import PositiveFloat
 from ctxval._util.registry import part
 from ctxval._util.representation import ShortRepr
-from ctxval.core.components import NamedStates
+from ctxval.core.distance import NamedStates
 from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory
 from ctxval.errors import InputError, UnknownNameError

@@ -6,13 +6,157 @@ maxima whose slopes the first samples have met. :mod:`ctxval.gp.global_search` l
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
 from ctxval._util.arrays import Array
-from ctxval._util.boxes import moves_to_bounds, separated_rows
-from ctxval.gp.evaluations import Evaluations, Values, line_search_cost
+from ctxval._util.boxes import Box, climb, moves_to_bounds, separated_rows
+
+Values = Callable[[Array], Array]
+"""Points ``(m, d)`` -> values ``(m,)``."""
+
+_SHARES = np.array([0.03, 0.1, 0.3, 0.6, 1.0])  # steps of a line search, as shares of the way to a corner
+_LENGTHS = np.array([0.1, 0.4])  # steps along the slopes, as shares of the box in the steepest coordinate
+_COORDINATES = (0.0, 0.25, 0.5)
+"""Shares of the coordinates that are moved to the corner alone, at least one coordinate each."""
+
+
+class Evaluations:
+    """The evaluations of a function over a box within the unit cube, no more of them than a budget.
+
+    Args:
+        function: points ``(m, d)`` -> values ``(m,)``; values that are not finite are never a maximum.
+        budget: number of points at which the function may be evaluated.
+        strict: whether the budget is a hard limit; if not, a climb that has begun may exceed it.
+    """
+
+    def __init__(self, function: Values, low: Array, high: Array, budget: int, *, strict: bool = True) -> None:
+        self.strict = strict
+        self.low, self.high = low, high
+        self.budget = budget
+        self._function = function
+        self._points: list[Array] = [np.empty((0, len(low)))]
+        self._values: list[Array] = [np.empty(0)]
+
+    @property
+    def dimension(self) -> int:
+        """The number of coordinates of a point."""
+        return len(self.low)
+
+    @property
+    def left(self) -> int:
+        """How many evaluations the budget still allows."""
+        return self.budget - sum(map(len, self._values))
+
+    def evaluate(self, points: Array) -> Array:
+        """Return the values ``(m,)`` at points ``(m, d)``; minus infinity if not finite or beyond the budget."""
+        asked = points[: max(0, self.left)] if self.strict else points
+        values = np.full(len(points), -np.inf)
+        if len(asked):
+            found = np.asarray(self._function(asked), dtype=np.float64)
+            values[: len(asked)] = np.where(np.isfinite(found), found, -np.inf)
+            self._points.append(asked)
+            self._values.append(values[: len(asked)])
+        return values
+
+    def evaluate_inside(self, points: Array) -> None:
+        """Evaluate points ``(m, d)`` of which some may be outside of the box; their values do not count."""
+        inside = ((points >= self.low) & (points <= self.high)).all(axis=1)
+        values = np.asarray(self._function(points), dtype=np.float64)[inside]
+        self._points.append(points[inside])
+        self._values.append(np.where(np.isfinite(values), values, -np.inf))
+
+    def in_order(self) -> tuple[Array, Array]:
+        """Return all points ``(m, d)`` and their values ``(m,)`` as they were evaluated."""
+        return np.concatenate(self._points), np.concatenate(self._values)
+
+    def best_first(self) -> tuple[Array, Array]:
+        """Return all points ``(m, d)`` and their values ``(m,)``, the largest first."""
+        points, values = self.in_order()
+        order = np.argsort(-values, kind="stable")
+        return points[order], values[order]
+
+    def samples(self, count: int, rng: np.random.Generator) -> Array:
+        """Return uniform points; in every second one, a random share of the coordinates is moved to bounds."""
+        points = self.low + rng.random((count, self.dimension)) * (self.high - self.low)
+        ends = np.where(rng.random(points.shape) < 0.5, self.low, self.high)
+        snapped = rng.random(points.shape) < np.where(np.arange(count) % 2, rng.random(count), 0.0)[:, None]
+        return np.where(snapped, ends, points)
+
+    def climb(self, starts: Array, budget: int) -> None:
+        """Climb from starts ``(s, d)`` along finite differences, with about so many evaluations."""
+        if not len(starts):
+            return
+        scale = max(float(np.abs(self.best_first()[1][0])), 1e-300)
+        calls = max(2, budget // (len(starts) * (self.dimension + 1)))
+
+        def sloped(points: Array) -> tuple[Array, Array]:
+            return self._slopes(np.clip(points, self.low, self.high))
+
+        climb(sloped, starts, self.low, self.high, scale=scale, iterations=calls, evaluations=calls)
+
+    def search_lines(self, starts: Array, rounds: int) -> None:
+        """Search along lines from all starts ``(s, d)`` at once, several times.
+
+        Each line leads along the slopes, or to the corner to which they point (Frank and Wolfe 1956), where convex
+        functions have their maxima. Some steps move only the coordinates that promise most.
+        """
+        points, row = starts, np.arange(len(starts))
+        for _ in range(rounds):
+            here, slopes = self._slopes(points)
+            moved = self._along(points, slopes)
+            values = self.evaluate(moved.reshape(-1, self.dimension)).reshape(moved.shape[:2])
+            best = values.argmax(axis=1)
+            better = values[row, best] > here
+            points = np.where(better[:, None], moved[row, best], points)
+            if not better.any():
+                return
+
+    def _along(self, points: Array, slopes: Array) -> Array:
+        """Return points on the lines from each point, shape ``(s, q, d)``."""
+        ways = np.where(slopes > 0, self.high, self.low) - points
+        order = np.argsort(-np.abs(slopes * ways), axis=1, kind="stable")
+        rank = np.argsort(order, axis=1)
+        counts = np.maximum(1, (np.array(_COORDINATES) * self.dimension).astype(int))
+        few = np.where(rank[:, None] < counts[:, None], ways[:, None], 0.0)
+        steepest = slopes / np.maximum(np.abs(slopes).max(axis=1, keepdims=True), 1e-300) * (self.high - self.low)
+        moves = [_SHARES[:, None] * ways[:, None], _LENGTHS[:, None] * steepest[:, None], few]
+        return np.asarray(np.clip(points[:, None] + np.concatenate(moves, axis=1), self.low, self.high))
+
+    def _slopes(self, points: Array) -> tuple[Array, Array]:
+
+        n, d = points.shape
+        steps = np.where(points + 1e-4 <= self.high, 1e-4, -1e-4)  # inward if a bound is near
+        moved = points[:, None, :] + np.eye(d) * steps[:, None, :]
+        values = self.evaluate(np.concatenate([points, moved.reshape(-1, d)]))
+        here, there = values[:n], values[n:].reshape(n, d)
+        with np.errstate(invalid="ignore"):
+            slopes = (there - here[:, None]) / steps
+        here = np.where(np.isfinite(here), here, 0.0)
+        return here, np.where(np.isfinite(slopes), slopes, 0.0)
+
+    def move_to_bounds(self, rng: np.random.Generator) -> bool:
+        """Move coordinates of the best points to bounds, singly and several at a time; return whether that helped."""
+        points, values = self.best_first()
+        d = self.dimension
+        best = points[:3]
+        ends = np.stack([self.low, self.high])
+        single = moves_to_bounds(best[0], self.low, self.high)
+        parents = best[rng.integers(len(best), size=2 * d)]
+        several = np.where(
+            rng.random(parents.shape) < 2 / d, ends[rng.integers(2, size=parents.shape), np.arange(d)], parents
+        )
+        gain = 1e-9 * abs(values[0]) if np.isfinite(values[0]) else 0.0
+        moved = np.concatenate([single, several])[: max(1, self.left)]
+        return bool(self.evaluate(moved).max() > values[0] + gain)
+
+
+def line_search_cost(dimension: int) -> int:
+    """Return the number of evaluations of one line search from one point."""
+    return dimension + 1 + len(_SHARES) + len(_LENGTHS) + len(_COORDINATES)
+
 
 _STARTS = 10  # number of points from which the function, or its approximation, is climbed
 _ROUNDS = 3  # number of line searches of each climb
@@ -27,8 +171,10 @@ _MOVED = 3  # number of best points of which single coordinates are moved to bou
 _REFINED = 16  # number of points at which the function itself is evaluated after its approximation
 
 
-class Ascent:
-    """One search for the maximum of a function over a box within the unit cube.
+def ascend(
+    function: Values, box: Box, budget: int, starts: Array, rng: np.random.Generator, rough: Values | None = None
+) -> tuple[Array, Array]:
+    """Search a box within the unit cube for the maximum; return all points ``(m, d)`` and values, the largest first.
 
     In few dimensions, the points of a fixed pool are evaluated, and then samples ever closer to the best ones. In more
     dimensions the function is sampled, and line searches start from the best samples, all at once, along slopes and
@@ -39,62 +185,54 @@ class Ascent:
     Args:
         function: points ``(m, d)`` -> values ``(m,)``; values that are not finite are never a maximum.
         budget: number of points at which the function may be evaluated; the last climb may exceed it.
+        starts: points to evaluate first, ``(s, d)``.
         rough: a cheap approximation of the function; the function itself if None.
     """
+    exact, inside = Evaluations(function, *box, budget, strict=False), np.clip(starts, *box)
+    if exact.dimension <= _FEW:
+        _search_few(exact, inside, rng)
+    else:
+        _search_many(exact, exact if rough is None else Evaluations(rough, *box, budget, strict=False), inside, rng)
+    return exact.best_first()
 
-    def __init__(self, function: Values, low: Array, high: Array, budget: int, rough: Values | None = None) -> None:
-        self._exact = Evaluations(function, low, high, budget, strict=False)
-        self._rough = self._exact if rough is None else Evaluations(rough, low, high, budget, strict=False)
 
-    def run(self, starts: Array, rng: np.random.Generator) -> tuple[Array, Array]:
-        """Evaluate starts first, and return all points ``(m, d)`` and their values ``(m,)``, the largest first."""
-        inside = np.clip(starts, self._exact.low, self._exact.high)
-        if self._exact.dimension <= _FEW:
-            self._search_few(inside, rng)
-        else:
-            self._search_many(inside, rng)
-        return self._exact.found()
+def _search_few(exact: Evaluations, starts: Array, rng: np.random.Generator) -> None:
+    """Sample ever closer to the best points: cheaper than slopes in few dimensions, and insensitive to kinks."""
+    d, low, high = exact.dimension, exact.low, exact.high
+    pool = _pool(d, min(_POOL * d, exact.budget // 3))
+    exact.evaluate(starts)
+    exact.evaluate_inside(pool)
+    best, gap = _best(exact, _ZOOMED), len(pool) ** (-1 / d)
+    for _ in range(2 * d - 1):
+        corners = moves_to_bounds(best[:_MOVED], low, high).reshape(-1, d)
+        count = min(_SAMPLES * d, exact.left - len(best) - len(corners))
+        if not len(best) or count < 1:
+            return
+        steps = np.resize((1.0, 0.3, 0.1), count)[:, None] * np.minimum(gap, 0.3 * (high - low))
+        near = np.resize(best, (count, d)) + steps * rng.normal(size=(count, d))
+        exact.evaluate(np.concatenate([best, np.clip(near, low, high), corners]))
+        best, gap = _best(exact, _ZOOMED), 0.5 * gap
 
-    @property
-    def _left(self) -> int:
-        used = 0 if self._rough is self._exact else self._rough.budget - self._rough.left
-        return self._exact.left - used
 
-    def _search_few(self, starts: Array, rng: np.random.Generator) -> None:
-        """Sample ever closer to the best points: cheaper than slopes in few dimensions, and insensitive to kinks."""
-        exact = self._exact
-        pool = _pool(exact.dimension, min(_POOL * exact.dimension, exact.budget // 3))
-        exact.evaluate(starts)
-        exact.evaluate_inside(pool)
-        best = _best(exact, _ZOOMED)
-        gap = len(pool) ** (-1 / exact.dimension)
-        for _ in range(2 * exact.dimension - 1):
-            corners = moves_to_bounds(best[:_MOVED], exact.low, exact.high).reshape(-1, exact.dimension)
-            count = min(_SAMPLES * exact.dimension, self._left - len(best) - len(corners))
-            if not len(best) or count < 1:
-                return
-            widths = np.minimum(gap, 0.3 * (exact.high - exact.low))
-            steps = np.resize((1.0, 0.3, 0.1), count)[:, None] * widths
-            near = np.resize(best, (count, exact.dimension)) + steps * rng.normal(size=(count, exact.dimension))
-            exact.evaluate(np.concatenate([best, np.clip(near, exact.low, exact.high), corners]))
-            best = _best(exact, _ZOOMED)
-            gap *= 0.5
+def _search_many(exact: Evaluations, rough: Evaluations, starts: Array, rng: np.random.Generator) -> None:
+    """Climb from the best samples, on the approximation first; both share the budget."""
 
-    def _search_many(self, starts: Array, rng: np.random.Generator) -> None:
-        rough, exact = self._rough, self._exact
-        rough.evaluate(np.concatenate([starts, rough.samples(max(8, rough.budget // 6), rng)]))
-        self._climb(rough, _STARTS, _ROUNDS)
-        if rough is not exact:
-            exact.evaluate(np.concatenate([starts, _best(rough, _REFINED, 0.02)]))
-        self._climb(exact, *_FINALISTS)
-        for _ in range(4):
-            if self._left < 1 or not exact.move_to_bounds(rng):
-                return
+    def left() -> int:
+        return exact.left - (0 if rough is exact else rough.budget - rough.left)
 
-    def _climb(self, done: Evaluations, starts: int, rounds: int) -> None:
-        allowed = self._left // (rounds * line_search_cost(done.dimension))
+    def climb(on: Evaluations, starts: int, rounds: int) -> None:
+        allowed = left() // (rounds * line_search_cost(on.dimension))
         if allowed:
-            done.search_lines(_best(done, min(starts, allowed)), rounds)
+            on.search_lines(_best(on, min(starts, allowed)), rounds)
+
+    rough.evaluate(np.concatenate([starts, rough.samples(max(8, rough.budget // 6), rng)]))
+    climb(rough, _STARTS, _ROUNDS)
+    if rough is not exact:
+        exact.evaluate(np.concatenate([starts, _best(rough, _REFINED, 0.02)]))
+    climb(exact, *_FINALISTS)
+    for _ in range(4):
+        if left() < 1 or not exact.move_to_bounds(rng):
+            return
 
 
 @dataclass(frozen=True)
@@ -129,7 +267,7 @@ def usual_effort(dimension: int, budget: int) -> Effort:
 
 
 def _best(done: Evaluations, count: int, share: float = 0.1) -> Array:
-    points, values = done.found()
+    points, values = done.best_first()
     finite = points[np.isfinite(values)]
     reach = share * float(np.linalg.norm(done.high - done.low))
     return finite[separated_rows(finite, reach, count)]

@@ -16,7 +16,7 @@ from scipy.spatial import KDTree
 
 from ctxval._util.arrays import Array, Rows
 from ctxval._util.boxes import separated_rows
-from ctxval.gp.evaluations import Evaluations, Values
+from ctxval.gp.ascent import Evaluations, Values
 
 _SAMPLED, _EVOLVED, _CLIMBED = 0.35, 0.7, 0.88
 """Shares of the evaluations after which sampling, evolution and climbs end."""
@@ -57,10 +57,10 @@ def search_globally(
     budget = done.left - int((1 - _CLIMBED) * evaluations)
     climbs = min(12, budget // (8 * (dimension + 1)))  # each with 8 slopes at least
     if climbs > 0:
-        points, values = done.found()
+        points, values = done.best_first()
         done.climb(_apart(points[np.isfinite(values)], 0.2)[:climbs], budget)
     _refine(done, rng)
-    points, values = done.found()
+    points, values = done.best_first()
     return GlobalMaximum(points, values, _apart(points[np.isfinite(values)], _REACHES[-1]))
 
 
@@ -89,39 +89,22 @@ def _evolve(done: Evaluations, rng: np.random.Generator) -> None:
     """Evaluate generations of offspring of good points and of prominent points, each set apart from each other."""
     count = done.left - int((1 - _EVOLVED) * done.budget)
     sizes = _batches(count, done.budget, int(np.clip(np.sqrt(done.budget) / 4, 3, 40)))
-    prominence = _Prominence()
+    # Of smooth functions, prominences are small once the samples are dense; the way to a cliff stays prominent.
+    prominent, seen = np.empty(0, dtype=np.intp), 0
     for generation, size in enumerate(sizes):
         share = generation / max(1, len(sizes) - 1)
-        points, values = done.found()
+        points, values = done.best_first()
         finite = points[np.isfinite(values)]
         if not len(finite):
             done.evaluate(done.samples(size, rng))
             continue
         reach, step = _geometric(_REACHES, share), _geometric(_STEPS, share)
-        prominent = prominence.update(*done.in_order())
+        everywhere, heights = done.in_order()
+        rows, seen = np.concatenate([prominent, np.arange(seen, len(everywhere))]), len(everywhere)
+        prominent = rows[np.argsort(-_prominences(everywhere, _compressed(heights), rows), kind="stable")[:200]]
         first = _offspring(_apart(finite, reach), finite[:100], step, size - size // 2, rng)
-        second = _offspring(_apart(prominent, 0.02), finite[:100], step, size // 2, rng)
+        second = _offspring(_apart(everywhere[prominent], 0.02), finite[:100], step, size // 2, rng)
         done.evaluate(np.concatenate([first, second]))
-
-
-class _Prominence:
-    """The points whose values exceed most what a linear function through their neighbours predicts.
-
-    A smooth function has small prominences once its samples are dense; the way to a cliff stays prominent.
-    """
-
-    def __init__(self) -> None:
-        self._seen = 0
-        self._kept: Rows = np.empty(0, dtype=np.intp)
-
-    def update(self, points: Array, values: Array) -> Array:
-        """Return the most prominent points, the most prominent first, among the new ones and those kept before."""
-        rows = np.concatenate([self._kept, np.arange(self._seen, len(points))])
-        self._seen = len(points)
-        found = _prominences(points, _compressed(values), rows)
-        order = np.argsort(-found, kind="stable")[:200]
-        self._kept = rows[order]
-        return points[self._kept]
 
 
 def _compressed(values: Array) -> Array:
@@ -147,7 +130,11 @@ def _prominences(points: Array, values: Array, rows: Rows) -> Array:
 
 def _offspring(parents: Array, pool: Array, step: float, count: int, rng: np.random.Generator) -> Array:
     """Return ``count`` points: mutations in all or a few coordinates, differential moves, and moves to bounds."""
-    chosen = parents[_drawn(len(parents), count, rng)]
+    # Half of the parents are drawn uniformly, so that each niche is followed; half prefer good ones.
+    preferences = 1 / np.arange(1, len(parents) + 1)
+    uniform = rng.integers(len(parents), size=count)
+    good = rng.choice(len(parents), size=count, p=preferences / preferences.sum())
+    chosen = parents[np.where(rng.random(count) < 0.5, uniform, good)]
     all_of, few_of, differential, bound = np.array_split(chosen, 4)
     children = [
         all_of + _normal(all_of.shape, step, rng),
@@ -157,14 +144,6 @@ def _offspring(parents: Array, pool: Array, step: float, count: int, rng: np.ran
     moved = bound + _normal(bound.shape, step, rng) * _few(bound.shape, rng)
     children.append(np.where(_few(bound.shape, rng) > 0, rng.integers(2, size=bound.shape), moved))
     return np.clip(np.concatenate(children), 0, 1)
-
-
-def _drawn(parents: int, count: int, rng: np.random.Generator) -> Rows:
-    """Return rows of parents: half of them uniform, so that each niche is followed, half prefer good ones."""
-    rank_weights = 1 / np.arange(1, parents + 1)
-    uniform = rng.integers(parents, size=count)
-    good = rng.choice(parents, size=count, p=rank_weights / rank_weights.sum())
-    return np.where(rng.random(count) < 0.5, uniform, good)
 
 
 def _normal(shape: tuple[int, ...], step: float, rng: np.random.Generator) -> Array:
@@ -192,7 +171,7 @@ def _differences(pool: Array, shape: tuple[int, ...], rng: np.random.Generator) 
 
 def _refine(done: Evaluations, rng: np.random.Generator) -> None:
     """Try moves to bounds and ever smaller random moves around the best points."""
-    points, values = done.found()
+    points, values = done.best_first()
     finite = points[np.isfinite(values)]
     if not len(finite):
         done.evaluate(done.samples(done.left, rng))
@@ -200,7 +179,7 @@ def _refine(done: Evaluations, rng: np.random.Generator) -> None:
     sizes = _batches(done.left, done.budget, 12)
     for batch, size in enumerate(sizes):
         done.move_to_bounds(rng)
-        best = done.found()[0][:100]
+        best = done.best_first()[0][:100]
         near = best[np.argsort(np.linalg.norm(best - best[0], axis=1), kind="stable")[: 2 * done.dimension + 2]]
         step = _geometric((0.02, 1e-5), batch / max(1, len(sizes) - 1))
         done.evaluate(_offspring(best[:4], near, step, min(size, done.left), rng))

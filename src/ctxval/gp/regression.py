@@ -12,8 +12,7 @@ from scipy.optimize import minimize
 
 from ctxval._util.arrays import Array, Rows
 from ctxval.errors import InputError
-from ctxval.gp.cholesky import CholeskyFactor, factorise
-from ctxval.gp.kernels import Bounds, Kernel
+from ctxval.gp.kernels import Bounds, CholeskyFactor, Kernel, factorise
 
 Mean = Callable[[Array], Array]
 """A prior mean: points ``(n, d)`` -> values ``(n,)``."""

@@ -6,13 +6,15 @@ import functools
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.distance import cdist
 
-from ctxval._util.arrays import Array
+from ctxval._util.arrays import Array, Rows
+from ctxval._util.boxes import farthest_rows
 from ctxval._util.representation import ShortRepr
 from ctxval.errors import InputError
 from ctxval.gp.hyperposterior import Warp
 from ctxval.gp.kernels import Kernel, Linear, Matern, Sum
-from ctxval.gp.regression import NOISE, GaussianProcess, Mean, condition, fit, zero_mean
+from ctxval.gp.regression import NOISE, GaussianProcess, LogDensity, Mean, condition, fit, zero_mean
 
 _KERNEL = Sum(Matern(1.5, ard=True, length_scale=(0.02, 100.0)), Linear())  # the kernel of :class:`Learned`
 
@@ -140,35 +142,48 @@ def _learn_on(points: Array, values: Array, warp: Warp) -> tuple[float, Learned]
     shift = float(warped.mean())
     scale = _scale(warped - shift)
     y = (warped - shift) / scale
-    prior = _LogPrior(points.shape[1])
-    rougher = np.zeros_like(prior.centre)
+    centre, log_prior = _prior(points.shape[1])
+    rougher = np.zeros_like(centre)
     rougher[1 : points.shape[1] + 1] = -1.0
-    starts = np.stack([prior.centre, prior.centre + rougher])
-    process = fit(_KERNEL, points, y, log_prior=prior, starts=starts)
+    process = fit(_KERNEL, points, y, log_prior=log_prior, starts=np.stack([centre, centre + rougher]))
     mean, variance = process.left_out()
     score = -0.5 * (np.log(variance) + (y - mean) ** 2 / variance).sum() - len(y) * np.log(scale)
     return float(score) + warp.log_slope(values), Learned(process.theta, warp, shift, scale)
 
 
-@dataclass(frozen=True)
-class _LogPrior:
-    """Independent normal densities of the hyperparameters' logarithms; length-scales share an uncertain mean."""
+def _prior(d: int) -> tuple[Array, LogDensity]:
+    """Return the prior medians of (theta, log noise), and its log density: length-scales share an uncertain mean."""
+    # The linear kernel's variances are 0.3, averaged over the cube; the noise is fixed.
+    centre = np.log([1.0, *[0.4 * np.sqrt(d)] * d, 0.3, 12 * 0.3 / d, NOISE])
 
-    dimension: int
-
-    @property
-    def centre(self) -> Array:
-        """The logarithms of the prior medians of theta, and of the noise, which is fixed."""
-        scales = [0.4 * np.sqrt(self.dimension)] * self.dimension
-        # The linear kernel's variances are 0.3, averaged over the cube.
-        return np.asarray(np.log([1.0, *scales, 0.3, 12 * 0.3 / self.dimension, NOISE]))
-
-    def __call__(self, parameters: Array) -> tuple[float, Array]:
-        """Return the log density at (theta, log noise), up to a constant, and its gradient."""
-        scales = slice(1, self.dimension + 1)
-        away = parameters - self.centre
+    def log_density(parameters: Array) -> tuple[float, Array]:
+        away = parameters - centre
         gradient = -away / 1.5**2
         # Few values suffice to learn the mean of the length-scales' logarithms, many are needed to learn each of them.
-        common = away[scales].mean()
-        gradient[scales] = -common / (self.dimension * 0.5**2) - (away[scales] - common) / 0.3**2
+        common = away[1 : d + 1].mean()
+        gradient[1 : d + 1] = -common / (d * 0.5**2) - (away[1 : d + 1] - common) / 0.3**2
         return 0.5 * float(away @ gradient), gradient  # the density is quadratic
+
+    return np.asarray(centre), log_density
+
+
+LONG = 1000
+"""Length of a history from which on only a subset is kept."""
+
+
+def kept_rows(points: Array, values: Array, count: int, long: int = LONG) -> Rows:
+    """Return the rows that represent a history of points ``(n, d)`` and values ``(n,)``, in their order.
+
+    Below ``long`` points these are all rows. From then on, a quarter of ``count`` rows have the largest values, a
+    quarter are the latest, including pending and failed ones, and the others are far from those and from each other.
+    So the surrogate keeps its knowledge of all regions that the history has explored.
+    """
+    if len(values) < long:
+        return np.arange(len(values))
+    largest = np.argsort(-np.nan_to_num(values, nan=-np.inf), kind="stable")[: count // 4]
+    latest = np.arange(len(values) - count // 4, len(values))
+    chosen = np.unique(np.concatenate([largest, latest]))
+    gaps = cdist(points, points[chosen], "sqeuclidean").min(axis=1)
+    gaps[chosen] = -np.inf
+    others = farthest_rows(points, gaps, count - len(chosen), squared=True)
+    return np.sort(np.concatenate([chosen, np.array(others, dtype=np.intp)]))

@@ -1,27 +1,22 @@
 """Inputs that act late: a delay and a lag of the actuators, found in executions, as a part of the controller.
 
 What S does in a step then depends on earlier inputs. Recorded inputs tell which input acts in each step, so the
-residual is a function of the state and of that input, and everything that is learned, covered and tested of state and
-input holds. A closed loop has the acting inputs and those that were commanded, in this order; M, the user's controllers
-and the distance see what was commanded.
+residual is a function of the state and of that input.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from scipy.optimize import minimize
 
-from ctxval._util.arrays import Array, Mask, Rows
-from ctxval.core.controller import Controller, Synthesizer, memory_of, stepped
-from ctxval.core.distance import Distance
+from ctxval._util.arrays import Array
+from ctxval.core.controller import Controller, memory_of, stepped
 from ctxval.core.model import Model
 from ctxval.core.task import Task
-from ctxval.core.trajectory import Trajectory
-from ctxval.core.validation import Validation
 from ctxval.learning.histories import History, Record, Structure
 from ctxval.learning.hyperparameters import FAMILIES, HyperparameterPosterior, Mode, learning_rows, log_posterior
 from ctxval.learning.residual_data import NEGLIGIBLE
@@ -97,69 +92,34 @@ def found_actuator(
     Raises:
         LinAlgError: if states cannot be estimated.
     """
-    evidence = _Evidence.of(model, records_of)
-    if not evidence.live.any():
+    records = records_of(Actuator())
+    history = History(model, Structure(0), np.eye(records[0].states.shape[1]))
+    Z, E, _ = history.along(records)
+    steps = np.concatenate([np.diff(each.states, axis=0) for each in records])
+    sizes = np.sqrt((E**2).mean(axis=0))
+    live = sizes > NEGLIGIBLE * standard_deviations(steps)
+    if not live.any():
         return None
-    without = evidence.mode(Actuator()).height
-    tried = [before] if before else [Actuator(*each) for each in _TRIED]
-    mode, best = max(((evidence.mode(each), each) for each in tried), key=lambda pair: pair[0].height)
-    values = len(evidence.rows) * int(evidence.live.sum())
-    if mode.height < without - _NEAR * values:
-        return None
-    for _ in range(2):  # the noise that a wrong actuator seems to add is less the second time
-        best = evidence.refined(best, mode, evaluations)
-        mode = evidence.mode(best)
-    return best if mode.height > without + _BETTER * values else None
+    inputs = records[0].inputs.shape[-1]
+    rows = learning_rows((Z - Z.mean(axis=0)) / standard_deviations(Z), inputs, _LEARNED_FROM)
 
+    def data(actuator: Actuator) -> tuple[Array, Array]:
+        """Return states and acting inputs ``(N, n + m)``, and residuals over their sizes if inputs act at once."""
+        Z, E, _ = history.along(records_of(actuator))
+        return Z[rows], E[rows][:, live] / sizes[live]
 
-@dataclass(frozen=True, eq=False)
-class _Evidence:
-    """How probable residuals of M are if the inputs act late.
-
-    Attributes:
-        rows: the transitions that count, shape ``(N,)``.
-        live: the states in which M errs, shape ``(n,)``.
-        sizes: of their residuals, if the inputs act at once.
-    """
-
-    history: History
-    records_of: RecordsOf
-    rows: Rows
-    live: Mask
-    sizes: Array
-
-    @classmethod
-    def of(cls, model: Model, records_of: RecordsOf) -> _Evidence:
-        records = records_of(Actuator())
-        history = History(model, Structure(0), np.eye(records[0].states.shape[1]))
-        Z, E, _ = history.along(records)
-        sizes = np.sqrt((E**2).mean(axis=0))
-        live = sizes > NEGLIGIBLE * standard_deviations(
-            np.concatenate([np.diff(each.states, axis=0) for each in records])
-        )
+    def mode_of(actuator: Actuator) -> Mode:
+        Z, E = data(actuator)
         scaled = (Z - Z.mean(axis=0)) / standard_deviations(Z)
-        rows = learning_rows(scaled, records[0].inputs.shape[-1], _LEARNED_FROM)
-        return cls(history, records_of, rows, live, sizes[live])
+        return HyperparameterPosterior.given(scaled, E, inputs, FAMILIES[:1]).highest
 
-    def data(self, actuator: Actuator) -> tuple[Array, Array]:
-        """Return states and acting inputs ``(N, n + m)``, and residuals over their sizes."""
-        Z, E, _ = self.history.along(self.records_of(actuator))
-        return Z[self.rows], E[self.rows][:, self.live] / self.sizes
-
-    def mode(self, actuator: Actuator) -> Mode:
-        """Return the most probable hyperparameters, and their log density."""
-        Z, E = self.data(actuator)
-        shift, scale = Z.mean(axis=0), standard_deviations(Z)
-        inputs = Z.shape[1] - len(self.live)
-        return HyperparameterPosterior.given((Z - shift) / scale, E, inputs, FAMILIES[:1]).highest
-
-    def refined(self, start: Actuator, mode: Mode, evaluations: int) -> Actuator:
+    def refined(start: Actuator, mode: Mode) -> Actuator:
         """Return the most likely actuator near one, with the hyperparameters that are most probable for that one."""
-        Z, _ = self.data(start)
+        Z, _ = data(start)
         shift, scale = Z.mean(axis=0), standard_deviations(Z)
 
         def unlikely(each: Array) -> float:
-            Z, E = self.data(Actuator(*np.clip(each, 0.0, _LONGEST).tolist()))
+            Z, E = data(Actuator(*np.clip(each, 0.0, _LONGEST).tolist()))
             return -log_posterior(mode.kernel, mode.place, (Z - shift) / scale, E)[0]
 
         at = np.array([start.delay, start.lag])
@@ -167,94 +127,42 @@ class _Evidence:
         options = {"initial_simplex": simplex, "maxfev": evaluations, "xatol": 1e-5, "fatol": 1e-3}
         best = np.clip(minimize(unlikely, at, method="Nelder-Mead", options=options).x, 0.0, _LONGEST)
         # Whole steps and no lag are preferred as by the Bayesian information criterion.
-        whole, each = np.array([np.round(best[0]), best[1]]), 0.5 * np.log(len(self.rows))
+        whole, each = np.array([np.round(best[0]), best[1]]), 0.5 * np.log(len(rows))
         near = [(best, 2), (whole, 1), (best * [1, 0], 1), (whole * [1, 0], 0)]
         chosen, _ = min(near, key=lambda pair: unlikely(pair[0]) + each * pair[1])
         return Actuator(*chosen.tolist())
 
+    without = mode_of(Actuator()).height
+    tried = [before] if before else [Actuator(*each) for each in _TRIED]
+    mode, best = max(((mode_of(each), each) for each in tried), key=lambda pair: pair[0].height)
+    values = len(rows) * int(live.sum())
+    if mode.height < without - _NEAR * values:
+        return None
+    for _ in range(2):  # the noise that a wrong actuator seems to add is less the second time
+        best = refined(best, mode)
+        mode = mode_of(best)
+    return best if mode.height > without + _BETTER * values else None
 
-# A closed loop whose inputs are those that act, followed by those that were commanded
 
+@dataclass(frozen=True)
+class ActuatedController:
+    """A controller with an actuator, which returns the input that acts and the one that is commanded, ``(..., 2 m)``.
 
-def with_actuator(validation: Validation, actuator: Actuator | None, inputs: int) -> Validation:
-    """Return a validation whose controllers have an actuator and return both inputs ``(..., 2 m)``; itself if None.
-
-    Its system is that of the given one, and cannot be executed.
+    Its memory has the latest commands, the latest first, and the input that acts.
     """
-    if actuator is None:
-        return validation
-    return validation.with_parts(
-        model=_OfCommands(validation.model, inputs),
-        synthesizer=_ActuatedSynthesizer(validation.synthesizer, validation.model, actuator),
-        distance=_DistanceOfCommands(validation.distance, inputs),
-    )
-
-
-def with_commands(trajectory: Trajectory, commanded: Array) -> Trajectory:
-    """Return a trajectory whose inputs act, with those that were commanded in its steps beside them."""
-    steps = trajectory.inputs.shape[-2]
-    return replace(trajectory, inputs=np.concatenate([trajectory.inputs, commanded[..., :steps, :]], axis=-1))
-
-
-@dataclass(frozen=True)
-class _OfCommands:
-    """M under the last m inputs, which are commanded, or under what acts if nothing else is given."""
-
-    model: Model
-    inputs: int
-
-    def step(self, x: Array, u: Array) -> Array:
-        return np.asarray(self.model.step(x, u[..., -self.inputs :]))
-
-
-@dataclass(frozen=True)
-class _ActuatedSynthesizer:
-    """Designs the user's controllers on the user's model."""
-
-    synthesizer: Synthesizer
-    model: Model
-    actuator: Actuator
-
-    @property
-    def batched(self) -> bool:
-        return bool(getattr(self.synthesizer, "batched", False))
-
-    def design(self, task: Task, model: Model) -> Controller:
-        return _ActuatedController(self.synthesizer.design(task, self.model), self.actuator)
-
-
-@dataclass(frozen=True)
-class _ActuatedController:
-    """A controller whose memory has the latest commands, the latest first, and the input that acts."""
 
     controller: Controller
     actuator: Actuator
 
     def start(self, task: Task) -> Any:
+        """Return the memory before the first step."""
         return memory_of(self.controller, task), (), None
 
     def step(self, t: int, x: Array, memory: Any) -> tuple[Array, Any]:
+        """Return both inputs and the memory after the step."""
         of_controller, commanded, acting = memory
         u, of_controller = stepped(self.controller, t, x, of_controller)
         u = np.array(u, dtype=np.float64)
         commanded = (u, *commanded)[: self.actuator.remembered]
         acting = self.actuator.follow(np.zeros_like(u) if acting is None else acting, commanded)
         return np.concatenate([acting, u], axis=-1), (of_controller, commanded, acting)
-
-
-@dataclass(frozen=True)
-class _DistanceOfCommands:
-    """The user's distance of trajectories with the inputs that were commanded."""
-
-    distance: Distance
-    inputs: int
-
-    def __call__(self, model_trajectory: Trajectory, system_trajectory: Trajectory, task: Task) -> Array:
-        return self.distance(
-            commands_of(model_trajectory, self.inputs), commands_of(system_trajectory, self.inputs), task
-        )
-
-
-def commands_of(trajectory: Trajectory, inputs: int) -> Trajectory:
-    """Return a closed loop with the m inputs that were commanded alone."""
-    return replace(trajectory, inputs=trajectory.inputs[..., -inputs:])

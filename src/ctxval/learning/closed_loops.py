@@ -20,14 +20,17 @@ from ctxval.core.rollout import rollout
 from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.validation import Validation
-from ctxval.learning.draws import DynamicsDraws
+from ctxval.learning.draws import DisturbedDynamics, DrawnModel, DynamicsDraws
 from ctxval.learning.dynamics_posterior import DynamicsPosterior
-from ctxval.learning.noisy_draws import NoisyDraws
+from ctxval.learning.noisy_draws import NoisyDraws, NoisyRuns
 
 T = TypeVar("T")
 
 AnyDraws = DynamicsDraws | NoisyDraws
 """Draws of dynamics without and with noise."""
+
+Together = AnyDraws | DisturbedDynamics
+"""Systems that are run together."""
 
 _REMEMBERED = 64_000_000  # largest size of the plans that are kept, in bytes, approximately
 
@@ -92,34 +95,29 @@ class LoopPlanner:
 
         If the synthesizer takes batches, at most ``together`` tasks are planned in one call.
         """
-        size = together if self.batched else 1
-        return [
-            replace(one, rows=first + one.rows)
-            for first in range(0, len(points), size)
-            for one in self._remembered(points[first : first + size])
-        ]
+        size, plans = together if self.batched else 1, list[PlannedTasks]()
+        for first in range(0, len(points), size):
+            some = points[first : first + size]
+            key = some.tobytes()
+            if key in self._kept:
+                self._kept.move_to_end(key)
+                planned = self._kept[key][0]
+            else:
+                planned = self._planned(some)
+                # Trajectories, and gains as large as those of a linear feedback.
+                arrays = [(plan.promised.states, plan.promised.inputs) for plan in planned]
+                needed = sum(2 * (x.nbytes + u.nbytes) + int(x.shape[-1]) * u.nbytes for x, u in arrays) + len(key)
+                self._kept[key] = planned, needed
+                self._size += needed
+                while self._size > _REMEMBERED:
+                    self._size -= self._kept.popitem(last=False)[1][1]
+            advance(len(some))  # as if those that are kept were planned again
+            plans += [replace(plan, rows=first + plan.rows) for plan in planned]
+        return plans
 
     def has(self, point: Array) -> bool:
         """Return whether the plan of one task ``(d,)`` is kept."""
         return point.tobytes() in self._kept
-
-    def _remembered(self, points: Array) -> list[PlannedTasks]:
-        """Return the plans of points that are planned together; their rows count from 0."""
-        key = points.tobytes()
-        if key in self._kept:
-            self._kept.move_to_end(key)
-            advance(len(points))  # as if they were planned
-            return self._kept[key][0]
-        planned = self._planned(points)
-        advance(len(points))
-        # Trajectories, and gains as large as those of a linear feedback.
-        arrays = [(one.promised.states, one.promised.inputs) for one in planned]
-        size = sum(2 * (x.nbytes + u.nbytes) + int(x.shape[-1]) * u.nbytes for x, u in arrays) + len(key)
-        self._kept[key] = planned, size
-        self._size += size
-        while self._size > _REMEMBERED:
-            self._size -= self._kept.popitem(last=False)[1][1]
-        return planned
 
     def _planned(self, points: Array) -> list[PlannedTasks]:
         """Return plans. A batch that fails is halved; one task is then planned without batch axis."""
@@ -142,11 +140,11 @@ class LoopPlanner:
             raise ValueError("the task function did not return one task for each point")
         return PlannedTasks(rows, task, controller, promised)
 
-    def run(self, draws: AnyDraws, planned: Sequence[PlannedTasks]) -> list[Loops]:
+    def run(self, draws: Together, planned: Sequence[PlannedTasks]) -> list[Loops]:
         """Return the closed loops of all draws on the same tasks."""
-        return [self._run(draws, one) for one in planned]
+        return [self._run(draws, plan) for plan in planned]
 
-    def distances(self, draws: AnyDraws, planned: Sequence[PlannedTasks], tasks: int) -> Array:
+    def distances(self, draws: Together, planned: Sequence[PlannedTasks], tasks: int) -> Array:
         """Return the distances ``(S, q)`` of all draws on the same q tasks; NaN for a task without a finite plan."""
         found = distances_of(draws, self.run(draws, planned), planned, tasks)
         advance(len(draws) * sum(len(one.rows) for one in planned))
@@ -155,25 +153,18 @@ class LoopPlanner:
     def own_distances(self, draws: AnyDraws, points: Array) -> Array:
         """Return the distances ``(S, q)`` of each draw on tasks of its own, at points ``(S, q, d)``."""
         S, q, d = points.shape
-        if isinstance(draws, NoisyDraws):
-            return self._own_noisy_distances(draws, points)
-        found = np.full(S * q, np.nan)
-        for one in self.plan(points.reshape(S * q, d), together=S * q):
-            alone = draws.model_of(int(one.rows[0]) // q).step
-            step: Step = _own_step(draws, q, one.rows) if one.task.batch_shape else alone
-            found[one.rows] = self.compared(one, rollout(step, one.controller, one.task))
-            advance(len(one.rows))
-        return found.reshape(S, q)
-
-    def _own_noisy_distances(self, draws: NoisyDraws, points: Array) -> Array:
-        S, q, d = points.shape
-        R = draws.replicates
+        R = draws.replicates if isinstance(draws, NoisyDraws) else 1
         found = np.full((R, S * q), np.nan)
-        for one in self.plan(points.reshape(S * q, d), together=S * q):
-            of_draw = np.broadcast_to(one.rows // q, (R, len(one.rows)))
-            found[:, one.rows] = self._noisy_loops(draws, one, of_draw, np.arange(R)).distances
-            advance(R * len(one.rows))
-        return draws.reduced(found.reshape(R, S, q).swapaxes(0, 1).reshape(S * R, q))
+        for plan in self.plan(points.reshape(S * q, d), together=S * q):
+            if isinstance(draws, NoisyDraws):
+                of_draw = np.broadcast_to(plan.rows // q, (R, len(plan.rows)))
+                found[:, plan.rows] = self._noisy_loops(draws, plan, of_draw, np.arange(R)).distances
+            else:
+                alone = not plan.task.batch_shape
+                step = draws.model_of(int(plan.rows[0]) // q).step if alone else _own_step(draws, q, plan.rows)
+                found[0, plan.rows] = self.compared(plan, rollout(step, plan.controller, plan.task))
+            advance(R * len(plan.rows))
+        return _of_draws(draws, found.reshape(R, S, q).swapaxes(0, 1).reshape(S * R, q))
 
     def _noisy_loops(self, draws: NoisyDraws, planned: PlannedTasks, of_draw: Rows, replicates: Rows) -> Loops:
         """Return closed loops of draws ``(L, q)`` with a sequence of noise for each row, ``(L,)``."""
@@ -181,13 +172,13 @@ class LoopPlanner:
         of_replicate = np.broadcast_to(replicates[:, None], of_draw.shape)
         if self._takes_draws_together(planned, L):
             start = np.repeat(task.initial_state[None], L, axis=0)
-            runs = draws.runs(of_draw, of_replicate, start)
+            runs = NoisyRuns(draws, of_draw, of_replicate, start)
             together = rollout(runs.step, planned.controller, task.starting_at(runs.first))
             loops = [Trajectory(together.times, together.states[k], together.inputs[k]) for k in range(L)]
         else:
             loops = []
             for k in range(L):
-                runs = draws.runs(of_draw[k], of_replicate[k], task.initial_state)
+                runs = NoisyRuns(draws, of_draw[k], of_replicate[k], task.initial_state)
                 loops.append(rollout(runs.step, planned.controller, task.starting_at(runs.first)))
         return self._stacked(planned, loops)
 
@@ -200,7 +191,7 @@ class LoopPlanner:
             inputs.reshape(*shape, *inputs.shape[-2:]),
         )
 
-    def _run(self, draws: AnyDraws, planned: PlannedTasks) -> Loops:
+    def _run(self, draws: Together, planned: PlannedTasks) -> Loops:
         task, S = planned.task, len(draws)
         if isinstance(draws, NoisyDraws):
             of_run, replicates = np.divmod(np.arange(S * draws.replicates), draws.replicates)
@@ -216,7 +207,7 @@ class LoopPlanner:
             together = rollout(step, planned.controller, task.starting_at(start))
             loops = [Trajectory(together.times, together.states[s], together.inputs[s]) for s in range(S)]
         else:
-            loops = [rollout(draws.model_of(s).step, planned.controller, task) for s in range(S)]
+            loops = [rollout(DrawnModel(draws[s]).step, planned.controller, task) for s in range(S)]
         return self._stacked(planned, loops)
 
     def _takes_draws_together(self, planned: PlannedTasks, draws: int) -> bool:
@@ -248,19 +239,14 @@ class LoopPlanner:
 
         It is infinity if the distance raises an exception or returns no finite number: nothing is known then.
         """
-        try:
-            with np.errstate(all="ignore"):
-                # The trajectories are used again, and some distances change the arrays that they are given.
-                values = np.asarray(self.validation.distance(model.copy(), system.copy(), task), dtype=np.float64)
+        with contextlib.suppress(Exception), np.errstate(all="ignore"):  # the user's distance
+            # The trajectories are used again, and some distances change the arrays that they are given.
+            values = np.asarray(self.validation.distance(model.copy(), system.copy(), task), dtype=np.float64)
             if values.shape == model.batch_shape:
                 return np.where(np.isfinite(values), values, np.inf)
-        except Exception:  # the user's distance
-            if not model.batch_shape:
-                return np.array(np.inf)
         if not model.batch_shape:
             return np.array(np.inf)
-        each = (self.measured(task[k], model[k], system[k]) for k in range(model.batch_shape[0]))
-        return np.array([float(one) for one in each])
+        return np.array([float(self.measured(task[k], model[k], system[k])) for k in range(model.batch_shape[0])])
 
 
 def _probed(controller: Controller, task: Task, steps: int) -> Array:
@@ -288,12 +274,17 @@ def halved(function: Callable[[Rows], T], count: int) -> list[tuple[Rows, T | No
     return results
 
 
-def distances_of(draws: AnyDraws, loops: Sequence[Loops], planned: Sequence[PlannedTasks], tasks: int) -> Array:
+def distances_of(draws: Together, loops: Sequence[Loops], planned: Sequence[PlannedTasks], tasks: int) -> Array:
     """Return the distances ``(S, q)`` of closed loops of S draws on planned tasks; NaN for a task without a plan."""
     found = np.full((len(draws), tasks), np.nan)
     for one, of_batch in zip(planned, loops, strict=True):
-        found[:, one.rows] = draws.reduced(of_batch.distances)
+        found[:, one.rows] = _of_draws(draws, of_batch.distances)
     return found
+
+
+def _of_draws(draws: Together, distances: Array) -> Array:
+    """Return the distances ``(S, q)`` of draws from those of their loops."""
+    return draws.reduced(distances) if isinstance(draws, NoisyDraws) else distances
 
 
 def loop_pairs(planner: LoopPlanner, posterior: DynamicsPosterior, tasks: Array) -> Array:

@@ -8,8 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ctxval._util.arrays import Array, Rows
-from ctxval.gp.cholesky import CholeskyFactor, factorise, tenfold
-from ctxval.gp.subset import pivoted_cholesky
+from ctxval.gp.kernels import CholeskyFactor, factorise, pivoted_cholesky, tenfold
 from ctxval.learning.hyperparameters import Hyperparameters
 from ctxval.learning.kernel_expansion import KernelExpansion
 
@@ -58,9 +57,9 @@ class Component:
 
     def variance(self, Z: Array) -> Array:
         """Return the posterior variance at pairs ``(N, k)``, relative to the amplitudes, shape ``(N,)``."""
-        return self._halved(Z)[1]
+        return self._whitened(Z)[1]
 
-    def _halved(self, Z: Array) -> tuple[Array, Array]:
+    def _whitened(self, Z: Array) -> tuple[Array, Array]:
         kernel, theta = self.hyperparameters.kernel, self.hyperparameters.theta
         # For many pairs, a product with the inverse factor is several times as fast as substitution.
         half = self.factor.whiten_many(kernel(theta, Z, self.centres).T)
@@ -69,7 +68,7 @@ class Component:
     def pivots(self, relevant: Array, count: int) -> tuple[Rows, Array, float]:
         """Return rows by pivoted Cholesky of the posterior covariance, its factor, and the share of variance left."""
         kernel, theta = self.hyperparameters.kernel, self.hyperparameters.theta
-        half, left = self._halved(relevant)
+        half, left = self._whitened(relevant)
         first = left.max(initial=0.0)
         # Variances below the noise are drawn too: many noisy transitions determine a function better than one does.
         rounding = 1e-13 * kernel.diagonal(theta, relevant).max(initial=0.0)

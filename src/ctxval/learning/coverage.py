@@ -24,10 +24,6 @@ MOST_COORDINATES = 6
 _FARTHEST = 1e3  # standardised coordinates are limited to this magnitude
 
 
-_BETWEEN = 8
-"""Number of points of an execution for each of its steps, between which it is a straight line."""
-
-
 @dataclass(frozen=True, eq=False)
 class Gap:
     """A gap between what closed loops visit and what is recorded.
@@ -77,21 +73,24 @@ def coverage(
     compared = _some(len(scaled), 256)
     some = scaled[compared][:, _some(scaled.shape[1], 40)]
     gaps = np.stack([_nearest(recorded[:, i], some[..., i]) for i in range(len(width))], axis=-1)
-    pairs = _pair_gaps(recorded, some)
+    pairs, couples = None, list(combinations(range(len(width)), 2))
+    if len(width) <= MOST_COORDINATES:
+        trees = [(cKDTree(recorded[:, list(two)]), list(two)) for two in couples]
+        pairs = np.stack([tree.query(some[..., two], p=np.inf)[0] for tree, two in trees], axis=-1)
     # What is beyond all records weighs ten times as much as a gap in one coordinate, and a gap in two of them less.
     far = 10.0 * beyond.max(axis=(1, 2))
     far[compared] += (gaps.max(axis=-1) + (0.0 if pairs is None else 0.3 * pairs.max(axis=-1))).max(axis=1)
 
-    def largest(of: Array, coordinates: list[tuple[int, ...]], where: Array) -> Gap:
+    def largest(of: Array, coordinates: Sequence[tuple[int, ...]], where: Array) -> Gap:
         at = np.unravel_index(int(of.argmax()), of.shape)
         place = where[at[:-1]] * width * posterior.data.scale + posterior.data.shift
         return Gap(float(of[at]), coordinates[int(at[-1])], place)
 
-    single: list[tuple[int, ...]] = [(i,) for i in range(len(width))]
+    single = [(i,) for i in range(len(width))]
     return Coverage(
         largest(gaps, single, some),
         largest(beyond, single, scaled),
-        None if pairs is None else largest(pairs, list(combinations(range(len(width)), 2)), some),
+        None if pairs is None else largest(pairs, couples, some),
         tasks[rows[int(far.argmax())]],
         np.maximum(gaps.max(axis=(0, 1)), beyond.max(axis=(0, 1))) * width * posterior.data.scale,
         len(rows),
@@ -139,15 +138,6 @@ def _nearest(recorded: Array, visited: Array) -> Array:
     return np.minimum(np.abs(visited - ordered[above]), np.abs(visited - ordered[above - 1]))
 
 
-def _pair_gaps(recorded: Array, visited: Array) -> Array | None:
-    """Return the gap in each two coordinates at each visited pair; None if there are too many coordinates."""
-    k = recorded.shape[1]
-    if k > MOST_COORDINATES:
-        return None
-    trees = {two: cKDTree(recorded[:, list(two)]) for two in combinations(range(k), 2)}
-    return np.stack([tree.query(visited[..., list(two)], p=np.inf)[0] for two, tree in trees.items()], axis=-1)
-
-
 # Pockets
 
 
@@ -184,7 +174,12 @@ def largest_pocket(visited: Array, executed: Sequence[Trajectory], units: Sequen
     usual = visited[((visited >= low) & (visited <= high)).all(axis=1)]
     if not executed or not len(usual):
         return None
-    entered, some = np.concatenate([_along(one.states) for one in executed]), usual[_some(len(usual), 4000)]
+    parts, some = [], usual[_some(len(usual), 4000)]
+    for trajectory in executed:  # eight points on the straight line of each step
+        steps = np.arange(len(trajectory.states))
+        fine = np.linspace(0, steps[-1], 8 * int(steps[-1]) + 1)
+        parts.append(np.stack([np.interp(fine, steps, column) for column in trajectory.states.T], axis=-1))
+    entered = np.concatenate(parts)
     widths, couples = np.maximum(high - low, 1e-9), list(combinations(range(len(units)), 2))
     places = [(i, j) for i, j in couples if units[i] == units[j] and units[i] and "/" not in units[i]]
     pockets = []
@@ -195,10 +190,3 @@ def largest_pocket(visited: Array, executed: Sequence[Trajectory], units: Sequen
         at = int(away.argmax())
         pockets.append(Pocket(float(away[at]), (i, j), some[at, [i, j]], away[at] * scale))
     return max(pockets, key=lambda pocket: pocket.size, default=None)
-
-
-def _along(states: Array) -> Array:
-    """Return points along the straight lines between states ``(H + 1, n)``."""
-    steps = np.arange(len(states))
-    fine = np.linspace(0, steps[-1], _BETWEEN * int(steps[-1]) + 1)
-    return np.stack([np.interp(fine, steps, column) for column in states.T], axis=-1)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
 
@@ -21,7 +21,7 @@ from ctxval._util.representation import ShortRepr
 from ctxval.core.model import Model
 from ctxval.core.trajectory import Transitions
 from ctxval.errors import InputError
-from ctxval.gp.subset import pivoted_rows
+from ctxval.gp.kernels import pivoted_rows
 from ctxval.learning.component import Component, draw_functions
 from ctxval.learning.draws import DynamicsDraws, bounded
 from ctxval.learning.hyperparameters import (
@@ -64,10 +64,6 @@ class PosteriorSettings:
     def for_horizon(cls, horizon: int) -> PosteriorSettings:
         """Return settings in which a closed loop of many steps has fewer centres, so that it does not take longer."""
         return cls(centres=int(np.clip(30_000 // horizon, 150, 400)))
-
-    def without_model(self) -> PosteriorSettings:
-        """Return settings for learning S itself, which is smoother than the error of M and takes more transitions."""
-        return replace(self, centres=2 * self.centres, families=SMOOTHER_FAMILIES)
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,24 +121,28 @@ class DynamicsPosterior(ShortRepr):
     @functools.cached_property
     def most_probable(self) -> Component:
         """The posterior of the learned states for the mode of the hyperparameters."""
-        return self._component(0)
+        return self._component(self.covariances.posterior.mode, self._rng(0))
 
     @functools.cached_property
     def components(self) -> tuple[Component, ...]:
-        """The posteriors of the learned states for each draw of the hyperparameters, the mode first.
+        """The posteriors of the learned states for each draw of the hyperparameters, the mode first."""
+        return self._components(range(1, len(self.covariances.drawn)))
+
+    def _components(self, rows: Iterable[int]) -> tuple[Component, ...]:
+        """Return the most probable one and those of some draws of the hyperparameters.
 
         Hyperparameters whose covariance matrix is not positive definite are left out.
         """
-        found, drawn = [self.most_probable], self.covariances.drawn
+        components, drawn = [self.most_probable], self.covariances.drawn
         last = drawn[0]
-        for row, one in enumerate(drawn[1:], 1):
-            if one is last:
-                found.append(found[-1].again(self._rng(row)))
+        for row in rows:
+            if drawn[row] is last:
+                components.append(components[-1].again(self._rng(row)))
                 continue
             with contextlib.suppress(InputError):
-                found.append(self._component(row))
-                last = one
-        return tuple(found)
+                components.append(self._component(drawn[row], self._rng(row)))
+                last = drawn[row]
+        return tuple(components)
 
     @functools.cached_property
     def rows(self) -> Rows:
@@ -156,10 +156,9 @@ class DynamicsPosterior(ShortRepr):
                 most.kernel, most.theta, self.data.pairs, self.settings.centres, least=_PIVOT * most.noise
             )
 
-    def _component(self, row: int) -> Component:
+    def _component(self, drawn: Hyperparameters, rng: np.random.Generator) -> Component:
         with single_threaded():
-            drawn = self.covariances.drawn[row] if row else self.covariances.posterior.mode
-            return Component.conditioned(self._rescaled(drawn), *self._known(self.rows), self._rng(row))
+            return Component.conditioned(self._rescaled(drawn), *self._known(self.rows), rng)
 
     def _rescaled(self, drawn: Hyperparameters) -> Hyperparameters:
         """Return hyperparameters in the units of these data."""
@@ -178,18 +177,13 @@ class DynamicsPosterior(ShortRepr):
 
     @functools.cached_property
     def mean(self) -> DynamicsDraws:
-        """The model plus the posterior mean of r for the most probable hyperparameters, as one draw."""
+        """The model plus the posterior mean of r for the most probable hyperparameters, as one draw.
+
+        It has no noise, and tasks are searched with it: it is ``silent`` and ``searched`` of :class:`NoisyPosterior`.
+        """
         return self._limited(self.most_probable.mean)
 
-    @property
-    def searched(self) -> DynamicsDraws:
-        """The mean, with which tasks are searched."""
-        return self.mean
-
-    @property
-    def silent(self) -> DynamicsDraws:
-        """The mean, which has no noise."""
-        return self.mean
+    silent = searched = property(lambda self: self.mean)
 
     @functools.cached_property
     def rough_mean(self) -> DynamicsDraws:
@@ -265,21 +259,23 @@ class DynamicsPosterior(ShortRepr):
         """
         count = self.settings.functions if functions is None else functions
         with single_threaded():
-            components = self.components if hyperparameters is None else self._some_components(hyperparameters)
+            if hyperparameters is None:
+                components = self.components
+            else:  # about so many, evenly spread
+                rows = np.linspace(1, len(self.covariances.drawn) - 1, hyperparameters - 1).astype(int)
+                components = self._components(np.unique(rows).tolist())
             # Adjacent components of the same hyperparameters share their pivots and are evaluated together.
-            groups = [list(group) for _, group in groupby(components, lambda one: id(one.factor))]
+            groups = [list(group) for _, group in groupby(components, lambda component: id(component.factor))]
             drawn = [draw_functions(group, relevant, count, self.settings.pivots, rng) for group in groups]
         expansions, left_out = zip(*drawn, strict=True)
         return DynamicsDraws(self.model, self.data, joined(expansions), max(left_out))
 
-    def _some_components(self, count: int) -> Sequence[Component]:
-        """Return the components of about so many draws of the hyperparameters, evenly spread."""
-        rows = np.unique(np.linspace(1, len(self.covariances.drawn) - 1, count - 1).astype(int)).tolist()
-        found = [self.most_probable]
-        for row in rows:
-            with contextlib.suppress(InputError):
-                found.append(self._component(row))
-        return found
+    @property
+    def deviations(self) -> Array:
+        """The most probable standard deviations of the noise of each state in a step, shape ``(n,)``."""
+        data, deviations = self.data, np.zeros(len(self.data.sizes))
+        deviations[data.learned] = self.most_probable.noise * data.sizes[data.learned]
+        return deviations
 
     @property
     def noise(self) -> float:
@@ -287,7 +283,7 @@ class DynamicsPosterior(ShortRepr):
 
         It is the median over the draws of the hyperparameters, of the state in which it is largest.
         """
-        return float(np.median([(one.noise**2).max() for one in self.components]))
+        return float(np.median([(component.noise**2).max() for component in self.components]))
 
 
 def learn_covariances(
@@ -305,21 +301,21 @@ def learn_covariances(
     Args:
         sources: the execution of each transition; -1 for data that the model was made from, shape ``(N,)``.
     """
-    chosen = settings or PosteriorSettings()
-    data = residual_data(model, transitions, sources)
+    settings, data, smoother = settings or PosteriorSettings(), residual_data(model, transitions, sources), None
     if data is None:
         return None
     with single_threaded():
-        smoother = None
-        with contextlib.suppress(InputError, np.linalg.LinAlgError):  # numbers too large for a linear model
-            smoother = smoother_than(data, chosen.learned_from) if chosen.of_steps else None
+        if settings.of_steps:
+            with contextlib.suppress(InputError, np.linalg.LinAlgError):  # numbers too large for a linear model
+                smoother = smoother_than(data, settings.learned_from)
         if smoother is not None:
             model, data = smoother
-            chosen = chosen.without_model()
+            # S itself is smoother than the error of M, and takes more transitions.
+            settings = replace(settings, centres=2 * settings.centres, families=SMOOTHER_FAMILIES)
         Z, Y = data.pairs, data.outputs[:, data.learned]
-        rows = learning_rows(Z, data.inputs, chosen.learned_from)
-        found = HyperparameterPosterior.given(Z[rows], Y[rows], data.inputs, chosen.families)
-    return LearnedCovariances(model, smoother is not None, data.scale, found, chosen, seed)
+        rows = learning_rows(Z, data.inputs, settings.learned_from)
+        posterior = HyperparameterPosterior.given(Z[rows], Y[rows], data.inputs, settings.families)
+    return LearnedCovariances(model, smoother is not None, data.scale, posterior, settings, seed)
 
 
 def condition(covariances: LearnedCovariances, transitions: Transitions, sources: Rows) -> DynamicsPosterior | None:
@@ -339,5 +335,5 @@ def learn_posterior(
     settings: PosteriorSettings | None = None,
 ) -> DynamicsPosterior | None:
     """Return the posterior of the dynamics, with hyperparameters that are learned from the same transitions."""
-    found = learn_covariances(model, transitions, sources, seed, settings)
-    return None if found is None else condition(found, transitions, sources)
+    covariances = learn_covariances(model, transitions, sources, seed, settings)
+    return None if covariances is None else condition(covariances, transitions, sources)

@@ -137,7 +137,10 @@ class DynamicsStudy(ShortRepr):
                 return learned
             actuator = None if logged else self._found_actuator(executed, learned)
             if actuator is not None:
-                return self._with_actuator(actuator, executed[0][1].inputs.shape[-1]).learn(executed) or learned
+                if self._actuated is None or self._actuated.actuator != actuator:
+                    acting = ExtendedValidation(self.given, actuator, executed[0][1].inputs.shape[-1])
+                    self._actuated = DynamicsStudy(self.given, self.seed, self.quantile, acting)
+                return self._actuated.learn(executed) or learned
             if not learned.left_out_error > _WELL:
                 return learned
             if (learned.posterior.data.sources == -1).any():
@@ -145,21 +148,21 @@ class DynamicsStudy(ShortRepr):
                 if without is not None and without.left_out_error < min(_WELL, learned.left_out_error / _CLEARLY):
                     learned = without
             if not logged and len(executed) >= _FEWEST_TOLD and learned.left_out_error > _WELL:
-                found = self._found_parameter(executed)
-                learned = learned if found is None else self._with_parameter(found).learn(executed)
+                parameter = self._found_parameter(executed)
+                learned = learned if parameter is None else self._with_parameter(parameter).learn(executed)
         return learned
 
     def _learn(self, executed: Executed, logged: Sequence[Trajectory], *, with_data: bool) -> LearnedDynamics | None:
         recorded = self._recorded(executed, logged, with_data)
         if recorded is None:
             return None
-        some = scheduled(len(executed))
-        known = recorded if some == len(executed) else None
-        covariances = self._learned_covariances(executed[:some], logged, known, with_data)
-        if covariances is None and some < len(executed):
-            # If nothing could be learned when it was scheduled, it is learned now.
-            covariances = self._learned_covariances(executed, logged, recorded, with_data)
-        return self._conditioned(covariances, recorded, executed, with_data)
+        # If nothing could be learned when it was scheduled, it is learned now.
+        for count in dict.fromkeys((scheduled(len(executed)), len(executed))):
+            known = recorded if count == len(executed) else None
+            covariances = self._learned_covariances(executed[:count], logged, known, with_data)
+            if covariances is not None:
+                return self._conditioned(covariances, recorded, executed, with_data)
+        return None
 
     def as_if_executed(
         self, learned: LearnedDynamics, executed: Executed, pending: Executed, logged: Sequence[Trajectory] = ()
@@ -186,12 +189,12 @@ class DynamicsStudy(ShortRepr):
 
     def _conditioned(
         self,
-        covariances: LearnedCovariances | None,
+        covariances: LearnedCovariances,
         recorded: tuple[Transitions, Rows] | None,
         executed: Executed,
         with_data: bool,
     ) -> LearnedDynamics | None:
-        if covariances is None or recorded is None:
+        if recorded is None:
             return None
         posterior = condition(covariances, *recorded)
         if posterior is None or not np.isfinite(posterior.most_probable.weights).all():
@@ -211,24 +214,21 @@ class DynamicsStudy(ShortRepr):
         """
         if self._loops is None or not len(learned.executed):
             return None
-        return self.noise.learn(learned.posterior, self._records(learned))
-
-    def _records(self, learned: LearnedDynamics) -> list[Record]:
-        return self.extended.records(list(zip(learned.executed, learned.trajectories_of_system, strict=True)))
+        return self.noise.learn(learned.posterior, self.extended.records(learned.executions))
 
     def without(self, learned: LearnedDynamics, k: int) -> LearnedDynamics | None:
         """Return what all executions but one teach, with the same hyperparameters and the same structure of noise.
 
         It is None if nothing can be learned from them.
         """
-        executed = list(zip(learned.executed, learned.trajectories_of_system, strict=True))
-        del executed[k]
-        recorded = self._recorded(executed, (), learned.with_data)
-        others = self._conditioned(learned.posterior.covariances, recorded, executed, learned.with_data)
-        noisy = learned.noisy
+        executed, noisy = learned.executions, learned.noisy
+        kept = executed[:k] + executed[k + 1 :]
+        recorded = self._recorded(kept, (), learned.with_data)
+        others = self._conditioned(learned.posterior.covariances, recorded, kept, learned.with_data)
         if others is None or noisy is None:
             return others and others.with_noisy(None)
-        again = self.noise.again(noisy, self._records(learned), others.posterior, self._records(others))
+        records, of_others = self.extended.records(executed), self.extended.records(kept)
+        again = self.noise.again(noisy, records, others.posterior, of_others)
         return None if again is None else others.with_noisy(again)
 
     def with_states(self, executed: Executed, point: Array, trajectory: Trajectory) -> Trajectory | None:
@@ -250,8 +250,7 @@ class DynamicsStudy(ShortRepr):
         with_data: bool,
     ) -> LearnedCovariances | None:
         """Return the covariances learned from some executions, whose transitions may be known; the latest are kept."""
-        together = [*(one for _, one in executed), *logged]
-        key = digest(together) + bytes([with_data])
+        key = digest([*(trajectory for _, trajectory in executed), *logged]) + bytes([with_data])
         if key not in self._covariances:
             recorded = self._recorded(executed, logged, with_data) if recorded is None else recorded
             if recorded is None or self._loops is None:
@@ -261,6 +260,10 @@ class DynamicsStudy(ShortRepr):
             self._covariances[key] = learn_covariances(model, *recorded, seed, settings)
         return self._covariances[key]
 
+    @functools.cached_property
+    def _data(self) -> Transitions | None:
+        return None if self._loops is None else data_near(self.validation.model, self._loops)
+
     def _recorded(
         self, executed: Executed, logged: Sequence[Trajectory], with_data: bool
     ) -> tuple[Transitions, Rows] | None:
@@ -268,13 +271,8 @@ class DynamicsStudy(ShortRepr):
             return None
         # The data that M was made from tell no earlier inputs.
         data = self._data if with_data and self.actuator is None else None
-        loops = [self.extended.with_acting(one) for _, one in executed]
+        loops = [replace(loop, inputs=self.extended.acting(loop)) for _, loop in executed]
         return recorded_transitions(data, loops, self._loops, logged)
-
-    @functools.cached_property
-    def _data(self) -> Transitions | None:
-        """The transitions that M was made from, near the tasks."""
-        return None if self._loops is None else data_near(self.validation.model, self._loops)
 
     def _found_parameter(self, executed: Executed) -> str | None:
         """Return a task parameter that explains the errors of predictions; asked in each doubling of the executions."""
@@ -291,7 +289,7 @@ class DynamicsStudy(ShortRepr):
     def _with_parameter(self, name: str) -> DynamicsStudy:
         """Return the study with another task parameter as a state; it is kept."""
         if name not in self._others:
-            given = self.given.with_physical([*self.given.physical, name])
+            given = self.given.with_parts(physical=[*self.given.physical, name])
             self._others[name] = DynamicsStudy(given, self.seed, self.quantile, self.extended.of(given))
         return self._others[name]
 
@@ -329,14 +327,6 @@ class DynamicsStudy(ShortRepr):
                 self._actuators[key] = found_actuator(model, records_of, before, 30 if estimated else 80)
         return self._actuators[key]
 
-    def _with_actuator(self, actuator: Actuator, inputs: int) -> DynamicsStudy:
-        """Return the study of inputs that act late; it is kept."""
-        if self._actuated is None or self._actuated.actuator != actuator:
-            self._actuated = DynamicsStudy(
-                self.given, self.seed, self.quantile, ExtendedValidation(self.given, actuator, inputs)
-            )
-        return self._actuated
-
     def _most_telling(self, executed: Executed) -> tuple[str | None, float, float]:
         """Return the task parameter with which predictions err least, and the left-out errors with it and without.
 
@@ -353,7 +343,6 @@ class DynamicsStudy(ShortRepr):
         return name, least, 0.0 if without_it is None else without_it.left_out_error
 
     def _learned_alone(self, executed: Executed) -> LearnedDynamics | None:
-        """Return what executions teach without the data that M was made from."""
         extended = self._executions(executed)
         return None if extended is None else self._learn(extended, (), with_data=False)
 
@@ -363,10 +352,9 @@ class DynamicsStudy(ShortRepr):
         Each execution is predicted from the others, with the parameter as a state and without it. It is None if there
         are too few executions, or if no parameter halves the error.
         """
-        executed = list(zip(learned.executed, learned.trajectories_of_system, strict=True))
-        if len(executed) < _FEWEST_TOLD or not learned.left_out_error > _WELL:
+        if len(learned.executed) < _FEWEST_TOLD or not learned.left_out_error > _WELL:
             return None
-        plain = [(point, self.recorded(trajectory)) for point, trajectory in executed]
+        plain = [(point, self.recorded(trajectory)) for point, trajectory in learned.executions]
         name, with_it, without_it = self._most_telling(plain)
         return None if name is None or with_it > without_it / 2 else (name, without_it / max(with_it, 1e-300))
 
@@ -387,8 +375,8 @@ class DynamicsStudy(ShortRepr):
                 return self._predict_vectors(executed)
             loops, seconds = self._timed_loops
             in_parallel = loops is not None and not loops.batch_shape and seconds > _SLOW
-            found = predict_distance(learned.study.planner, learned.posterior, learned.executed, in_parallel)
-            return replace(found, otherwise=lambda: self._predict_vectors(executed))
+            prediction = predict_distance(learned.study.planner, learned.posterior, learned.executed, in_parallel)
+            return replace(prediction, otherwise=lambda: self._predict_vectors(executed))
 
     def _predict_vectors(self, executed: Executed) -> Prediction | None:
         """Return the prediction from the vectors of which distances are composed; None if they are not known."""

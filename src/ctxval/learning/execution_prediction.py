@@ -35,23 +35,15 @@ class NoisePrediction(ShortRepr):
     roughness: tuple[float, ...]
     statistics: tuple[tuple[float, ...], ...]
 
-    def to_json(self) -> dict[str, Any]:
-        """Return all attributes, ready for JSON: infinity is None."""
-        distances = [None if np.isinf(one) else one for one in self.distances]
-        return {**asdict(self), "distances": distances}
-
     def chance_of_more(self, distance: float) -> float:
         """Return the predicted probability that the distance of an execution exceeds a value."""
         return chance_of_more(self.distances, distance, self.runs)
 
     def p_values(self, executed: Trajectory, deviation: float) -> tuple[float, ...]:
         """Return the predicted probabilities that the statistics exceed those of an execution."""
-        values = (
-            deviation,
-            *(float(each[0]) for each in _differences(executed.states[None], np.array(self.roughness))),
-        )
-        chances = zip(self.statistics, values, strict=True)
-        return tuple(chance_of_more(quantiles, value, self.runs) for quantiles, value in chances)
+        differences = _differences(executed.states[None], np.array(self.roughness))
+        pairs = zip(self.statistics, (deviation, *(float(each[0]) for each in differences)), strict=True)
+        return tuple(chance_of_more(quantiles, value, self.runs) for quantiles, value in pairs)
 
 
 def _differences(states: Array, roughness: Array) -> tuple[Array, Array]:
@@ -97,24 +89,21 @@ class ExecutionPrediction(ShortRepr):
 
     def to_json(self) -> dict[str, Any]:
         """Return all attributes, ready for JSON: infinity is None."""
-        return {
-            **asdict(self),
-            "quantiles": [None if np.isinf(one) else one for one in self.quantiles],
-            "steps": list(self.steps),
-            "states": [list(row) for row in self.states],
-            "deviations": [list(row) for row in self.deviations],
-            "noise": self.noise and self.noise.to_json(),
-        }
+        rows = {name: [list(row) for row in getattr(self, name)] for name in ("states", "deviations")}
+        values = {**asdict(self), "quantiles": _without_infinity(self.quantiles), "steps": list(self.steps), **rows}
+        if self.noise is not None:
+            values["noise"]["distances"] = _without_infinity(self.noise.distances)
+        return values
 
     @classmethod
     def from_json(cls, values: Mapping[str, Any]) -> Self | None:
         """Return the prediction that :meth:`to_json` returned; None if these are not its values."""
         try:
-            found = cls(
+            prediction = cls(
                 int(values["learned_from"]),
-                tuple(np.inf if one is None else float(one) for one in values["quantiles"]),
+                _with_infinity(values["quantiles"]),
                 float(values["deviation"]),
-                tuple(int(one) for one in values["steps"]),
+                tuple(int(step) for step in values["steps"]),
                 _rows(values["states"]),
                 _rows(values["deviations"]),
                 float(values["diverged"]),
@@ -122,11 +111,11 @@ class ExecutionPrediction(ShortRepr):
             )
         except (KeyError, TypeError, ValueError, OverflowError):
             return None
-        widths = {len(row) for row in (*found.states, *found.deviations)}
-        lengths = {len(found.steps), len(found.states), len(found.deviations)}
-        ordered = all(one <= other for one, other in pairwise(found.quantiles))
-        consistent = len(found.quantiles) == len(_QUANTILES) and ordered and len(lengths) == len(widths) == 1
-        return found if consistent else None
+        widths = {len(row) for row in (*prediction.states, *prediction.deviations)}
+        lengths = {len(prediction.steps), len(prediction.states), len(prediction.deviations)}
+        ordered = all(low <= high for low, high in pairwise(prediction.quantiles))
+        consistent = len(prediction.quantiles) == len(_QUANTILES) and ordered and len(lengths) == len(widths) == 1
+        return prediction if consistent else None
 
     def score(self, executed: Trajectory, distance: float) -> PredictionScore | None:
         """Return how an execution agrees with the prediction; None if they do not fit together."""
@@ -185,19 +174,19 @@ def predict_execution(
     ``recorded`` turns a trajectory of all states into what the system records.
     """
     planned = planner.plan(point[None])
-    found = planner.run(draws, planned)
-    if not found:
+    if not planned:
         return None
-    horizon = found[0].inputs.shape[2]
+    (run,) = planner.run(draws, planned)
+    horizon = run.inputs.shape[2]
     steps = np.unique(np.linspace(1, horizon, min(horizon, 16)).astype(int))
-    loops = recorded(Trajectory(planned[0].promised.times, found[0].states[:, 0], found[0].inputs[:, 0])).states
-    states, distances = loops[:, steps], found[0].distances[:, 0]
+    loops = recorded(Trajectory(planned[0].promised.times, run.states[:, 0], run.inputs[:, 0])).states
+    states, distances = loops[:, steps], run.distances[:, 0]
     size = max(float(np.nanmedian(np.abs(states))), 1e-9)
     with np.errstate(all="ignore"):  # what is far beyond the states of all other draws has diverged
         kept = np.isfinite(distances) & (np.abs(states) < 1e6 * size).all(axis=(1, 2))
     good, values = (states[kept], distances[kept]) if kept.any() else (np.zeros_like(states), np.zeros(len(states)))
     medians, deviations = np.median(good, axis=0), good.std(axis=0)
-    noise = None
+    noise, kept_distances = None, np.where(kept, distances, np.inf)
     if noisy and kept.any():
         whole = loops[kept]
         roughness = np.sqrt((np.diff(whole, 2, axis=1) ** 2).mean(axis=(0, 1)))
@@ -205,17 +194,17 @@ def predict_execution(
         of_runs = (_deviation(good, medians, deviations, ranges), *_differences(whole, roughness))
         noise = NoisePrediction(
             len(kept),
-            tuple(_rounded(np.quantile(np.where(kept, distances, np.inf), LEVELS, method="higher"))),
-            tuple(_rounded(roughness)),
-            tuple(tuple(_rounded(np.quantile(values, LEVELS))) for values in of_runs),
+            _rounded(np.quantile(kept_distances, LEVELS, method="higher")),
+            _rounded(roughness),
+            tuple(_rounded(np.quantile(each, LEVELS)) for each in of_runs),
         )
     return ExecutionPrediction(
         learned_from,
-        tuple(_rounded(np.quantile(np.where(kept, distances, np.inf), _QUANTILES, method="higher"))),
+        _rounded(np.quantile(kept_distances, _QUANTILES, method="higher")),
         _rounded(values.std())[0],
         tuple(steps.tolist()),
-        tuple(tuple(_rounded(row)) for row in medians),
-        tuple(tuple(_rounded(row)) for row in deviations),
+        tuple(map(_rounded, medians)),
+        tuple(map(_rounded, deviations)),
         float(1 - kept.mean()),
         noise,
     )
@@ -224,8 +213,7 @@ def predict_execution(
 def _noise(values: Mapping[str, Any] | None) -> NoisePrediction | None:
     if values is None:
         return None
-    distances = tuple(np.inf if one is None else float(one) for one in values["distances"])
-    roughness = tuple(float(value) for value in values["roughness"])
+    (roughness,), distances = _rows([values["roughness"]]), _with_infinity(values["distances"])
     noise = NoisePrediction(int(values["runs"]), distances, roughness, _rows(values["statistics"]))
     if {len(row) for row in (noise.distances, *noise.statistics)} != {len(LEVELS)} or len(noise.statistics) != 3:
         raise ValueError("other numbers of quantiles")
@@ -236,5 +224,13 @@ def _rows(listed: Iterable[Iterable[Any]]) -> tuple[tuple[float, ...], ...]:
     return tuple(tuple(float(value) for value in row) for row in listed)
 
 
-def _rounded(values: ArrayLike) -> list[float]:
-    return [float(f"{value:.8g}") for value in np.ravel(values)]
+def _without_infinity(values: Iterable[float]) -> list[float | None]:
+    return [None if np.isinf(value) else value for value in values]
+
+
+def _with_infinity(values: Iterable[Any]) -> tuple[float, ...]:
+    return tuple(np.inf if value is None else float(value) for value in values)
+
+
+def _rounded(values: ArrayLike) -> tuple[float, ...]:
+    return tuple(float(f"{value:.8g}") for value in np.ravel(values))

@@ -1,22 +1,55 @@
-"""The validation of which dynamics are learned: states of M for outputs, parameters as states, inputs that act late."""
+"""The validation of which dynamics are learned: states of M for outputs, parameters as states, inputs that act late.
+
+What M misses must be a function of state and input. Task parameters may change the dynamics, as a payload does: each of
+these becomes a state that does not change. If inputs act late, a closed loop has the acting inputs and those that were
+commanded, in this order. So everything that is learned, covered and tested of states and inputs holds. M, the
+controllers and the distance are the user's, and see a closed loop as the system records it.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import functools
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
 from weakref import WeakKeyDictionary
 
 import numpy as np
 
 from ctxval._util.arrays import Array
+from ctxval.core.controller import Controller, ControllerWithMemory, Synthesizer
+from ctxval.core.distance import Distance
+from ctxval.core.labels import Labels, labels_of
+from ctxval.core.model import Model
+from ctxval.core.space import Parameters
+from ctxval.core.system import Outputs
+from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.validation import Validation
-from ctxval.learning.actuators import Actuator, commands_of, with_actuator, with_commands
+from ctxval.learning.actuators import ActuatedController, Actuator
 from ctxval.learning.histories import Record
-from ctxval.learning.physical import added_states, with_parameters, with_parameters_as_states, without_parameters
 from ctxval.learning.recorded import closed_loops_on_model
-from ctxval.learning.state_estimates import StateEstimates, with_states_of_model
+from ctxval.learning.state_estimates import StateEstimates
 from ctxval.learning.vector import Executed
+
+
+def with_states_of_model(validation: Validation) -> Validation:
+    """Return a validation whose trajectories have the states of M; itself if the states are recorded.
+
+    Its system is that of the given one, and cannot be executed.
+    """
+    return (
+        validation if validation.outputs is None else ExtendedValidation(validation.with_parts(physical=())).validation
+    )
+
+
+def estimates_by_loops_on_model(validation: Validation) -> StateEstimates | None:
+    """Return the estimates of states for a validation; None if no task can be planned, or if it has no outputs."""
+    if validation.outputs is None:
+        return None
+    loops = closed_loops_on_model(with_states_of_model(validation))
+    return None if loops is None else StateEstimates(validation, validation.outputs, loops.states)
 
 
 class ExtendedValidation:
@@ -26,8 +59,7 @@ class ExtendedValidation:
         given: the user's validation.
         actuator: how the inputs act; None if they act at once.
         inputs: their number m; it need not be known without an actuator.
-        validation: the other one. Its closed loops have the inputs that act and those that are commanded, if they
-            differ.
+        validation: the other one, whose system cannot be executed; the given one if nothing is extended.
     """
 
     def __init__(
@@ -39,7 +71,46 @@ class ExtendedValidation:
     ) -> None:
         self.given, self.actuator, self.inputs, self._known = given, actuator, inputs, estimates
         self._acting = WeakKeyDictionary[Trajectory, Trajectory]()
-        self.validation = with_actuator(with_parameters_as_states(with_states_of_model(given)), actuator, inputs)
+        of_names = (np.arange(given.space.dimension)[given.space.columns(name)] for name in given.physical)
+        self._columns = np.hstack([np.empty(0, dtype=np.intp), *of_names])
+        self.validation = self._extended() if self.needs_tasks else given
+
+    def _extended(self) -> Validation:
+        given, columns, k = self.given, self._columns, len(self._columns)
+
+        def task(parameters: Parameters) -> Task:
+            plain = given.task(parameters)
+            return _ExtendedTask(plain, parameters.points[..., columns]) if k else plain
+
+        # If only outputs are recorded, M is that of the user, and controllers are designed on the model that is given.
+        model = _ExtendedModel(given.model, k, self.inputs) if k or self.actuator else None
+        own = None if model is None else given.model
+        return given.with_parts(
+            task=task,
+            model=model or given.model,
+            synthesizer=_ExtendedSynthesizer(given.synthesizer, own, given.outputs, k, self.actuator),
+            distance=_ExtendedDistance(given.distance, self.recorded),
+            labels=self._labels(),
+            outputs=None,
+            physical=(),
+        )
+
+    def _labels(self) -> Labels:
+        given, space, outputs = self.given, self.given.space, self.given.outputs
+        labels = given.labels if outputs is None else replace(given.labels, states=())
+        with contextlib.suppress(Exception):  # the user's task, which is planned with its own errors elsewhere
+            n = given.task(space.parameters(0.5 * (space.low + space.high))).initial_state.shape[-1]
+            if outputs is not None:
+                names, recorded = [f"x{i}" for i in range(n)], outputs.indices or []
+                for i, label in zip(recorded, labels_of(given.names(len(recorded), 0)[0]), strict=True):
+                    names[i] = label
+                labels = replace(labels, states=tuple(names))
+            if len(self._columns):
+                states, _ = labels.names(given.system, n, 0)
+                parameters = [(space.names[i], space.labels[i]) for i in self._columns]
+                more = (f"task {label}" if name in states else label for name, label in parameters)
+                labels = replace(labels, states=(*labels_of(states), *more))
+        return labels
 
     @property
     def needs_tasks(self) -> bool:
@@ -73,8 +144,13 @@ class ExtendedValidation:
             acting = [(point, trajectory) for (point, _), trajectory in zip(acting, states, strict=True)]
         together = []
         for (point, trajectory), (_, whole) in zip(acting, executed, strict=True):
-            extended = with_parameters(self.given, point, trajectory)
-            together.append((point, with_commands(extended, whole.inputs) if self.actuator else extended))
+            if len(self._columns):
+                values = self.given.space.from_unit(point)[self._columns]
+                trajectory = replace(trajectory, states=_joined(trajectory.states, values))
+            if self.actuator is not None:
+                commanded = whole.inputs[..., : trajectory.inputs.shape[-2], :]
+                trajectory = replace(trajectory, inputs=np.concatenate([trajectory.inputs, commanded], axis=-1))
+            together.append((point, trajectory))
         return together
 
     def _actuated(self, trajectory: Trajectory) -> Trajectory:
@@ -93,22 +169,20 @@ class ExtendedValidation:
     def _estimates(self) -> StateEstimates | None:
         if self.given.outputs is None or self.loops is None or self._known is not None:
             return self._known
-        states = self.loops.states[..., : self.loops.states.shape[-1] - added_states(self.given)]
+        states = self.loops.states[..., : self.loops.states.shape[-1] - len(self._columns)]
         return StateEstimates(self.given, self.given.outputs, states)
 
     def recorded(self, trajectory: Trajectory) -> Trajectory:
         """Return a closed loop as the system records it."""
-        plain = without_parameters(self.given, trajectory)
-        plain = plain if self.actuator is None else commands_of(plain, self.inputs)
-        return plain if self.given.outputs is None else self.given.outputs.of(plain)
+        if len(self._columns):
+            trajectory = replace(trajectory, states=trajectory.states[..., : -len(self._columns)])
+        if self.actuator is not None:
+            trajectory = replace(trajectory, inputs=trajectory.inputs[..., -self.inputs :])
+        return trajectory if self.given.outputs is None else self.given.outputs.of(trajectory)
 
     def acting(self, trajectory: Trajectory) -> Array:
         """Return the inputs of a closed loop that act."""
         return trajectory.inputs if self.actuator is None else trajectory.inputs[..., : self.inputs]
-
-    def with_acting(self, trajectory: Trajectory) -> Trajectory:
-        """Return a closed loop with the inputs that act alone."""
-        return replace(trajectory, inputs=self.acting(trajectory))
 
     def records(self, executed: Executed) -> list[Record]:
         """Return executions of the other validation with the inputs that act, and the initial states of their tasks."""
@@ -118,3 +192,97 @@ class ExtendedValidation:
             start = np.asarray(task.initial_state, dtype=np.float64)
             records.append(Record(trajectory.states, self.acting(trajectory), start))
         return records
+
+
+def _joined(states: Array, values: Array) -> Array:
+    return np.concatenate([states, np.broadcast_to(values, (*states.shape[:-1], values.shape[-1]))], axis=-1)
+
+
+class _ExtendedTask(Task):
+    """A task with values ``(..., k)`` as further states, which it keeps."""
+
+    def __init__(self, plain: Task, values: Array) -> None:
+        self.plain, self.values = plain, values
+        reference = _joined(plain.reference, values[..., None, :]) if plain.has_goal else None
+        start = _joined(plain.initial_state, values)
+        more = {"name": plain.name, "environment": plain.environment}
+        super().__init__(start, horizon=plain.horizon, dt=plain.dt, reference=reference, **more)
+
+    def __getitem__(self, index: int | slice) -> Task:
+        return _ExtendedTask(self.plain[index], self.values[index])
+
+    def named(self, name: Any) -> Task:
+        return _ExtendedTask(self.plain.named(name), self.values)
+
+    def starting_at(self, states: Array) -> Task:
+        k = self.values.shape[-1]
+        return _ExtendedTask(self.plain.starting_at(states[..., :-k]), states[..., -k:])
+
+
+def _plain(task: Task) -> Task:
+    return task.plain if isinstance(task, _ExtendedTask) else task
+
+
+@dataclass(frozen=True)
+class _ExtendedModel:
+    """M, beside k states that stay as they are, under the last m inputs, which are commanded, or under all if m = 0."""
+
+    model: Model
+    k: int
+    inputs: int
+
+    def step(self, x: Array, u: Array) -> Array:
+        n = x.shape[-1] - self.k
+        following = np.asarray(self.model.step(x[..., :n], u[..., -self.inputs :]))
+        return _joined(following, x[..., n:]) if self.k else following
+
+
+@dataclass(frozen=True)
+class _ExtendedSynthesizer:
+    """Designs the user's controllers, on this model if it is given; they see what is recorded and may act late."""
+
+    synthesizer: Synthesizer
+    model: Model | None
+    outputs: Outputs | None
+    k: int
+    actuator: Actuator | None
+
+    @property
+    def batched(self) -> bool:
+        return bool(getattr(self.synthesizer, "batched", False))
+
+    def design(self, task: Task, model: Model) -> Controller:
+        designed = self.synthesizer.design(_plain(task), model if self.model is None else self.model)
+        seeing = designed if self.outputs is None else self.outputs.seen_by(designed)
+        controller = _without_parameters(seeing, self.k) if self.k else seeing
+        return controller if self.actuator is None else ActuatedController(controller, self.actuator)
+
+
+def _without_parameters(controller: Controller, k: int) -> Controller:
+    """Return a controller that sees all states but the last k."""
+    if isinstance(controller, ControllerWithMemory):
+        return _ExtendedController(controller, k)
+    return lambda t, x: controller(t, x[..., :-k])
+
+
+@dataclass(frozen=True)
+class _ExtendedController:
+    controller: ControllerWithMemory
+    k: int
+
+    def start(self, task: Task) -> Any:
+        return self.controller.start(_plain(task))
+
+    def step(self, t: int, x: Array, memory: Any) -> tuple[Array, Any]:
+        return self.controller.step(t, x[..., : -self.k], memory)
+
+
+@dataclass(frozen=True)
+class _ExtendedDistance:
+    """The user's distance of what the system records."""
+
+    distance: Distance
+    recorded: Callable[[Trajectory], Trajectory]
+
+    def __call__(self, model_trajectory: Trajectory, system_trajectory: Trajectory, task: Task) -> Array:
+        return self.distance(self.recorded(model_trajectory), self.recorded(system_trajectory), _plain(task))

@@ -18,10 +18,8 @@ from scipy.special import gammaln, logsumexp
 
 from ctxval._util.arrays import Array, Rows
 from ctxval.errors import InputError
-from ctxval.gp.cholesky import CholeskyFactor, factorise
-from ctxval.gp.kernels import Bounds, Covariance, Linear, Matern, Towards
+from ctxval.gp.kernels import Bounds, CholeskyFactor, Covariance, Linear, Matern, Towards, factorise, pivoted_rows
 from ctxval.gp.regression import most_likely
-from ctxval.gp.subset import pivoted_rows
 
 FAMILIES = ((2.5, 0.0), (2.5, 1.0), (1.5, 0.0))
 """Smoothness and growth of the covariances, equally likely a priori."""
@@ -32,10 +30,9 @@ SMOOTHER_FAMILIES = ((4.5, 0.0), *FAMILIES)
 NOISE = (1e-7, 1.0)
 """Bounds of the noise variance, relative to that of the Matern part."""
 
-_LENGTH = (3.0, 1.0)
-"""Median of the length-scales in standard deviations of the data, and the deviation of their logarithms."""
-_LINEAR_PART = (1.0, 5.0)
-"""The same for the variances of the constant and of the linear part, relative to that of the Matern part."""
+# Medians of the length-scales, in standard deviations of the data, and of the variances of the constant and of the
+# linear part, relative to that of the Matern part, with the deviations of their logarithms.
+_LENGTH, _LINEAR_PART = (3.0, 1.0), (1.0, 5.0)
 _FREEDOM = 6.0  # degrees of freedom of the t distribution of the proposals
 
 _LINEAR_KERNEL = Linear(centre=0.0, variance=(1e-4, 1e6))
@@ -66,7 +63,7 @@ class ResidualKernel(Covariance):
 
     def towards(self, theta: Array, Z: Array) -> Towards:
         """Return the covariances with points ``(m, k)`` as a function of other points."""
-        matern = Matern(self.nu, ard=True).towards(self._unit(theta), Z)
+        matern = Matern(self.nu, ard=True).towards(np.concatenate([[0.0], theta[:-2]]), Z)
         linear = _LINEAR_KERNEL.towards(theta[-2:], Z)
 
         def covariances(X: Array) -> Array:
@@ -112,10 +109,6 @@ class ResidualKernel(Covariance):
         """Return the columns of the inputs; a system may have none."""
         return Z[:, Z.shape[1] - self.inputs :]
 
-    @staticmethod
-    def _unit(theta: Array) -> Array:
-        return np.concatenate([[0.0], theta[:-2]])
-
 
 @dataclass(frozen=True, eq=False)
 class Hyperparameters:
@@ -149,16 +142,29 @@ class Mode:
     @functools.cached_property
     def scale(self) -> Array:
         """A root ``(D, D)`` of the inverse of the curvature of the log posterior, by differences of its gradient."""
+
+        def slopes(parameters: Array) -> Array:
+            try:
+                return log_posterior(self.kernel, parameters, self.Z, self.Y)[1]
+            except InputError:  # the covariance is not positive definite
+                return np.zeros_like(parameters)
+
         low, high = _box(self.kernel, self.Z.shape[1])
         curvature = np.empty((len(self.place), len(self.place)))
         for i, step in enumerate(np.eye(len(self.place)) * 0.05):
             up, down = np.minimum(self.place + step, high), np.maximum(self.place - step, low)
-            slopes = _gradient_or_zero(self.kernel, up, self.Z, self.Y)
-            slopes -= _gradient_or_zero(self.kernel, down, self.Z, self.Y)
-            curvature[i] = -slopes / (up - down)[i]
+            curvature[i] = (slopes(down) - slopes(up)) / (up - down)[i]
         values, vectors = np.linalg.eigh(0.5 * (curvature + curvature.T))
         # No direction is less certain than a standard deviation of 2 in the logarithm.
         return np.asarray(vectors / np.sqrt(np.maximum(values, 0.25)))
+
+    def log_posterior_or_none(self, parameters: Array) -> float:
+        """Return the log density of (theta, log noise); minus infinity if the covariance is not positive definite."""
+        try:
+            theta, noise = _within(self.kernel, parameters)
+            return _log_likelihood(self.kernel(theta, self.Z, self.Z), noise, self.Y)[0] + _log_prior(parameters)[0]
+        except InputError:
+            return -np.inf
 
     def proposals(self, count: int, rng: np.random.Generator) -> Array:
         """Return draws ``(count, D)`` of a t distribution around the mode."""
@@ -197,7 +203,7 @@ class HyperparameterPosterior:
     @functools.cached_property
     def mode(self) -> Hyperparameters:
         """The most probable hyperparameters."""
-        return _of(self.highest.kernel, self.highest.place)
+        return Hyperparameters(self.highest.kernel, *_within(self.highest.kernel, self.highest.place))
 
     def draw(self, count: int, rng: np.random.Generator) -> list[Hyperparameters]:
         """Return ``count`` draws; hyperparameters that are drawn again are the same object, and follow each other."""
@@ -206,21 +212,20 @@ class HyperparameterPosterior:
             drawn = np.concatenate([mode.proposals(48 // len(family), rng) for mode in family])
             # All modes of a family make one proposal distribution: the mixture of theirs in equal parts.
             density = logsumexp([mode.log_density(drawn) for mode in family], axis=0) - np.log(len(family))
-            first = family[0]
-            found += [(first.kernel, place) for place in drawn]
-            heights = [_log_posterior_or_none(first.kernel, place, first.Z, first.Y) for place in drawn]
+            found += [(family[0].kernel, place) for place in drawn]
+            heights = [family[0].log_posterior_or_none(place) for place in drawn]
             weights.append(np.array(heights) - density)
         chosen = _resampled(np.concatenate(weights), count, rng).tolist()
         # What follows from the same object is computed once.
-        drawn_rows = {row: _of(*found[row]) for row in chosen}
-        return [drawn_rows[row] for row in chosen]
+        draws = {row: Hyperparameters(found[row][0], *_within(*found[row])) for row in chosen}
+        return [draws[row] for row in chosen]
 
 
 def draw_prior(dimension: int, inputs: int, rng: np.random.Generator) -> Hyperparameters:
     """Return hyperparameters from the prior, such as those of a system on which a posterior is tested."""
     nu, growth = FAMILIES[rng.integers(len(FAMILIES))]
-    centres, deviations = _prior(dimension + 3)
-    return _of(ResidualKernel(nu, growth, inputs), centres + deviations * rng.standard_normal(dimension + 3))
+    kernel, (centres, deviations) = ResidualKernel(nu, growth, inputs), _prior(dimension + 3)
+    return Hyperparameters(kernel, *_within(kernel, centres + deviations * rng.standard_normal(dimension + 3)))
 
 
 def highest_log_posterior(Z: Array, Y: Array, inputs: int) -> float:
@@ -296,23 +301,6 @@ def _climbed(kernel: ResidualKernel, Z: Array, Y: Array) -> list[tuple[float, Ar
     return sorted(((density(mode)[0], mode) for mode in modes), key=lambda mode: -mode[0])
 
 
-def _gradient_or_zero(kernel: ResidualKernel, parameters: Array, Z: Array, Y: Array) -> Array:
-    try:
-        return log_posterior(kernel, parameters, Z, Y)[1]
-    except InputError:
-        return np.zeros_like(parameters)
-
-
-def _log_posterior_or_none(kernel: ResidualKernel, parameters: Array, Z: Array, Y: Array) -> float:
-    """Return the log density; minus infinity if the covariance is not positive definite."""
-    try:
-        theta, noise = _within(kernel, parameters)
-        value = _log_likelihood(kernel(theta, Z, Z), noise, Y)[0]
-    except InputError:
-        return -np.inf
-    return value + _log_prior(parameters)[0]
-
-
 def _resampled(log_weights: Array, count: int, rng: np.random.Generator) -> Rows:
     """Return rows drawn in proportion to truncated weights, by systematic resampling."""
     weights = np.exp(log_weights - log_weights.max())
@@ -320,10 +308,6 @@ def _resampled(log_weights: Array, count: int, rng: np.random.Generator) -> Rows
     edges = np.cumsum(weights) / weights.sum()
     places = (np.arange(count) + rng.random()) / count
     return np.asarray(np.minimum(np.searchsorted(edges, places), len(weights) - 1), dtype=np.intp)
-
-
-def _of(kernel: ResidualKernel, parameters: Array) -> Hyperparameters:
-    return Hyperparameters(kernel, *_within(kernel, parameters))
 
 
 def _within(kernel: ResidualKernel, parameters: Array) -> tuple[Array, float]:

@@ -13,6 +13,7 @@ import functools
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 from scipy.special import logsumexp
@@ -120,11 +121,6 @@ class InnovationsFit(ABC):
         """The variance of the innovations as a share of the mean square of the error of M, where it is largest."""
         return float(((self.noise[self.live] / self.scaled.sizes[self.live]) ** 2).max(initial=0.0))
 
-    @property
-    def most_probable(self) -> list[DrawnWeights]:
-        """The most probable weights, as one draw."""
-        return [(self.features, self.weights[None], self.noise[None])]
-
     def residual(self, z: Array) -> Array:
         """Return the most probable residual ``(..., n)`` of regressors ``(..., D)``."""
         flat = (z.reshape(-1, z.shape[-1]) - self.scaled.shift) / self.scaled.scale
@@ -148,40 +144,43 @@ class LaggedFit(InnovationsFit):
         """Return draws in groups of the same hyperparameters."""
         theta, n = self.theta, self.scaled.states
         others = theta + 0.35 * rng.standard_normal((2 * groups, len(theta)))
-        heights = np.array([_height(self.scaled, one, self.live, self.rows) for one in others])
+        heights = np.array([_height(self.scaled, other, self.live, self.rows) for other in others])
         heights -= _height(self.scaled, theta, self.live, self.rows)
         chances = np.exp(np.clip(heights, -30.0, 0.0))
         chosen = rng.choice(len(others), groups - 1, p=chances / chances.sum())
-        places = [theta, *(others[row] if heights[row] > -6 else theta for row in np.sort(chosen))]
         drawn = []
-        for place in places:
+        for place in [theta, *(others[row] if heights[row] > -6 else theta for row in np.sort(chosen))]:
             features = self.scaled.features(place)
-            spectrum = _Spectrum.given(features(self.scaled.Z), self.scaled, self.live, self.rows)
-            posterior = _WeightPosterior.of(spectrum, self.scaled.sizes[self.live])
-            weights, noise = np.zeros((each, posterior.size, n)), np.zeros((each, n))
+            spectrum = _Spectrum.of(features(self.scaled.Z), self.scaled, self.live, self.rows)
+            weights, noise = np.zeros((each, len(spectrum.values), n)), np.zeros((each, n))
             for k in range(each):
-                weights[k][:, self.live], noise[k, self.live] = posterior.draw(rng)
+                weights[k][:, self.live], noise[k, self.live] = spectrum.draw(rng)
             drawn.append((features, weights, noise))
         return drawn
 
 
 @dataclass(frozen=True, eq=False)
 class _Spectrum:
-    """What the evidence needs of features and standardised errors."""
+    """The posterior of weights, amplitudes and noises for one set of features, in the units ``sizes`` of the states.
+
+    Its values and vectors are those of the features' second moments, on which errors are projected.
+    """
 
     values: Array
     vectors: Array
     projected: Array
     squares: Array
     count: int
+    sizes: Array
 
     @classmethod
-    def given(cls, phi: Array, scaled: Scaled, live: Mask, rows: Array) -> _Spectrum:
+    def of(cls, phi: Array, scaled: Scaled, live: Mask, rows: Array) -> _Spectrum:
         """Return it for features ``(N, F)`` of the regressors, with weights of the transitions ``(N, 1)``."""
-        Phi, Y = phi * rows, scaled.E[:, live] / scaled.sizes[live] * rows
+        sizes = scaled.sizes[live]
+        Phi, Y = phi * rows, scaled.E[:, live] / sizes * rows
         values, vectors = np.linalg.eigh(Phi.T @ Phi)
         values = np.maximum(values, 1e-12)
-        return cls(values, vectors, vectors.T @ (Phi.T @ Y), (Y**2).sum(axis=0), len(Y))
+        return cls(values, vectors, vectors.T @ (Phi.T @ Y), (Y**2).sum(axis=0), len(Y), sizes)
 
     def log_evidence(self, i: int, amplitudes: Array, noises: Array) -> Array:
         """Return the log density of one state's errors for all amplitudes and noises, shape ``(A, S)``."""
@@ -191,45 +190,38 @@ class _Spectrum:
         explained = (a2 * self.projected[:, i] ** 2 / (s2 * total)).sum(axis=-1)
         return np.asarray(-0.5 * volume - 0.5 * np.maximum(self.squares[i] / s2[..., 0] - explained, 0.0))
 
+    def log_posterior(self, theta: Array) -> float:
+        """Return the log posterior of hyperparameters, with amplitudes and noises integrated out on a grid."""
+        heights = [self.log_evidence(i, _AMPLITUDES, _NOISES).ravel() for i in range(len(self.squares))]
+        prior = -0.5 * (((theta[:-1] - _LENGTH) ** 2).sum() + ((theta[-1] - _LENGTH) / 3) ** 2)
+        return float(sum(logsumexp(each) - np.log(each.size) for each in heights) + prior)
 
-@dataclass(frozen=True, eq=False)
-class _WeightPosterior:
-    """The posterior of weights, amplitudes and noises for one set of features, on a grid around the mode."""
-
-    spectrum: _Spectrum
-    grids: list[tuple[Array, Array, Array]]
-    sizes: Array
-
-    @classmethod
-    def of(cls, spectrum: _Spectrum, sizes: Array) -> _WeightPosterior:
-        """Return it in the units of states whose errors of M have these root mean squares."""
-        width, grids = min(0.3, 3 / np.sqrt(spectrum.count)), []
-        for i in range(len(sizes)):
-            coarse = spectrum.log_evidence(i, _AMPLITUDES, _NOISES)
+    @functools.cached_property
+    def _grids(self) -> list[tuple[Array, Array, Array]]:
+        """The log densities of amplitudes and noises on a grid around the mode, for each state."""
+        width, grids = min(0.3, 3 / np.sqrt(self.count)), []
+        for i in range(len(self.sizes)):
+            coarse = self.log_evidence(i, _AMPLITUDES, _NOISES)
             j, k = np.unravel_index(int(coarse.argmax()), coarse.shape)
             amplitudes = _AMPLITUDES[j] * np.logspace(-0.7, 0.7, 11)
             noises = _NOISES[k] * np.exp(np.linspace(-0.24 - width, 0.24 + width, 25))
-            grids.append((spectrum.log_evidence(i, amplitudes, noises), amplitudes, noises))
-        return cls(spectrum, grids, sizes)
-
-    @property
-    def size(self) -> int:
-        return len(self.spectrum.values)
+            grids.append((self.log_evidence(i, amplitudes, noises), amplitudes, noises))
+        return grids
 
     def draw(self, rng: np.random.Generator | None) -> tuple[Array, Array]:
         """Return weights ``(F, live)`` and noises ``(live,)`` in the units of states; the mode if there is no rng."""
         weights, noises = [], []
-        for i, (heights, amplitudes, sds) in enumerate(self.grids):
+        for i, (heights, amplitudes, sds) in enumerate(self._grids):
             if rng is None:
                 j, k = divmod(int(heights.argmax()), len(sds))
             else:
                 chances = np.exp(heights - heights.max()).ravel()
                 j, k = divmod(int(rng.choice(chances.size, p=chances / chances.sum())), len(sds))
-            precision = self.spectrum.values / sds[k] ** 2 + 1 / amplitudes[j] ** 2
-            coefficients = self.spectrum.projected[:, i] / sds[k] ** 2 / precision
+            precision = self.values / sds[k] ** 2 + 1 / amplitudes[j] ** 2
+            coefficients = self.projected[:, i] / sds[k] ** 2 / precision
             if rng is not None:
                 coefficients = coefficients + rng.standard_normal(len(coefficients)) / np.sqrt(precision)
-            weights.append(self.spectrum.vectors @ coefficients)
+            weights.append(self.vectors @ coefficients)
             noises.append(sds[k])
         return np.stack(weights, axis=1) * self.sizes, np.array(noises) * self.sizes
 
@@ -237,35 +229,9 @@ class _WeightPosterior:
 def _height(scaled: Scaled, theta: Array, live: Mask, rows: Array) -> float:
     """Return the log posterior of hyperparameters; minus infinity if their covariance is not positive definite."""
     try:
-        phi = scaled.features(theta)(scaled.Z)
-        return _height_of(_Spectrum.given(phi, scaled, live, rows), theta)
+        return _Spectrum.of(scaled.features(theta)(scaled.Z), scaled, live, rows).log_posterior(theta)
     except np.linalg.LinAlgError:
         return -np.inf
-
-
-def _height_of(spectrum: _Spectrum, theta: Array) -> float:
-    """Return the log posterior of hyperparameters, with amplitudes and noises integrated out on a grid."""
-    heights = [spectrum.log_evidence(i, _AMPLITUDES, _NOISES).ravel() for i in range(len(spectrum.squares))]
-    prior = -0.5 * (((theta[:-1] - _LENGTH) ** 2).sum() + ((theta[-1] - _LENGTH) / 3) ** 2)
-    return float(sum(logsumexp(each) - np.log(each.size) for each in heights) + prior)
-
-
-def learn_theta(scaled: Scaled, live: Mask, lags: int) -> Array:
-    """Return likely hyperparameters, by moves of one coordinate at a time."""
-    theta = scaled.usual_theta
-    rows = np.ones((len(scaled.Z), 1))
-    best = _height(scaled, theta, live, rows)
-    moved = [i for i in range(len(theta)) if lags or i != len(theta) - 2]
-    for step in (0.9, 0.5):
-        for i in moved:
-            for sign in (1, -1):
-                other = theta.copy()
-                other[i] += sign * step * (2 if i == len(theta) - 1 else 1)
-                height = _height(scaled, other, live, rows)
-                if height > best:
-                    theta, best = other, height
-                    break
-    return theta
 
 
 def fit_lagged(
@@ -276,24 +242,34 @@ def fit_lagged(
     live: Mask,
     *,
     products: bool = True,
+    usual: bool = False,
 ) -> LaggedFit:
-    """Return the posterior if records are the state; hyperparameters are learned if they are not given."""
+    """Return the posterior if records are the state; hyperparameters are learned if they are not given.
+
+    If the ``usual`` one is asked for, its hyperparameters are the most likely ones a priori and its noise is constant,
+    which costs little.
+    """
     Z, E, _ = history.along(records)
-    scaled = Scaled.of(Z, E, pairs, records[0].inputs.shape[1], products)
-    theta = learn_theta(scaled, live, history.structure.lags) if theta is None else theta
-    fit = _conditioned(history, scaled, theta, live, np.ones((len(Z), 1)), None)
+    scaled, rows = Scaled.of(Z, E, pairs, records[0].inputs.shape[1], products), np.ones((len(Z), 1))
+    if usual:
+        return _conditioned(history, scaled, scaled.usual_theta, live, rows, None)
+    if theta is None:
+        theta, best = scaled.usual_theta, _height(scaled, scaled.usual_theta, live, rows)
+        # Moves of one coordinate at a time; that of lags does nothing if there are none.
+        moved = [i for i in range(len(theta)) if history.structure.lags or i != len(theta) - 2]
+        for step, i in product((0.9, 0.5), moved):
+            for sign in (1, -1):
+                other = theta.copy()
+                other[i] += sign * step * (2 if i == len(theta) - 1 else 1)
+                height = _height(scaled, other, live, rows)
+                if height > best:
+                    theta, best = other, height
+                    break
+    fit = _conditioned(history, scaled, theta, live, rows, None)
     local = local_noise(scaled.Z[:, : pairs.shape[1]], fit.innovations[:, live])
     if local is None:
         return fit
-    rows = 1 / local(scaled.Z[:, : pairs.shape[1]])[:, None]
-    return _conditioned(history, scaled, theta, live, rows, local)
-
-
-def fit_usual(history: History, records: Sequence[Record], pairs: Array, live: Mask) -> LaggedFit:
-    """Return :func:`fit_lagged` with the usual hyperparameters and constant noise, which costs little."""
-    Z, E, _ = history.along(records)
-    scaled = Scaled.of(Z, E, pairs, records[0].inputs.shape[1])
-    return _conditioned(history, scaled, scaled.usual_theta, live, np.ones((len(Z), 1)), None)
+    return _conditioned(history, scaled, theta, live, 1 / local(scaled.Z[:, : pairs.shape[1]])[:, None], local)
 
 
 def _conditioned(
@@ -301,13 +277,12 @@ def _conditioned(
 ) -> LaggedFit:
     features = scaled.features(theta)
     phi = features(scaled.Z)
-    spectrum = _Spectrum.given(phi, scaled, live, rows)
-    posterior = _WeightPosterior.of(spectrum, scaled.sizes[live])
-    weights, noise = np.zeros((posterior.size, scaled.states)), np.zeros(scaled.states)
-    weights[:, live], noise[live] = posterior.draw(None)
+    spectrum = _Spectrum.of(phi, scaled, live, rows)
+    weights, noise = np.zeros((phi.shape[1], scaled.states)), np.zeros(scaled.states)
+    weights[:, live], noise[live] = spectrum.draw(None)
     innovations = _unit((scaled.E - phi @ weights) * rows, live)
     units = len(scaled.Z) * np.log(scaled.sizes[live]).sum() - live.sum() * np.log(rows).sum()
-    evidence = _height_of(spectrum, theta) - units
+    evidence = spectrum.log_posterior(theta) - units
     return LaggedFit(history, scaled, theta, live, features, weights, noise, evidence, innovations, local, rows)
 
 

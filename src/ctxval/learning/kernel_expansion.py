@@ -10,7 +10,7 @@ from itertools import groupby, product
 import numpy as np
 
 from ctxval._util.arrays import Array, Mask, Rows
-from ctxval.gp.cholesky import factorise, tenfold
+from ctxval.gp.kernels import factorise, tenfold
 from ctxval.learning.hyperparameters import Hyperparameters, ResidualKernel
 
 

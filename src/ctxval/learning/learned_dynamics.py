@@ -44,6 +44,11 @@ class LearnedDynamics(ShortRepr):
     _worst_cases: dict[int, WorstCase] = field(default_factory=dict, init=False)
     _draws: dict[tuple[int, bool], AnyDraws] = field(default_factory=dict, init=False)
 
+    @property
+    def executions(self) -> list[tuple[Array, Trajectory]]:
+        """The executed tasks with their trajectories."""
+        return list(zip(self.executed, self.trajectories_of_system, strict=True))
+
     @functools.cached_property
     def noisy(self) -> NoisyPosterior | None:
         """The dynamics with noise and histories, if the next state does not follow from state and input; else None."""
@@ -69,15 +74,15 @@ class LearnedDynamics(ShortRepr):
 
     def trajectories(self, points: Array) -> list[tuple[Array, Trajectory]]:
         """Return tasks ``(m, d)`` with their closed loops on the posterior mean, without those that diverge."""
-        planner, found = self.study.planner, list[tuple[Array, Trajectory]]()
+        planner, tasks = self.study.planner, list[tuple[Array, Trajectory]]()
         with single_threaded():
             for point in points:
-                for one in planner.plan(point[None]):
-                    (loops,) = planner.run(self.posterior.mean, [one])
-                    executed = Trajectory(one.promised.times, loops.states[0, 0], loops.inputs[0, 0])
+                for plan in planner.plan(point[None]):
+                    (loops,) = planner.run(self.posterior.mean, [plan])
+                    executed = Trajectory(plan.promised.times, loops.states[0, 0], loops.inputs[0, 0])
                     if executed.finite:
-                        found.append((point, executed))
-        return found
+                        tasks.append((point, executed))
+        return tasks
 
     @functools.cached_property
     def left_out_error(self) -> float:
@@ -116,29 +121,30 @@ class LearnedDynamics(ShortRepr):
         search, planner = self.study.search, self.study.planner
         with single_threaded():
             planned = planner.plan(points)
-            values = planner.distances(self._draws_for_all_tasks(draws, settled), planned, len(points))
+            functions = self._functions(draws)
+            key = functions, settled
+            if key not in self._draws:
+                # Their pivots lie on the loops of all tasks.
+                rng = self._rng(6)
+                some = search.pool[rng.permutation(len(search.pool))[:64]]
+                drawn = self.drawn_from.draw(search.relevant(self.drawn_from, some, rng), rng, functions)
+                if settled and isinstance(drawn, NoisyDraws):
+                    drawn = drawn.with_replicates(SETTLED, rng)
+                self._draws[key] = drawn
+            values = planner.distances(self._draws[key], planned, len(points))
             of_pool, loops = (planner.run(self.drawn_from.silent, plans) for plans in (search.plans, planned))
             beyond = np.full(len(points), np.inf)
             for plan, each in zip(planned, beyond_records(self.posterior, of_pool, loops), strict=True):
                 beyond[plan.rows] = each
         return values, beyond
 
-    def _draws_for_all_tasks(self, draws: int, settled: bool) -> AnyDraws:
-        """Return at least so many draws whose pivots lie on the loops of all tasks."""
-        functions = max(self.drawn_from.functions, -(-draws // self.drawn_from.groups))
-        key = functions, settled
-        if key not in self._draws:
-            search, rng = self.study.search, self._rng(6)
-            some = search.pool[rng.permutation(len(search.pool))[:64]]
-            drawn = self.drawn_from.draw(search.relevant(self.drawn_from, some, rng), rng, functions)
-            if settled and isinstance(drawn, NoisyDraws):
-                drawn = drawn.with_replicates(SETTLED, rng)
-            self._draws[key] = drawn
-        return self._draws[key]
+    def _functions(self, draws: int) -> int:
+        """Return the number of functions for each draw of the hyperparameters that gives at least so many draws."""
+        return max(self.drawn_from.functions, -(-draws // self.drawn_from.groups))
 
     def worst_case_of(self, draws: int) -> WorstCase:
         """Return the largest distance over all tasks, for each of at least so many draws of the dynamics."""
-        functions = max(self.drawn_from.functions, -(-draws // self.drawn_from.groups))
+        functions = self._functions(draws)
         if functions not in self._worst_cases:
             search, known, rng = self.study.search, self.executed, self._rng(1)
             of_mean = search.on_mean(self.drawn_from, self._on_pool[0], known, rng)
@@ -183,7 +189,7 @@ class LearnedDynamics(ShortRepr):
         ]
         if not gaps:
             return None
-        j, gap, value = max(gaps, key=lambda one: one[1])
+        j, gap, value = max(gaps, key=lambda each: each[1])
         task = self.coverage.task.copy()
         task[j] = value
         return j, gap, task
@@ -206,17 +212,16 @@ class LearnedDynamics(ShortRepr):
 
     def predict(self, point: Array) -> ExecutionPrediction | None:
         """Return the prediction of the execution of a task, a point ``(d,)``; None if it cannot be planned."""
-        rng, recorded = self._rng(2), self.study.recorded
+        rng, planner, is_noisy = self._rng(2), self.study.planner, self.noisy is not None and self.noisy.is_noisy
         with single_threaded():
-            if self.noisy is not None:
-                drawn = self.noisy.draw(np.empty((0, 0)), rng)
-                is_noisy = self.noisy.is_noisy
-                return predict_execution(self.study.planner, drawn, point, len(self.executed), recorded, noisy=is_noisy)
-            pairs = loop_pairs(self.study.planner, self.posterior, point[None])
-            if not len(pairs):
-                return None
-            draws = self.posterior.draw(pairs[rng.permutation(len(pairs))[:300]], rng)
-            return predict_execution(self.study.planner, draws, point, len(self.executed), recorded)
+            relevant = np.empty((0, 0))
+            if self.noisy is None:
+                pairs = loop_pairs(planner, self.posterior, point[None])
+                if not len(pairs):
+                    return None
+                relevant = pairs[rng.permutation(len(pairs))[:300]]
+            draws = self.drawn_from.draw(relevant, rng)
+            return predict_execution(planner, draws, point, len(self.executed), self.study.recorded, noisy=is_noisy)
 
     def _rng(self, purpose: int) -> np.random.Generator:
         return np.random.default_rng([self.study.seed, len(self.executed), purpose])

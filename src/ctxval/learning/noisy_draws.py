@@ -11,20 +11,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ctxval._util.arrays import Array, ArrayLike, Rows, single_threaded
+from ctxval._util.arrays import Array, ArrayLike, Rows
 from ctxval._util.representation import ShortRepr
-from ctxval.core.quantiles import QUANTILE
-from ctxval.errors import InputError
-from ctxval.learning.dynamics_posterior import DynamicsPosterior
 from ctxval.learning.features import Features, LinearFunction
-from ctxval.learning.histories import Record
 from ctxval.learning.innovations import DrawnWeights, InnovationsFit
 from ctxval.learning.residual_data import ResidualData
-from ctxval.learning.structures import ChosenStructure, fit_structures
-
-MATTERS = 0.01
-"""Standard deviation of the distance of a task over its executions, as a share of the largest distance, from which
-noise matters."""
 
 GROUPS, EACH = 5, 4  # draws of the hyperparameters, and of weights for each
 REPLICATES = 10  # sequences of noise of each draw in a search
@@ -99,13 +90,13 @@ class NoisyDraws(ShortRepr):
         ordered = np.sort(of_draws, axis=1)  # NaN, of a task that cannot be planned, is last in every sequence
         return np.asarray(ordered[:, int(np.ceil(self.quantile * (self.replicates - 1)))])
 
-    def runs(self, draws: Rows, replicates: Rows, start: Array) -> NoisyRuns:
-        """Return closed loops from initial states ``(..., n)``, of one draw and sequence of noise each, ``(...)``."""
-        return NoisyRuns(self, draws.ravel(), replicates.ravel(), start)
-
 
 class NoisyRuns:
     """The steps of closed loops that run together, one after the other; it remembers their histories.
+
+    Args:
+        of_draw, of_replicate: the draw and the sequence of noise of each loop, shape ``(...)``.
+        start: initial states, shape ``(..., n)``.
 
     Attributes:
         first: the first records, shape ``(..., n)``.
@@ -113,25 +104,22 @@ class NoisyRuns:
 
     def __init__(self, draws: NoisyDraws, of_draw: Rows, of_replicate: Rows, start: Array) -> None:
         self._draws, self._fit = draws, draws.fit
-        self._of_draw, self._of_replicate = of_draw, of_replicate
+        self._of_draw, self._of_replicate = of_draw.ravel(), of_replicate.ravel()
         flat = start.reshape(-1, start.shape[-1])
-        self.first = (flat + draws.start[of_draw, of_replicate]).reshape(start.shape)
+        self.first = (flat + draws.start[self._of_draw, self._of_replicate]).reshape(start.shape)
         self._memory = self._fit.history.start(self.first.reshape(flat.shape), flat, self._fit.scaled.inputs)
-        self._noise = np.concatenate([noise for _, _, noise in draws.groups])[of_draw]
+        self._noise = np.concatenate([noise for _, _, noise in draws.groups])[self._of_draw]
         self._step = 0
-
-    @functools.cached_property
-    def _parts(self) -> list[tuple[Features, Rows, list[tuple[Rows, LinearFunction]]]]:
-        """Of each group: the loops of its draws, and for each draw, which of these are its own, and its residual."""
-        parts, first = [], 0
-        for features, weights, _ in self._draws.groups:
+        # Of each group: the loops of its draws, and for each draw, which of these are its own, and its residual.
+        self._parts: list[tuple[Features, Rows, list[tuple[Rows, LinearFunction]]]] = []
+        first = 0
+        for features, weights, _ in draws.groups:
             loops = np.flatnonzero((self._of_draw >= first) & (self._of_draw < first + len(weights)))
-            of_draw = self._of_draw[loops] - first
-            each = [(np.flatnonzero(of_draw == k), features.function(own)) for k, own in enumerate(weights)]
+            draw = self._of_draw[loops] - first
+            each = [(np.flatnonzero(draw == k), features.function(own)) for k, own in enumerate(weights)]
             if len(loops):
-                parts.append((features, loops, each))
+                self._parts.append((features, loops, each))
             first += len(weights)
-        return parts
 
     def step(self, x: Array, u: Array) -> Array:
         """Return the next records, shapes ``(..., n), (..., m) -> (..., n)``."""
@@ -192,9 +180,10 @@ class NoisyPosterior(ShortRepr):
         """The usual number of weights that are drawn for each of them."""
         return EACH
 
-    def with_effect(self, effect: float) -> NoisyPosterior:
-        """Return it without noise if noise changes distances by less than a share of the largest one."""
-        return self if effect > MATTERS else replace(self, replicates=1)
+    @property
+    def deviations(self) -> Array:
+        """The learned standard deviations of the noise of each state in a step, shape ``(n,)``."""
+        return self.fit.noise
 
     @property
     def is_noisy(self) -> bool:
@@ -204,9 +193,8 @@ class NoisyPosterior(ShortRepr):
     @functools.cached_property
     def mean(self) -> NoisyDraws:
         """The most probable residual, as one draw."""
-        rng = np.random.default_rng([*self.seed, 1])
-        most = self.fit.most_probable
-        return self._with_noise(most, rng)
+        most = [(self.fit.features, self.fit.weights[None], self.fit.noise[None])]
+        return self._with_noise(most, np.random.default_rng([*self.seed, 1]))
 
     @functools.cached_property
     def searched(self) -> NoisyDraws:
@@ -236,41 +224,8 @@ class NoisyPosterior(ShortRepr):
         groups, each = GROUPS, EACH if functions is None else functions
         if hyperparameters is not None:
             groups, each = hyperparameters // 2, 2 * each  # a few for a screening
-        drawn = self.fit.draw(groups, each, rng)
-        return self._with_noise(drawn, rng)
+        return self._with_noise(self.fit.draw(groups, each, rng), rng)
 
     def _with_noise(self, drawn: Sequence[DrawnWeights], rng: np.random.Generator) -> NoisyDraws:
         draws = NoisyDraws.of(self.fit, drawn, self.scatter, self.horizon, self.replicates, self.quantile, rng)
         return draws if self.is_noisy else draws.without_noise()
-
-
-def learn_noisy(
-    posterior: DynamicsPosterior,
-    records: Sequence[Record],
-    pairs: Array,
-    chosen: ChosenStructure | None = None,
-    *,
-    replicates: int = REPLICATES,
-    quantile: float = QUANTILE,
-    seed: tuple[int, ...] = (0,),
-) -> tuple[NoisyPosterior, ChosenStructure] | None:
-    """Return the posterior of noisy dynamics, and its structure, which is learned unless it was chosen before.
-
-    Returns None if nothing can be learned: the recursions diverge, or numbers are too large.
-
-    Args:
-        posterior: that of dynamics without noise and history, for its model and its units.
-        pairs: states and inputs of closed loops on M, shape ``(V, n + m)``.
-    """
-    try:
-        with single_threaded(), np.errstate(all="ignore"):
-            fit, chosen = fit_structures(posterior.model, records, pairs, posterior.data.learned, chosen)
-    except (np.linalg.LinAlgError, InputError, ValueError):  # numbers that are not finite
-        return None
-    horizon = max(len(record.inputs) for record in records)
-    return NoisyPosterior(fit, posterior.data, scatter_of(records), horizon, replicates, quantile, seed), chosen
-
-
-def scatter_of(records: Sequence[Record]) -> Array:
-    """Return the standard deviations of first records from the initial states of their tasks, shape ``(n,)``."""
-    return np.asarray(np.sqrt(np.mean([(record.states[0] - record.start) ** 2 for record in records], axis=0)))

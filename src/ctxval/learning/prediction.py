@@ -44,7 +44,11 @@ class PredictedDistance:
         new = [row for row, key in enumerate(keys) if key not in self._known]
         if new:
             with single_threaded():
-                found = self._predicted(points[new])
+                if self.in_parallel and not all(map(self.planner.has, points[new])):
+                    found = np.concatenate(on_all_cores(self._predicted, list(points[new, None])), axis=1)
+                else:
+                    found = self._predicted(points[new])
+            found = np.where(np.isfinite(found).all(axis=0), found, np.nan)
             self._known.update(zip((keys[row] for row in new), map(tuple, found.T.tolist()), strict=True))
         distance, doubt = np.array([self._known[key] for key in keys]).reshape(-1, 2).T
         return distance, doubt
@@ -61,25 +65,18 @@ class PredictedDistance:
         return np.where(np.isfinite(found), found, np.nan)
 
     def _predicted(self, points: Array) -> Array:
-        """Return distances and doubts ``(2, m)``; both are NaN if one is not finite."""
-        if not self.in_parallel or all(map(self.planner.has, points)):
-            found = self._guarded(points)
-        else:
-            found = np.concatenate(on_all_cores(self._guarded, list(points[:, None])), axis=1)
-        return np.where(np.isfinite(found).all(axis=0), found, np.nan)
+        """Return distances and doubts ``(2, m)``; NaN for a task that cannot be planned or where a part fails."""
 
-    def _guarded(self, points: Array) -> Array:
-        return _nan_where_it_fails(lambda rows: self._closed_loops(points[rows]), len(points), 2)
+        def closed_loops(some: Array) -> Array:
+            found = np.full((2, len(some)), np.nan)
+            planned = self.planner.plan(some)
+            for plan, loops in zip(planned, self.planner.run(self.mean, planned), strict=True):
+                with np.errstate(all="ignore"):
+                    doubt = self.posterior.unfamiliarity(loops.states[0], loops.inputs[0])
+                found[:, plan.rows] = loops.distances[0], doubt
+            return found
 
-    def _closed_loops(self, points: Array) -> Array:
-        """Return distances and doubts ``(2, m)``; NaN for a task that cannot be planned."""
-        found = np.full((2, len(points)), np.nan)
-        planned = self.planner.plan(points)
-        for one, loops in zip(planned, self.planner.run(self.mean, planned), strict=True):
-            with np.errstate(all="ignore"):
-                doubt = self.posterior.unfamiliarity(loops.states[0], loops.inputs[0])
-            found[:, one.rows] = loops.distances[0], doubt
-        return found
+        return _nan_where_it_fails(lambda rows: closed_loops(points[rows]), len(points), 2)
 
 
 def _nan_where_it_fails(function: Callable[[Rows], Array], count: int, values: int) -> Array:

@@ -18,7 +18,7 @@ from ctxval.core.trajectory import Trajectory
 from ctxval.learning.dynamics_study import DynamicsStudy
 from ctxval.learning.histories import Record
 from ctxval.learning.learned_dynamics import LearnedDynamics
-from ctxval.learning.tolerance import PushedDynamics
+from ctxval.learning.tolerance import pushed
 
 NEGLIGIBLE = 0.01
 """Share of the threshold: what moves no distance by so much is no change."""
@@ -64,19 +64,21 @@ class RunStatistics:
         others = self.learned.study.without(self.learned, k)
         if others is None:
             return None
-        point, trajectory = self.learned.executed[k], self.learned.trajectories_of_system[k]
-        return self._of(others, trajectory, point, distance)
+        point, trajectory = self.learned.executions[k]
+        return self.later(trajectory, point, distance, others)
 
-    def later(self, trajectory: Trajectory, point: Array | None, distance: float | None) -> dict[str, RunStatistic]:
-        """Return the statistics of a later run, with the states that are learned.
+    def later(
+        self,
+        trajectory: Trajectory,
+        point: Array | None,
+        distance: float | None,
+        learned: LearnedDynamics | None = None,
+    ) -> dict[str, RunStatistic]:
+        """Return the statistics of a later run, with the states that are learned, beside what was learned.
 
         Without its task, ``(d,)``, and its distance, only those of the residuals are known.
         """
-        return self._of(self.learned, trajectory, point, distance)
-
-    def _of(
-        self, learned: LearnedDynamics, trajectory: Trajectory, point: Array | None, distance: float | None
-    ) -> dict[str, RunStatistic]:
+        learned = self.learned if learned is None else learned
         study, floors = learned.study, self.floors**2
         if point is None:
             inputs = trajectory.inputs if study.actuator is None else study.actuator.acting(trajectory.inputs)
@@ -87,7 +89,8 @@ class RunStatistics:
             residuals, doubt, noise, regressors = _residuals(learned, record)
         H = len(residuals)
         columns = np.concatenate([np.ones((H, 1)), regressors], axis=1)
-        basis = _orthonormal(columns)
+        U, S, _ = np.linalg.svd(columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-300), full_matrices=False)
+        basis = U[:, 1e-3 * S[0] < S]
         rank = basis.shape[1]
         linear = ((basis.T @ residuals) ** 2).sum(axis=0) / H
         whole = ((residuals**2).mean(axis=0) + floors) / (doubt + noise + floors)
@@ -138,15 +141,12 @@ def names(study: DynamicsStudy, states: int) -> Sequence[str]:
 def influences(learned: LearnedDynamics) -> Array:
     """Return what a unit of a constant residual of each state moves the distance of executed tasks by, ``(n, q)``."""
     posterior, planner = learned.posterior, learned.study.planner
-    data, mean, n = posterior.data, posterior.mean, len(posterior.data.sizes)
+    data, n = posterior.data, len(posterior.data.sizes)
     sizes = np.maximum(_PUSH * data.sizes, 1e-3 * data.steps)
     pushes = np.concatenate([np.zeros((1, n)), np.diag(sizes), -np.diag(sizes)])
-    pushed = PushedDynamics(
-        model=posterior.model, data=data, expansions=mean.expansions, limit=mean.limit, pushes=pushes,
-        widths=np.ones(n),
-    )  # fmt: skip
     with single_threaded():
-        distances = planner.distances(pushed, planner.plan(learned.executed), len(learned.executed))
+        planned = planner.plan(learned.executed)
+        distances = planner.distances(pushed(posterior.mean, pushes), planned, len(learned.executed))
     moved = np.abs(distances[1:] - distances[0]).reshape(2, n, -1).max(axis=0)
     return np.asarray(np.where(np.isfinite(moved), moved, 0.0) / sizes[:, None])
 
@@ -161,11 +161,9 @@ def _residuals(learned: LearnedDynamics, record: Record) -> tuple[Array, Array, 
         data, most = posterior.data, posterior.most_probable
         residuals = record.states[1:] - posterior.mean.alone(record.states[:-1], record.inputs)
         Z = data.standardised(record.states[:-1], record.inputs)
-        doubt, noise = np.zeros(len(data.sizes)), np.zeros(len(data.sizes))
-        sizes = data.sizes[data.learned]
-        doubt[data.learned] = most.variance(Z).mean() * most.squares / len(most.centres) * sizes**2
-        noise[data.learned] = (most.noise * sizes) ** 2
-        return residuals, doubt, noise, Z
+        doubt = np.zeros(len(data.sizes))
+        doubt[data.learned] = most.variance(Z).mean() * most.squares / len(most.centres) * data.sizes[data.learned] ** 2
+        return residuals, doubt, posterior.deviations**2, Z
     fit = noisy.fit
     Z, _, residuals = fit.history.along([record], fit.residual)
     z = (Z - fit.scaled.shift) / fit.scaled.scale
@@ -174,10 +172,3 @@ def _residuals(learned: LearnedDynamics, record: Record) -> tuple[Array, Array, 
     values = np.concatenate([features(z) @ weights for features, weights, _ in drawn])  # (k, H, n)
     relative = 1.0 if fit.local is None else float((fit.local(pairs) ** 2).mean())
     return residuals, values.var(axis=0).mean(axis=0), fit.noise**2 * relative, pairs
-
-
-def _orthonormal(columns: Array) -> Array:
-    """Return an orthonormal basis ``(H, r)`` of columns ``(H, k)``."""
-    columns = columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
-    U, S, _ = np.linalg.svd(columns, full_matrices=False)
-    return np.asarray(U[:, 1e-3 * S[0] < S])

@@ -7,20 +7,15 @@ recorded, beside what it misses in the other states, is chosen by how well the f
 
 from __future__ import annotations
 
-import contextlib
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from weakref import WeakKeyDictionary
 
 import numpy as np
 
 from ctxval._util.arrays import Array
-from ctxval.core.controller import Controller, Synthesizer
-from ctxval.core.distance import Distance
 from ctxval.core.kalman import Estimate, corrected, predicted, smoothed
-from ctxval.core.labels import labels_of
 from ctxval.core.model import Model
-from ctxval.core.outputs import Outputs
-from ctxval.core.task import Task
+from ctxval.core.system import Outputs
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.validation import Validation
 from ctxval.learning.vector import Executed
@@ -31,56 +26,6 @@ _SHARES = np.array([1.0, 1e-1, 1e-2, 1e-3, 1e-4])
 """What M misses in recorded directions, beside what it misses in all others, as shares of their steps."""
 
 _EXACT = 1e-6  # error of the recorded outputs, as a share of their smallest step: they are reproduced
-
-
-def with_states_of_model(validation: Validation) -> Validation:
-    """Return a validation whose trajectories have the states of M; itself if the states are recorded.
-
-    Its system is that of the given one, and cannot be executed.
-    """
-    outputs = validation.outputs
-    if outputs is None:
-        return validation
-    labels, space = replace(validation.labels, states=()), validation.space
-    with contextlib.suppress(Exception):  # the user's task, which is planned with its own errors elsewhere
-        n = validation.task(space.parameters(0.5 * (space.low + space.high))).initial_state.shape[-1]
-        names = [f"x{i}" for i in range(n)]
-        recorded = outputs.indices or []
-        for i, label in zip(recorded, labels_of(validation.names(len(recorded), 0)[0]), strict=True):
-            names[i] = label
-        labels = replace(labels, states=tuple(names))
-    return validation.with_parts(
-        synthesizer=_OutputSynthesizer(validation.synthesizer, outputs),
-        distance=_OutputDistance(validation.distance, outputs),
-        labels=labels,
-        outputs=None,
-    )
-
-
-@dataclass(frozen=True)
-class _OutputSynthesizer:
-    """Designs the user's controllers, which see the outputs alone."""
-
-    synthesizer: Synthesizer
-    outputs: Outputs
-
-    @property
-    def batched(self) -> bool:
-        return bool(getattr(self.synthesizer, "batched", False))
-
-    def design(self, task: Task, model: Model) -> Controller:
-        return self.outputs.seen_by(self.synthesizer.design(task, model))
-
-
-@dataclass(frozen=True)
-class _OutputDistance:
-    """The user's distance, which is about the outputs alone."""
-
-    distance: Distance
-    outputs: Outputs
-
-    def __call__(self, model_trajectory: Trajectory, system_trajectory: Trajectory, task: Task) -> Array:
-        return self.distance(self.outputs.of(model_trajectory), self.outputs.of(system_trajectory), task)
 
 
 class StateEstimates:

@@ -12,7 +12,7 @@ from ctxval._util.arrays import Array, Mask
 from ctxval.core.model import Model
 from ctxval.learning.dynamics_posterior import DynamicsPosterior
 from ctxval.learning.histories import History, Record, Structure
-from ctxval.learning.innovations import FilterFit, InnovationsFit, LaggedFit, fit_filter, fit_lagged, fit_usual
+from ctxval.learning.innovations import FilterFit, InnovationsFit, LaggedFit, fit_filter, fit_lagged
 
 STRUCTURES = (
     Structure(0), Structure(1), Structure(2), Structure(3), Structure(0, 3.0), Structure(0, 30.0), Structure(2, 30.0)
@@ -59,7 +59,7 @@ def fit_structures(
     of_states = fits[0]
     least = min(fit.share for fit in fits)
     exact = [fit for fit in fits if fit.share <= max(10 * least, 1e-6)] if least <= EXACT else []
-    best = min(exact, key=_lags) if exact else max(fits, key=_preference)
+    best = min(exact, key=lambda fit: fit.history.structure.lags) if exact else max(fits, key=_preference)
     if best.share > NOISY:
         for structure in STRUCTURES:
             if structure.ratio and structure.lags <= longest:
@@ -89,16 +89,12 @@ def predicted_by_history(
     shares = []
     for lags in (1, 2, 3):
         history = History(posterior.model, Structure(lags), np.eye(len(live)))
-        fit = fit_usual(history, records[:-1], pairs, live)
+        fit = fit_lagged(history, records[:-1], pairs, None, live, usual=True)
         with_history = share(history.along([last], fit.residual)[2])
         if with_history < min(_BETTER * without, _GOOD):
             return True
         shares += [with_history, fit.share]
     return min(without, *shares) > _UNEXPLAINED  # noise
-
-
-def _lags(fit: InnovationsFit) -> int:
-    return fit.history.structure.lags
 
 
 def _preference(fit: InnovationsFit) -> float:

@@ -7,14 +7,14 @@ no record is near. A contact that nobody met, or a load that nobody carried, is 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from ctxval._util.arrays import Array, ArrayLike, Rows, single_threaded
+from ctxval._util.arrays import Array, Rows, single_threaded
 from ctxval.learning.closed_loops import LoopPlanner
-from ctxval.learning.draws import DynamicsDraws
+from ctxval.learning.draws import DisturbedDynamics, DynamicsDraws
 from ctxval.learning.dynamics_posterior import DynamicsPosterior
 
 LEVELS = np.array([0.0, *2.0 ** np.arange(-4, 4)])  # sizes of pushes, as multiples of the largest recorded residual
@@ -51,47 +51,30 @@ def push_response(planner: LoopPlanner, posterior: DynamicsPosterior, tasks: Arr
         low, high = np.quantile(visited[np.isfinite(visited).all(axis=1)], [1e-3, 1 - 1e-3], axis=0)
         widths = np.maximum(high - low, 1e-9)
         recorded = cKDTree((data.pairs * data.scale + data.shift)[:, :n] / widths)
-        everywhere = PushedDynamics(
-            model=posterior.model,
-            data=data,
-            expansions=posterior.mean.expansions,
-            limit=posterior.mean.limit,
-            pushes=pushes.reshape(-1, n),
-            widths=widths,
-        )
         largest = []
-        for pushed in (everywhere, replace(everywhere, recorded=recorded)):
-            distances = np.nan_to_num(planner.distances(pushed, planned, len(tasks)), nan=0.0, posinf=np.inf)
+        for near in (None, recorded):
+            dynamics = pushed(posterior.mean, pushes.reshape(-1, n), widths, near)
+            distances = np.nan_to_num(planner.distances(dynamics, planned, len(tasks)), nan=0.0, posinf=np.inf)
             signed = distances.max(axis=1).reshape(pushes.shape[:3])
             largest.append(np.maximum.accumulate(signed.max(axis=1), axis=1))
     return PushResponse(states, residuals / planned[0].task.dt, *largest)
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class PushedDynamics(DynamicsDraws):
-    """One model, whose next state is moved by several pushes: models that are run together, as draws are.
+def pushed(
+    mean: DynamicsDraws, pushes: Array, widths: Array | float = 1.0, recorded: cKDTree | None = None
+) -> DisturbedDynamics:
+    """Return a model whose next state is moved by pushes ``(S, n)``, everywhere or only where no record is near.
 
-    Attributes:
-        pushes: what is added to the next state in each step, shape ``(S, n)``.
+    Args:
         widths: the ranges of the states on rollouts, shape ``(n,)``.
-        recorded: recorded states in units of these ranges; None if the pushes act everywhere.
+        recorded: recorded states in units of these ranges.
     """
 
-    pushes: Array
-    widths: Array
-    recorded: cKDTree | None = None
+    def added(ways: Rows, x: Array) -> Array:
+        if recorded is None:
+            return np.asarray(pushes[ways, None])
+        scaled = np.clip(np.nan_to_num(x / widths), -1e6, 1e6)
+        distance, _ = recorded.query(scaled, p=np.inf, distance_upper_bound=NEAR)
+        return np.asarray(pushes[ways, None] * np.isinf(distance)[..., None])
 
-    def __len__(self) -> int:
-        return len(self.pushes)
-
-    def __getitem__(self, rows: ArrayLike) -> PushedDynamics:
-        return replace(self, pushes=self.pushes[np.atleast_1d(rows)])
-
-    def step(self, x: Array, u: Array) -> Array:
-        """Return the next states, shapes ``(S, q, n), (S, q, m) -> (S, q, n)``."""
-        pushes = self.pushes[:, None]
-        if self.recorded is not None:
-            scaled = np.clip(np.nan_to_num(x / self.widths), -1e6, 1e6)
-            distance, _ = self.recorded.query(scaled, p=np.inf, distance_upper_bound=NEAR)
-            pushes = pushes * np.isinf(distance)[..., None]
-        return np.asarray(self.alone(x, u) + pushes)
+    return DisturbedDynamics(mean, np.arange(len(pushes)), added)

@@ -7,7 +7,6 @@ Gaussian processes that share a covariance, one for each entry, and values are c
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -17,17 +16,13 @@ from ctxval._util.progress import advance
 from ctxval.core.distance import ComposedDistance
 from ctxval.core.trajectory import Trajectory
 from ctxval.errors import ShapeError
-from ctxval.gp.cholesky import tenfold
-from ctxval.gp.kernels import Linear, Matern, Sum
+from ctxval.gp.kernels import Linear, Matern, Sum, tenfold
 from ctxval.gp.regression import MultiOutputProcess, log_likelihood_of_outputs, most_likely
 from ctxval.learning.closed_loops import LoopPlanner
 from ctxval.searches.base import Prediction
 
 Executed = Sequence[tuple[Array, Trajectory]]
 """Points of the unit cube ``(d,)`` with the system's trajectories there."""
-
-Compose = Callable[[Array], Array]
-"""Vectors ``(..., k)`` -> values ``(...)``."""
 
 _KERNEL = Sum(Matern(2.5, ard=True, length_scale=(0.05, 100.0), variance=(1e-6, 1e3)), Linear(variance=(1e-6, 1e3)))
 _NOISE = 1e-8  # noise variance relative to the vectors' mean square: it keeps the covariance matrix positive definite
@@ -49,58 +44,35 @@ class ErrorVectors:
 
     def of(self, executed: Executed) -> Array | None:
         """Return the vectors ``(n, k)`` of two executions or more; None if a vector cannot be computed."""
-        distance = self.validation.distance
+        distance, validation = self.validation.distance, self.validation
         if not isinstance(distance, ComposedDistance) or len(executed) < 2:
             return None
         try:
-            errors = np.array([self._of(distance, *pair) for pair in executed])
+            for point, trajectory in executed:
+                if trajectory in self._known:
+                    continue
+                if self._planner.batched:
+                    plan = validation.plan(validation.space.from_unit(point))
+                    advance()
+                    task, promised = plan.task, plan.model_trajectory
+                else:
+                    (planned,) = self._planner.plan(point[None])
+                    task, promised = planned.task, planned.promised
+                # Some distances change the arrays that they are given.
+                self._known[trajectory] = distance.error(promised.copy(), trajectory.copy(), task)
+            errors = np.array([self._known[trajectory] for _, trajectory in executed])
         except Exception:  # the user's own parts: a distance may reject even tasks that were executed
             return None
         return errors if errors.ndim == 2 and np.isfinite(errors).all() else None
 
-    def _of(self, distance: ComposedDistance, point: Array, trajectory: Trajectory) -> Array:
-        known = self._known.get(trajectory)
-        if known is None:
-            if self._planner.batched:
-                plan = self.validation.plan(self.validation.space.from_unit(point))
-                advance()
-                task, promised = plan.task, plan.model_trajectory
-            else:
-                (planned,) = self._planner.plan(point[None])
-                task, promised = planned.task, planned.promised
-            # Some distances change the arrays that they are given.
-            known = self._known[trajectory] = distance.error(promised.copy(), trajectory.copy(), task)
-        return known
 
-
-@dataclass(frozen=True, eq=False)
-class _ComposedPosterior:
-    """The posterior of the vectors, which are divided by their root mean square, and the values composed of it."""
-
-    vectors: MultiOutputProcess
-    scale: float
-    compose: Compose
-
-    def expected(self, points: Array) -> tuple[Array, Array]:
-        """Return the values composed of the expected vectors ``(m,)``, and the relative deviation of draws ``(m,)``."""
-        with single_threaded():
-            mean, variance = self.vectors.predict(points)
-        expected = np.asarray(self.compose(self.scale * mean))
-        # The draws are the same at all points and in all calls, so that the result is a function of the point.
-        draws = np.random.default_rng(0).normal(size=(32, 1, mean.shape[1]))
-        drawn = self.compose(self.scale * (mean + np.sqrt(variance)[:, None] * draws))
-        deviation = np.sqrt(((drawn - expected) ** 2).mean(axis=0))
-        return expected, deviation / np.maximum(np.abs(expected), 1e-12 * self.scale)
-
-    def left_out(self, rows: Rows) -> Array:
-        """Return the values composed of vectors that are predicted from all others, ``(len(rows),)``."""
-        return np.asarray(self.compose(self.scale * self.vectors.left_out(rows)))
-
-
-def predict_composed(points: Array, vectors: Array, compose: Compose) -> Prediction | None:
+def predict_composed(points: Array, vectors: Array, compose: Callable[[Array], Array]) -> Prediction | None:
     """Return a prediction of values from the vectors ``(n, k)`` of which they are composed at points ``(n, d)``.
 
     Returns None if fewer than two vectors are known, or if all of them are zero.
+
+    Args:
+        compose: vectors ``(..., k)`` -> values ``(...)``.
     """
     if points.ndim != 2 or vectors.ndim != 2 or len(points) != len(vectors):
         raise ShapeError(f"points must be (n, d) and vectors (n, k), got {points.shape}, {vectors.shape}.")
@@ -110,9 +82,24 @@ def predict_composed(points: Array, vectors: Array, compose: Compose) -> Predict
     with single_threaded():
         theta = _most_likely(points[-_LEARNED_FROM:], vectors[-_LEARNED_FROM:] / scale)
     noises = (_NOISE, *(_NOISE + more for more in tenfold(_NOISE)))  # points may be too similar for the first
-    known = _ComposedPosterior(MultiOutputProcess(_KERNEL, theta, points, vectors / scale, noises), scale, compose)
+    process = MultiOutputProcess(_KERNEL, theta, points, vectors / scale, noises)
+
+    def expected(at: Array) -> tuple[Array, Array]:
+        """Return the values composed of the expected vectors ``(m,)``, and the relative deviation of draws ``(m,)``."""
+        with single_threaded():
+            mean, variance = process.predict(at)
+        values = np.asarray(compose(scale * mean))
+        # The draws are the same at all points and in all calls, so that the result is a function of the point.
+        draws = np.random.default_rng(0).normal(size=(32, 1, mean.shape[1]))
+        drawn = compose(scale * (mean + np.sqrt(variance)[:, None] * draws))
+        deviation = np.sqrt(((drawn - values) ** 2).mean(axis=0))
+        return values, deviation / np.maximum(np.abs(values), 1e-12 * scale)
+
+    def left_out(rows: Rows) -> Array:
+        return np.asarray(compose(scale * process.left_out(rows)))
+
     # Many points may be predicted, because no controller is designed for them.
-    return Prediction(known.expected, known.left_out, 6000)
+    return Prediction(expected, left_out, 6000)
 
 
 def _most_likely(X: Array, Y: Array) -> Array:

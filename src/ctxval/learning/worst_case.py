@@ -10,14 +10,14 @@ rounds each draw tries the best tasks of the others.
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 
 from ctxval._util.arrays import Array, Mask, Rows, single_threaded
 from ctxval._util.boxes import latin_hypercube, moves_to_bounds, separated_rows
-from ctxval.gp.ascent import Ascent
+from ctxval.gp.ascent import ascend
 from ctxval.gp.global_search import search_globally
 from ctxval.learning.closed_loops import AnyDraws, LoopPlanner, PlannedTasks, loop_pairs
 from ctxval.learning.dynamics_posterior import DynamicsPosterior
@@ -27,8 +27,7 @@ AnyPosterior = DynamicsPosterior | NoisyPosterior
 """The posterior of dynamics without and with noise."""
 
 _DIVERGED = 1e30  # the distance of a loop that diverges, in searches: larger than all others, and finite
-_EVALUATIONS = (512, 2048, 4096, 6000, 6000, 6000, 12000)
-"""Number of tasks in the global search for 1, 2, ... task parameters; the last one holds for all higher numbers."""
+_EVALUATIONS = (512, 2048, 4096, 6000, 6000, 6000, 12000)  # tasks of a global search, for 1, 2, ... parameters
 _SHOWN = 16  # largest number of these tasks
 _NEARBY = 1e-3  # largest change of each coordinate to a task that is nearly the same
 _NEARER = 64  # how many times nearer tasks are that tell kinks of a distance from jumps, a power of 2
@@ -197,26 +196,14 @@ class WorstCaseSearch:
 
         Each of them has four times as many tasks as the usual one, and none of its tasks.
         """
-        distance, none = partial(self._distances, posterior.mean), np.empty((0, self.dimension))
+        distance, none = self._on_one(posterior.mean), np.empty((0, self.dimension))
         evaluations = 4 * self.settings.evaluations
         with single_threaded():
             found = [search_globally(distance, self.dimension, none, rng, evaluations=evaluations) for _ in range(2)]
         return np.array([one.values[0] for one in found]), np.array([one.points[0] for one in found])
 
-    @functools.cached_property
-    def unplanned(self) -> float:
-        """The share of the pool's tasks for which no controller can be designed, or on which M diverges."""
-        planned = sum(int(np.sum(one.promised.finite)) for one in self.plans)
-        return 1 - planned / len(self.pool)
-
     def on_mean(
-        self,
-        posterior: AnyPosterior,
-        of_pool: Array,
-        known: Array,
-        rng: np.random.Generator,
-        *,
-        globally: bool = True,
+        self, posterior: AnyPosterior, of_pool: Array, known: Array, rng: np.random.Generator, *, globally: bool = True
     ) -> WorstCase:
         """Return the largest distance on the posterior mean, as if it were the only draw.
 
@@ -230,16 +217,16 @@ class WorstCaseSearch:
             order = [row for row in np.argsort(-values, kind="stable") if left[row]] or [int(values.argmax())]
             elites = self.members[order[: self.settings.elites]]
             return self._of_mean(posterior, float(values[order[0]]), elites, len(values))
-        settings, distance = self.settings, partial(self._distances, posterior.searched)
+        settings, distance = self.settings, self._on_one(posterior.searched)
         best = self.pool[np.argsort(-_finite(of_pool), kind="stable")[: settings.elites * 4]]
         starts = np.concatenate([known, best])
         with single_threaded():
             if not globally and not is_kinked(self.planner.validation.distance):
                 budget = min(_SCREENED[1], settings.evaluations)
                 same = posterior.rough_mean is posterior.searched
-                rough = None if same else partial(self._distances, posterior.rough_mean)
-                ascent = Ascent(distance, np.zeros(self.dimension), np.ones(self.dimension), budget, rough)
-                points, values = ascent.run(starts[: len(known) + _SHOWN], rng)
+                rough = None if same else self._on_one(posterior.rough_mean)
+                box = np.zeros(self.dimension), np.ones(self.dimension)
+                points, values = ascend(distance, box, budget, starts[: len(known) + _SHOWN], rng, rough)
                 apart = separated_rows(points, _APART * np.sqrt(self.dimension), settings.elites)
                 return self._of_mean(posterior, float(values[0]), points[apart], len(points))
             evaluations = max(len(starts) + 50, settings.evaluations - len(self.pool))
@@ -250,11 +237,12 @@ class WorstCaseSearch:
     def _of_mean(self, posterior: AnyPosterior, highest: float, elites: Array, evaluations: int) -> WorstCase:
         if posterior.searched is not posterior.mean:
             with single_threaded():
-                values = self._distances(posterior.mean, elites)
+                values = self._distances(posterior.mean, elites)[0]
             order = np.argsort(-values, kind="stable")
             highest, elites, evaluations = float(values[order[0]]), elites[order], evaluations + len(elites)
-        maxima, loops = np.array([highest]), len(self.pool) + evaluations
-        return WorstCase(maxima, elites[:1], highest, elites, loops, 0.0, self.unplanned)
+        unplanned = 1 - sum(int(np.sum(plan.promised.finite)) for plan in self.plans) / len(self.pool)
+        loops = len(self.pool) + evaluations
+        return WorstCase(np.array([highest]), elites[:1], highest, elites, loops, 0.0, unplanned)
 
     def screened(
         self, posterior: AnyPosterior, of_mean: WorstCase, known: Array, rng: np.random.Generator
@@ -263,17 +251,12 @@ class WorstCaseSearch:
         with single_threaded():
             tasks = self._shared_tasks(of_mean, known, self.settings.shared // 4, rng)
             draws = posterior.draw(self.relevant(posterior, tasks, rng), rng, 1, _SCREENED[0])
-            values = _finite(self.planner.distances(draws, self.planner.plan(tasks), len(tasks)))
+            values = self._distances(draws, tasks)
         best = values.argmax(axis=1)
         return self._worst_case(of_mean, draws, values.max(axis=1), tasks[best], values.size, 0.0)
 
     def maxima(
-        self,
-        posterior: AnyPosterior,
-        of_mean: WorstCase,
-        known: Array,
-        rng: np.random.Generator,
-        functions: int | None = None,
+        self, posterior: AnyPosterior, of_mean: WorstCase, known: Array, rng: np.random.Generator, functions: int
     ) -> WorstCase:
         """Return the largest distances of so many functions for each draw of the posterior's hyperparameters."""
         with single_threaded():
@@ -312,9 +295,13 @@ class WorstCaseSearch:
             sharpness=sharpness,
         )
 
-    def _distances(self, mean: AnyDraws, points: Array) -> Array:
-        """Return the distances ``(m,)`` on one draw, such as the posterior mean, as a search takes them."""
-        return np.asarray(_finite(self.planner.distances(mean, self.planner.plan(points), len(points)))[0])
+    def _distances(self, draws: AnyDraws, points: Array) -> Array:
+        """Return the distances ``(S, q)`` of draws on points ``(q, d)``, as a search takes them."""
+        return _finite(self.planner.distances(draws, self.planner.plan(points), len(points)))
+
+    def _on_one(self, mean: AnyDraws) -> Callable[[Array], Array]:
+        """Return the distances ``(q,)`` on one draw, such as the posterior mean, as a function of points."""
+        return lambda points: np.asarray(self._distances(mean, points)[0])
 
     def _sharpness(self, mean: AnyDraws, elites: Array, rng: np.random.Generator) -> float:
         """Return the largest share that the distance of an elite loses at the median of the tasks next to it.
@@ -326,7 +313,7 @@ class WorstCaseSearch:
         near = _NEARBY / _NEARER if is_kinked(self.planner.validation.distance) else _NEARBY
         moves = rng.uniform(-near, near, (len(peaks), self.settings.nearby, self.dimension))
         tasks = np.concatenate([peaks[:, None], np.clip(peaks[:, None] + moves, 0, 1)], axis=1)
-        found = self._distances(mean, tasks.reshape(-1, self.dimension))
+        found = self._distances(mean, tasks.reshape(-1, self.dimension))[0]
         distances = np.maximum(found.reshape(tasks.shape[:2]), 0.0)
         peak, next_to_it = distances[:, 0], np.median(distances[:, 1:], axis=1)
         lost = np.divide(peak - next_to_it, peak, out=np.zeros(len(peak)), where=peak > 0)
@@ -351,7 +338,7 @@ class WorstCaseSearch:
                 # Each draw tries the best tasks of all others.
                 ordered = points[np.argsort(-best, kind="stable")]
                 shown = ordered[separated_rows(ordered, 0.02 * np.sqrt(self.dimension), _SHOWN)]
-                found = _finite(self.planner.distances(draws, self.planner.plan(shown), len(shown)))
+                found = self._distances(draws, shown)
                 points, best = _better(points, best, np.broadcast_to(shown, (len(best), *shown.shape)), found)
                 loops += found.size
             some, at, highest = draws[searched], points[searched], best[searched]
@@ -378,7 +365,7 @@ class WorstCaseSearch:
         """
         values = np.full((len(draws), len(tasks)), -np.inf)
         first = np.unique(np.linspace(0, len(draws) - 1, _FIRST).astype(int))
-        values[first] = _finite(self.planner.distances(draws[first], self.planner.plan(tasks), len(tasks)))
+        values[first] = self._distances(draws[first], tasks)
         others = np.setdiff1d(np.arange(len(draws)), first)
         if not len(others):
             return values, values.size
@@ -388,9 +375,8 @@ class WorstCaseSearch:
             may_be_worst = below.mean(axis=0) - 5 * below.std(axis=0) <= 0.01 * np.median(np.abs(highest))
         may_be_worst[np.argsort(-values[first], axis=1, kind="stable")[:, :4]] = True
         chosen = np.flatnonzero(may_be_worst)
-        found = self.planner.distances(draws[others], self.planner.plan(tasks[chosen]), len(chosen))
-        values[np.ix_(others, chosen)] = _finite(found)
-        return values, len(first) * len(tasks) + found.size
+        values[np.ix_(others, chosen)] = self._distances(draws[others], tasks[chosen])
+        return values, len(first) * len(tasks) + len(others) * len(chosen)
 
     def _moves(self, points: Array, others: Array, share: float, rng: np.random.Generator) -> Array:
         """Return the moves of each point: to bounds, 2 d of them, and at random around it and around another one."""

@@ -11,17 +11,14 @@ from typing import Any
 import numpy as np
 
 from ctxval._util.arrays import Array
-from ctxval._util.files import MADE_BY, read_bytes, written_whole
-from ctxval._util.npz import Archive
+from ctxval._util.files import MADE_BY, Archive, read_bytes, written_whole
 from ctxval._util.registry import part
 from ctxval.core.model import Model
 from ctxval.core.trajectory import Transitions
 from ctxval.errors import InputError
 from ctxval.models.corrected import Corrected, Correction, Refined
-from ctxval.models.gaussian_process import GaussianProcessModel, SquaredExponential
 from ctxval.models.linear import Linear
-from ctxval.models.neural_network import FeedforwardReLU
-from ctxval.models.scaling import IncrementScaling
+from ctxval.models.scaling import FeedforwardReLU, GaussianProcessModel, IncrementScaling, SquaredExponential
 
 _FORMAT = "ctxval model"
 _SCALING = ("shift_in", "scale_in", "shift_out", "scale_out")

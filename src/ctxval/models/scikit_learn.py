@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -13,9 +14,9 @@ from ctxval._util.representation import ShortRepr
 from ctxval.core.model import central_differences, paired
 from ctxval.core.trajectory import Transitions
 from ctxval.errors import InputError, ShapeError
-from ctxval.models.regressors import smooth_map
+from ctxval.models import smooth_maps as maps
 from ctxval.models.scaling import require_finite
-from ctxval.models.smooth_maps import SmoothMap
+from ctxval.models.smooth_maps import Kernel, Slope, Slopes, SmoothMap
 
 
 @part()
@@ -41,7 +42,17 @@ class ScikitLearn(ShortRepr):
         if features is None or not callable(getattr(regressor, "predict", None)):
             raise InputError(f"the regressor must be fitted and have predict and n_features_in_, got {regressor!r}.")
         self.features = int(features)
-        self._known = _predicts_the_same(regressor, smooth_map(regressor), self.features)
+        # Whether the formula gives what the regressor predicts, at some points: another release of scikit-learn may
+        # give the numbers another meaning.
+        self._known = False
+        if (formula := smooth_map(regressor)) is not None:
+            rows = np.random.default_rng(0).normal(size=(8, self.features))
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # of feature names
+                predicted = _as_columns(regressor.predict(rows))
+            values, largest = formula.value(rows), float(np.abs(predicted).max())
+            same = values.shape == predicted.shape
+            self._known = same and np.allclose(values, predicted, rtol=1e-4, atol=1e-4 * largest)
 
     @classmethod
     def fit(cls, regressor: Any, data: Transitions, *, increments: bool = True) -> ScikitLearn:
@@ -104,17 +115,161 @@ def _as_columns(output: Any) -> Array:
     return values[:, None] if values.ndim == 1 else values
 
 
-def _predicts_the_same(regressor: Any, formula: SmoothMap | None, features: int) -> bool:
-    """Return whether a formula gives what the regressor predicts, at some points.
+_LINEAR = {
+    *("ARDRegression", "BayesianRidge", "ElasticNet", "ElasticNetCV", "HuberRegressor", "Lars", "LarsCV", "Lasso"),
+    *("LassoCV", "LassoLars", "LassoLarsCV", "LassoLarsIC", "LinearRegression", "LinearSVR", "MultiTaskElasticNet"),
+    *("MultiTaskElasticNetCV", "MultiTaskLasso", "MultiTaskLassoCV", "OrthogonalMatchingPursuit"),
+    *("OrthogonalMatchingPursuitCV", "QuantileRegressor", "Ridge", "RidgeCV", "SGDRegressor", "TheilSenRegressor"),
+}
+"""The regressors whose prediction is ``z coef_ + intercept_``."""
 
-    It guards against releases of scikit-learn with another meaning of the numbers.
+
+def smooth_map(regressor: Any) -> SmoothMap | None:
+    """Return the formula of a fitted regressor; None if it is not known, or not differentiable.
+
+    The formula refers to the numbers of the regressor and does not copy them. Classes that users derive from those of
+    scikit-learn may predict otherwise, so only the classes themselves are known.
     """
-    if formula is None:
-        return False
-    rows = np.random.default_rng(0).normal(size=(8, features))
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of feature names
-        predicted = _as_columns(regressor.predict(rows))
-    values = formula.value(rows)
-    scale = float(np.abs(predicted).max())
-    return values.shape == predicted.shape and np.allclose(values, predicted, rtol=1e-4, atol=1e-4 * scale)
+    match _name(regressor):
+        case name if name in _LINEAR:
+            coefficients = np.asarray(regressor.coef_, dtype=np.float64)
+            constants = np.atleast_1d(np.asarray(regressor.intercept_, dtype=np.float64))
+            return maps.affine(np.atleast_2d(coefficients).T, constants)
+        case "MLPRegressor":
+            if regressor.activation not in maps.ACTIVATIONS or regressor.out_activation_ != "identity":
+                return None
+            return maps.network(regressor.coefs_, regressor.intercepts_, regressor.activation)
+        case "GaussianProcessRegressor":
+            centres = getattr(regressor, "X_train_", None)
+            kernel = None if centres is None else _covariance(regressor.kernel_)
+            if kernel is None or not isinstance(centres, np.ndarray) or centres.ndim != 2:
+                return None
+            process = maps.kernel_sum(kernel, centres, _columns(regressor.alpha_))
+            return maps.chain([process, maps.scaled(regressor._y_train_std, regressor._y_train_mean)])
+        case "KernelRidge" if isinstance(regressor.X_fit_, np.ndarray):
+            kernel = _ridge_kernel(regressor, regressor.X_fit_.shape[1])
+            return kernel and maps.kernel_sum(kernel, regressor.X_fit_, _columns(regressor.dual_coef_))
+        case "MultiOutputRegressor":
+            return _composed(maps.side_by_side, [smooth_map(estimator) for estimator in regressor.estimators_])
+        case "Pipeline":
+            *before, (_, last) = regressor.steps
+            used = [part for _, part in before if part is not None and part != "passthrough"]
+            return _composed(maps.chain, [*map(_transformer, used), smooth_map(last)])
+        case "TransformedTargetRegressor":
+            forward = _scaler(regressor.transformer_)
+            inverse = None if forward is None else maps.scaled(1.0 / forward[0], -forward[1] / forward[0])
+            return _composed(maps.chain, [smooth_map(regressor.regressor_), inverse])
+    return None
+
+
+def _name(part: Any) -> str:
+    """Return the name of a class of scikit-learn; nothing for all other classes."""
+    kind = type(part)
+    return kind.__name__ if kind.__module__.startswith("sklearn.") else ""
+
+
+def _composed(
+    compose: Callable[[Sequence[SmoothMap]], SmoothMap], parts: Sequence[SmoothMap | None]
+) -> SmoothMap | None:
+    known = [part for part in parts if part is not None]
+    return compose(known) if len(known) == len(parts) else None
+
+
+def _columns(weights: Array) -> Array:
+    return weights[:, None] if weights.ndim == 1 else weights
+
+
+# Transformers of features and targets
+
+
+def _transformer(part: Any) -> SmoothMap | None:
+    if _name(part) == "PolynomialFeatures":
+        return maps.monomials(part.powers_)
+    if _name(part) == "PCA" and not part.whiten:
+        return maps.affine(part.components_.T, -part.mean_ @ part.components_.T)
+    scaler = _scaler(part)
+    return None if scaler is None else maps.scaled(*scaler)
+
+
+def _scaler(part: Any) -> tuple[Array | float, Array | float] | None:
+    """Return the scale and the shift by which a scaler transforms columns; None if it is not known."""
+
+    def centred(centre: Array | None, scale: Array | None) -> tuple[Array | float, Array | float]:
+        factor = 1.0 if scale is None else 1.0 / scale
+        return factor, 0.0 if centre is None else -centre * factor
+
+    match _name(part):
+        case "MinMaxScaler" if not part.clip:
+            return part.scale_, part.min_
+        case "StandardScaler":
+            return centred(part.mean_ if part.with_mean else None, part.scale_)
+        case "RobustScaler":
+            centre, scale = part.with_centering, part.with_scaling
+            return centred(part.center_ if centre else None, part.scale_ if scale else None)
+        case "MaxAbsScaler" if not getattr(part, "clip", False):
+            return centred(None, part.scale_)
+        case "FunctionTransformer" if part.func is None and part.inverse_func is None:
+            return 1.0, 0.0
+    return None
+
+
+# Kernels between new points and known ones
+
+
+def _ridge_kernel(regressor: Any, features: int) -> Kernel | None:
+    gamma = 1.0 / features if regressor.gamma is None else float(regressor.gamma)
+    shift, degree = regressor.coef0, regressor.degree
+    match regressor.kernel:
+        case "rbf":
+            return maps.matern(float((2 * gamma) ** -0.5), np.inf)
+        case "linear":
+            return _of_products(lambda p: p, lambda p: 1.0)
+        case "poly" | "polynomial":
+            return _of_products(
+                lambda p: (gamma * p + shift) ** degree, lambda p: gamma * degree * (gamma * p + shift) ** (degree - 1)
+            )
+    return None
+
+
+def _covariance(kernel: Any) -> Kernel | None:
+    match _name(kernel):
+        case "ConstantKernel":
+            value = float(kernel.constant_value)
+            return lambda Z, X: (value, list)
+        case "WhiteKernel":
+            return lambda Z, X: (0.0, list)  # its noise is not shared with a new point
+        case "RBF":
+            return maps.matern(kernel.length_scale, np.inf)
+        case "Matern" if kernel.nu in (0.5, 1.5, 2.5, np.inf):
+            return maps.matern(kernel.length_scale, kernel.nu)
+        case "DotProduct":
+            offset = float(kernel.sigma_0) ** 2
+            return _of_products(lambda p: p + offset, lambda p: 1.0)
+        case "Sum" | "Product" as name:
+            first, second = _covariance(kernel.k1), _covariance(kernel.k2)
+            return first and second and _joined(first, second, is_sum=name == "Sum")
+    return None
+
+
+def _of_products(function: Callable[[Array], Array], slope: Callable[[Array], Any]) -> Kernel:
+    """Return a function of the inner product x'z as a kernel, from the function and its derivative."""
+
+    def kernel(Z: Array, X: Array) -> tuple[Array, Slopes]:
+        products = Z @ X.T
+        return function(products), lambda: [(slope(products), 0.0, 1.0)]
+
+    return kernel
+
+
+def _times(slopes: list[Slope], other: Array | float) -> list[Slope]:
+    return [(factor * other, pull, weight) for factor, pull, weight in slopes]
+
+
+def _joined(first: Kernel, second: Kernel, *, is_sum: bool) -> Kernel:
+    def kernel(Z: Array, X: Array) -> tuple[Array | float, Slopes]:
+        (K, slopes), (L, other_slopes) = first(Z, X), second(Z, X)
+        if is_sum:
+            return K + L, lambda: [*slopes(), *other_slopes()]
+        return K * L, lambda: [*_times(slopes(), L), *_times(other_slopes(), K)]
+
+    return kernel

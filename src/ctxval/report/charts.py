@@ -209,30 +209,26 @@ class Chart(ShortRepr):
 
     def render(self, *below: Markup, with_legend: bool = True) -> Markup:
         """Return the chart as a figure with a legend and its title; elements ``below`` follow the legend."""
-        inside = element("title", self.title), self._frame(), element("g", *self._parts)
-        shape = {"viewBox": f"0 0 {self.width} {self.height}", "role": "img", "class_": "chart", "width": self.width}
-        names = _legend(self._legend) if with_legend else None
-        return element("figure", element("svg", *inside, **shape), names, *below, element("figcaption", self.title))
-
-    def _frame(self) -> Markup:
         left, right, top, bottom = _LEFT, self.width - _RIGHT, _TOP, self.height - _BOTTOM
-        parts = []
+        upright = f"translate(13 {0.5 * (top + bottom)}) rotate(-90)"
+        frame = []
         for value in self.x.ticks():
             at = round(float(self.across(value)), 1)
-            parts.append(element("path", d=f"M{at},{bottom}v4", class_="axis"))
-            parts.append(element("text", number(value), x=at, y=bottom + 18, class_="tick across"))
+            frame.append(element("path", d=f"M{at},{bottom}v4", class_="axis"))
+            frame.append(element("text", number(value), x=at, y=bottom + 18, class_="tick across"))
         for value in self.y.ticks():
             at = round(float(self.up(value)), 1)
-            parts.append(element("path", d=f"M{left},{at}H{right}", class_="grid"))
-            parts.append(element("text", number(value), x=left - 6, y=at + 4, class_="tick up"))
-        upright = f"translate(13 {0.5 * (top + bottom)}) rotate(-90)"
-        return element(
-            "g",
-            *parts,
+            frame.append(element("path", d=f"M{left},{at}H{right}", class_="grid"))
+            frame.append(element("text", number(value), x=left - 6, y=at + 4, class_="tick up"))
+        frame += [
             element("path", d=f"M{left},{top}V{bottom}H{right}", class_="axis"),
             element("text", self.x.label, x=0.5 * (left + right), y=self.height - 8, class_="axis-label"),
             element("text", self.y.label, transform=upright, class_="axis-label"),
-        )
+        ]
+        inside = element("title", self.title), element("g", *frame), element("g", *self._parts)
+        shape = {"viewBox": f"0 0 {self.width} {self.height}", "role": "img", "class_": "chart", "width": self.width}
+        names = _legend(self._legend) if with_legend else None
+        return element("figure", element("svg", *inside, **shape), names, *below, element("figcaption", self.title))
 
 
 def small_charts(charts: Sequence[Chart]) -> Markup:

@@ -16,7 +16,7 @@ from ctxval.campaign.campaign import Campaign
 from ctxval.campaign.dynamics import NEAR, CampaignDynamics
 from ctxval.campaign.envelope import has_tests
 from ctxval.campaign.interval_search import with_next_task
-from ctxval.campaign.provenance import provenance_of_store
+from ctxval.campaign.storage.other_stores import provenance_of_store
 from ctxval.campaign.storage.store import CAUSE, Store
 from ctxval.certificates import Certificate, CertificateOptions, Provenance, Verdict, judge
 from ctxval.certificates.envelope import Envelope
@@ -24,7 +24,7 @@ from ctxval.core.labels import Labels, labels_of
 from ctxval.core.space import TaskSpace
 from ctxval.core.task_suite import TASK, TaskSuite
 from ctxval.core.trajectory import Trajectory
-from ctxval.core.trial import Change, Trial, designs_sentence
+from ctxval.core.trial import Trial, designs_sentence
 from ctxval.core.validation import Validation
 from ctxval.errors import InputError
 from ctxval.learning.replays import Replay, replay_executed
@@ -58,8 +58,6 @@ class ReportContext(ShortRepr):
         dynamics: what the campaign has learned; None if the experiment is not loaded.
         missing: why the experiment is not loaded, as a sentence; empty if it is.
         budget: the budget of the campaign; None if it is not known.
-        settings, description: what the store knows of the experiment; the settings make it again.
-        changes: the later changes of the store.
         provenance: what a certificate knows besides the trials.
         envelope: the tasks on which the threshold is kept; None if it was not computed.
     """
@@ -74,11 +72,24 @@ class ReportContext(ShortRepr):
     missing: str = ""
     labels: Labels = field(default_factory=Labels)
     budget: int | None = None
-    settings: Mapping[str, Any] = field(default_factory=dict)
-    description: Mapping[str, Any] = field(default_factory=dict)
-    changes: tuple[Change, ...] = ()
     provenance: Provenance = field(default_factory=Provenance)
     envelope: Envelope | None = None
+
+    @functools.cached_property
+    def settings(self) -> Mapping[str, Any]:
+        """The settings in the store, which make the experiment again."""
+        return self.store.settings()
+
+    @functools.cached_property
+    def description(self) -> Mapping[str, Any]:
+        """What the store knows of the experiment."""
+        return self.store.description()
+
+    @property
+    def parts(self) -> Mapping[str, Any]:
+        """The descriptions of the parts of the validation by name; a store may hold anything instead."""
+        parts = self.description.get("validation")
+        return parts if isinstance(parts, Mapping) else {}
 
     @functools.cached_property
     def cause(self) -> str:
@@ -156,6 +167,8 @@ class ReportContext(ShortRepr):
     def _unit_points(self, trials: Sequence[Trial]) -> Array:
         return np.array([trial.unit_point for trial in trials]).reshape(-1, self.space.dimension)
 
+    # The verdict
+
     @property
     def threshold(self) -> float | None:
         """The threshold of the verdict; None if there is none."""
@@ -172,15 +185,14 @@ class ReportContext(ShortRepr):
         return None if self.verdict is None else self.verdict.bound
 
     @property
+    def limits(self) -> list[float]:
+        """The threshold and the bound, as far as there are any."""
+        return [limit for limit in (self.threshold, self.bound) if limit is not None]
+
+    @property
     def designs(self) -> str | None:
         """Which controllers did not converge or jump, as a clause; None if that is not known of any."""
         return designs_sentence(self.trials)
-
-    @property
-    def parts(self) -> Mapping[str, Any]:
-        """The descriptions of the parts of the validation by name; a store may hold anything instead."""
-        parts = self.description.get("validation")
-        return parts if isinstance(parts, Mapping) else {}
 
     # Trajectories
 
@@ -267,13 +279,11 @@ def context_of_campaign(
     Its verdict is ``verdict``, if that was computed before, or else that against ``threshold`` by ``certificate``. If
     it is falsified and the tests of an envelope were executed, the envelope is ``envelope`` or computed.
     """
-    known = campaign.provenance
+    known, options = campaign.provenance, certificate or CertificateOptions()
     if verdict is None and threshold is not None:
         # A report only reads: it does not record that the threshold was stated.
-        options = certificate or CertificateOptions()
         with stage("certifying"):
             verdict = with_next_task(judge(campaign.trials, threshold, options, known), campaign.recorder, options)
-    options = certificate or CertificateOptions()
     falsified = verdict is not None and verdict.answer == "falsified"
     if envelope is None and verdict is not None and falsified and has_tests(campaign.recorder, options):
         envelope = campaign.envelope(verdict.threshold, options.confidence, certificate=options)
@@ -287,9 +297,6 @@ def context_of_campaign(
         campaign.recorder.dynamics,
         labels=campaign.validation.labels,
         budget=budget,
-        settings=campaign.store.settings(),
-        description=campaign.store.description(),
-        changes=tuple(campaign.store.history()),
         provenance=known,
         envelope=envelope,
     )
@@ -300,30 +307,29 @@ def context_of_store(
     threshold: float | None = None,
     *,
     certificate: CertificateOptions | None = None,
-    missing: str = "",
+    missing: str = "the experiment is not loaded",
     labels: Labels | None = None,
+    budget: int | None = None,
 ) -> ReportContext:
     """Return what a report of a store is made from, if its experiment is not loaded. No code is imported or run.
 
     Without ``threshold`` there is no verdict; ``missing`` says why the experiment is not loaded, as a sentence.
     """
     with store.snapshot():
-        description, changes, trials = store.description(), store.history(), store.trials()
-    provenance = provenance_of_store(store)
-    space = provenance.space
+        name, trials = store.description().get("name"), tuple(store.trials())
+    known = provenance_of_store(store)
+    space = known.space
     if space is None or any(len(trial.unit_point) != space.dimension for trial in trials):
         raise InputError(f"{store.name} has no readable task space, so there is nothing to report.")
-    name = description.get("name")
+    verdict = None if threshold is None else judge(trials, threshold, certificate, known)
     return ReportContext(
         name if isinstance(name, str) else "",
         space,
-        tuple(trials),
+        trials,
         store,
-        None if threshold is None else judge(trials, threshold, certificate, provenance),
-        missing=missing or "the experiment is not loaded",
+        verdict,
+        missing=missing,
         labels=labels or Labels(),
-        settings=store.settings(),
-        description=description,
-        changes=tuple(changes),
-        provenance=provenance,
+        budget=budget,
+        provenance=known,
     )

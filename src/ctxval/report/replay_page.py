@@ -23,9 +23,10 @@ _CHARTED = 12  # largest number of states and inputs with charts of their own
 
 def replay_page(report: ReplayReport, *, name: str = "", units: str = "") -> str:
     """Return what recordings show of a model as one HTML page, which opens no connection."""
-    tasks = report.tasks
+    tasks, none = report.tasks, paragraph("The model predicts these recordings, and nothing is unusual.")
+    follows = bullets(f"{sentence(words)}." for words in report.insights) if report.insights else none
     sections: list[tuple[str, Callable[[], object]]] = [
-        ("What follows", lambda: _insights(report)),
+        ("What follows", lambda: follows),
         ("Error of the prediction", lambda: _errors(report)),
         ("Where the error is large", lambda: _regions(report)),
         ("What a better model could explain", lambda: _residuals(report)),
@@ -40,12 +41,6 @@ def replay_page(report: ReplayReport, *, name: str = "", units: str = "") -> str
 def write_replay_page(report: ReplayReport, path: str | Path, *, name: str = "", units: str = "") -> Path:
     """Write :func:`replay_page` as one file, and return its path."""
     return write_text(path, replay_page(report, name=name, units=units))
-
-
-def _insights(report: ReplayReport) -> Markup:
-    if not report.insights:
-        return paragraph("The model predicts these recordings, and nothing is unusual.")
-    return bullets(f"{sentence(words)}." for words in report.insights)
 
 
 def _errors(report: ReplayReport) -> Markup:

@@ -21,8 +21,7 @@ from ctxval._util.boxes import Box
 from ctxval._util.checked import NonNegativeFloat, PositiveInt
 from ctxval._util.registry import part
 from ctxval.gp.acquisition import Acquisition, LogExpectedImprovement, UpperConfidenceBound, maximise
-from ctxval.gp.subset import kept_rows
-from ctxval.gp.surrogate import Learned, learn
+from ctxval.gp.surrogate import Learned, kept_rows, learn
 from ctxval.searches.base import Note, SequentialSearch, best_first
 
 _WORTH = 0.005

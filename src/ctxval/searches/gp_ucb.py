@@ -1,17 +1,16 @@
-"""GP-UCB, the search of the paper."""
+"""The paper's searches: GP-UCB, and two random baselines (Sec. IV-A)."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from ctxval._util.arrays import Array, single_threaded
-from ctxval._util.checked import NonNegativeFloat, PositiveFloat, PositiveInt
+from ctxval._util.checked import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 from ctxval._util.registry import part
 from ctxval.gp.acquisition import Uncertainty, UpperConfidenceBound, maximise
 from ctxval.gp.kernels import Kernel, Matern
 from ctxval.gp.regression import NOISE, Mean
-from ctxval.gp.subset import kept_rows
-from ctxval.gp.surrogate import Surrogate, fit_surrogate
+from ctxval.gp.surrogate import Surrogate, fit_surrogate, kept_rows
 from ctxval.searches.base import SequentialSearch, best_first
 
 
@@ -66,3 +65,25 @@ class GPUCB(SequentialSearch):
         points, values = self.points, self.values
         rows = kept_rows(points, values, 500)
         return fit_surrogate(points[rows], values[rows], self.kernel, noise=self.noise, prior_mean=self.prior_mean)
+
+
+@part("random")
+class Random(SequentialSearch):
+    """Independent uniform points: scenario optimisation, SC. The estimate of d* is the largest distance."""
+
+    iid = True
+
+    def propose(self, rng: np.random.Generator) -> Array:
+        return rng.random(self.dimension)
+
+
+@part("sampling-discarding")
+class SamplingDiscarding(Random):
+    """Independent uniform points; the estimate of d* leaves out the largest distances: sampling and discarding, SD.
+
+    Args:
+        discard: number of the largest distances that the estimate of d* leaves out, the paper's k.
+    """
+
+    def __init__(self, discard: NonNegativeInt = 5) -> None:
+        self.discard = discard

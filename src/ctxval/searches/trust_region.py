@@ -16,6 +16,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 from scipy.spatial.distance import cdist
@@ -23,11 +24,11 @@ from scipy.spatial.distance import cdist
 from ctxval._util.arrays import Array, Mask, single_threaded
 from ctxval._util.boxes import Box
 from ctxval._util.checked import NonNegativeFloat, PositiveInt
+from ctxval._util.progress import expect
 from ctxval._util.registry import part
-from ctxval.gp.ascent import Ascent
-from ctxval.gp.subset import kept_rows
-from ctxval.gp.surrogate import fit_surrogate
-from ctxval.searches.base import Note, Prediction, SequentialSearch, best_first
+from ctxval.gp.ascent import ascend, usual_effort
+from ctxval.gp.surrogate import fit_surrogate, kept_rows
+from ctxval.searches.base import Costs, Note, Prediction, SequentialSearch, best_first
 from ctxval.searches.bayesian_optimisation import BayesianOptimisation
 
 _ENGINE = "climb"
@@ -52,27 +53,14 @@ class _Candidate:
         return self.expected * (1 + optimism * self.doubt)
 
 
-@dataclass(frozen=True, eq=False)
-class _OptimisticValue:
-    """The optimistic value of points: the prediction d_hat, raised by kappa (``optimism``) times its doubt w."""
+def _optimistic(predicted: Callable[[Array], tuple[Array, Array]], optimism: float) -> Callable[[Array], Array]:
+    """Return the optimistic value: the prediction d_hat, raised by kappa (``optimism``) times its doubt w."""
 
-    prediction: Prediction
-    optimism: float
+    def value(points: Array) -> Array:
+        expected, doubt = predicted(points)
+        return np.asarray(expected * (1 + optimism * doubt))
 
-    @property
-    def rough(self) -> _OptimisticValue | None:
-        """The same with the rough prediction; None if there is none."""
-        rough = self.prediction.rough
-        return None if rough is None else replace(self, prediction=replace(self.prediction, expected=rough))
-
-    def __call__(self, points: Array) -> Array:
-        """Return the optimistic values ``(m,)`` of points ``(m, d)``."""
-        expected, doubt = self.prediction.expected(points)
-        return np.asarray(expected * (1 + self.optimism * doubt))
-
-    def at(self, point: Array) -> _Candidate:
-        expected, doubt = self.prediction.expected(point[None])
-        return _Candidate(point, float(expected[0]), float(doubt[0]))
+    return value
 
 
 @dataclass(frozen=True, eq=False)
@@ -233,41 +221,42 @@ class TrustRegion(SequentialSearch):
         self, prediction: Prediction, history: _History, rng: np.random.Generator
     ) -> tuple[_Candidate | None, _Region]:
         """Return the next candidate after a history, None if no point can be predicted, and its region."""
-        value = _OptimisticValue(prediction, self.optimism)
         if not self.restrict:
-            return self._best(value, _Region(), history, rng), _Region()
+            return self._best(prediction, self.optimism, _Region(), history, rng), _Region()
         region = self._state(history)
         if region.misses < self.misses and region.radius >= 0.02:
-            found = self._best(value, region, history, rng)
-            if found is not None:
+            best = self._best(prediction, self.optimism, region, history, rng)
+            if best is not None:
                 # It may exceed the region's best value and, with ten times the optimism, the largest value of all.
                 least, largest = 1 + _IMPROVEMENT, float(np.nanmax(history.values, initial=0.0))
-                patient = found.optimistic(10.0 * self.optimism)
-                if found.optimistic(self.optimism) > region.best * least and patient > largest * least:
-                    return found, region
+                patient = best.optimistic(10.0 * self.optimism)
+                if best.optimistic(self.optimism) > region.best * least and patient > largest * least:
+                    return best, region
         # The optimism grows with every region that finds nothing larger, so the search explores more.
-        bold = replace(value, optimism=self.optimism * self.boldness ** (1 + region.stale))
-        return self._best(bold, _Region(), history, rng), _Region(region.number + 1, radius=0.4)
+        bold = self.optimism * self.boldness ** (1 + region.stale)
+        return self._best(prediction, bold, _Region(), history, rng), _Region(region.number + 1, radius=0.4)
 
     def _best(
-        self, value: _OptimisticValue, region: _Region, history: _History, rng: np.random.Generator
+        self, prediction: Prediction, optimism: float, region: _Region, history: _History, rng: np.random.Generator
     ) -> _Candidate | None:
         """Return the new point of largest optimistic value in a region; None if no point there can be predicted."""
-        points, few = np.empty((0, self.dimension)), value.prediction.candidates
+        value, few, box = _optimistic(prediction.expected, optimism), prediction.candidates, region.box(self.dimension)
         if few is not None:
-            low, high = region.box(self.dimension)
-            points = few[((few >= low) & (few <= high)).all(axis=1)]
+            points = few[((few >= box[0]) & (few <= box[1])).all(axis=1)]
             promised = value(points) if len(points) else np.empty(0)
             order = np.argsort(-np.nan_to_num(promised, nan=-np.inf), kind="stable")
             points, promised = points[order], promised[order]
         else:
-            budget = min(value.prediction.budget, POINTS * self.dimension)
-            ascent = Ascent(value, *region.box(self.dimension), budget, value.rough)
-            points, promised = ascent.run(best_first(history.points, history.values)[:8], rng)
+            budget = min(prediction.budget, POINTS * self.dimension)
+            rough = None if prediction.rough is None else _optimistic(prediction.rough, optimism)
+            starts = best_first(history.points, history.values)[:8]
+            points, promised = ascend(value, box, budget, starts, rng, rough)
         points = points[self._is_new(points, history) & np.isfinite(promised)]
-        steady = value.prediction.steady or (lambda point: True)
-        best = next(filter(steady, points), points[0]) if len(points) else None
-        return None if best is None else value.at(best)
+        if not len(points):
+            return None
+        point = next(filter(prediction.steady or (lambda point: True), points), points[0])
+        expected, doubt = prediction.expected(point[None])
+        return _Candidate(point, float(expected[0]), float(doubt[0]))
 
     def _is_new(self, points: Array, history: _History) -> Mask:
         known, reach = np.isfinite(history.values), 0.05 * np.sqrt(self.dimension)
@@ -307,3 +296,80 @@ def _log_error(expected: Array, values: Array) -> float:
         return np.inf
     floor = max(0.1 * float(np.median(values)), 1e-12)
     return float(np.abs(np.log(np.maximum(expected, 0.0) + floor) - np.log(values + floor)).mean())
+
+
+Thinking = Literal["balanced", "fast", "thorough"]
+
+FAST = 0.15
+"""Share of the largest number of points that fast thinking predicts."""
+_SHARES = (1.0, 0.4, FAST)
+"""Shares of the largest number of points that are predicted for one choice, from thorough to fast."""
+
+DESIGNS = "designs"
+"""Key in a note: the number of points that are predicted for each choice of the campaign."""
+
+
+@part("auto")
+class Auto(TrustRegion):
+    """Trust-region search on the distance that executed trajectories predict; Bayesian optimisation without them.
+
+    Args:
+        thinking: how many tasks are predicted for one suggestion; each needs the design of a controller.
+            ``"thorough"``: at most 2,000 if controllers are designed in batches and 150 if they are designed one after
+            the other, and at most 400 for each task parameter. ``"fast"``: 15 % of that. ``"balanced"``: 15 %, 40 % or
+            all of that, whichever is the largest number that takes no longer than one execution or 1 s. This is
+            measured once, after the first execution, and stored in a note; so another campaign with the same seed may
+            make other choices. A whole number: at most so many, whatever they cost.
+        optimism, misses: see :class:`TrustRegion`.
+    """
+
+    def __init__(
+        self, thinking: Thinking | PositiveInt = "balanced", optimism: NonNegativeFloat = 2.0, misses: PositiveInt = 3
+    ) -> None:
+        super().__init__(optimism, misses)
+        self.thinking = thinking
+        self._fixed_now: int | None = None
+
+    def use_prediction(self, prediction: Prediction | None) -> None:
+        self._fixed_now = None
+        if prediction is not None:
+            prediction = replace(prediction, budget=self.designs(prediction))
+            expect(usual_effort(self.dimension, prediction.budget).points + self.predicted_besides)
+        super().use_prediction(prediction)
+
+    def propose(self, rng: np.random.Generator) -> Array:
+        """Return the next point; if the number of designs is fixed at this choice, its note contains the number."""
+        point = super().propose(rng)
+        if self._fixed_now is not None:
+            self._last_note = {**(self._last_note or {}), DESIGNS: self._fixed_now}
+        return point
+
+    def designs(self, prediction: Prediction) -> int:
+        """Return the number of points that are predicted for the next choice."""
+        most = min(prediction.budget, POINTS * self.dimension)
+        match self.thinking:
+            case "thorough":
+                return most
+            case "fast":
+                return max(1, round(FAST * most))
+            case number if number != "balanced":
+                return min(int(number), most)
+        # The number is fixed once an execution was timed; the note of that choice has it.
+        noted = (note.get(DESIGNS) for note in self.notes if note is not None)
+        fixed = next((number for number in noted if isinstance(number, int) and number >= 1), None)
+        if fixed is not None or prediction.costs is None:
+            return min(most, fixed or most)
+        # As many designs as take no longer than one evaluation, or one second. An evaluation that was not timed is
+        # supposed to take 10 s.
+        costs = prediction.costs()
+        seconds = max(1.0, 10.0 if costs.evaluation is None else costs.evaluation)
+        numbers = [max(1, round(share * most)) for share in _SHARES]
+        designs = next((number for number in numbers if self.thinking_seconds(costs, number) <= seconds), numbers[-1])
+        self._fixed_now = None if costs.evaluation is None else designs
+        return designs
+
+    def thinking_seconds(self, costs: Costs, designs: int) -> float:
+        """Return the estimated seconds of CPU time of the predictions of a choice with so many designs."""
+        effort = usual_effort(self.dimension, designs)
+        rough = costs.prediction if costs.rough is None else costs.rough
+        return effort.batches * costs.batch + effort.exact * costs.prediction + effort.rough * rough

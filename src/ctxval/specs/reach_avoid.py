@@ -12,7 +12,7 @@ import numpy as np
 
 from ctxval._util.arrays import Array, Rows
 from ctxval._util.registry import part
-from ctxval.core.components import NamedStates, selected
+from ctxval.core.distance import NamedStates, selected
 from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory
 from ctxval.errors import InputError

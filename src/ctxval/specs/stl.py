@@ -11,7 +11,7 @@ from ctxval._util.arrays import Array
 from ctxval._util.extras import require_extra
 from ctxval._util.registry import part
 from ctxval._util.texts import reason_of
-from ctxval.core.components import NamedStates, selected
+from ctxval.core.distance import NamedStates, selected
 from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory
 from ctxval.errors import InputError, ShapeError

@@ -55,8 +55,7 @@ class Aspect1Report:
     """What simulations of M show of its tasks and controllers. The system is never executed.
 
     Attributes:
-        distance: the distance between the trajectory of M and its task.
-        units: its units; empty if they are not known.
+        distance, units: the distance between the trajectory of M and its task; the units are empty if not known.
         threshold: the largest error with which a task counts as completed; None if there is none.
         simulated: all tasks, the worst first; tasks without an error come before those with one.
         verdict: the verdict on M against the threshold, with a bound over all tasks; None if there is no threshold.
@@ -64,12 +63,10 @@ class Aspect1Report:
             the independent draws among the simulated tasks exceed the threshold; None if there is no threshold.
         distribution: the distribution of tasks as a text, under which the share is a probability; None if it is
             uniform.
-        flips: how much the controllers of neighbouring tasks differ; None if no tasks are neighbours.
-        flipped: the parameters of two such tasks.
-        saturation: the share of the steps at which each input is at a limit; None if there are no inputs.
-        inputs: the labels of the inputs.
-        not_converged: the tasks whose design did not converge.
-        designs: the number of designs that tell whether they converged.
+        flips, flipped: how much the controllers of neighbouring tasks differ, and the parameters of two such tasks;
+            None if no tasks are neighbours.
+        saturation: the share of the steps at which each of the ``inputs`` is at a limit; None if there are no inputs.
+        not_converged, designs: the tasks whose design did not converge, and how many designs tell this.
     """
 
     distance: Distance
@@ -110,7 +107,6 @@ class Aspect1Report:
     def to_json(self) -> dict[str, Any]:
         """Return all results as plain values."""
         flips, saturation, verdict = self.flips, self.saturation, self.verdict
-        shares = saturation and dict(zip(self.inputs, saturation.shares.tolist(), strict=False))
         return {
             "distance": repr(self.distance),
             **{name: getattr(self, name) for name in ("units", "threshold", "completes", "distribution", "designs")},
@@ -122,7 +118,7 @@ class Aspect1Report:
             "bound": verdict and verdict.bound,
             "share_at_most": self.share,
             "flips": flips and {**asdict(flips), "example": self.flipped},
-            "saturation": shares,
+            "saturation": saturation and dict(zip(self.inputs, saturation.shares.tolist(), strict=False)),
             "not_converged": list(self.not_converged),
         }
 
@@ -142,12 +138,10 @@ def check(
     Half of the tasks are independent draws from the distribution of tasks, and the search chooses the others.
 
     Args:
-        validation: the map p -> d(p).
         threshold: the largest error with which a task counts as completed, in the units of ``distance``.
         distance: how far the trajectory of M is from completing its task; that of :func:`completion` by default.
         tasks: number of simulated tasks.
         search: chooses the tasks; Bayesian optimisation by default.
-        seed: seed of the search.
     """
     measured = completion(validation) if distance is None else distance
     on_model = validation.on_model(measured, units=None if distance is None else "")

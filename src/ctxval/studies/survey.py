@@ -7,7 +7,7 @@ some of the recordings and judged by the others.
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -15,45 +15,37 @@ from typing import Any, Literal
 import numpy as np
 
 from ctxval._util.arrays import single_threaded
-from ctxval._util.columns import TIMES, time_column
+from ctxval._util.columns import TIMES, named_unit, time_column
 from ctxval._util.representation import ShortRepr, counted
 from ctxval._util.texts import enumerated
-from ctxval._util.units import named_unit
+from ctxval.core.model import Model
 from ctxval.data import Clock, Field, Log, LogMapping, Recordings, Table, component_names, read_logs, recordings_of
 from ctxval.errors import InputError
 from ctxval.studies.fitting import FitReport, fit
 from ctxval.studies.fitting.fit import FittedModel
 from ctxval.studies.replay import ReplayReport, replay
 from ctxval.studies.replay.accuracy import RecordedSteps, step_errors
-from ctxval.studies.replay.report import plain_numbers
+from ctxval.studies.replay.report import plain_numbers, unseen
 
 Role = Literal["state", "input", ""]
 
 CLOSE = 0.1  # largest error, as a share of the recorded change, of a prediction that is called close
 
-_READ = 20  # largest number of logs whose fields are looked at
 _NEVER, _HARDLY = "it never changes", "it hardly changes"
-_SAME = 0.02  # range of a field, as a share of its largest magnitude, below which it hardly changes
 
-_WORD = re.compile("[a-z]+")
-_INPUTS = set(
-    _WORD.findall(
-        "u cmd command commands commanded input inputs action actions ref reference target goal setpoint desired tau "
-        "torque force voltage volt volts duty pwm throttle steer steering brake effort control ctrl valve thrust enable"
-    )
+# Words in the names of fields by which their roles are guessed.
+_INPUTS = (
+    "u cmd command commands commanded input inputs action actions ref reference target goal setpoint desired tau "
+    "torque force voltage volt volts duty pwm throttle steer steering brake effort control ctrl valve thrust enable"
 )
-_OTHERS = set(
-    _WORD.findall(
-        "time t stamp timestamp sec nsec secs nanosec index frame episode seq id count counter status temp temperature "
-        "battery done reward success run trial"
-    )
+_OTHERS = (
+    "time t stamp timestamp sec nsec secs nanosec index frame episode seq id count counter status temp temperature "
+    "battery done reward success run trial"
 )
-_RATES = set(_WORD.findall("rate rates speed vel velocity velocities omega dq qd gyro twist"))
-_STATES = _RATES | set(
-    _WORD.findall(
-        "pos position positions angle theta phi psi q x y z yaw pitch roll heading level height altitude state states "
-        "displacement deflection encoder"
-    )
+_RATES = "rate rates speed vel velocity velocities omega dq qd gyro twist"
+_STATES = (
+    f"{_RATES} pos position positions angle theta phi psi q x y z yaw pitch roll heading level height altitude state "
+    "states displacement deflection encoder"
 )
 
 
@@ -63,8 +55,7 @@ class FieldSummary(ShortRepr):
 
     Attributes:
         path, unit: its name and its unit; the unit is empty if the log states none.
-        records: number of records.
-        period: median seconds between two of them.
+        records, period: number of records, and median seconds between two of them.
         low, high: its smallest and its largest value.
         role: whether it is taken as a state, as an input, or not at all.
         remark: what is unusual, such as that it never changes.
@@ -87,9 +78,7 @@ class Survey(ShortRepr):
     Attributes:
         sources: the files and episodes.
         fields: the fields of the first log.
-        mapping: which fields are taken as states and inputs.
-        guesses: what was guessed, one sentence each.
-        recordings: the recordings.
+        mapping, guesses: which fields are taken as states and inputs, and what was guessed, one sentence each.
         fit: a linear model and one with what this leaves, each with its errors.
         replay: what the recordings show of the better one.
         reach: number of steps for which its errors are close, and those that were compared.
@@ -118,30 +107,30 @@ class Survey(ShortRepr):
         if not close:
             return f"{model} errs by more than {share} after one step of {dt:g} s already: it suits no task yet"
         if close == compared:
-            return (
-                f"{model} errs by less than {share} for at least {far}, as long as was compared: it suits tasks in the "
-                "recorded range"
+            suits = "at least {far}, as long as was compared: it suits tasks in the recorded range"
+        else:
+            suits = (
+                "up to {far}, and by more after that: it suits tasks that end, or that feedback corrects, in less time"
             )
-        return (
-            f"{model} errs by less than {share} for up to {far}, and by more after that: it suits tasks that end, or "
-            "that feedback corrects, in less time"
-        )
+        return f"{model} errs by less than {share} for {suits.format(far=far)}"
 
     def to_json(self) -> dict[str, Any]:
         """Return all results as plain values."""
-        about: dict[str, Any] = {
-            "sources": list(self.sources),
-            "fields": [asdict(field) for field in self.fields],
-            "states": self.recordings.states,
-            "inputs": self.recordings.inputs,
-            "guesses": list(self.guesses),
-            "fit": self.fit.to_json(),
-            "replay": self.replay.to_json(),
-            "close": self.reach[0],
-            "compared": self.reach[1],
-            "statement": self.statement,
-        }
-        return {name: plain_numbers(value) for name, value in about.items()}
+        about: dict[str, Any] = plain_numbers(
+            {
+                "sources": self.sources,
+                "fields": list(map(asdict, self.fields)),
+                "states": self.recordings.states,
+                "inputs": self.recordings.inputs,
+                "guesses": self.guesses,
+                "fit": self.fit.to_json(),
+                "replay": self.replay.to_json(),
+                "close": self.reach[0],
+                "compared": self.reach[1],
+                "statement": self.statement,
+            }
+        )
+        return about
 
 
 def survey(
@@ -163,12 +152,14 @@ def survey(
     clock = _clock(first, dt, guesses) if mapping is None else mapping.clock
     times = (*TIMES, clock.field or "")
     fields = [path for path in first.fields() if named_unit(path)[0].casefold() not in times and path != clock.field]
-    summaries = [_summary(logs[:_READ], path, clock) for path in fields]
+    summaries = [_summary(logs[:20], path, clock) for path in fields]
     chosen = replace(_guessed(first, summaries, clock, guesses), time=clock.field) if mapping is None else mapping
     chosen = chosen if dt is None else replace(chosen, dt=dt)
     recordings = recordings_of(logs, chosen, names)
-    if mapping is None:
-        chosen, recordings = _with_turns(logs, chosen, recordings, names, guesses)
+    if mapping is None and (turned := _turning(chosen, recordings)):
+        guesses.append(f"{enumerated(turned, 6)} jumps by 2 pi, so it is an angle that is continued over turns")
+        chosen = replace(chosen, states={**chosen.states, **turned})
+        recordings = recordings_of(logs, chosen, names)
     if not any(np.ptp(run.trajectory.states, axis=0).any() for run in recordings.runs):
         raise InputError(
             f"no state ever changes in the logs ({enumerated(recordings.states, 6)}), so nothing is learned."
@@ -180,10 +171,8 @@ def survey(
     fitted = fit(recordings, ["linear", "gaussian-process"], steps=sorted({1, min(10, whole), whole}), seed=seed)
     if not fitted.fitted:
         raise InputError(f"no model can be learned: {'; '.join(failure.reason for failure in fitted.failed)}")
-    best = fitted.fitted[0]
+    model = fitted.fitted[0].model
     steps = {1, min(10, whole), *np.unique(np.geomspace(1, whole, 8).astype(int)).tolist(), whole}
-    report = replay(best.model, recordings, steps=sorted(steps), seed=seed)
-    reach = _reach(best, recordings, whole)
     return Survey(
         tuple(dict.fromkeys(log.source for log in logs)),
         tuple(replace(summary, role=roles.get(summary.path, "")) for summary in summaries),
@@ -191,13 +180,12 @@ def survey(
         tuple(guesses),
         recordings,
         fitted,
-        report,
-        reach,
+        replay(model, recordings, steps=sorted(steps), seed=seed),
+        _reach(model, recordings, whole),
     )
 
 
 def _summary(logs: Sequence[Log], path: str, clock: Clock) -> FieldSummary:
-    """Return what a field of some logs holds."""
     try:
         signals = [log.signals([path], clock)[path] for log in logs]
     except InputError as error:
@@ -216,7 +204,7 @@ def _summary(logs: Sequence[Log], path: str, clock: Clock) -> FieldSummary:
     remark = ""
     if low == high:
         remark = _NEVER
-    elif np.ptp(values, axis=0).max() <= _SAME * max(abs(low), abs(high)):
+    elif np.ptp(values, axis=0).max() <= 0.02 * max(abs(low), abs(high)):
         remark = _HARDLY
     elif changes == 0:
         remark = "it has one value in each file"
@@ -231,10 +219,10 @@ def _summary(logs: Sequence[Log], path: str, clock: Clock) -> FieldSummary:
     return FieldSummary(path, unit, len(values), period, low, high, "", remark)
 
 
-def _words(path: str) -> set[str]:
-    """Return the words in the name of a field, without its unit."""
+def _is(path: str, words: str) -> bool:
+    """Return whether the name of a field, without its unit, has one of some words."""
     name = re.sub(r"(?<=[a-z])(?=[A-Z])", " ", named_unit(path)[0])
-    return set(_WORD.findall(name.casefold()))
+    return not set(re.findall("[a-z]+", name.casefold())).isdisjoint(words.split())
 
 
 def _guessed(log: Log, fields: Sequence[FieldSummary], clock: Clock, guesses: list[str]) -> LogMapping:
@@ -247,37 +235,29 @@ def _guessed(log: Log, fields: Sequence[FieldSummary], clock: Clock, guesses: li
         pass
     moving = [each for each in fields if each.records and not each.remark.startswith((_NEVER, _HARDLY))]
     still = [each.path for each in fields if each not in moving]
-    inputs = [each.path for each in moving if _words(each.path) & _INPUTS]
-    others = [each.path for each in moving if each.path not in inputs and _words(each.path) & _OTHERS]
+    inputs = [each.path for each in moving if _is(each.path, _INPUTS)]
+    others = [each.path for each in moving if each.path not in inputs and _is(each.path, _OTHERS)]
     left = [each.path for each in moving if each.path not in (*inputs, *others)]
-    states = [path for path in left if _words(path) & _STATES] or left
+    states = [path for path in left if _is(path, _STATES)] or left
     if not states:
         raise InputError(
             f"{log.source} has no field that looks like a state; name the states and inputs with --state and --input. "
             f"Its fields are {enumerated((each.path for each in fields), 24)}."
         )
-    names = dict(zip(states + inputs, _short(states + inputs), strict=True))
+    # Short names: the last part of each path, or the whole path if that is not unique.
+    plain = {path: named_unit(path)[0] for path in states + inputs}
+    last = {path: re.split(r"[/.]", name)[-1].strip() or name for path, name in plain.items()}
+    names = {path: name if [*last.values()].count(name) == 1 else plain[path] for path, name in last.items()}
     taken = f"states: {enumerated(states, 12)}; inputs: {enumerated(inputs, 12) or 'none'}"
     guesses.append(f"the names of the fields tell what they are taken as; {taken}")
     if unused := [*others, *still, *(path for path in left if path not in states)]:
         guesses.append(f"not used: {enumerated(unused, 12)}")
     of_states = {names[path]: Field(path) for path in states}
-    single = [path for path in states if "[" in path or _is_scalar(log, path, clock)]
-    if not any(_words(path) & _RATES for path in states) and single:
+    single = [path for path in states if "[" in path or log.signals([path], clock)[path].values.shape[1] == 1]
+    if not any(_is(path, _RATES) for path in states) and single:
         of_states |= {f"{names[path]} rate": Field(derivative_of=names[path]) for path in single}
         guesses.append("no rate is recorded, so the derivatives of the states are states too")
     return LogMapping(of_states, {names[path]: Field(path) for path in inputs}, dt=log.period)
-
-
-def _is_scalar(log: Log, path: str, clock: Clock) -> bool:
-    return bool(log.signals([path], clock)[path].values.shape[1] == 1)
-
-
-def _short(paths: Sequence[str]) -> list[str]:
-    """Return short names of fields: the last part of each path, or the whole path if that is not unique."""
-    plain = [named_unit(path)[0] for path in paths]
-    last = [re.split(r"[/.]", name)[-1].strip() or name for name in plain]
-    return [name if last.count(name) == 1 else path for name, path in zip(last, plain, strict=True)]
 
 
 def _clock(log: Log, dt: float | None, guesses: list[str]) -> Clock:
@@ -291,14 +271,8 @@ def _clock(log: Log, dt: float | None, guesses: list[str]) -> Clock:
     return Clock(inside[0])
 
 
-def _with_turns(
-    logs: Sequence[Log],
-    mapping: LogMapping,
-    recordings: Recordings,
-    names: Mapping[str, list[str]],
-    guesses: list[str],
-) -> tuple[LogMapping, Recordings]:
-    """Return the mapping with angles that are kept within a turn continued, and the recordings."""
+def _turning(mapping: LogMapping, recordings: Recordings) -> dict[str, Field]:
+    """Return the states that are angles kept within a turn, as fields that are continued over turns."""
     turned = {}
     for name, field in mapping.states.items():
         if field.derivative_of or name not in recordings.states:
@@ -306,44 +280,22 @@ def _with_turns(
         column = list(recordings.states).index(name)
         values = [run.trajectory.states[:, column] for run in recordings.runs]
         jumps = np.abs(np.concatenate([np.diff(each) for each in values]))
-        span = float(np.ptp(np.concatenate(values)))
-        if (
-            span <= 1.05 * 2 * np.pi
-            and (jumps > 1.5 * np.pi).any()
-            and not ((jumps > 1.0) & (jumps < 1.5 * np.pi)).any()
-        ):
+        small, large = jumps <= 1.0, jumps >= 1.5 * np.pi
+        if large.any() and (small | large).all() and np.ptp(np.concatenate(values)) <= 1.05 * 2 * np.pi:
             turned[name] = replace(field, angle=True)
-    if not turned:
-        return mapping, recordings
-    guesses.append(f"{enumerated(turned, 6)} jumps by 2 pi, so it is an angle that is continued over turns")
-    chosen = replace(mapping, states={**mapping.states, **turned})
-    return chosen, recordings_of(logs, chosen, names)
+    return turned
 
 
-def _reach(best: FittedModel, recordings: Recordings, whole: int) -> tuple[int, int]:
+def _reach(model: Model, recordings: Recordings, whole: int) -> tuple[int, int]:
     """Return for how many steps errors on recordings that were not learned from are close, and the most compared."""
-    known = getattr(best.model, "data", None)
-    held = _held_out(recordings, known)
+    held = unseen(model, recordings) or range(len(recordings.runs))
     grid = sorted({min(whole, round(1.5**k)) for k in range(40) if 1.5**k <= 2 * whole} | {whole})
     with single_threaded():
-        errors = step_errors(best.model, RecordedSteps(recordings, held), grid)
+        errors = step_errors(model, RecordedSteps(recordings, held), grid)
     close, most = 0, 0
-    for count in grid:
-        of_count = [error for error in errors if error.steps == count]
-        if not of_count:
-            break
+    for count in sorted({error.steps for error in errors}):
         most = count
-        if any(not error.relative < CLOSE or error.diverged for error in of_count):
+        if any(not error.relative < CLOSE or error.diverged for error in errors if error.steps == count):
             break
         close = count
     return close, most
-
-
-def _held_out(recordings: Recordings, data: Any) -> list[int]:
-    """Return the recordings whose steps are not in the data of a model; all if there are none."""
-    every = range(len(recordings.runs))
-    if data is None:
-        return list(every)
-    known = {row.tobytes() for row in data.x}
-    held = [k for k in every if recordings.runs[k].trajectory.states[0].tobytes() not in known]
-    return held or list(every)

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from ctxval._util.registry import Registry
 from ctxval.core.system import Simulated, System, WithOutputs
-from ctxval.data.recorded import Recorded
+from ctxval.data.recordings import Recorded
 from ctxval.systems.fmu import FMU
-from ctxval.systems.function import Function
+from ctxval.systems.function import Function, Manual
 from ctxval.systems.gymnasium import Gymnasium
 from ctxval.systems.imperfect import Imperfect
 from ctxval.systems.integrate import rk4
-from ctxval.systems.manual import Manual
 from ctxval.systems.mujoco import MuJoCo
 from ctxval.systems.subprocess import Subprocess
 

@@ -1,14 +1,16 @@
-"""A function that runs a complete execution, as the true system."""
+"""Plain functions and people as the true system."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Mapping
+from typing import Any, NoReturn
 
 from ctxval._util.arrays import as_floats
+from ctxval._util.checked import Seconds
 from ctxval._util.registry import part
 from ctxval._util.representation import ShortRepr
 from ctxval.core.controller import Controller, Feedback, started
+from ctxval.core.labels import require_names
 from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory
 from ctxval.errors import ExecutionError, InputError
@@ -25,8 +27,6 @@ class Function(ShortRepr):
     """
 
     def __init__(self, execute: Callable[[Feedback, Task], Any], *, batched: bool = False) -> None:
-        if not callable(execute):
-            raise InputError(f"a system must be a function (controller, task) -> trajectory, got {execute!r}.")
         self.function = execute
         self.batched = batched
 
@@ -40,3 +40,26 @@ class Function(ShortRepr):
         except (InputError, TypeError, ValueError) as error:
             wanted = f"a Trajectory, or states (H + 1, n) and inputs (H, m) with H = {task.horizon}"
             raise ExecutionError(f"the system's function must return {wanted}: {error}") from error
+
+
+@part()
+class Manual(ShortRepr):
+    """A system whose tasks people execute: get a task with ``campaign.ask()``, report it with ``campaign.tell()``.
+
+    States and inputs are names of the components with their units, for files.
+    """
+
+    manual = True
+    """Mark of a system that a program cannot execute."""
+
+    def __init__(self, *, states: Mapping[str, str], inputs: Mapping[str, str], dt: Seconds) -> None:
+        self.states, self.inputs = dict(states), dict(inputs)
+        texts = [*self.states.items(), *self.inputs.items()]
+        if not self.states or not all(isinstance(text, str) for pair in texts for text in pair):
+            raise InputError(f"states and inputs must be names with units, got {self.states} and {self.inputs}.")
+        require_names(self.states, self.inputs)
+        self.dt = float(dt)
+
+    def execute(self, controller: Controller, task: Task) -> NoReturn:
+        advice = "get a task with campaign.ask() and report its result with campaign.tell() instead of campaign.run()"
+        raise ExecutionError(f"a manual system is executed by people; {advice}.")

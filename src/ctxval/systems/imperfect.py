@@ -11,7 +11,7 @@ from ctxval._util.checked import NonNegativeFloat, checked
 from ctxval._util.registry import part
 from ctxval._util.representation import ShortRepr
 from ctxval.core.controller import Controller
-from ctxval.core.model import Function, Model, Step
+from ctxval.core.model import Model, Step, as_model
 from ctxval.core.rollout import rollout
 from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory
@@ -50,7 +50,7 @@ class Imperfect(ShortRepr):
         vectorized: bool = False,
         seed: int | None = None,
     ) -> None:
-        self.model = step if isinstance(step, Model) else Function(step, vectorized=vectorized)
+        self.model = as_model(step, vectorized=vectorized)
         self.start, self.process, self.measurement, self.resolution = (
             np.asarray(value, dtype=np.float64) for value in (start, process, measurement, resolution)
         )

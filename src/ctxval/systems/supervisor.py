@@ -1,5 +1,5 @@
 # ruff: noqa: SIM105  -- importing contextlib takes as long as all other imports
-"""The process that runs one command and ends all processes of it; :mod:`ctxval.systems.supervised` starts this file.
+"""The process that runs one command and ends all processes of it; :mod:`ctxval.systems.subprocess` starts this file.
 
 A command may start processes that leave its group (``setsid``) or lose their parent. On Linux this process is their
 reaper: a process that loses its parent becomes a child of this one, so that none escapes. This process has no other

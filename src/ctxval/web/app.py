@@ -22,7 +22,7 @@ from ctxval._util.texts import shortened, visible
 from ctxval.errors import CampaignError, CtxvalError, InputError, StoreError
 from ctxval.web import forms
 from ctxval.web.page import Page, Problem
-from ctxval.web.security import MOST_UPLOAD, Access, Guard, Hosts
+from ctxval.web.security import Access, Guard, Hosts
 from ctxval.web.service import CampaignService
 from ctxval.web.state import PageState
 
@@ -37,32 +37,27 @@ class PageRoutes:
     """The routes of a page that shows a campaign, and takes nothing."""
 
     def __init__(self, state: PageState, access: Access) -> None:
-        self.state, self.access = state, access
-        self.page = Page(state)
+        self.state, self.access, self.page = state, access, Page(state)
 
     def routes(self) -> list[BaseRoute]:
         """Return all routes; every one but the static files and the entrance needs a session."""
         return [
-            Route("/", self.start, methods=["GET"]),
-            Route("/enter", self.enter, methods=["POST"]),
+            Route("/", self._start, methods=["GET"]),
+            Route("/enter", self._enter, methods=["POST"]),
             Mount("/static", StaticFiles(packages=[("ctxval.web", "static")])),
-            Route("/pictures/{name}.svg", self._inside(self.picture), methods=["GET"]),
-            Route("/events", self._inside(self.events), methods=["GET"]),
+            Route("/pictures/{name}.svg", self._inside(self._picture), methods=["GET"]),
+            Route("/events", self._inside(self._events), methods=["GET"]),
         ]
 
-    # Entrance
-
-    async def start(self, request: Request) -> Response:
-        """Show the campaign, or ask for the token."""
+    async def _start(self, request: Request) -> Response:
         token = request.query_params.get("token")
-        return await (self._inside(self._campaign)(request) if token is None else self._enter(token))
+        return await (self._inside(self._campaign)(request) if token is None else self._admit(token))
 
-    async def enter(self, request: Request) -> Response:
-        """Take the token from the form of the entrance."""
+    async def _enter(self, request: Request) -> Response:
         async with _form(request, max_files=0, max_fields=4) as (fields, _):
-            return await self._enter(fields.get("token", "").strip())
+            return await self._admit(fields.get("token", "").strip())
 
-    async def _enter(self, token: str) -> Response:
+    async def _admit(self, token: str) -> Response:
         if not self.access.needs_token:
             return RedirectResponse("/", 303)
         if not self.access.admits(token):
@@ -112,8 +107,7 @@ class PageRoutes:
         )
         return HTMLResponse(page, 200 if problem is None else problem.status)
 
-    async def picture(self, request: Request, session: str) -> Response:
-        """Return a picture of the campaign."""
+    async def _picture(self, request: Request, session: str) -> Response:
         picture = self.state.pictures.get(request.path_params["name"])
         if not isinstance(picture, bytes):
             return self._message("No picture", "There is no such picture yet.")
@@ -121,8 +115,7 @@ class PageRoutes:
         policy = {"Content-Security-Policy": "default-src 'none'; style-src 'unsafe-inline'; sandbox"}
         return Response(picture, media_type="image/svg+xml", headers=policy)
 
-    async def events(self, request: Request, session: str) -> Response:
-        """Send an event for each change of the page."""
+    async def _events(self, request: Request, session: str) -> Response:
         if self.state.listeners >= 64:
             return Response("too many pages are open", 503, media_type="text/plain")
         return StreamingResponse(self.state.events(), media_type="text/event-stream")
@@ -137,19 +130,15 @@ class OperatorPage(PageRoutes):
 
     def routes(self) -> list[BaseRoute]:
         """Return the further routes, too."""
-        inside = self._inside
         return [
             *super().routes(),
-            Route("/choose", inside(self.choose), methods=["POST"]),
-            Route("/trials/{number:int}/{kind}", inside(self.tell), methods=["POST"]),
-            Route("/trials/{number:int}/files.zip", inside(self.file), methods=["GET"]),
-            Route("/trials/{number:int}/files/{name}", inside(self.file), methods=["GET"]),
+            Route("/choose", self._inside(self._choose), methods=["POST"]),
+            Route("/trials/{number:int}/{kind}", self._inside(self._tell), methods=["POST"]),
+            Route("/trials/{number:int}/files.zip", self._inside(self._file), methods=["GET"]),
+            Route("/trials/{number:int}/files/{name}", self._inside(self._file), methods=["GET"]),
         ]
 
-    # Forms
-
-    async def choose(self, request: Request, session: str) -> Response:
-        """Start to choose a task."""
+    async def _choose(self, request: Request, session: str) -> Response:
         async with _form(request, max_files=0, max_fields=1_000, max_part_size=4096) as (fields, _):
             allowed = self.access.allows_form(session, fields.get("token", ""))
         if not allowed:
@@ -163,8 +152,7 @@ class OperatorPage(PageRoutes):
             return await self._campaign(request, session, Problem("choose", str(error), fields, status))
         return RedirectResponse("/#next", 303)
 
-    async def tell(self, request: Request, session: str) -> Response:
-        """Record the result of a trial."""
+    async def _tell(self, request: Request, session: str) -> Response:
         number, kind = request.path_params["number"], request.path_params["kind"]
         if kind not in ("recording", "distance", "failure"):
             return self._message("Not found", "There is no such page.")
@@ -172,7 +160,7 @@ class OperatorPage(PageRoutes):
         try:
             async with _form(request, max_files=1, max_fields=20, max_part_size=65_536) as (fields, upload):
                 if self.access.allows_form(session, fields.get("token", "")):
-                    await self._tell(number, kind, fields, upload)
+                    await self._record(number, kind, fields, upload)
                     return RedirectResponse(f"/?told={number}#message", 303)
             sentence, status = _OUT_OF_DATE, 403
         except HTTPException as error:
@@ -188,7 +176,7 @@ class OperatorPage(PageRoutes):
         where = f"{kind}-{number}" if any(trial.number == number for trial in shown) else "trial"
         return await self._campaign(request, session, Problem(where, sentence, fields, status))
 
-    async def _tell(self, number: int, kind: str, fields: dict[str, str], upload: object) -> None:
+    async def _record(self, number: int, kind: str, fields: dict[str, str], upload: object) -> None:
         with tempfile.TemporaryDirectory(prefix="ctxval-") as folder:
             path = None
             if isinstance(upload, UploadFile) and upload.filename:
@@ -201,9 +189,7 @@ class OperatorPage(PageRoutes):
                 # The operator knows the name of the file, not the folder in which it is read.
                 raise InputError(str(error).replace(f"{folder}/", "")) from error
 
-    # Files
-
-    async def file(self, request: Request, session: str) -> Response:
+    async def _file(self, request: Request, session: str) -> Response:
         """Return one file of an open trial, or all of them in one archive."""
         number, name = request.path_params["number"], request.path_params.get("name")
         try:
@@ -211,15 +197,18 @@ class OperatorPage(PageRoutes):
         except CtxvalError as error:
             return self._message("No file", str(error))
         if name is None:
-            content = io.BytesIO()
-            with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as archive:
+            packed = io.BytesIO()
+            with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
                 for each, data in files.items():
                     archive.writestr(f"trial-{number}/{each}", data)
-            return _download(content.getvalue(), f"trial-{number}.zip")
-        if name not in files:
+            content, title = packed.getvalue(), f"trial-{number}.zip"
+        elif name in files:
+            content, title = files[name], f"trial-{number}-{name}"
+        else:
             sentence = f"There is no file {visible(name)[:80]} of trial {number}; there are {', '.join(files)}."
             return self._message("No file", sentence)
-        return _download(files[name], f"trial-{number}-{name}")
+        headers = {"Content-Disposition": f'attachment; filename="{title}"'}
+        return Response(content, media_type="application/octet-stream", headers=headers)
 
 
 def _number(text: str) -> int | None:
@@ -236,12 +225,7 @@ async def _form(request: Request, **limits: int) -> AsyncIterator[tuple[dict[str
         raise HTTPException(400, "it is damaged") from error
 
 
-def _download(content: bytes, name: str) -> Response:
-    headers = {"Content-Disposition": f'attachment; filename="{name}"'}
-    return Response(content, media_type="application/octet-stream", headers=headers)
-
-
-def application(state: PageState, access: Access, hosts: Hosts, most: int = MOST_UPLOAD) -> Guard:
+def application(state: PageState, access: Access, hosts: Hosts) -> Guard:
     """Return the ASGI application of a campaign."""
 
     @contextlib.asynccontextmanager
@@ -253,4 +237,4 @@ def application(state: PageState, access: Access, hosts: Hosts, most: int = MOST
             await state.stop()
 
     page = OperatorPage(state, access) if isinstance(state, CampaignService) else PageRoutes(state, access)
-    return Guard(Starlette(routes=page.routes(), lifespan=running), hosts, access, most)
+    return Guard(Starlette(routes=page.routes(), lifespan=running), hosts, access)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import tempfile
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +13,11 @@ import numpy as np
 
 from ctxval._util.progress import stage
 from ctxval._util.texts import reason_of
-from ctxval.campaign.by_hand import write_files
+from ctxval.campaign.by_hand import parameters_of_trial, write_files
 from ctxval.campaign.campaign import Campaign
 from ctxval.campaign.choices import OpenTrial
 from ctxval.campaign.interval_search import require_decisive
 from ctxval.campaign.plot import overview, worst_trajectories
-from ctxval.campaign.telling import parameters_of_trial
 from ctxval.certificates import CertificateOptions, Verdict
 from ctxval.certificates import judge as judge_trials
 from ctxval.core.experiment import Experiment
@@ -35,24 +34,37 @@ Pictures = dict[str, bytes | str]
 
 @dataclass(frozen=True, eq=False)
 class Snapshot:
-    """The trials of the store at one moment: the open ones with their tasks by number, and the number of executions."""
+    """The trials of the store at one moment, the number of its changes, and the tasks of the open trials by number."""
 
-    signature: tuple[int, int, int]
     trials: tuple[Trial, ...]
-    tasks: dict[int, dict[str, Any]]
-    executions: int
-    worst: Trial | None
-
-    @property
-    def ended(self) -> tuple[int, int]:
-        """Identifies the trials that have ended, which are those that a verdict is about."""
-        total, waiting, changes = self.signature
-        return total - waiting, changes
+    changes: int = 0
+    tasks: dict[int, dict[str, Any]] = field(default_factory=dict)
 
     @property
     def waiting(self) -> list[Trial]:
         """The open trials, which people execute, or which a program is executing."""
         return [trial for trial in self.trials if trial.state == "open"]
+
+    @property
+    def signature(self) -> tuple[int, int, int]:
+        """That of the store, which shows whether it has changed."""
+        return len(self.trials), len(self.waiting), self.changes
+
+    @property
+    def ended(self) -> tuple[int, int]:
+        """Identifies the trials that have ended, which are those that a verdict is about."""
+        return len(self.trials) - len(self.waiting), self.changes
+
+    @property
+    def executions(self) -> int:
+        """The number of executions of S that have ended."""
+        return sum(trial.executed for trial in self.trials)
+
+    @property
+    def worst(self) -> Trial | None:
+        """The trial with the largest distance."""
+        known = (trial for trial in self.trials if trial.state == "completed")
+        return max(known, key=lambda trial: trial.distance or 0.0, default=None)
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,13 +92,6 @@ class ServedCampaign:
             return False
         return self.threshold is not None
 
-    def snapshot(self, tasks: dict[int, dict[str, Any]] | None = None, changes: int = 0) -> Snapshot:
-        """Return the trials that the campaign knows; the last number of the signature counts changes of results."""
-        trials = self.campaign.trials
-        signature = (len(trials), sum(trial.state == "open" for trial in trials), changes)
-        executions = sum(trial.executed for trial in trials)
-        return Snapshot(signature, trials, tasks or {}, executions, self.campaign.worst)
-
     def read(self) -> Snapshot:
         """Read the trials in the store, with what people must know of the open tasks before they execute them."""
         self.campaign.refresh()
@@ -98,7 +103,7 @@ class ServedCampaign:
             starts = list(zip(labels, start, strict=True))
             tasks[trial.number] = {"start": starts, "horizon": task.horizon, "dt": task.dt}
         # The trials were read after this process's last change, so their counts are those of the signature.
-        return self.snapshot(tasks, self.campaign.store.signature()[2])
+        return Snapshot(self.campaign.trials, self.campaign.store.signature()[2], tasks)
 
 
 OpenCampaign = Callable[[], ServedCampaign]

@@ -13,8 +13,8 @@ from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescap
 
 from ctxval._util.representation import counted, line, number
 from ctxval._util.texts import shortened, visible
+from ctxval.campaign.by_hand import result_sentence
 from ctxval.campaign.dynamics import PREDICTION
-from ctxval.campaign.telling import result_sentence
 from ctxval.certificates.bounds import with_error
 from ctxval.core.task_suite import TaskSuite
 from ctxval.core.trial import Trial

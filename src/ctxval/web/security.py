@@ -43,14 +43,14 @@ HEADERS = {
 class Access:
     """Who may use the page: the token of the server, sessions in signed cookies, and tokens of forms.
 
-    The key of the signatures lives as long as the server. Without a token, every browser on this computer is admitted.
+    Without a token, every browser on this computer is admitted.
     """
 
     def __init__(self, token: str | None, port: int) -> None:
         if token is not None and (len(token) < 16 or not (token.isascii() and token.isprintable())):
             raise InputError("the token must have at least 16 characters, all of them visible ASCII.")
         self._token = token
-        self._key = secrets.token_bytes(32)
+        self._key = secrets.token_bytes(32)  # of the signatures, as long as the server lives
         self.needs_token = token is not None
         self.cookie = f"ctxval-session-{port}"  # browsers share cookies among the ports of one computer
 
@@ -183,8 +183,8 @@ class _Body:
 class Guard:
     """Refuses requests before the application reads them, and adds the security headers to every response."""
 
-    def __init__(self, app: ASGIApp, hosts: Hosts, access: Access, most: int = MOST_UPLOAD) -> None:
-        self.app, self.hosts, self.access, self.most = app, hosts, access, most
+    def __init__(self, app: ASGIApp, hosts: Hosts, access: Access) -> None:
+        self.app, self.hosts, self.access = app, hosts, access
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer a request."""
@@ -229,7 +229,7 @@ class Guard:
             connection.waiting.remove(connection)
         if scope["path"] == "/enter" or not (known or not self.access.needs_token):
             return 2**12
-        return self.most if scope["path"].endswith("/recording") else min(self.most, 2**18)
+        return MOST_UPLOAD if scope["path"].endswith("/recording") else 2**18
 
 
 _REFUSED = (

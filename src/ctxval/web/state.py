@@ -14,12 +14,10 @@ from collections.abc import AsyncIterator
 from dataclasses import dataclass, replace
 from typing import Any
 
-from ctxval._util.progress import Listener, Progress
-from ctxval._util.progress_display import amount
+from ctxval._util.progress import Listener, Progress, amount
 from ctxval.campaign.interval_search import IntervalSearch
 from ctxval.certificates import Certificate, Verdict
 from ctxval.core.trial import Trial
-from ctxval.web.background import Innermost
 from ctxval.web.jobs import Files, Pictures, ServedCampaign, Snapshot, pictures_of
 
 
@@ -48,6 +46,27 @@ class Work:
         counted = amount(progress, now - self.reached)
         text = f"{progress.stage}, {counted}" if counted else progress.stage
         return {"text": text, "done": progress.done, "expected": progress.expected, "seconds": int(now - self.started)}
+
+
+class Innermost:
+    """Sends the innermost stage of long work to a listener, and not more than five times a second if it only counts."""
+
+    def __init__(self, send: Listener) -> None:
+        self._send, self._stage, self._at = send, "", 0.0
+        self._running: dict[int, Progress] = {}
+
+    def __call__(self, progress: Progress) -> None:
+        """Hear the progress of any stage."""
+        if progress.ended:
+            self._running.pop(progress.depth, None)
+        else:
+            self._running[progress.depth] = progress
+        if not self._running:
+            return
+        innermost, now = self._running[max(self._running)], time.monotonic()
+        if innermost.stage != self._stage or now - self._at >= 0.2:
+            self._stage, self._at = innermost.stage, now
+            self._send(innermost)
 
 
 class PageState:
@@ -165,7 +184,7 @@ class LiveCampaign(PageState):
     live = True
 
     def __init__(self, served: ServedCampaign, search: IntervalSearch | None) -> None:
-        super().__init__(served, served.snapshot())
+        super().__init__(served, Snapshot(served.campaign.trials))
         self._search = search
         self.hear = Innermost(self._follow_progress("choosing"))
         self._drawn = self._cost = 0.0
@@ -221,7 +240,7 @@ class LiveCampaign(PageState):
 
     async def _watch(self) -> None:
         while True:
-            fresh = self.served.snapshot()
+            fresh = Snapshot(self.served.campaign.trials)
             if (fresh.signature, fresh.executions) != (self.snapshot.signature, self.snapshot.executions):
                 self.snapshot = fresh
                 self.update()

@@ -298,7 +298,7 @@ def test_a_store_in_wal_mode_becomes_one_file_again(store: Path, tmp_path: Path)
     assert (len(recover(left).trials), recover(left).damaged) == (5, [])
     opened = Store.existing(left)
     assert len(opened.trials()) == 5
-    assert opened._database.execute("PRAGMA journal_mode").fetchone()[0] == "delete"
+    assert opened._execute("PRAGMA journal_mode").fetchone()[0] == "delete"
     assert [path.name for path in tmp_path.glob("left*")] == ["left.sqlite"]
     left.with_name("left.sqlite-wal").write_bytes(b"\x37\x7f\x06\x82" + random.Random(1).randbytes(9000))
     assert len(Store.existing(left).trials()) == 5

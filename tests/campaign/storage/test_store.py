@@ -130,8 +130,8 @@ def test_an_impossible_path_is_an_access_error(tmp_path: Path) -> None:
 def test_a_full_disk_loses_nothing_that_was_stored(tmp_path: Path) -> None:
     store = Store(tmp_path / "a.sqlite")
     store.add([(trial(), TRAJECTORY, None)])
-    pages = store._database.execute("PRAGMA page_count").fetchone()[0]
-    store._database.execute(f"PRAGMA max_page_count = {pages}")
+    pages = store._execute("PRAGMA page_count").fetchone()[0]
+    store._execute(f"PRAGMA max_page_count = {pages}")
     big = Trajectory(np.arange(5001.0), np.random.default_rng(1).normal(size=(5001, 4)), np.zeros((5000, 1)))
     with pytest.raises(StoreAccessError, match="full"):
         store.add([(trial(1), big, None)])

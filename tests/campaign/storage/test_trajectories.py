@@ -10,9 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ctxval import Store, Trajectory, Trial
-from ctxval.campaign.storage.database import Database
-from ctxval.campaign.storage.rows import checksum_of
-from ctxval.campaign.storage.trajectories import Side, StoredTrajectories
+from ctxval.campaign.storage.rows import Side, checksum_of
 from ctxval.errors import ForeignStoreError
 
 
@@ -29,13 +27,13 @@ def add(store: Store, number: int, system: Trajectory | None) -> None:
 def reads_of(store: Store, monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """Return a list to which each trajectory that is read from the file adds its number."""
     numbers: list[int] = []
-    read = store._trajectories._read
+    read = store._read_trajectory
 
     def counted(number: int, side: str) -> object:
         numbers.append(number)
         return read(number, side)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(store._trajectories, "_read", counted)
+    monkeypatch.setattr(store, "_read_trajectory", counted)
     return numbers
 
 
@@ -98,26 +96,26 @@ def test_a_row_that_was_repaired_is_read_again_and_a_damaged_one_is_refused(tmp_
         add(store, number, trajectory(number))
     store.trajectories([0, 1], "system")
     npz = trajectory(7).to_npz()
-    with other._database.transaction():
+    with other._transaction():
         change = "UPDATE trajectories SET npz = ?, checksum = ? WHERE trial = ? AND side = 'system'"
-        other._database.execute(change, (npz, checksum_of((0, "system", npz)), 0))
+        other._execute(change, (npz, checksum_of((0, "system", npz)), 0))
     np.testing.assert_array_equal(store.trajectories([0, 1], "system")[0].states, trajectory(7).states)
-    with other._database.transaction():
-        other._database.execute(change, (npz, 1, 1))
+    with other._transaction():
+        other._execute(change, (npz, 1, 1))
     with pytest.raises(ForeignStoreError, match="trial 1 cannot be read"):
         store.trajectories([0, 1], "system")
 
 
 def test_memory_is_bounded(tmp_path: Path) -> None:
-    database = Database(tmp_path / "a.sqlite")
     one = trajectory(0, steps=100)
     size = one.times.nbytes + one.states.nbytes + one.inputs.nbytes
-    stored = StoredTrajectories(database, memory=3 * size)
+    stored = Store(tmp_path / "a.sqlite")
+    stored._memory = 3 * size
     store = Store(tmp_path / "a.sqlite")
     for number in range(5):
         add(store, number, trajectory(number, steps=100))
-    found = stored.read(range(5), "system")
-    again = stored.read(range(5), "system")
+    found = stored.trajectories(range(5), "system")
+    again = stored.trajectories(range(5), "system")
     assert [again[number] is found[number] for number in range(5)] == [True] * 3 + [False] * 2
     for number in range(5):
         np.testing.assert_array_equal(again[number].states, trajectory(number, steps=100).states)

@@ -106,6 +106,19 @@ def test_init_overwrites_nothing(invoke: Any) -> None:
     assert Path("experiment.toml").read_bytes() == before
 
 
+def test_init_for_hardware_executes_the_program_that_it_writes(invoke: Any) -> None:
+    assert "cart.toml and cart_rig.py" in invoke("init", "cart.toml", "--hardware").stdout
+    simulated, rig = (ctxval.load_experiment(Path(name)).validation for name in ("experiment.toml", "cart.toml"))
+    assert isinstance(rig.system, systems.Subprocess)
+    point = np.array([0.4, 0.7])
+    np.testing.assert_allclose(rig.distances(point[None]), simulated.distances(point[None]), rtol=1e-9)
+    program = Path("cart_rig.py")
+    program.write_text(program.read_text().replace("> 10.0", "> 0.1"))
+    plan = rig.plan(point)
+    with pytest.raises(CtxvalError, match="at step 4 is unsafe"):
+        rig.system.execute(plan.controller, plan.task)
+
+
 def test_a_described_experiment_can_be_asked_by_hand(invoke: Any) -> None:
     manual = (
         'type = "Simulated"\nstep = { ref = "experiment_system:step" }',

@@ -187,7 +187,7 @@ def test_a_comparison_that_is_stopped_continues_with_the_same_choices(tmp_path: 
         (lambda: {"a": cart(), "b": 3}, "each value is a Validation or an Experiment or a Campaign, also 'b'"),
         (lambda: [cart(), cart()], "must be a table of names"),
         (
-            lambda: {"a": cart(), "b": cart().with_labels(Labels(units="mm"))},
+            lambda: {"a": cart(), "b": cart().with_parts(labels=Labels(units="mm"))},
             "must have the same unit, got 'm' and 'mm'",
         ),
     ],

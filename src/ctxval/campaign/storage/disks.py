@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import tempfile
-import warnings
 from contextlib import suppress
 from pathlib import Path
 
@@ -35,17 +34,6 @@ def network(path: Path) -> str:
     return kind if kind in networks else ""
 
 
-def warn_of_network(path: Path) -> None:
-    """Warn if a store is on a file system of another machine."""
-    if kind := network(path):
-        warnings.warn(
-            f"{path} is on a network file system ({kind}), whose locks and flushes are not reliable; keep "
-            "the store on a disk of this computer.",
-            StoreWarning,
-            stacklevel=4,
-        )
-
-
 def make_folder(folder: Path) -> None:
     """Make a folder and its missing parents so that they survive a power cut."""
     missing = [place for place in (folder, *folder.parents) if not place.exists()]
@@ -67,10 +55,21 @@ def sync_folder(folder: Path) -> None:
 def error_with_fallback(
     ended: Trial, trajectory: Trajectory | None, store: Path | None, error: CtxvalError
 ) -> CtxvalError:
-    """Write the fallback file of an execution; return the error of the store with a sentence that names the file."""
+    """Write the fallback file of an execution; return the error of the store with a sentence that names the file.
+
+    It has the trajectory as NPZ, or the distance or failure as JSON, and lies next to the store, or in the temporary
+    folder if this is not possible.
+    """
     if not ended.executed:
         return error
-    path = _written(ended, trajectory, store)
+    if trajectory is None:
+        values = {"trial": ended.number, "distance": ended.distance, "failure": ended.failure}
+        content, suffix = json.dumps(values).encode(), "json"
+    else:
+        content, suffix = trajectory.to_npz(), "npz"
+    name = f"{'memory' if store is None else store.stem}.trial-{ended.number}"
+    folders = (Path() if store is None else store.parent, Path(tempfile.gettempdir()))
+    path = next(filter(None, (_written(content, folder, name, suffix) for folder in folders)), None)
     if path is None:
         return type(error)(f"{error} The result of trial {ended.number} could not be written to a file either.")
     how = f"--npz {path}" if trajectory is not None else "--failed or --distance with the value in the file"
@@ -80,32 +79,25 @@ def error_with_fallback(
     )
 
 
-def _written(trial: Trial, trajectory: Trajectory | None, store: Path | None) -> Path | None:
-    """Write the trajectory of a trial as NPZ, or its distance or failure as JSON; files of other attempts stay.
-
-    The file is next to the store, or in the temporary folder if this is not possible; None if neither is.
-    """
-    stem = "memory" if store is None else store.stem
-    ended = {"trial": trial.number, "distance": trial.distance, "failure": trial.failure}
-    content, suffix = (json.dumps(ended).encode(), "json") if trajectory is None else (trajectory.to_npz(), "npz")
-    for folder in (Path() if store is None else store.parent, Path(tempfile.gettempdir())):
-        for count in range(1000):
-            path = folder / f"{stem}.trial-{trial.number}{f'.{count}' if count else ''}.{suffix}"
-            try:
-                file = path.open("xb")
-            except FileExistsError:
-                continue
-            except OSError:
-                break
-            try:
-                with file:
-                    file.write(content)
-                    file.flush()
-                    os.fsync(file.fileno())
-            except OSError:
-                with suppress(OSError):
-                    path.unlink()
-                break
-            sync_folder(folder)
-            return path
+def _written(content: bytes, folder: Path, name: str, suffix: str) -> Path | None:
+    """Write a file that survives a power cut, beside those of other attempts; None if this is not possible."""
+    for count in range(1000):
+        path = folder / f"{name}{f'.{count}' if count else ''}.{suffix}"
+        try:
+            file = path.open("xb")
+        except FileExistsError:
+            continue
+        except OSError:
+            return None
+        try:
+            with file:
+                file.write(content)
+                file.flush()
+                os.fsync(file.fileno())
+        except OSError:
+            with suppress(OSError):
+                path.unlink()
+            return None
+        sync_folder(folder)
+        return path
     return None

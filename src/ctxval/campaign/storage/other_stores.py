@@ -1,4 +1,4 @@
-"""Search for other stores of the same experiment beside a store.
+"""What a store says to a certificate besides its trials, and the other stores of the same experiment beside it.
 
 A verdict that is chosen among several stores is wrong more often than one verdict.
 """
@@ -15,12 +15,21 @@ from urllib.parse import quote
 from ctxval._util.describe import first_difference
 from ctxval.campaign.storage import schema
 from ctxval.campaign.storage.rows import COLUMNS, MOST_CHARACTERS, read_trial
-from ctxval.certificates import Neighbour
+from ctxval.campaign.storage.store import Store
+from ctxval.certificates import Neighbour, Provenance
 from ctxval.core.trial import Trial
 
 STORE_SUFFIXES = (".sqlite", ".sqlite3", ".db")
 """Suffixes of files that are taken for stores."""
 _UNREADABLE = (sqlite3.Error, OSError, ValueError, TypeError, OverflowError, MemoryError, RecursionError)
+
+
+def provenance_of_store(store: Store) -> Provenance:
+    """Return what a store says besides its trials. Nothing is written, and no code is imported or run."""
+    with store.snapshot():
+        description, changes, thresholds = store.description(), store.history(), store.thresholds()
+    beside = () if store.path is None else other_stores(store.path)
+    return Provenance.of(description, changes, thresholds, beside)
 
 
 def other_stores(path: Path) -> list[Neighbour]:

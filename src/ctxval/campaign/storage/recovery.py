@@ -18,9 +18,8 @@ from ctxval._util.describe import describe
 from ctxval._util.files import MADE_BY, temporary_folder, write_text, written_whole
 from ctxval._util.texts import guarded, shortened, visible
 from ctxval.campaign.storage import schema
-from ctxval.campaign.storage.rows import COLUMNS, checksum_of, read_json, read_trajectory, read_trial
+from ctxval.campaign.storage.rows import COLUMNS, Side, checksum_of, read_json, read_trajectory, read_trial
 from ctxval.campaign.storage.store import Store
-from ctxval.campaign.storage.trajectories import Side
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import Trial
 from ctxval.errors import CtxvalError, InputError, StoreAccessError
@@ -196,12 +195,7 @@ def _cell(value: Any) -> Any:
 
 
 def _flat(trial: Trial) -> dict[str, Any]:
-    parameters: dict[str, Any] = {}
+    flat: dict[str, Any] = {name: getattr(trial, name) for name in ("number", "origin", "state")}
     for name, value in trial.parameters.items():
-        parameters |= {f"{name}[{i}]": v for i, v in enumerate(value)} if isinstance(value, list) else {name: value}
-    last = ("distance", "failure", "executed", "attempts", "seconds")
-    return {
-        **{name: getattr(trial, name) for name in ("number", "origin", "state")},
-        **parameters,
-        **{name: getattr(trial, name) for name in last},
-    }
+        flat |= {f"{name}[{i}]": v for i, v in enumerate(value)} if isinstance(value, list) else {name: value}
+    return flat | {name: getattr(trial, name) for name in ("distance", "failure", "executed", "attempts", "seconds")}

@@ -7,7 +7,7 @@ import sys
 import zlib
 from collections.abc import Iterable
 from dataclasses import replace
-from typing import Any, NoReturn, get_args
+from typing import Any, Literal, NoReturn, get_args
 
 import numpy as np
 
@@ -18,19 +18,19 @@ from ctxval.errors import InputError
 COLUMNS = "number, origin, state, unit_point, parameters, attempts, executed, distance, failure, seconds, note, because"
 """Columns of a trial, in the order that :func:`read_trial` takes."""
 
+Side = Literal["model", "system"]
+"""Whose trajectory it is."""
+
 
 def row_of(trial: Trial) -> tuple[Any, ...]:
     """Return a trial as the values of its columns."""
+    # SQLite returns floats, which the checksum must be of.
+    distance, seconds = (None if value is None else float(value) for value in (trial.distance, trial.seconds))
     return (
         *(trial.number, trial.origin, trial.state, json.dumps(trial.unit_point.tolist())),
         *(json.dumps(trial.parameters), trial.attempts, int(trial.executed)),
-        *(real(trial.distance), trial.failure, real(trial.seconds), json.dumps(trial.note), trial.because),
+        *(distance, trial.failure, seconds, json.dumps(trial.note), trial.because),
     )
-
-
-def real(value: float | None) -> float | None:
-    """Return a number as the float that SQLite returns for it."""
-    return None if value is None else float(value)
 
 
 def checksum_of(row: tuple[Any, ...]) -> int:
@@ -39,7 +39,7 @@ def checksum_of(row: tuple[Any, ...]) -> int:
 
 
 def read_trial(row: tuple[Any, ...], checksum: Any) -> Trial | None:
-    """Return the trial of a row. Returns None if the row is damaged, or if its values are not those of a trial."""
+    """Return the trial of a row; None if the row is damaged, or if its values are not those of a trial."""
     number, origin, state, point, names, attempts, executed, distance, failure, seconds, note, because = row
     if checksum_of(row) != checksum:
         return None
@@ -53,8 +53,7 @@ def read_trial(row: tuple[Any, ...], checksum: Any) -> Trial | None:
         _numbers(unit_point) and all(0 <= value <= 1 for value in unit_point),
         isinstance(parameters, dict)
         and all(isinstance(v, str) or _number(v) or _numbers(v) for v in parameters.values()),
-        distance is None or (isinstance(distance, float) and 0 <= distance < np.inf),
-        seconds is None or (isinstance(seconds, float) and 0 <= seconds < np.inf),
+        all(value is None or (isinstance(value, float) and 0 <= value < np.inf) for value in (distance, seconds)),
         (state == "completed") == (distance is not None),
         executed if state == "unmeasured" else state != "open" or not executed,
         isinstance(failure, str | None) and isinstance(notes, dict | None) and isinstance(because, str | None),
@@ -67,7 +66,6 @@ def read_trial(row: tuple[Any, ...], checksum: Any) -> Trial | None:
 
 
 def _number(value: Any) -> bool:
-    """Return whether a value of JSON is a number that a float can hold."""
     return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
 
 
@@ -77,8 +75,7 @@ def _numbers(value: Any) -> bool:
 
 def follows(trial: Trial, earlier: list[Trial]) -> bool:
     """Return whether a trial has the next number and the same task space as the earlier trials."""
-    same_space = not earlier or trial.unit_point.shape == earlier[0].unit_point.shape
-    return trial.number == len(earlier) and same_space
+    return trial.number == len(earlier) and (not earlier or trial.unit_point.shape == earlier[0].unit_point.shape)
 
 
 def read_json(text: Any, *, finite: bool = True) -> Any:
@@ -99,10 +96,8 @@ def read_json(text: Any, *, finite: bool = True) -> Any:
 
 
 def _shallow(value: Any, levels: int) -> bool:
-    if not isinstance(value, dict | list):
-        return True
-    items = value.values() if isinstance(value, dict) else value
-    return levels > 0 and all(_shallow(item, levels - 1) for item in items)
+    items = value.values() if isinstance(value, dict) else value if isinstance(value, list) else None
+    return items is None or (levels > 0 and all(_shallow(item, levels - 1) for item in items))
 
 
 MOST_CHARACTERS = 2**24  # largest number of characters of a key, and of the JSON text of a value
@@ -139,10 +134,10 @@ def read_thresholds(stated: Any) -> tuple[StatedThreshold, ...]:
 
 
 def read_trajectory(number: int, side: str, npz: Any, checksum: Any) -> Trajectory | None:
-    """Return the trajectory of a row. Returns None if it is damaged, or belongs to another trial or side."""
-    if checksum_of((number, side, npz)) != checksum:
+    """Return the trajectory of a row; None if it is damaged, or belongs to another trial or side."""
+    if checksum_of((number, side, npz)) != checksum or not isinstance(npz, bytes):
         return None
     try:
-        return Trajectory.from_npz(npz) if isinstance(npz, bytes) else None
+        return Trajectory.from_npz(npz)
     except (InputError, TypeError, ValueError):
         return None

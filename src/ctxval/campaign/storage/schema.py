@@ -105,7 +105,7 @@ def require_files(path: Path) -> None:
                 what = f"{real}{ending} {reason.removeprefix('it ')}"
                 raise StoreAccessError(f"{path} cannot be read as a store: {what}; move it away.")
     end = b""
-    with suppress(OSError), Path(f"{real}-journal").open("rb") as file:
+    with suppress(OSError), open(f"{real}-journal", "rb") as file:
         file.seek(-8, os.SEEK_END)
         end = file.read()
     # The end of the journal of a transaction over several databases, which a store never makes.
@@ -117,11 +117,10 @@ def require_files(path: Path) -> None:
 
 def require_file(path: Path) -> None:
     """Check that a path is a regular file or does not exist."""
-    reason = ""
     try:
         reason = why_not_regular(os.stat(path).st_mode)
     except (FileNotFoundError, NotADirectoryError):
-        pass
+        return
     except (OSError, ValueError) as error:
         reason = str(getattr(error, "strerror", None) or error)
     if reason:
@@ -166,7 +165,7 @@ def plain_tables(connection: sqlite3.Connection, names: Iterable[str]) -> dict[s
 
 
 def difference(connection: sqlite3.Connection, script: str) -> str | None:
-    """Return how the tables of a file differ from those that a script makes. Returns None if they agree."""
+    """Return how the tables of a file differ from those that a script makes; None if they agree."""
     with closing(sqlite3.connect(":memory:", isolation_level=None)) as made:
         made.executescript(script)
         expected, present = _tables(made), _tables(connection)
@@ -182,6 +181,6 @@ _MASTER = "SELECT type, name, tbl_name, sql FROM sqlite_master"
 
 
 def _tables(connection: sqlite3.Connection) -> dict[tuple[str, str], tuple[str, str]]:
-    """Return the definitions without spaces and quotes, which versions of SQLite write differently."""
+    # Versions of SQLite write definitions with different spaces and quotes.
     rows = itertools.islice(connection.execute(_MASTER), 100)
     return {(k, name): (table, re.sub(r'[\s"`\[\]]', "", str(made)).lower()) for k, name, table, made in rows}

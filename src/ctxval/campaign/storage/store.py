@@ -7,7 +7,6 @@ import hashlib
 import json
 import os
 from collections.abc import Iterable, Sequence
-from contextlib import AbstractContextManager
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -17,8 +16,7 @@ from ctxval._util.representation import Shown, call
 from ctxval._util.version import VERSION
 from ctxval.campaign.storage import rows, schema
 from ctxval.campaign.storage.database import Database, now
-from ctxval.campaign.storage.rows import COLUMNS, checksum_of, read_trial, row_of
-from ctxval.campaign.storage.trajectories import Side, StoredTrajectories
+from ctxval.campaign.storage.rows import COLUMNS, Side, checksum_of, read_trajectory, read_trial, row_of
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import REDEFINED, Change, StatedThreshold, Trial
 from ctxval.errors import CtxvalError, ForeignStoreError, InputError, StoreAccessError, StoreMismatchError
@@ -30,7 +28,7 @@ CAUSE = "cause"
 
 
 @checked
-class Store:
+class Store(Database):
     """A file with the trials of one experiment.
 
     Every change is one transaction, which is on the disk before the call returns. Methods with the argument ``changes``
@@ -45,13 +43,12 @@ class Store:
     """
 
     def __init__(self, path: str | Path | None = None) -> None:
-        self._database = self._opened(path)
-        self._trajectories = StoredTrajectories(self._database)
-        # The absolute path of the file, None if the trials are in memory; and the name of the store in messages.
-        self.path, self.name = self._database.path, self._database.name
-
-    def _opened(self, path: str | Path | None) -> Database:
-        return Database(path)
+        super().__init__(path)
+        # The system's trajectories are read for each choice of a task: they stay in memory, None if there is none, with
+        # their checksums, which show what another connection has changed.
+        self._kept: dict[int, tuple[int | None, Trajectory | None]] = {}
+        self._memory = 512 * 2**20  # bytes that are left for them
+        self._version: int | None = None  # of the file when they were read
 
     @classmethod
     def existing(cls, path: str | Path) -> Store:
@@ -65,26 +62,11 @@ class Store:
             raise ForeignStoreError(f"{path} is an empty file, not a store.")
         return cls(path)
 
-    def close(self) -> None:
-        """Close the file."""
-        self._database.close()
-
-    def sole_writer(self, wait: float = 0.0) -> AbstractContextManager[None]:
-        """Prevent other processes from running this store; wait so many seconds for one that is running it.
-
-        The lock is released when the process ends, however it ends.
-        """
-        return self._database.sole_writer(wait)
-
-    def snapshot(self) -> AbstractContextManager[None]:
-        """Make all reads inside see the store at one moment. Keep them short: other processes wait to write."""
-        return self._database.snapshot()
-
     # The experiment
 
     def describe_first(self, description: dict[str, Any]) -> dict[str, Any]:
         """Store the description of the experiment if there is none yet; return the stored description."""
-        with self._database.transaction():
+        with self._transaction():
             if not self.description():
                 self._write_description(description)
                 self._insert_pairs("experiment", {_THRESHOLDS: []})
@@ -92,12 +74,12 @@ class Store:
 
     def describe_anew(self, description: dict[str, Any], change: Change) -> None:
         """Replace the description of the experiment, and record in the history what has changed and why."""
-        with self._database.transaction():
+        with self._transaction():
             self._write_description(description)
             self._insert_change(change)
 
     def _write_description(self, description: dict[str, Any]) -> None:
-        self._database.execute("DELETE FROM experiment WHERE key NOT IN (?, ?)", (_DRAWS, _THRESHOLDS))
+        self._execute("DELETE FROM experiment WHERE key NOT IN (?, ?)", (_DRAWS, _THRESHOLDS))
         self._insert_pairs("experiment", description)
 
     def description(self) -> dict[str, Any]:
@@ -106,14 +88,14 @@ class Store:
         return {key: value for key, value in pairs if key not in (_DRAWS, _THRESHOLDS)}
 
     def draws(self) -> int | None:
-        """Return the number that seeds independent draws together with the seed. Returns None if none is stored."""
+        """Return the number that seeds independent draws together with the seed; None if none is stored."""
         number = self._pairs("experiment").get(_DRAWS)
         return number if isinstance(number, int) else None
 
     def keep_draws(self, number: int) -> None:
         """Store the number that seeds independent draws; a number that is stored already stays."""
-        with self._database.transaction():
-            self._database.execute("INSERT OR IGNORE INTO experiment VALUES (?, ?)", (_DRAWS, json.dumps(number)))
+        with self._transaction():
+            self._execute("INSERT OR IGNORE INTO experiment VALUES (?, ?)", (_DRAWS, json.dumps(number)))
 
     def thresholds(self) -> tuple[StatedThreshold, ...] | None:
         """Return the thresholds in the order in which they were first stated; None if the store does not keep them.
@@ -124,7 +106,7 @@ class Store:
         try:
             return None if stated is None else rows.read_thresholds(stated)
         except InputError as error:
-            raise self._database.damaged("its thresholds cannot be read") from error
+            raise self._damaged("its thresholds cannot be read") from error
 
     def state_threshold(self, threshold: float) -> None:
         """Record a threshold with the number of distances that are known; if it is recorded already, nothing changes.
@@ -133,22 +115,22 @@ class Store:
         """
         if any(each.threshold == threshold for each in self.thresholds() or ()):
             return
-        with self._database.transaction():
+        with self._transaction():
             stated = self.thresholds()
             if stated is not None and all(each.threshold != threshold for each in stated):
-                known = self._database.execute("SELECT count(*) FROM trials WHERE state = 'completed'").fetchone()[0]
+                known = self._execute("SELECT count(*) FROM trials WHERE state = 'completed'").fetchone()[0]
                 self._write_thresholds((*stated, StatedThreshold(float(threshold), int(known), now())))
 
     def _write_thresholds(self, stated: Sequence[StatedThreshold]) -> None:
         _, text = rows.pair_of(_THRESHOLDS, [asdict(each) for each in stated])
-        self._database.execute("UPDATE experiment SET value = ? WHERE key = ?", (text, _THRESHOLDS))
+        self._execute("UPDATE experiment SET value = ? WHERE key = ?", (text, _THRESHOLDS))
 
     def keep_settings(self, settings: dict[str, Any]) -> None:
         """Store the settings that make the experiment again, for commands that get only the store."""
         if self.settings() == json.loads(json.dumps(settings)):
             return
-        with self._database.transaction():
-            self._database.execute("DELETE FROM settings")
+        with self._transaction():
+            self._execute("DELETE FROM settings")
             self._insert_pairs("settings", settings)
 
     def settings(self) -> dict[str, Any]:
@@ -157,31 +139,29 @@ class Store:
 
     def _insert_pairs(self, table: str, pairs: dict[str, Any]) -> None:
         for pair in pairs.items():
-            self._database.execute(f"INSERT INTO {table} VALUES (?, ?)", rows.pair_of(*pair))
+            self._execute(f"INSERT INTO {table} VALUES (?, ?)", rows.pair_of(*pair))
 
     def _pairs(self, table: str) -> dict[str, Any]:
         bounded = (f"CASE WHEN length({cell}) <= {rows.MOST_CHARACTERS} THEN {cell} END" for cell in ("key", "value"))
-        with self._database.rows(f"SELECT {', '.join(bounded)} FROM {table} ORDER BY rowid") as pairs:
+        with self._rows(f"SELECT {', '.join(bounded)} FROM {table} ORDER BY rowid") as pairs:
             try:
                 return rows.read_pairs(pairs)
             except InputError as error:
-                raise self._database.damaged(f"the {table} in it cannot be read") from error
+                raise self._damaged(f"the {table} in it cannot be read") from error
 
     # The history
 
     def history(self) -> list[Change]:
         """Return the later changes of the store in order, each with its reason."""
-        with self._database.rows("SELECT what, why, content, at FROM history ORDER BY number") as changes:
+        with self._rows("SELECT what, why, content, at FROM history ORDER BY number") as changes:
             try:
                 return [Change(str(what), str(why), rows.read_json(text), str(at)) for what, why, text, at in changes]
             except InputError as error:
-                raise self._database.damaged("its history cannot be read") from error
+                raise self._damaged("its history cannot be read") from error
 
     def _insert_change(self, change: Change) -> None:
-        self._database.execute(
-            "INSERT INTO history (at, what, why, content) VALUES (?, ?, ?, ?)",
-            (now(), change.what, change.why, json.dumps(change.content)),
-        )
+        statement = "INSERT INTO history (at, what, why, content) VALUES (?, ?, ?, ?)"
+        self._execute(statement, (now(), change.what, change.why, json.dumps(change.content)))
 
     def remeasure(
         self, trials: Sequence[Trial], description: dict[str, Any], change: Change, seen: tuple[int, int, int]
@@ -191,7 +171,7 @@ class Store:
         Returns False, and stores nothing, if the :meth:`signature` of the store is not the one that was seen when the
         trials were read. The change, for the history, has the previous distances.
         """
-        with self._database.transaction():
+        with self._transaction():
             if self.signature() != seen:
                 return False
             for trial in trials:
@@ -203,7 +183,6 @@ class Store:
         return True
 
     def _require_unchanged(self, changes: int | None) -> None:
-        """Check that the experiment of the store has not changed since a campaign opened it."""
         if changes is not None and self.signature()[2] != changes:
             raise StoreMismatchError(
                 f"{self.name} has changed since the campaign was opened, by remeasure or by accept_change; open the "
@@ -216,21 +195,21 @@ class Store:
         self, new: Iterable[tuple[Trial, Trajectory | None, Trajectory | None]], *, changes: int | None = None
     ) -> None:
         """Store new trials with their trajectories of model and system, None if there is none, in one transaction."""
-        with self._database.transaction():
+        with self._transaction():
             self._require_unchanged(changes)
             for trial, model_trajectory, system_trajectory in new:
                 row = row_of(trial)
                 values = (*row, checksum_of(row), now(), None if trial.state == "open" else now())
                 places = ", ".join("?" * len(values))
-                self._database.execute(
+                self._execute(
                     f"INSERT INTO trials ({COLUMNS}, checksum, opened_at, closed_at) VALUES ({places})", values
                 )
-                self._trajectories.write(trial.number, "model", model_trajectory)
-                self._trajectories.write(trial.number, "system", system_trajectory)
+                self._write_trajectory(trial.number, "model", model_trajectory)
+                self._write_trajectory(trial.number, "system", system_trajectory)
 
     def begin_attempt(self, trial: Trial, *, changes: int | None = None) -> None:
         """Record one more attempt, which the trial counts, before the execution starts."""
-        with self._database.transaction():
+        with self._transaction():
             self._require_unchanged(changes)
             self._update_open(trial, "AND state = 'open'")
 
@@ -240,11 +219,11 @@ class Store:
 
     def close_trials(self, ended: Iterable[tuple[Trial, Trajectory | None]], *, changes: int | None = None) -> None:
         """Store the results of open trials with their trajectories of the system in one transaction: all, or none."""
-        with self._database.transaction():
+        with self._transaction():
             self._require_unchanged(changes)
             for trial, system_trajectory in ended:
                 self._update_open(trial, f"AND state = 'open' AND attempts = {trial.attempts:d}", closed_at=now())
-                self._trajectories.write(trial.number, "system", system_trajectory)
+                self._write_trajectory(trial.number, "system", system_trajectory)
 
     def replace_result(
         self, before: Trial, after: Trial, trajectory: Trajectory | None, why: str, *, changes: int | None = None
@@ -253,11 +232,11 @@ class Store:
         executed = self.trajectory(before.number, "system")
         npz = None if executed is None else base64.b64encode(executed.to_npz()).decode()
         result = {"state": before.state, "distance": before.distance, "failure": before.failure, "npz": npz}
-        with self._database.transaction():
+        with self._transaction():
             self._require_unchanged(changes)
             self._update(after, closed_at=now())
-            self._trajectories.remove(after.number, "system")
-            self._trajectories.write(after.number, "system", trajectory)
+            self._execute("DELETE FROM trajectories WHERE trial = ? AND side = 'system'", (after.number,))
+            self._write_trajectory(after.number, "system", trajectory)
             self._insert_change(Change("replaced", why, {"before": {str(before.number): result}}))
 
     def _update(self, trial: Trial, where: str = "", closed_at: str | None = None) -> bool:
@@ -266,46 +245,47 @@ class Store:
         row = dict(zip(COLUMNS.split(", "), row_of(trial), strict=True))
         values = (*(row[name] for name in columns), checksum_of(row_of(trial)), closed_at, trial.number)
         assignments = f"{' = ?, '.join(columns)} = ?, checksum = ?, closed_at = coalesce(?, closed_at)"
-        return self._database.execute(f"UPDATE trials SET {assignments} WHERE number = ? {where}", values).rowcount == 1
+        return self._execute(f"UPDATE trials SET {assignments} WHERE number = ? {where}", values).rowcount == 1
 
     def _update_open(self, trial: Trial, where: str, closed_at: str | None = None) -> None:
-        """Store what an execution changes in a trial that is open, and refuse another one."""
         if self._update(trial, where, closed_at):
             return
-        row = self._database.execute("SELECT state FROM trials WHERE number = ?", (trial.number,)).fetchone()
+        row = self._execute("SELECT state FROM trials WHERE number = ?", (trial.number,)).fetchone()
         state = "not open" if row is None else "being executed by another process" if row[0] == "open" else row[0]
         raise InputError(f"trial {trial.number} is {state}, so nothing more can be told of it.")
 
     def trials(self) -> list[Trial]:
         """Return all trials in their order. Raises a :class:`ForeignStoreError` if one is damaged."""
         trials: list[Trial] = []
-        with self._database.rows(f"SELECT {COLUMNS}, checksum FROM trials ORDER BY number") as cursor:
+        with self._rows(f"SELECT {COLUMNS}, checksum FROM trials ORDER BY number") as cursor:
             for *row, checksum in cursor:
                 trial = read_trial(tuple(row), checksum)
                 if trial is None or not rows.follows(trial, trials):
-                    raise self._database.damaged(f"its trial {len(trials)} cannot be read")
+                    raise self._damaged(f"its trial {len(trials)} cannot be read")
                 trials.append(trial)
         return trials
 
     def signature(self) -> tuple[int, int, int]:
         """Return the numbers of trials, of open trials and of changes, to notice what another process has changed."""
-        with self._database.translated_errors():
-            row = self._database.execute(
+        with self._translated_errors():
+            row = self._execute(
                 "SELECT count(*), coalesce(sum(state = 'open'), 0), (SELECT count(*) FROM history) FROM trials"
             ).fetchone()
         return int(row[0]), int(row[1]), int(row[2])
 
+    # What was computed
+
     def digest(self) -> str:
         """Return a digest of all that results follow from: trials, trajectories, the experiment, and this version."""
         digest = hashlib.sha256(VERSION.encode())
-        with self._database.snapshot():
+        with self.snapshot():
             for query in (
                 f"SELECT key, value FROM experiment WHERE key != '{_THRESHOLDS}' ORDER BY key",
                 "SELECT number, checksum FROM trials ORDER BY number",
                 "SELECT trial, side, checksum FROM trajectories ORDER BY trial, side",
                 "SELECT number, what, why, content FROM history ORDER BY number",
             ):
-                with self._database.rows(query) as content:
+                with self._rows(query) as content:
                     for row in content:
                         digest.update(repr(row).encode())
         return digest.hexdigest()
@@ -313,8 +293,8 @@ class Store:
     def computed(self, key: str) -> Any:
         """Return what was computed from the present content and kept under a key; None if nothing was."""
         query = f"SELECT value, digest FROM computed WHERE key = ? AND length(value) <= {rows.MOST_CHARACTERS}"
-        with self._database.translated_errors():
-            row = self._database.execute(query, (key,)).fetchone()
+        with self._translated_errors():
+            row = self._execute(query, (key,)).fetchone()
         try:
             return rows.read_json(row[0], finite=False) if row is not None and row[1] == self.digest() else None
         except InputError:
@@ -322,10 +302,12 @@ class Store:
 
     def keep_computed(self, key: str, value: Any, digest: str) -> None:
         """Keep what was computed from the content with a digest, and forget what other content gave."""
-        with self._database.transaction():
-            self._database.execute("DELETE FROM computed WHERE digest != ?", (digest,))
+        with self._transaction():
+            self._execute("DELETE FROM computed WHERE digest != ?", (digest,))
             key, text = rows.pair_of(key, value)
-            self._database.execute("INSERT OR REPLACE INTO computed VALUES (?, ?, ?)", (key, digest, text))
+            self._execute("INSERT OR REPLACE INTO computed VALUES (?, ?, ?)", (key, digest, text))
+
+    # Trajectories
 
     def trajectory(self, number: int, side: Side) -> Trajectory | None:
         """Return a stored trajectory of a trial, whose arrays may be changed; None if there is none."""
@@ -339,7 +321,58 @@ class Store:
         Those of the system are kept in memory, up to 512 MiB, so that they are read once. Their arrays are read-only.
         A damaged trajectory is a :class:`ForeignStoreError`.
         """
-        return self._trajectories.read(numbers, side)
+        if side == "system":
+            self._forget_changed()
+            read = {number: self._of_system(number) for number in numbers}
+        else:
+            read = {number: self._read_trajectory(number, side)[1] for number in numbers}
+        return {number: trajectory for number, trajectory in read.items() if trajectory is not None}
+
+    def _forget_changed(self) -> None:
+        with self.snapshot():
+            version = self._execute("PRAGMA data_version").fetchone()[0]
+            if version == self._version:
+                return  # no other connection has changed the file
+            self._version = version
+            statement = "SELECT trial, checksum FROM trajectories WHERE side = 'system'"
+            stored = dict(self._execute(statement)) if self._kept else {}
+        for number in [number for number, (checksum, _) in self._kept.items() if stored.get(number) != checksum]:
+            self._forget(number)
+
+    def _forget(self, number: int) -> None:
+        self._memory += _size(self._kept.pop(number, (None, None))[1])
+
+    def _of_system(self, number: int) -> Trajectory | None:
+        if number not in self._kept:
+            checksum, trajectory = self._read_trajectory(number, "system")
+            if _size(trajectory) > self._memory:  # to drop an older one would not help: all are read in turn
+                return trajectory
+            if trajectory is not None:
+                for array in (trajectory.times, trajectory.states, trajectory.inputs):
+                    array.setflags(write=False)
+            self._memory -= _size(trajectory)
+            self._kept[number] = checksum, trajectory
+        return self._kept[number][1]
+
+    def _read_trajectory(self, number: int, side: Side) -> tuple[int | None, Trajectory | None]:
+        where = "FROM trajectories {} WHERE trial = ? AND side = ?"
+        with self.snapshot():
+            row = self._execute(f"SELECT npz, checksum {where.format('')}", (number, side)).fetchone()
+            # A damaged index may hide a row. The search without the index is slower, so it runs only if none is found.
+            if row is None and not self._execute(f"SELECT 1 {where.format('NOT INDEXED')}", (number, side)).fetchone():
+                return None, None
+        trajectory = None if row is None else read_trajectory(number, side, *row)
+        if trajectory is None:
+            raise self._damaged(f"the {side}'s trajectory of its trial {number} cannot be read")
+        return int(row[1]), trajectory
+
+    def _write_trajectory(self, number: int, side: Side, trajectory: Trajectory | None) -> None:
+        if side == "system":
+            self._forget(number)
+        if trajectory is not None:
+            npz = trajectory.to_npz()
+            values = (number, side, npz, checksum_of((number, side, npz)))
+            self._execute("INSERT INTO trajectories (trial, side, npz, checksum) VALUES (?, ?, ?, ?)", values)
 
     def __repr__(self) -> str:
         place = Shown("in memory") if self.path is None else self.path
@@ -348,3 +381,7 @@ class Store:
         except CtxvalError:
             return call(self, place, Shown("cannot be read"))
         return call(self, place, trials=trials, open=waiting)
+
+
+def _size(trajectory: Trajectory | None) -> int:
+    return 0 if trajectory is None else trajectory.times.nbytes + trajectory.states.nbytes + trajectory.inputs.nbytes

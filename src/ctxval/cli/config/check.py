@@ -24,7 +24,8 @@ from ctxval.core.task_suite import TaskSuite
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.validation import Validation
 from ctxval.errors import ConformanceError, CtxvalError
-from ctxval.learning.state_estimates import with_states_of_model
+from ctxval.learning.extended import with_states_of_model
+from ctxval.specs import Specification
 from ctxval.studies.aspect1 import Aspect1Report
 from ctxval.testing import check_distance, check_model, check_synthesizer
 
@@ -41,8 +42,10 @@ class Checked:
     text: str
 
 
-def check_experiment(experiment: Experiment, *, execute: bool = False, seed: int = 0) -> list[Checked]:
-    """Check that the parts of an experiment fit together."""
+def check_experiment(
+    experiment: Experiment, *, execute: bool = False, seed: int = 0, spec: Specification | None = None
+) -> list[Checked]:
+    """Check that the parts of an experiment fit together, and what the model says of its specification."""
     validation = experiment.validation
     plans: list[Plan] = []
     findings = _checked({"space": lambda: _space(validation), "tasks": lambda: _tasks(validation, seed, plans)})
@@ -60,6 +63,7 @@ def check_experiment(experiment: Experiment, *, execute: bool = False, seed: int
             "model": lambda: _model(validation, of_model),
             "batches": lambda: _batches(validation, plans),
             "distance": lambda: _distance(experiment, plans),
+            "specification": lambda: _specification(spec, plans),
             "execution": lambda: _executions(validation, plans[1], execute),
             "cost": lambda: _cost(validation, plans),
         }
@@ -216,6 +220,15 @@ def _distance(experiment: Experiment, plans: Sequence[Plan]) -> Findings:
     largest = max(validation.measure(plan, plan.model_trajectory) for plan in plans)
     if largest > 0:
         yield "noted", f"the distance between a trajectory and itself is up to {largest:.3g}, not 0"
+
+
+def _specification(spec: Specification | None, plans: Sequence[Plan]) -> Findings:
+    if spec is None:
+        return
+    robustness = [float(spec.robustness(plan.model_trajectory, plan.task)) for plan in plans]
+    satisfied, span = sum(rho > 0 for rho in robustness), f"{min(robustness):.3g} to {max(robustness):.3g}"
+    text = f"the model satisfies it in {satisfied} of {len(plans)} tasks, with a robustness of {span}"
+    yield "ok" if satisfied else "failed", text
 
 
 def _executions(validation: Validation, plan: Plan, execute: bool) -> Findings:

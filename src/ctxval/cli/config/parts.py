@@ -16,8 +16,7 @@ from pydantic.errors import PydanticUserError
 from pydantic_core import SchemaError
 
 from ctxval import cases, controllers, distances, models, systems
-from ctxval._util.files import read_bytes
-from ctxval._util.npz import Archive
+from ctxval._util.files import Archive, read_bytes
 from ctxval._util.registry import Declaration, Registry, construct, declaration_of
 from ctxval.cli.config.references import accepts, is_function, reference, require_function, require_part
 from ctxval.core.experiment import Experiment
@@ -258,11 +257,9 @@ def with_distribution(
             continue
         if kind != "normal":
             raise UnknownNameError.among(f"distribution of {name}", str(kind), ("normal", "uniform"))
-        for key in given.keys() - {"mean", "deviation"}:
-            raise UnknownNameError.among(f"argument of the distribution of {name}", key, ("mean", "deviation"))
-        if len(given) < 2:
+        if given.keys() <= {"mean", "deviation"} and len(given) < 2:
             raise InputError(f"the normal distribution of {name} needs a mean and a deviation, got {given!r}.")
-        stated[name] = Normal(**given)
+        stated[name] = construct(f"the distribution of {name}", Normal, given)
     return space.distributed(**stated) if stated else space
 
 

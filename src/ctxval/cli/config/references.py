@@ -66,7 +66,12 @@ def _here() -> str:
 def _require_place(text: str, module: str, home: str) -> None:
     """Check that a top-level module is found, and that no other module of this name is already loaded."""
     importlib.invalidate_caches()
-    place = _place_of(module)
+    # None for a module without a file, such as a built-in one.
+    specs = (finder.find_spec(module, None) for finder in sys.meta_path)
+    spec = next((spec for spec in specs if spec is not None), None)
+    place = None
+    if spec is not None:
+        place = _place(spec.origin if spec.has_location else None, spec.submodule_search_locations)
     beside = place is not None and os.path.dirname(place) in (home, os.path.join(home, module))
     if module in sys.stdlib_module_names and not beside:
         raise InputError(f"{text} is in Python's standard library, which contains no part of an experiment.")
@@ -91,15 +96,6 @@ def _require_place(text: str, module: str, home: str) -> None:
         apart = "." in name or used is None or not {folder, os.path.dirname(folder)} & others
         if not apart and PathFinder.find_spec(name, [home]) is not None:
             raise InputError(clash.format(text, name, used, f"there is one in {home} too"))
-
-
-def _place_of(module: str) -> str | None:
-    """Return the file or folder that would be imported; None if there is none, as for built-in modules."""
-    for finder in sys.meta_path:
-        spec = finder.find_spec(module, None)
-        if spec is not None:
-            return _place(spec.origin if spec.has_location else None, spec.submodule_search_locations)
-    return None
 
 
 def _place(file: str | None, folders: Any) -> str | None:

@@ -1,7 +1,4 @@
-"""Settings: the content of an experiment file with the options of the command line, as a store keeps them.
-
-:func:`load_experiment` is the way from Python to an experiment file.
-"""
+"""Settings: the content of an experiment file with the options of the command line, as a store keeps them."""
 
 from __future__ import annotations
 
@@ -22,16 +19,8 @@ from ctxval.campaign.storage.store import Store
 from ctxval.certificates import KINDS, RESOLUTION, CertificateOptions, require_use
 from ctxval.certificates.options import CONFIDENCE, LEAST_CONFIDENCE, MOST_VOLUME, WITHIN
 from ctxval.certificates.prediction_tests import TESTS
-from ctxval.cli.config.parts import (
-    TaskTable,
-    argument,
-    named_experiment,
-    part,
-    refusal_of,
-    require_types,
-    task_function,
-    with_distribution,
-)
+from ctxval.cli.config import parts
+from ctxval.cli.config.parts import argument, part, refusal_of, require_types
 from ctxval.cli.config.references import reference, require_function
 from ctxval.cli.config.signatures import code_named, signed
 from ctxval.core.experiment import Experiment
@@ -81,14 +70,14 @@ class CertificateTable(BaseModel):
     def _used(self) -> CertificateTable:
         if self.kind not in KINDS.imported:
             return self  # it is checked when it is used: reading imports nothing, and a store must stay readable
-        fields = {name: field for name, field in type(self).model_fields.items() if name != "kind"}
-        changed = [name for name, field in fields.items() if getattr(self, name) != field.default]
+        fields, extra = type(self).model_fields, self.model_extra or {}
+        changed = {name for name, field in fields.items() if name != "kind" and getattr(self, name) != field.default}
         try:
-            for name in self.model_extra or {}:
-                if name not in (names := {*type(self).model_fields, *KINDS[self.kind].options()}):
+            for name in extra:
+                if name not in (names := {*fields, *KINDS[self.kind].options()}):
                     raise UnknownNameError.among("setting", name, names)
-            require_use(self.kind, sorted({*changed, *(self.model_extra or {})}))
-            require_types(f"certificate {self.kind!r}", KINDS[self.kind], self.model_extra or {})
+            require_use(self.kind, sorted({*changed, *extra}))
+            require_types(f"certificate {self.kind!r}", KINDS[self.kind], extra)
         except (CertificateError, InputError) as error:
             raise PydanticCustomError("use", str(error)) from error
         return self
@@ -98,13 +87,12 @@ class CertificateTable(BaseModel):
     ) -> CertificateOptions:
         """Return the kind, the options and the confidence of the certificate for the verdict."""
         given, chosen = dict(stated or {}), KINDS.find(kind or self.kind)
-        planned_kind = kind is None or kind == self.kind
         require_use(chosen.name, given)
-        # For another kind than the planned one, only those settings of the file hold that are not about one kind.
-        common = {"stochastic", "resolution", "volume", "tests", "quantile"}
-        planned = self.model_dump(include=None if planned_kind else common)
-        further = {**(self.model_extra or {}), **given} if planned_kind else given
-        merged = {**planned, **require_types(f"certificate {chosen.name!r}", chosen, further)}
+        if kind in (None, self.kind):
+            planned, given = self.model_dump(), {**(self.model_extra or {}), **given}
+        else:  # only those settings of the file hold that are not about one kind
+            planned = self.model_dump(include={"stochastic", "resolution", "volume", "tests", "quantile"})
+        merged = {**planned, **require_types(f"certificate {chosen.name!r}", chosen, given)}
         return CertificateOptions(chosen.of(merged), confidence, merged["volume"])
 
 
@@ -140,11 +128,8 @@ class Aspect1Table(BaseModel):
 class SpecTable(BaseModel):
     """The table ``[spec]``: what a closed loop shall do, which ``ctxval safe`` judges.
 
-    Its other entries are the arguments of the specification.
-
-    Attributes:
-        type: the name of the specification.
-        margin: the robustness of M that shall suffice for a task to be safe; None to find it.
+    Its other entries are the arguments of the specification. The margin is the robustness of M that shall suffice for a
+    task to be safe; None to find it.
     """
 
     model_config = ConfigDict(extra="allow")
@@ -154,8 +139,7 @@ class SpecTable(BaseModel):
 
     def on(self, experiment: Experiment) -> Experiment:
         """Return an experiment that judges the specification in place of its distance; the threshold is the margin."""
-        distance = UnsafeMargin({"type": self.type, **(self.model_extra or {})}, margin=self.margin)
-        return judged_by(experiment, distance)
+        return judged_by(experiment, UnsafeMargin({"type": self.type, **(self.model_extra or {})}, margin=self.margin))
 
 
 _WHOLE = ("space", "task", "system", "model", "synthesizer")
@@ -169,8 +153,6 @@ class Settings(BaseModel):
     Attributes:
         suite: the parameters of each task by its name, in the place of the space, if tasks are a list.
         distribution: see :func:`~ctxval.cli.config.parts.with_distribution`; a named experiment may have one too.
-        longest: the largest horizon.
-        spec: what a closed loop shall do, if ``judge`` is ``spec``.
         judge: whether the distance is judged or, as by ``ctxval safe``, the specification.
         physical: the task parameters that change the dynamics of the system; a named experiment may have some too.
         outputs: the indices of M's states that are recorded, or the function ``module:attr`` of them.
@@ -216,7 +198,17 @@ class Settings(BaseModel):
 
     def load(self) -> Experiment:
         """Return the experiment."""
-        experiment = self._described() if self.experiment is None else self._named(self.experiment)
+        if self.experiment is None:
+            experiment = self._described()
+        else:
+            for name in (*_WHOLE, "suite", "distance", "name", "outputs"):
+                if getattr(self, name) is not None:
+                    why = f"remove one of them, because a named experiment has its own {name}"
+                    raise InputError(f"the file has both 'experiment' and {name!r}: {why}.")
+            if "seed" in self.options:
+                where = "write it at the top of the file, or give --seed"
+                raise InputError(f"[options] must not contain the seed: {where}.")
+            experiment = parts.named_experiment(self.experiment, self.seed, self.options, self.folder)
         validation = given = experiment.validation
         if self.refined is not None:  # a model that was learned from executions of the given one
             path = (self.folder or Path()) / self.refined
@@ -226,11 +218,13 @@ class Settings(BaseModel):
             validation = validation.with_model(Refined(refined, refined.data, given.model))
             experiment = replace(experiment, truth=None)
         if self.longest is not None:
-            validation = validation.with_longest(self.longest)
+            validation = validation.with_parts(longest=self.longest)
         if self.physical is not None:
-            validation = validation.with_physical(self.physical)
+            validation = validation.with_parts(physical=self.physical)
         if self.distribution is not None:
-            validation = validation.with_space(with_distribution(validation.space, self.distribution, self.folder))
+            validation = validation.with_space(
+                parts.with_distribution(validation.space, self.distribution, self.folder)
+            )
         experiment = experiment if validation is given else replace(experiment, validation=validation)
         if self.judge == "distance":
             return experiment
@@ -240,31 +234,19 @@ class Settings(BaseModel):
             raise InputError(f"if a specification is judged, its margin is the threshold, got {self.threshold:g}.")
         return self.spec.on(experiment)
 
-    def _named(self, experiment: str) -> Experiment:
-        for name in (*_WHOLE, "suite", "distance", "name", "outputs"):
-            if getattr(self, name) is not None:
-                why = f"remove one of them, because a named experiment has its own {name}"
-                raise InputError(f"the file has both 'experiment' and {name!r}: {why}.")
-        if "seed" in self.options:
-            raise InputError("[options] must not contain the seed: write it at the top of the file, or give --seed.")
-        return named_experiment(experiment, self.seed, self.options, self.folder)
-
     def _described(self) -> Experiment:
         if self.space is not None and self.suite is not None:
             raise InputError("the file has both [space] and [suite]: tasks fill a box, or they are a list.")
-        whole = [name for name in _WHOLE if name != "space" or self.suite is None]
-        missing = ", ".join(name for name in whole if getattr(self, name) is None)
-        if missing:
+        needed = _WHOLE if self.suite is None else _WHOLE[1:]
+        if missing := ", ".join(name for name in needed if getattr(self, name) is None):
             how = "name an experiment, as in experiment = 'pendulum', or describe one"
             raise InputError(f"the file must {how}: it has no {missing}.")
         if self.options:
             raise InputError(
                 "[options] is only for a named experiment (experiment = ...); this file describes its own."
             )
-        if self.suite is not None:
-            space: TaskSpace = TaskSuite(self.suite)
-        else:
-            space = TaskSpace(**{name: tuple(bounds) for name, bounds in (self.space or {}).items()})
+        box = {name: tuple(bounds) for name, bounds in (self.space or {}).items()}
+        space = TaskSpace(**box) if self.suite is None else TaskSuite(self.suite)
         system = part("system", self.system or {}, self.folder)
         outputs: Any = self.outputs
         if isinstance(self.outputs, str):
@@ -272,9 +254,10 @@ class Settings(BaseModel):
         default: Part = "FinalState"
         if self.spec is not None:  # d_a, of the states that the specification looks at
             default = {"type": "MaximumDeviation", "components": (self.spec.model_extra or {}).get("components")}
+        task = parts.task_function(self.task or {}, space, system, self.folder)
         validation = Validation(
             space=space,
-            task=task_function(self.task or {}, space, system, self.folder),
+            task=task,
             system=system,
             model=part("model", self.model or {}, self.folder),
             synthesizer=part("synthesizer", self.synthesizer or {}, self.folder),
@@ -282,17 +265,14 @@ class Settings(BaseModel):
             labels=Labels(labels_of(self.states), labels_of(self.inputs), self.units or ""),
             outputs=outputs,
         )
-        if isinstance(validation.task, TaskTable):
-            validation.require_goal(validation.task(space.parameters(space.low)))
+        if isinstance(task, parts.TaskTable):
+            validation.require_goal(task(space.parameters(space.low)))
         return Experiment(self.name or "experiment", validation)
 
     def campaign(
         self, experiment: Experiment, store: Store | Path, *, accept_change: str | None = None, remeasure: bool = False
     ) -> Campaign:
-        """Return a campaign, and write these settings into its store, signed by this user.
-
-        The signature lets later commands run the code that the settings name without asking.
-        """
+        """Return a campaign, and sign these settings in its store: later commands may run the code that they name."""
         campaign = Campaign(
             experiment.validation,
             search=self.search.build(self.folder),
@@ -352,13 +332,28 @@ def read_settings(target: str, overrides: dict[str, Any]) -> Settings:
     is_file = target.endswith(".toml")
     if not is_file and ":" not in target and Path(target).suffix:
         raise InputError(not_an_experiment(target))
-    content = _read_toml(Path(target)) if is_file else {"experiment": target}
+    content: dict[str, Any] = {"experiment": target}
+    if is_file:
+        path = Path(target)
+        try:
+            content = tomllib.loads(path.read_bytes().decode("utf-8"))
+        except FileNotFoundError:
+            example = f"`ctxval init {shlex.quote(str(path))}` writes an example"
+            raise InputError(f"there is no experiment file {path}; {example}.") from None
+        except OSError as error:
+            raise InputError(f"the experiment file {path} cannot be read: {error.strerror}.") from error
+        except (ValueError, RecursionError) as error:
+            raise InputError(f"{path} is not valid TOML: {error}.") from error
     if "folder" in content:
         where = "modules and files are read from the folder of this file"
         raise InputError(f"{target}: no setting is called 'folder'; {where}.")
     given = {key: value for key, value in overrides.items() if value is not None}
-    options = {**_table(content, "options"), **given.pop("options", {})}
-    search = _table(content, "search")
+    options: Any = content.get("options", {})
+    search: Any = content.get("search", {})
+    for key, table in (("options", options), ("search", search)):
+        if not isinstance(table, dict):
+            raise InputError(f"[{key}] must be a table, got {table!r}.")
+    options = {**options, **given.pop("options", {})}
     named = given.pop("search", None)
     if named is not None and named != search.get("name", DEFAULT_SEARCH):
         search = {"name": named}  # the options in the file were those of another search
@@ -381,9 +376,6 @@ def load_experiment(target: str | Path, *, seed: int | None = None, **options: A
         target: the path of the file, or the name or reference.
         seed: the seed of a case, or of the function that makes the experiment (default: that of the file, or 0).
         options: options of a case, or of that function.
-
-    Raises:
-        InputError: if the file or a part that it describes cannot be used.
     """
     return read_settings(str(target), {"seed": seed, "options": options or None}).load()
 
@@ -393,26 +385,6 @@ def not_an_experiment(target: str, *others: str) -> str:
     kinds = ", ".join(("neither a case", "an experiment file (.toml)", *others))
     attribute = f" (here {Path(target).stem}:NAME)" if Path(target).suffix == ".py" else ""
     return f"{target} is {kinds} nor a reference module:attr{attribute}."
-
-
-def _table(content: dict[str, Any], key: str) -> dict[str, Any]:
-    table = content.get(key, {})
-    if not isinstance(table, dict):
-        raise InputError(f"[{key}] must be a table, got {table!r}.")
-    return table
-
-
-def _read_toml(path: Path) -> dict[str, Any]:
-    try:
-        with path.open("rb") as file:
-            return tomllib.load(file)
-    except FileNotFoundError:
-        name = shlex.quote(str(path))
-        raise InputError(f"there is no experiment file {path}; `ctxval init {name}` writes an example.") from None
-    except OSError as error:
-        raise InputError(f"the experiment file {path} cannot be read: {error.strerror}.") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise InputError(f"{path} is not valid TOML: {error}.") from error
 
 
 def sentence_of(source: str, error: ValidationError) -> str:

@@ -43,8 +43,8 @@ def key_path() -> Path:
 
 def signed(settings: Mapping[str, Any], before: Mapping[str, Any]) -> dict[str, Any]:
     """Return settings with a signature of this user; without one if the user's key cannot be made."""
-    plain = _plain(settings)
-    signatures = _signatures(before) if _plain(before) == plain else []
+    plain: dict[str, Any] = json.loads(json.dumps(unsigned(settings)))  # as a store returns them
+    signatures = _signatures(before) if unsigned(before) == plain else []
     with suppress(OSError):
         signatures = list(dict.fromkeys([_signature(_made_key(), plain), *signatures]))
     # At most 16, one for each user and computer.
@@ -73,12 +73,6 @@ def why_no_key() -> str | None:
     except OSError as error:
         return f"the key in {error.filename or 'the home folder'} cannot be used: {error.strerror}"
     return None
-
-
-def _plain(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Return settings without signatures, in the form in which a store returns them."""
-    plain: dict[str, Any] = json.loads(json.dumps(unsigned(settings)))
-    return plain
 
 
 def _signatures(settings: Mapping[str, Any]) -> list[str]:

@@ -172,10 +172,9 @@ def experiment(seed: int = 0, model: str = "fnn", settings: Settings | None = No
 
 @dataclass(frozen=True, eq=False)
 class Aspects:
-    """The final distances of the closed loops from their targets, the two aspects of Remark 1.
+    """The final distances of the closed loops from their targets ``(N, 2)`` in m, the two aspects of Remark 1.
 
     Attributes:
-        targets: the targets, shape ``(N, 2)``, m.
         model_error: Aspect-1, the final distance of the model's end effector from its target, shape ``(N,)``, m.
         system_error: the same distance of the arm under the same controllers; NaN if the execution failed.
     """

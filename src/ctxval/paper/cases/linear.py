@@ -53,12 +53,7 @@ class Settings:
 
 @dataclass(frozen=True, eq=False)
 class LinearSystem:
-    """The system ``x' = A x + B u``.
-
-    Attributes:
-        A: matrix of the states, shape ``(n, n)``, 1/s.
-        B: matrix of the inputs, shape ``(n, m)``, 1/s.
-    """
+    """The system ``x' = A x + B u`` with the matrices A ``(n, n)`` and B ``(n, m)`` in 1/s."""
 
     A: Array
     B: Array
@@ -73,11 +68,7 @@ class LinearSystem:
 
 @dataclass(frozen=True, eq=False)
 class Feedback:
-    """The feedback ``u = K (x - x_final)``.
-
-    Attributes:
-        gain: the gain K, shape ``(m, n)``.
-    """
+    """The feedback ``u = K (x - x_final)`` with the gain K, shape ``(m, n)``."""
 
     gain: Array
 

@@ -27,10 +27,7 @@ from ctxval.errors import UnknownNameError
 class Pendulum:
     """A rod on a hinge, driven by a torque: ``m l^2 / 3 th'' = m g l / 2 sin th + u`` (eq. 3); th = 0 is upright.
 
-    Attributes:
-        mass: kg.
-        length: m.
-        gravity: m/s^2.
+    The mass is in kg, the length in m, and gravity in m/s^2.
     """
 
     mass: float = 1.0

@@ -111,7 +111,6 @@ def table_text(out: Path, studies: Sequence[Study], results: Results, scale: Sca
 
 
 def _parameters(case: str) -> list[str]:
-    """Return a case's settings and the reasons that its docstring gives."""
     module = importlib.import_module(f"ctxval.paper.cases.{case}")
     fields = dataclasses.fields(module.Settings)
     values = [f"`{field.name}` = {field.default}" for field in fields]

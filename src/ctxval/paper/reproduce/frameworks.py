@@ -165,20 +165,19 @@ class _Pair:
         return np.asarray((slope(gap, rows) * gap).sum(axis=(-1, -2)))
 
     def gradient(self, U: Array, weights: Array) -> Array:
-        """Gradient of ``sum(weights * gap)`` with respect to the inputs, shape ``(..., H, 1)``."""
-        return self._pulled_back(self.system, U, weights) - self._pulled_back(self.model, U, weights)
+        """Gradient of ``sum(weights * gap)`` with respect to the inputs, shape ``(..., H, 1)``.
 
-    def _pulled_back(self, model: Model, U: Array, weights: Array) -> Array:
-        """Propagate the weights of the states back to the inputs by the adjoint ``l_t = w_t + A_t' l_(t+1)``."""
-        A, B = linearize(model, self.run(model, U).states[..., :-1, :], U)
-        A = np.broadcast_to(A, (*U.shape[:-1], *A.shape[-2:]))
-        B = np.broadcast_to(B, (*U.shape[:-1], *B.shape[-2:]))
-        gradient = np.empty_like(U)
-        adjoint = weights[..., -1, None, :]
-        for t in reversed(range(self.task.horizon)):
-            gradient[..., t, :] = (adjoint @ B[..., t, :, :])[..., 0, :]
-            adjoint = weights[..., t, None, :] + adjoint @ A[..., t, :, :]
-        return gradient
+        The weights of the states are propagated back to the inputs by the adjoint ``l_t = w_t + A_t' l_(t+1)``.
+        """
+        of_system, of_model = np.empty_like(U), np.empty_like(U)
+        for model, gradient in ((self.system, of_system), (self.model, of_model)):
+            A, B = linearize(model, self.run(model, U).states[..., :-1, :], U)
+            A, B = (np.broadcast_to(matrix, (*U.shape[:-1], *matrix.shape[-2:])) for matrix in (A, B))
+            adjoint = weights[..., -1, None, :]
+            for t in reversed(range(self.task.horizon)):
+                gradient[..., t, :] = (adjoint @ B[..., t, :, :])[..., 0, :]
+                adjoint = weights[..., t, None, :] + adjoint @ A[..., t, :, :]
+        return of_system - of_model
 
 
 def _directions(order: float, counts: Array, restarts: int) -> Array:
@@ -190,14 +189,14 @@ def _directions(order: float, counts: Array, restarts: int) -> Array:
     times, n = np.flatnonzero(counts.any(axis=1)), counts.shape[1]
     directions = np.zeros((restarts, *counts.shape))
     for r in range(restarts):
-        if order == np.inf:
-            index, sign = divmod(r, 2)
-            level, component = divmod(index, n)
-            # 0, 1/2, 1/4, 3/4, 1/8, ... (van der Corput): each entry falls into the largest gap.
-            share = sum((level >> j & 1) * 0.5 ** (j + 1) for j in range(level.bit_length()))
-            directions[r, times[-1 - int(share * len(times))], component] = 1 - 2 * sign
-        else:
+        if order == 1:
             directions[r] = [1 - 2 * (r >> j & 1) for j in range(n)]
+            continue
+        index, sign = divmod(r, 2)
+        level, component = divmod(index, n)
+        # 0, 1/2, 1/4, 3/4, 1/8, ... (van der Corput): each entry falls into the largest gap.
+        share = sum((level >> j & 1) * 0.5 ** (j + 1) for j in range(level.bit_length()))
+        directions[r, times[-1 - int(share * len(times))], component] = 1 - 2 * sign
     return directions * counts
 
 

@@ -21,6 +21,7 @@ from ctxval._util.code_digest import module_digest
 from ctxval._util.json_lines import JsonLines
 from ctxval.campaign.campaign import Campaign
 from ctxval.core.experiment import Experiment
+from ctxval.core.validation import Validation
 from ctxval.distances import TrackingError
 from ctxval.gp.kernels import Matern
 from ctxval.gp.surrogate import fit_surrogate
@@ -38,7 +39,7 @@ class Job:
     """One run, completely defined by its fields.
 
     Attributes:
-        kind: a key of :data:`KINDS`.
+        kind: ``search``, ``truth``, ``profile``, ``frameworks``, ``aspects`` or ``loops``.
         seed: seed of the data, the model and the search.
         options: options of the case, as pairs of name and value.
         search: the name of the search, for the kind ``search``.
@@ -63,23 +64,6 @@ class Job:
     def experiment(self) -> Experiment:
         """Return the case that the job runs on."""
         return cases.by_name(self.case, self.seed, **dict(self.options))
-
-
-def _search(job: Job) -> Result:
-    """Return the points and distances of one campaign in order, or only the records for independent draws."""
-    experiment = job.experiment()
-    search = _informed(job) if job.search in INFORMED else searches.by_name(job.search)
-    if searches.BaseSearch.of(search).iid:
-        # The points do not depend on the distances, so all of them are executed in one batch.
-        search.reset(experiment.validation.space.dimension, job.seed)
-        unit = search.ask(job.budget)
-        points = experiment.validation.space.from_unit(unit)
-        return {"executions": job.budget, "records": records(experiment.validation.distances(points))}
-    campaign = Campaign(experiment.validation, search=search, seed=job.seed, name=experiment.name)
-    campaign.run(job.budget, explore=True)
-    points = experiment.validation.space.from_unit(np.array([trial.unit_point for trial in campaign.trials]))
-    distances = [np.nan if trial.distance is None else trial.distance for trial in campaign.trials]
-    return {"points": points.tolist(), "distances": distances}
 
 
 INFORMED = ("gp-ucb-prior-mean", "gp-ucb-hyperprior")
@@ -123,20 +107,51 @@ def distances_of(result: Result) -> Array:
     return distances
 
 
-def _truth(job: Job) -> Result:
-    find = job.experiment().truth
-    assert find is not None  # each case of the paper has one
-    truth = find()
-    return {"distance": truth.distance, "point": truth.parameters.points.tolist(), "method": truth.method}
+def run_job(job: Job) -> Result:
+    """Run one job on one thread."""
+    with single_threaded():
+        if job.kind == "frameworks":
+            return frameworks(job.seed, per_axis=job.budget)
+        experiment = job.experiment()
+        validation = experiment.validation
+        if job.kind == "search":
+            return _searched(job, experiment)
+        if job.kind == "truth":
+            assert experiment.truth is not None  # each case of the paper has one
+            truth = experiment.truth()
+            return {"distance": truth.distance, "point": truth.parameters.points.tolist(), "method": truth.method}
+        if job.kind == "profile":
+            points = validation.space.grid(job.budget)
+            return {"points": points[:, 0].tolist(), "distances": validation.distances(points).tolist()}
+        if job.kind == "aspects":
+            return _aspects(job, validation)
+        # How far the closed loops on M and on S go below the paper's goal, and how far they are apart.
+        model, system = closed_loops(validation, validation.task(validation.space.parameters([PAPERS_GOAL])))
+        gap = np.abs(system.states - model.states)
+        return {
+            "model_undershoot": PAPERS_GOAL - float(model.states[:, 0].min()),
+            "system_undershoot": PAPERS_GOAL - float(system.states[:, 0].min()),
+            "apart": float(gap.max()),
+            "end": float(gap[-1].sum()),
+        }
 
 
-def _profile(job: Job) -> Result:
-    validation = job.experiment().validation
-    points = validation.space.grid(job.budget)
-    return {"points": points[:, 0].tolist(), "distances": validation.distances(points).tolist()}
+def _searched(job: Job, experiment: Experiment) -> Result:
+    """Return the points and distances of one campaign in order, or only the records for independent draws."""
+    search = _informed(job) if job.search in INFORMED else searches.by_name(job.search)
+    if searches.BaseSearch.of(search).iid:
+        # The points do not depend on the distances, so all of them are executed in one batch.
+        search.reset(experiment.validation.space.dimension, job.seed)
+        points = experiment.validation.space.from_unit(search.ask(job.budget))
+        return {"executions": job.budget, "records": records(experiment.validation.distances(points))}
+    campaign = Campaign(experiment.validation, search=search, seed=job.seed, name=experiment.name)
+    campaign.run(job.budget, explore=True)
+    points = experiment.validation.space.from_unit(np.array([trial.unit_point for trial in campaign.trials]))
+    distances = [np.nan if trial.distance is None else trial.distance for trial in campaign.trials]
+    return {"points": points.tolist(), "distances": distances}
 
 
-def _aspects(job: Job) -> Result:
+def _aspects(job: Job, validation: Validation) -> Result:
     """Return how far model and system are from completing their tasks (Remark 1).
 
     For the arm, it is the final distance from a grid of targets. For other cases, it is the mean distance of the
@@ -145,7 +160,6 @@ def _aspects(job: Job) -> Result:
     if job.case == "arm":
         errors = arm.aspects(job.seed, **dict(job.options), per_axis=job.budget)
         return {"model_error": errors.model_error.tolist(), "system_error": errors.system_error.tolist()}
-    validation = job.experiment().validation
     points = validation.space.iid(job.budget, np.random.default_rng(job.seed))
     missed = TrackingError(components=(0, 1), over="mean")
     references = validation.task(validation.space.parameters(points)).reference
@@ -154,36 +168,6 @@ def _aspects(job: Job) -> Result:
         "system_error": validation.with_distance(missed).distances(points).tolist(),
         "size": np.abs(references[..., 1:, 1]).mean(axis=-1).tolist(),
     }
-
-
-def _loops(job: Job) -> Result:
-    """Return how far the closed loops on M and on S go below the paper's goal, and how far they are apart."""
-    validation = job.experiment().validation
-    model, system = closed_loops(validation, validation.task(validation.space.parameters([PAPERS_GOAL])))
-    gap = np.abs(system.states - model.states)
-    return {
-        "model_undershoot": PAPERS_GOAL - float(model.states[:, 0].min()),
-        "system_undershoot": PAPERS_GOAL - float(system.states[:, 0].min()),
-        "apart": float(gap.max()),
-        "end": float(gap[-1].sum()),
-    }
-
-
-KINDS: dict[str, Callable[[Job], Result]] = {
-    "search": _search,
-    "truth": _truth,
-    "profile": _profile,
-    "frameworks": lambda job: frameworks(job.seed, per_axis=job.budget),
-    "aspects": _aspects,
-    "loops": _loops,
-}
-"""The kinds of jobs, each with the function that runs it."""
-
-
-def run_job(job: Job) -> Result:
-    """Run one job on one thread."""
-    with single_threaded():
-        return KINDS[job.kind](job)
 
 
 class Results:

@@ -78,7 +78,6 @@ class Study(ABC):
 
     Attributes:
         name: its name on the command line, and the name of its files.
-        title: its title.
         case: the case that it runs on.
         axes: the labels of the two axes.
         legend: the number of columns of the legend.
@@ -132,7 +131,6 @@ class ExecutionsWithin(Study):
 
     Attributes:
         column: the name of the places in the data.
-        places: the places on the horizontal axis.
         dodge: the horizontal distance between the triangles of two techniques.
     """
 

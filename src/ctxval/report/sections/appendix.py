@@ -108,7 +108,7 @@ def appendix(context: ReportContext) -> Iterator[Entry]:
         listed = "; ".join(f"{label} {share}" for label, share in shares)
         robustness = f"Total Sobol indices of the predicted distance, the largest first: {listed}."
     lights = "; ".join(f"{finding.name}: {WORDS[finding.light]}" for finding in context.diagnostics)
-    changes = "; ".join(f"{change.at[:19]} {change.what}: {change.why}" for change in context.changes)
+    changes = "; ".join(f"{change.at[:19]} {change.what}: {change.why}" for change in context.store.history())
     yield Entry("Uncertainty characterization", f"{_NASA}, {_V10}, {_V20}", uncertainty)
     yield Entry("Results robustness (sensitivity)", _NASA, robustness)
     yield Entry("Assumptions", f"{_NASA}, {_V10}", f"{assumptions}.")

@@ -1,20 +1,22 @@
-"""The distance over the tasks, as a curve, a map or slices, and in the order of execution."""
+"""The distance over the tasks, as a curve, a map or slices, and in the order of execution; and the envelope."""
 
 from __future__ import annotations
 
 import numpy as np
 from markupsafe import Markup
 
-from ctxval._util.arrays import Array
+from ctxval._util.arrays import Array, Mask
 from ctxval._util.progress import stage
+from ctxval.certificates.envelope import Envelope
+from ctxval.core.space import TaskSpace
 from ctxval.core.trial import Trial
 from ctxval.report.charts import SMALL, Axis, Chart, Kind, colour_scale, small_charts
 from ctxval.report.context import ReportContext
 from ctxval.report.distance_model import Band, DistanceModel, distance_of
 from ctxval.report.findings import stored_predictions
-from ctxval.report.markup import bar, element, heading, joined, number, paragraph, percent, table
+from ctxval.report.markup import UNCUT, bar, element, heading, joined, number, paragraph, percent, table, text
 
-_CURVE, _GRID = 121, 32  # number of points of a curve, and of each side of a map
+_CURVE, _GRID, _CELLS = 121, 32, 41  # points of a curve, of each side of a map, and of each side of an envelope
 
 _ORIGINS: tuple[tuple[Kind, str, tuple[str, ...]], ...] = (
     ("initial", "initial, drawn as a test or chosen by a person", ("iid", "spread", "initial", "manual")),
@@ -28,37 +30,31 @@ def distances(context: ReportContext) -> Markup:
     model = context.distance_model
     if model is None:
         return paragraph("Fewer than two distances are known, so no picture of the distance can be drawn.")
-    predicted = _predicted(context, model)
+    predicted, d = _predicted(context, model), context.space.dimension
     # The distance over one parameter is on the first screen; a suite has no tasks between its own.
-    if context.space.dimension == 1 or context.suite is not None:
-        parts = [element("div", predicted, class_="charts")]
-    else:
-        caption = (
-            "Sensitivity of the distance: the share of each parameter in the variance of the predicted distance, alone "
-            "and together with others (total Sobol index)"
-        )
-        shares = ((context.space.labels[j], float(model.sensitivity[j])) for j in model.influence)
-        rows = ((label, percent(share), bar(share)) for label, share in shares)
-        second = element("div", table(caption, ("Parameter", "Share", "Bar"), rows), predicted, class_="charts")
-        note = "Lines, bands and maps are pictures of what the trials suggest, and no certificate."
-        parts = [paragraph(note), *_over_space(context, model), second]
-    return joined([*parts, *_region(context)])
-
-
-def _over_space(context: ReportContext, model: DistanceModel) -> list[Markup]:
-    """Return a map with two slices if there are two parameters, otherwise a slice for each."""
-    d = context.space.dimension
+    if d == 1 or context.suite is not None:
+        return joined([element("div", predicted, class_="charts"), *_region(context)])
+    parts = [paragraph("Lines, bands and maps are pictures of what the trials suggest, and no certificate.")]
     if d == 2:
         values = (_estimated(context, _grid_of_tasks()) or model.predict(_grid_of_tasks())).median
         values = np.nan_to_num(values, nan=float(context.distances.max()))
         title = "Map of the distance over the two parameters, with the executed tasks"
         drawn = _map(context, title, values, context.distance_label)
-        return [element("div", drawn, *(_slice(context, axis) for axis in range(2)), class_="charts")]
-    axes = model.influence[:12]
-    rest = f"{d - len(axes)} parameters with less influence have no slice here."
-    slices = filter(None, (_slice(context, axis, small=True) for axis in axes))
-    parts = [heading("Slices through the worst task"), small_charts(list(slices))]
-    return parts if d == len(axes) else [paragraph(rest), *parts]
+        parts.append(element("div", drawn, *(distance_along(context, axis) for axis in range(2)), class_="charts"))
+    else:
+        axes = model.influence[:12]
+        if d > len(axes):
+            parts.append(paragraph(f"{d - len(axes)} parameters with less influence have no slice here."))
+        slices = filter(None, (distance_along(context, axis, small=True) for axis in axes))
+        parts += [heading("Slices through the worst task"), small_charts(list(slices))]
+    caption = (
+        "Sensitivity of the distance: the share of each parameter in the variance of the predicted distance, alone and "
+        "together with others (total Sobol index)"
+    )
+    shares = ((context.space.labels[j], float(model.sensitivity[j])) for j in model.influence)
+    rows = ((label, percent(share), bar(share)) for label, share in shares)
+    sensitivity = table(caption, ("Parameter", "Share", "Bar"), rows)
+    return joined([*parts, element("div", sensitivity, predicted, class_="charts"), *_region(context)])
 
 
 def _estimated(context: ReportContext, unit: Array) -> Band | None:
@@ -81,13 +77,10 @@ def _estimated(context: ReportContext, unit: Array) -> Band | None:
     return None if model is None else model.predict(unit)
 
 
-def distance_over_task(context: ReportContext) -> Chart | None:
-    """Return the distance over the only parameter with the executed tasks; None if too few distances are known."""
-    return _slice(context, 0) if context.worst_first else None
-
-
-def _slice(context: ReportContext, axis: int, *, small: bool = False) -> Chart | None:
+def distance_along(context: ReportContext, axis: int, *, small: bool = False) -> Chart | None:
     """Return the distance along one parameter, through the worst executed task; None if it cannot be estimated."""
+    if not context.worst_first:
+        return None
     space, worst = context.space, context.worst_first[0]
     # Designs that cannot be made in a batch take long.
     count = _CURVE if context.batched or context.validation is None else 31
@@ -96,16 +89,14 @@ def _slice(context: ReportContext, axis: int, *, small: bool = False) -> Chart |
     x, band = space.from_unit(unit)[:, axis], _estimated(context, unit)
     if band is None:
         return None
-    title = f"Distance over {space.labels[axis]}" + (
-        "" if space.dimension == 1 else ", through the worst executed task"
-    )
-    limits = [limit for limit in (context.threshold, context.bound) if limit is not None]
+    title = f"Distance over {space.labels[axis]}"
+    title += "" if space.dimension == 1 else ", through the worst executed task"
     # A threshold far above all distances would flatten the curve, so it may lie outside.
     top = 3 * max(float(context.distances.max()), float(np.nanmax(band.median)))
-    shown = [value for value in limits if value <= top or top == 0]
+    shown = [value for value in context.limits if value <= top or top == 0]
     high = np.minimum(band.high, max(top, *shown, 1e-300))
     y = Axis.over(context.distance_label, context.distances, high, shown, zero=True)
-    chart = Chart(title, _parameter_axis(context, axis), y, **(SMALL if small else {}))
+    chart = Chart(title, _parameter_axis(space, axis), y, **(SMALL if small else {}))
     if band.low is band.high:
         chart.line(x, band.median, "mean", "predicted by the learned dynamics")
     else:
@@ -117,8 +108,7 @@ def _slice(context: ReportContext, axis: int, *, small: bool = False) -> Chart |
     return chart
 
 
-def _parameter_axis(context: ReportContext, axis: int) -> Axis:
-    space = context.space
+def _parameter_axis(space: TaskSpace, axis: int) -> Axis:
     return Axis(space.labels[axis], float(space.low[axis]), float(space.high[axis]))
 
 
@@ -151,7 +141,7 @@ def _grid_of_tasks() -> Array:
 def _map(context: ReportContext, title: str, values: Array, label: str) -> Markup:
     """Return a map of values on the grid of tasks, with the edge of the threshold and the executed tasks."""
     tau, top = context.threshold, max(float(values.max()), float(context.distances.max()))
-    chart = Chart(title, _parameter_axis(context, 0), _parameter_axis(context, 1), height=360)
+    chart = Chart(title, _parameter_axis(context.space, 0), _parameter_axis(context.space, 1), height=360)
     chart.image(values.reshape(_GRID, _GRID), 0.0, top)
     if tau is not None and (values > tau).any() and (values <= tau).any():
         # The edge of the region above the threshold lies between the cells of the map.
@@ -207,7 +197,7 @@ def _region(context: ReportContext) -> list[Markup]:
         unit = _grid_of_tasks() if d == 2 else np.random.default_rng(0).random((400, d))
     bounds = learned.expected(unit, before) + margin
     inside, points, label = bounds <= tau, space.from_unit(unit), f"predicted {context.distance_label} + margin"
-    text = paragraph(
+    meaning = paragraph(
         f"A task keeps the threshold {number(tau)} if its predicted distance plus the margin {number(margin)} of the "
         f"certificate is at most the threshold. This holds for {percent(float(inside.mean()))} of the tasks that are "
         f"drawn here. {certificate.statement}"
@@ -217,17 +207,17 @@ def _region(context: ReportContext) -> list[Markup]:
     if d == 2:
         drawn = _map(context, title, np.nan_to_num(bounds, nan=np.nanmax(bounds)), label)
     elif d == 1:
-        axes = _parameter_axis(context, 0), Axis.over(label, bounds, tau, zero=True)
+        axes = _parameter_axis(context.space, 0), Axis.over(label, bounds, tau, zero=True)
         chart = Chart("Predicted distance plus margin, and the threshold", *axes)
         drawn = chart.line(points[:, 0], bounds, "mean", label).limit(tau, "threshold", "threshold")
     else:  # the chart shows the two parameters to which the distance is most sensitive
         i, j = (0, 1) if model is None else model.influence[:2]
-        drawn = chart = Chart(title, _parameter_axis(context, i), _parameter_axis(context, j), height=360)
+        drawn = chart = Chart(title, _parameter_axis(context.space, i), _parameter_axis(context.space, j), height=360)
         if not inside.all():
             chart.marks(points[~inside, i], points[~inside, j], "weak", "above the threshold or not predicted")
         if inside.any():
             chart.marks(points[inside, i], points[inside, j], "sample", "keeps the threshold")
-    return [heading("Where the threshold is kept"), text, element("div", drawn, class_="charts wide")]
+    return [heading("Where the threshold is kept"), meaning, element("div", drawn, class_="charts wide")]
 
 
 def convergence(context: ReportContext) -> Markup:
@@ -253,9 +243,8 @@ def distances_in_order(context: ReportContext) -> Chart | None:
     numbers = np.array([trial.number for trial in context.completed], dtype=np.float64)
     so_far = np.maximum.accumulate(context.distances)
     last = float(max(trial.number for trial in context.trials))
-    limits = [limit for limit in (context.threshold, context.bound) if limit is not None]
     x = Axis("trial", -0.02 * max(last, 1.0), 1.02 * max(last, 1.0), whole=True)
-    y = Axis.over(context.distance_label, context.distances, limits, zero=True)
+    y = Axis.over(context.distance_label, context.distances, context.limits, zero=True)
     chart = Chart("Distance of each trial, and the largest one so far", x, y)
     risen = np.flatnonzero(np.diff(so_far, prepend=-1.0) > 0)  # the line is the same without all other points
     steps = np.repeat(numbers[risen], 2)[1:], np.repeat(so_far[risen], 2)[:-1]
@@ -271,3 +260,68 @@ def distances_in_order(context: ReportContext) -> Chart | None:
         bottom = np.full(len(context.failed), 0.03 * chart.y.ends[1])
         chart.marks([trial.number for trial in context.failed], bottom, "failed", "no distance is known")
     return chart
+
+
+# The envelope, on the first screen
+
+
+def envelope(context: ReportContext) -> Markup:
+    """Return where the model can be trusted; empty if no envelope was computed."""
+    known = context.envelope
+    if known is None:
+        return Markup()
+    stated = [] if known.doubt is not None else [paragraph(text(known.statement, UNCUT))]
+    has_picture = known.doubt is None and context.suite is None and known.share > 0
+    drawn = [_trusted_tasks(context, known)] if has_picture else []
+    words = paragraph(text(known.words, UNCUT))
+    return element("div", heading("Where the model can be trusted"), *stated, words, joined(drawn), class_="envelope")
+
+
+def _trusted_tasks(context: ReportContext, known: Envelope) -> Chart:
+    """Return the trusted tasks over one or two parameters; the others are those of a task in the largest region."""
+    space = context.space
+    if space.dimension == 1:
+        unit = np.linspace(0, 1, 401)[:, None]
+        points, bounds = space.from_unit(unit)[:, 0], known.bound_at(unit)
+        trusted = np.isfinite(bounds)
+        y = Axis.over(context.distance_label, bounds[trusted], context.distances, known.threshold, zero=True)
+        chart = Chart("Trusted tasks, and a bound on their distance", _parameter_axis(space, 0), y)
+        for run in _runs(trusted):
+            chart.band(points[run], np.zeros_like(points[run]), bounds[run], "trusted")
+        chart.limit(known.threshold, "threshold", "threshold")
+        chart.line(points, np.where(trusted, bounds, np.nan), "bound", "bound on the distance there")
+        return chart.marks(context.coordinates(context.completed)[:, 0], context.distances, "sample", "executed")
+    # The two parameters of the picture, and a trusted task whose other parameters it shows.
+    limited = [] if not known.regions else [space.labels.index(x) for x in known.regions[0].limits if x in space.labels]
+    i, j = sorted([*limited, *(k for k in range(space.dimension) if k not in limited)][:2])
+    tasks = np.random.default_rng(0).random((1000, space.dimension))
+    centre = tasks[known.bound_at(tasks).argmin()]
+    side = (np.arange(_CELLS) + 0.5) / _CELLS
+    unit = np.broadcast_to(centre, (_CELLS, _CELLS, space.dimension)).copy()
+    unit[..., i], unit[..., j] = np.meshgrid(side, side, indexing="xy")
+    trusted = np.isfinite(known.bound_at(unit))
+    title = "Trusted tasks (shaded)"
+    if space.dimension > 2:
+        values = space.from_unit(centre)
+        others = [k for k in range(space.dimension) if k not in (i, j)]
+        title += f", at {', '.join(f'{space.names[k]} {values[k]:.3g}' for k in others[:4])}"
+        title += "" if len(others) <= 4 else " and so on"
+    chart = Chart(title, _parameter_axis(space, i), _parameter_axis(space, j), height=330)
+    low, width = space.low[[i, j]], (space.high - space.low)[[i, j]] / _CELLS
+    for row in range(_CELLS):
+        bottom, top = low[1] + width[1] * np.array([row, row + 1])
+        for run in _runs(trusted[row]):
+            chart.band(low[0] + width[0] * np.array([run.start, run.stop]), [bottom] * 2, [top] * 2, "trusted")
+    if space.dimension == 2:
+        points = context.coordinates(context.completed)
+        above = context.distances > known.threshold
+        for chosen, kind, label in ((~above, "sample", "executed below the threshold"), (above, "failed", "above it")):
+            if chosen.any():
+                chart.marks(points[chosen, 0], points[chosen, 1], kind, label)  # type: ignore[arg-type]
+    return chart
+
+
+def _runs(mask: Mask) -> list[slice]:
+    """Return the runs of trusted points."""
+    ends = np.flatnonzero(np.diff(mask, prepend=False, append=False)).tolist()
+    return [slice(*pair) for pair in zip(ends[::2], ends[1::2], strict=True)]

@@ -28,29 +28,7 @@ def trials(context: ReportContext) -> Markup:
     """Return the table of all trials, the place for one trial, its data, and the worst trials."""
     if not context.trials:
         return paragraph("There are no trials.")
-    lines = recorded_lines(context)
-    # Data for the page's script: the element is no script itself, and its content cannot end it.
-    plain = json.dumps(lines.data, allow_nan=False, separators=(",", ":"))
-    escaped = Markup(plain.translate({ord(character): f"\\u{ord(character):04x}" for character in "<>&"}))
-    # Those with the largest distances, and those without a distance.
-    shown = [*context.worst_first, *(trial for trial in context.trials if trial.distance is None)][:_ROWS]
-    headers = ("trial", "distance", "state", "origin", *context.task_labels, "time [s]", "attempts", "remarks")
-    tasks = zip(shown, context.tasks_of(shown), strict=True)
-    rows = [_row(trial, task, trial.number in lines.kept) for trial, task in tasks]
-    caption = f"Trials, the largest distance first{'' if len(shown) == len(context.trials) else f' ({_ROWS} of them)'}"
-    return joined(
-        [
-            *_left_out(context, lines),
-            table(caption, headers, rows, "sortable", id_="trials", label="Table of trials", scroll="scroll tall"),
-            element("div", id="trial", aria_live="polite", class_="needs-script"),
-            element("script", escaped, type="application/json", id="trial-data"),
-            *_worst(context),
-        ]
-    )
-
-
-def _left_out(context: ReportContext, lines: RecordedLines) -> list[Markup]:
-    notes = []
+    lines, notes = recorded_lines(context), list[str]()
     if lines.left_out:
         notes.append(
             f"The page has the trajectories of {len(lines.kept)} of {len(context.trials)} trials. Those of "
@@ -62,7 +40,24 @@ def _left_out(context: ReportContext, lines: RecordedLines) -> list[Markup]:
         notes.append("The corrected model is not drawn, because the experiment is not loaded.")
     elif context.replays:
         notes.append("The corrected model in each trial is learned from the other trials.")
-    return [paragraph(" ".join(notes))] if notes else []
+    # Data for the page's script: the element is no script itself, and its content cannot end it.
+    plain = json.dumps(lines.data, allow_nan=False, separators=(",", ":"))
+    escaped = Markup(plain.translate({ord(character): f"\\u{ord(character):04x}" for character in "<>&"}))
+    # Those with the largest distances, and those without a distance.
+    shown = [*context.worst_first, *(trial for trial in context.trials if trial.distance is None)][:_ROWS]
+    headers = ("trial", "distance", "state", "origin", *context.task_labels, "time [s]", "attempts", "remarks")
+    tasks = zip(shown, context.tasks_of(shown), strict=True)
+    rows = [_row(trial, task, trial.number in lines.kept) for trial, task in tasks]
+    caption = f"Trials, the largest distance first{'' if len(shown) == len(context.trials) else f' ({_ROWS} of them)'}"
+    return joined(
+        [
+            *([paragraph(" ".join(notes))] if notes else []),
+            table(caption, headers, rows, "sortable", id_="trials", label="Table of trials", scroll="scroll tall"),
+            element("div", id="trial", aria_live="polite", class_="needs-script"),
+            element("script", escaped, type="application/json", id="trial-data"),
+            *_worst(context),
+        ]
+    )
 
 
 def _row(trial: Trial, task: list[float | str], recorded: bool) -> Markup:

@@ -13,8 +13,7 @@ from ctxval.report.context import ReportContext
 from ctxval.report.distance_model import distance_of
 from ctxval.report.findings import WORDS, Finding
 from ctxval.report.markup import UNCUT, bullets, element, heading, joined, paragraph, percent, quantity, table, text
-from ctxval.report.sections.distances import distance_over_task, distances_in_order
-from ctxval.report.sections.envelope import envelope
+from ctxval.report.sections.distances import distance_along, distances_in_order, envelope
 from ctxval.report.sections.repeat import command_of, path_of
 from ctxval.report.sections.trials import task_of
 
@@ -30,7 +29,7 @@ def verdict(context: ReportContext) -> Markup:
     answer = "no verdict" if context.verdict is None else context.verdict.answer
     word = element("p", _shape(answer), " ", answer.capitalize(), class_="word")
     curve = context.space.dimension == 1 and context.suite is None
-    chart = (distance_over_task(context) if curve else None) or distances_in_order(context)
+    chart = (distance_along(context, 0) if curve else None) or distances_in_order(context)
     picture = element("div", chart or paragraph("No distance is known yet."), class_="picture")
     advice, command = _next(context)
     block = markup.code(command, "Next command") if command else None

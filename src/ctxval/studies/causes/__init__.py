@@ -1,6 +1,23 @@
 """Why a model fails: the causes of its error, with their sizes in physical units."""
 
-from ctxval.studies.causes.actuators import (
+from ctxval.studies.causes.cause import Cause, Repaired
+from ctxval.studies.causes.find import find_causes
+from ctxval.studies.causes.mechanics import (
+    Bias,
+    BodyMass,
+    Coulomb,
+    Gravity,
+    Inertia,
+    JointAttribute,
+    LoadFriction,
+    MassCentre,
+    Stribeck,
+    TimeStep,
+    Viscous,
+)
+from ctxval.studies.causes.plant import Joint
+from ctxval.studies.causes.report import CauseReport
+from ctxval.studies.causes.signals import (
     Backlash,
     DeadZone,
     Delay,
@@ -9,15 +26,11 @@ from ctxval.studies.causes.actuators import (
     Lag,
     ReversedInput,
     Saturation,
+    SensorOffset,
+    SensorScale,
     SwappedInputs,
+    SwappedJoints,
 )
-from ctxval.studies.causes.cause import Cause, Repaired
-from ctxval.studies.causes.find import find_causes
-from ctxval.studies.causes.mechanics import Bias, Coulomb, Gravity, Inertia, LoadFriction, Stribeck, TimeStep, Viscous
-from ctxval.studies.causes.mjcf import BodyMass, JointAttribute, MassCentre
-from ctxval.studies.causes.plant import Joint, Plant
-from ctxval.studies.causes.report import CauseReport, Explained, Separating
-from ctxval.studies.causes.sensors import SensorOffset, SensorScale, SwappedJoints
 
 __all__ = [
     "Backlash",
@@ -28,7 +41,6 @@ __all__ = [
     "Coulomb",
     "DeadZone",
     "Delay",
-    "Explained",
     "Gravity",
     "Inertia",
     "InputGain",
@@ -38,13 +50,11 @@ __all__ = [
     "Lag",
     "LoadFriction",
     "MassCentre",
-    "Plant",
     "Repaired",
     "ReversedInput",
     "Saturation",
     "SensorOffset",
     "SensorScale",
-    "Separating",
     "Stribeck",
     "SwappedInputs",
     "SwappedJoints",

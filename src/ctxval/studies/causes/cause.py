@@ -6,6 +6,7 @@ for those that are commanded, the next state, or what is recorded of a state.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
@@ -29,7 +30,6 @@ class Cause(ShortRepr):
     A subclass changes one of the hooks below. All of them take batches.
 
     Attributes:
-        sizes: the parameters of the cause.
         name: what it is in two or three words.
         remembers: whether the inputs that act depend on earlier ones, so that it cannot be a part of a step.
     """
@@ -88,9 +88,7 @@ class Repaired(ShortRepr):
     It is a model and a system. As a system, it has all causes. A step of the model is a function of state and input, so
     it lacks causes that remember inputs, such as a delay; ``complete`` is False then.
 
-    Attributes:
-        given: M.
-        causes: those of the inputs act in this order, after the controller.
+    Causes of the inputs act in the given order, after the controller.
     """
 
     given: Model
@@ -98,11 +96,13 @@ class Repaired(ShortRepr):
 
     batched: ClassVar[bool] = True
 
-    def __post_init__(self) -> None:
+    @functools.cached_property
+    def mechanics(self) -> Model:
+        """M with what causes change in it."""
         model = self.given
         for cause in self.causes:
             model = cause.model(model)
-        object.__setattr__(self, "mechanics", model)
+        return model
 
     @property
     def complete(self) -> bool:
@@ -117,11 +117,10 @@ class Repaired(ShortRepr):
 
     def reached(self, x: Array, acting: Array) -> Array:
         """Return the next states ``(..., n)`` for the inputs that act."""
-        model: Model = vars(self)["mechanics"]
         with np.errstate(all="ignore"):
-            reached = free = np.asarray(model.step(x, acting))
+            reached = free = np.asarray(self.mechanics.step(x, acting))
             for cause in self.causes:
-                reached = cause.pushed(model, x, acting, free, reached)
+                reached = cause.pushed(self.mechanics, x, acting, free, reached)
         return reached
 
     def true(self, recorded: Array) -> Array:
@@ -140,10 +139,9 @@ class Repaired(ShortRepr):
         """Return the inputs that act in each step, for commanded ones ``(..., H, m)``."""
         for cause in self.causes:
             if cause.remembers:
-                memory, followed = None, np.empty_like(inputs)
+                memory, commanded, inputs = None, inputs, np.empty_like(inputs)
                 for t in range(inputs.shape[-2]):
-                    followed[..., t, :], memory = cause.follow(inputs[..., t, :], memory)
-                inputs = followed
+                    inputs[..., t, :], memory = cause.follow(commanded[..., t, :], memory)
             else:
                 inputs, _ = cause.follow(inputs, None)
         return inputs

@@ -16,20 +16,14 @@ from ctxval.studies.causes.candidates import Candidate
 from ctxval.studies.causes.cause import Repaired
 
 STEPS = (1, 6)  # of the predictions
-MOST = (600, 120)  # predictions of one step, and of several
-_EXACT, _NEGLIGIBLE = 0.01, 1e-3  # what is smaller is no evidence: shares of the residuals of M, and of the changes
-_LAGS = (2, 3, 4)  # steps; see `Records.structure`
 _LARGEST = 1e3  # of a residual, as a multiple of the typical one of M
 
 
 @dataclass(frozen=True, eq=False)
 class Windows(ShortRepr):
-    """Predictions over some steps: where they begin, and residuals that are too small to be evidence.
+    """Predictions over some steps: where they begin, and residuals ``(n,)`` that are too small to be evidence.
 
-    Attributes:
-        steps: after so many steps, predictions are compared with what is recorded.
-        states, inputs: rows of the first state and, in all padded runs, of the first input, shape ``(N,)``.
-        floors: shape ``(n,)``.
+    ``states`` and ``inputs`` are rows of the first state and, in all padded runs, of the first input, shape ``(N,)``.
     """
 
     steps: int
@@ -44,8 +38,7 @@ class Records:
     Attributes:
         states: of all k runs, one after the other, ``(N + k, n)``.
         inputs: of all runs, with zeros after the end of shorter ones, ``(k, H, m)``.
-        windows: predictions of one step, and of several.
-        sizes: of the residuals of M in these, shape ``(n,)`` each.
+        windows, sizes: predictions of one step and of several, and the sizes ``(n,)`` of the residuals of M in these.
     """
 
     def __init__(
@@ -53,7 +46,7 @@ class Records:
         model: Model,
         runs: Sequence[Trajectory],
         floors: Sequence[Array] | None = None,
-        most: tuple[int, int] = MOST,
+        most: tuple[int, int] = (600, 120),
         steps: tuple[int, int] = STEPS,
     ) -> None:
         self.model, self.horizons = model, [len(run.inputs) for run in runs]
@@ -62,17 +55,17 @@ class Records:
         self.inputs = np.zeros((len(runs), longest, runs[0].inputs.shape[1]))
         for padded, run in zip(self.inputs, runs, strict=True):
             padded[: len(run.inputs)] = run.inputs
-        self.windows: list[Windows] = []
-        nothing, n = Repaired(model, ()), self.states.shape[1]
+        self.windows, self.sizes = list[Windows](), list[Array]()
         for number, length in enumerate(steps):
-            window = self._window(min(length, min(self.horizons)), most[number], np.zeros(n))
-            left = self.left_by(nothing, window)
+            window = self._window(min(length, min(self.horizons)), most[number])
+            left = self.left_by(Repaired(model, ()), window)
             changes = _size(self.states[window.states + window.steps] - self.states[window.states])
-            least = np.hypot(_EXACT * _size(left), _NEGLIGIBLE * changes) if floors is None else floors[number]
+            # Smaller residuals are no evidence.
+            least = np.hypot(0.01 * _size(left), 1e-3 * changes) if floors is None else floors[number]
             self.windows.append(replace(window, floors=np.maximum(least, 1e-15)))
-        self.sizes = [np.maximum(_size(self.left_by(nothing, window)), window.floors) for window in self.windows]
+            self.sizes.append(np.maximum(_size(left), self.windows[-1].floors))
 
-    def _window(self, steps: int, most: int, floors: Array) -> Windows:
+    def _window(self, steps: int, most: int) -> Windows:
         states, inputs, first = [], [], 0
         for number, horizon in enumerate(self.horizons):
             begins = np.arange(0, horizon - steps + 1, max(1, steps // 2))
@@ -81,7 +74,7 @@ class Records:
             first += horizon + 1
         of_states, of_inputs = np.concatenate(states), np.concatenate(inputs)
         rows = np.linspace(0, len(of_states) - 1, min(len(of_states), most)).round().astype(np.intp)
-        return Windows(steps, of_states[rows], of_inputs[rows], floors)
+        return Windows(steps, of_states[rows], of_inputs[rows], np.zeros(self.states.shape[1]))
 
     @property
     def pairs(self) -> tuple[Array, Array, Array]:
@@ -105,26 +98,23 @@ class Records:
         The part is at most so large, up to one standard error. It is their autocovariance over two steps to four. Noise
         of a step or of a measurement has none of it: a measurement enters the residuals of two successive steps.
         """
-        of_runs, squares, first = [], [], 0
-        for number, horizon in enumerate(self.horizons):
-            of_states, of_inputs = first + np.arange(horizon), number * self.inputs.shape[1] + np.arange(horizon)
-            left = self.left_by(repaired, Windows(1, of_states, of_inputs, self.windows[0].floors))
-            left = np.nan_to_num(left / self.sizes[0], nan=_LARGEST).clip(-_LARGEST, _LARGEST)
-            lags = [k for k in _LAGS if k < horizon]
-            of_runs.append(np.sum([(left[k:] * left[:-k]).sum(axis=0) / (len(lags) * horizon) for k in lags], axis=0))
-            squares.append((left**2).mean(axis=0))
-            first += horizon + 1
+        left = self.left_by(repaired, self._window(1, len(self.states)))
+        left = np.nan_to_num(left / self.sizes[0], nan=_LARGEST).clip(-_LARGEST, _LARGEST)
+        of_runs, squares = [], []
+        for run in np.split(left, np.cumsum(self.horizons)[:-1]):
+            lags = [k for k in (2, 3, 4) if k < len(run)]
+            of_runs.append(np.sum([(run[k:] * run[:-k]).sum(axis=0) / (len(lags) * len(run)) for k in lags], axis=0))
+            squares.append((run**2).mean(axis=0))
         matter = self.sizes[0] > 2 * self.windows[0].floors
         part, whole = (float(np.mean(each, axis=0)[matter].sum()) for each in (of_runs, squares))
-        return max(part, 0.0) + whole / float(np.sqrt(len(_LAGS) * sum(self.horizons))), whole
+        return max(part, 0.0) + whole / float(np.sqrt(3 * sum(self.horizons))), whole
 
     def measured(self, repaired: Repaired) -> tuple[float, float]:
         """Return minus twice the log-likelihood, and the share of the squared residuals of M that is left."""
         misfit, left = 0.0, 0.0
         for window, sizes in zip(self.windows, self.sizes, strict=True):
-            errors = np.clip(
-                np.nan_to_num(self.left_by(repaired, window), nan=np.inf), -_LARGEST * sizes, _LARGEST * sizes
-            )
+            most = _LARGEST * sizes
+            errors = np.nan_to_num(self.left_by(repaired, window), nan=np.inf).clip(-most, most)
             squares = (errors**2).mean(axis=0)
             misfit += len(errors) * float(np.log((squares + window.floors**2) / sizes**2).sum())
             matter = sizes > 2 * window.floors
@@ -148,9 +138,9 @@ class Explanation(ShortRepr):
     left: float
 
     @property
-    def count(self) -> int:
-        """The number of sizes."""
-        return sum(len(each.scales) for each in self.candidates)
+    def sizes(self) -> list[float]:
+        """The sizes of all causes."""
+        return [size for cause in self.repaired.causes for size in cause.sizes]
 
 
 def explained(records: Records, candidates: tuple[Candidate, ...], begun: Sequence[float] | Array) -> Explanation:
@@ -172,7 +162,10 @@ def explained(records: Records, candidates: tuple[Candidate, ...], begun: Sequen
                 for window, size in zip(records.windows, records.sizes, strict=True)
             ]
             theta = fit.best(theta, sizes, 6)
-    return fit.explanation(theta)
+    model = fit.repaired(theta)
+    misfit, left = records.measured(model)
+    fitted = tuple(replace(each, cause=cause) for each, cause in zip(candidates, model.causes, strict=True))
+    return Explanation(fitted, model, misfit + fit.penalty, left)
 
 
 def screened(records: Records, candidates: tuple[Candidate, ...]) -> tuple[float, Array]:
@@ -271,12 +264,6 @@ class _Fit:
             xtol=1e-4, ftol=1e-5,
         )  # fmt: skip
         return np.asarray(result.x)
-
-    def explanation(self, theta: Array) -> Explanation:
-        model = self.repaired(theta)
-        misfit, left = self.records.measured(model)
-        fitted = tuple(replace(each, cause=cause) for each, cause in zip(self.candidates, model.causes, strict=True))
-        return Explanation(fitted, model, misfit + self.penalty, left)
 
 
 def _size(errors: Array) -> Array:

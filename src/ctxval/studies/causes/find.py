@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
-from ctxval._util.arrays import Array, single_threaded
+from ctxval._util.arrays import single_threaded
 from ctxval._util.progress import advance, stage
 from ctxval.campaign.campaign import Campaign
 from ctxval.campaign.history import executed_trials
@@ -16,8 +16,7 @@ from ctxval.core.system import System, WithOutputs
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.validation import Validation
 from ctxval.errors import CtxvalError, InputError
-from ctxval.learning.recorded import closed_loops_on_model
-from ctxval.learning.state_estimates import StateEstimates, with_states_of_model
+from ctxval.learning.extended import estimates_by_loops_on_model
 from ctxval.studies.causes.candidates import Candidate, candidates
 from ctxval.studies.causes.cause import Repaired
 from ctxval.studies.causes.evidence import STEPS, Explanation, Records, explained, screened
@@ -25,25 +24,15 @@ from ctxval.studies.causes.mechanics import Force
 from ctxval.studies.causes.plant import Plant, plant_of
 from ctxval.studies.causes.report import CauseReport, Explained, Separating
 
-_MOST = 8  # executions that are learned from, those with the largest distances
 _ALIKE = 10.0  # differences of the criterion that do not tell causes apart
-_SYSTEMATIC = 0.02  # of residuals that are left, differences by a third may be the way of integration; see `_alike`
 _NAMED = 0.95  # share of the squared closed-loop deviations of M that causes must explain, to be the cause
-_LEFT = 0.02  # share of the residuals that must be left, for another cause to be looked for
-_ENOUGH = 0.99  # share of the deviations that is explained, from which on no other cause is looked for
-_BETTER = 0.5  # largest share of the deviations left by one cause that two causes may leave
-_SHORT, _LONG = 60, 12  # predictions of estimated states take these parts of an execution
-_SOME = (200, 40)  # predictions of one step, and of several, that all causes are screened on
-_REFINED = 8  # causes that are fitted to all of them
 _CHECKED = 4  # explanations that are tried in closed loop
-_TASKS = 24  # at which the predictions of two causes are compared
 
 
 @dataclass(frozen=True, eq=False)
 class _Execution:
     """An executed task: its plan, what the system did, and the same with states of M if only outputs are recorded."""
 
-    point: Array
     plan: Plan
     executed: Trajectory
     states: Trajectory
@@ -67,40 +56,31 @@ def find_causes(campaign: Campaign, *, most: int = 2) -> CauseReport:
     trials.sort(key=lambda pair: -(pair[0].distance or 0.0))
     if len(trials) < 2:
         raise InputError(f"causes need at least 2 executions with trajectories in the store, got {len(trials)}.")
+    executed = [(trial.unit_point, run) for trial, run in trials[:8]]  # those with the largest distances
     with single_threaded():
-        executions = _executions(validation, [(trial.unit_point, run) for trial, run in trials[:_MOST]])
+        states = [run for _, run in executed]
+        if validation.outputs is not None:
+            estimates = estimates_by_loops_on_model(validation)
+            estimated = None if estimates is None else estimates.of(executed, len(executed))
+            if estimated is None:
+                raise InputError("the states of the model cannot be estimated from the recorded outputs.")
+            states = estimated
+        plans = [validation.plan(validation.space.from_unit(point)) for point, _ in executed]
+        executions = list(map(_Execution, plans, (run for _, run in executed), states))
         return _Study(validation, executions).report(most)
 
 
-def _executions(validation: Validation, executed: Sequence[tuple[Array, Trajectory]]) -> list[_Execution]:
-    states = [run for _, run in executed]
-    if validation.outputs is not None:
-        loops = closed_loops_on_model(with_states_of_model(validation))
-        estimates = None if loops is None else StateEstimates(validation, validation.outputs, loops.states)
-        estimated = None if estimates is None else estimates.of(executed, len(executed))
-        if estimated is None:
-            raise InputError("the states of the model cannot be estimated from the recorded outputs.")
-        states = estimated
-    space = validation.space
-    return [
-        _Execution(point, validation.plan(space.from_unit(point)), run, of_model)
-        for (point, run), of_model in zip(executed, states, strict=True)
-    ]
-
-
 class _Study:
-    """The search for the causes of a model's error in some executions."""
-
     def __init__(self, validation: Validation, executions: Sequence[_Execution]) -> None:
         self.validation, self.executions, self.model = validation, executions, validation.model
         self.outputs = validation.outputs is not None
         runs = [each.states for each in executions]
         horizon = min(len(run.inputs) for run in runs)
         # Estimated states are worth little in one step.
-        steps = (max(1, horizon // _SHORT), max(1, horizon // _LONG)) if self.outputs else STEPS
+        steps = (max(1, horizon // 60), max(1, horizon // 12)) if self.outputs else STEPS
         self.records = Records(self.model, runs, steps=steps)
         floors = [window.floors for window in self.records.windows]
-        self.some = Records(self.model, runs, floors, _SOME, steps)
+        self.some = Records(self.model, runs, floors, (200, 40), steps)  # all causes are screened on these
         self.others = [Records(self.model, runs[:k] + runs[k + 1 :], floors, steps=steps) for k in range(len(runs))]
         self.structure, _ = self.records.structure(Repaired(self.model, ()))
         x, u, residuals = self.records.pairs
@@ -123,14 +103,14 @@ class _Study:
             ranked = self._ranked(())
             chosen, alike = self._chosen(ranked)
             while chosen is not None and len(chosen.explanation.candidates) < most:
-                if chosen.explanation.left < _LEFT or chosen.share > _ENOUGH:
+                if chosen.explanation.left < 0.02 or chosen.share > 0.99:  # nothing is left for another cause
                     break
                 better, others = self._chosen(self._ranked(chosen.explanation.candidates))
                 if better is not None:  # the first one was chosen without the other ones
                     better, others = self._chosen(self._ranked(better.explanation.candidates[1:]))
                 if better is None or better.explanation.criterion > chosen.explanation.criterion - _ALIKE:
                     break
-                if 1 - better.share > _BETTER * (1 - chosen.share):
+                if 1 - better.share > 0.5 * (1 - chosen.share):
                     break
                 chosen, alike = better, others
         named = chosen is not None and chosen.complete >= _NAMED
@@ -160,7 +140,7 @@ class _Study:
                 results.append((*screened(self.some, together), together))
             advance(1)
         results.sort(key=lambda result: result[0])
-        refined = [explained(self.records, together, begun) for _, begun, together in results[:_REFINED]]
+        refined = [explained(self.records, together, begun) for _, begun, together in results[:8]]
         return sorted(refined, key=lambda explanation: explanation.criterion)
 
     def _chosen(self, ranked: list[Explanation]) -> tuple[Explained | None, list[Explained]]:
@@ -177,17 +157,16 @@ class _Study:
         others = [each for each in ranked if each is not best.explanation and _alike(best.explanation, each)]
         group = [best, *(self._in_closed_loop(each) for each in others[:_CHECKED])]
         group = [each for each in group if 1 - each.share <= 2 * (1 - best.share) + 1e-3]
-        first = min(group, key=lambda each: each.explanation.count)
+        first = min(group, key=lambda each: len(each.explanation.sizes))
         return first, [each for each in group if each is not first and not _contains(each, first)]
 
     def _in_closed_loop(self, explanation: Explanation) -> Explained:
         """Return how well causes predict each execution if they are fitted to the others."""
         deviations, distances, sizes = [], [], []
         for execution, others in zip(self.executions, self.others, strict=True):
-            begun = [size for cause in explanation.repaired.causes for size in cause.sizes]
-            fitted = explained(others, explanation.candidates, begun).repaired
-            sizes.append([size for cause in fitted.causes for size in cause.sizes])
-            loop = self.loop(fitted, execution.plan, execution)
+            fitted = explained(others, explanation.candidates, explanation.sizes)
+            sizes.append(fitted.sizes)
+            loop = self._loop(fitted.repaired, execution.plan, execution)
             deviations.append(self._deviation(execution, loop))
             distances.append(self._distance(execution, loop))
         share = 1 - float(np.sum(deviations) / max(np.sum(self.without), 1e-300))
@@ -196,7 +175,7 @@ class _Study:
         spreads = tuple(map(float, np.ptp(sizes, axis=0)))
         return Explained(explanation, share, float(np.max(distances)), spreads, min(structure, 1.0), min(noise, 1.0))
 
-    def loop(self, repaired: Repaired, plan: Plan, execution: _Execution | None = None) -> Trajectory | None:
+    def _loop(self, repaired: Repaired, plan: Plan, execution: _Execution | None = None) -> Trajectory | None:
         """Return the closed loop of a plan on a model with causes; None if it fails."""
         system: System = repaired
         task = plan.task
@@ -234,30 +213,31 @@ class _Study:
 
     def _separating(self, group: Sequence[Explained]) -> Separating | None:
         """Return the task at which the predictions of causes that the executions do not tell apart differ most."""
-        first, space, best = group[0], self.validation.space, None
-        points = space.from_unit(np.random.default_rng(0).random((_TASKS, space.dimension)))
-        for point in points:
+        first, space = group[0], self.validation.space
+        best: Separating | None = None
+        for point in space.from_unit(np.random.default_rng(0).random((24, space.dimension))):
             try:
                 plan = self.validation.plan(point)
             except CtxvalError:
                 continue
-            promised = self.loop(first.explanation.repaired, plan)
+            promised = self._loop(first.explanation.repaired, plan)
             if promised is None:
                 continue
             for number, other in enumerate(group[1:], start=1):
-                loop = self.loop(other.explanation.repaired, plan)
+                loop = self._loop(other.explanation.repaired, plan)
                 if loop is None:
                     continue
                 gap = float(np.max(np.abs(loop.states - promised.states) / self.ranges))
-                apart = float(self.validation.distance(promised.copy(), loop.copy(), plan.task))
-                if best is None or gap > best[0]:
-                    best = gap, Separating(space.describe_point(point), apart, number)
-        return None if best is None else replace(best[1], gap=best[0])
+                if best is None or gap > best.gap:
+                    apart = float(self.validation.distance(promised.copy(), loop.copy(), plan.task))
+                    best = Separating(space.describe_point(point), apart, number, gap)
+        return best
 
 
 def _alike(best: Explanation, other: Explanation) -> bool:
     """Return whether another explanation is as good as the best one, except for what is no evidence."""
-    systematic = best.left < _SYSTEMATIC and other.left < 1.3 * best.left + 2e-4
+    # Of residuals that are nearly explained, differences by a third may be the way of integration.
+    systematic = best.left < 0.02 and other.left < 1.3 * best.left + 2e-4
     return other.criterion < best.criterion + _ALIKE or systematic
 
 
@@ -265,5 +245,5 @@ def _contains(general: Explained, special: Explained) -> bool:
     """Return whether an explanation has another one as a special case, as Stribeck friction has Coulomb friction."""
     ends = general.causes[-1], special.causes[-1]
     forces = [cause for cause in ends if isinstance(cause, Force)]
-    more = general.explanation.count > special.explanation.count
+    more = len(general.explanation.sizes) > len(special.explanation.sizes)
     return more and len(forces) == 2 and forces[0].joint.rate == forces[1].joint.rate

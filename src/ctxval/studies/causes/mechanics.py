@@ -1,10 +1,10 @@
-"""Causes in the mechanics: forces that M lacks, and inertia, gravity or a time step that differ."""
+"""Causes in the mechanics: forces that M lacks; inertia, gravity, a time step and attributes of MuJoCo that differ."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -40,11 +40,7 @@ class Force(Cause):
             moved = np.array(u)
             moved[..., self.joint.input] += self.probe
             return (np.asarray(model.step(x, moved)) - free) / self.probe
-        effect = np.zeros_like(x)
-        effect[..., self.joint.rate] = self.dt
-        if self.joint.position is not None:
-            effect[..., self.joint.position] = self.joint.share * self.dt**2
-        return effect
+        return _accelerated(np.zeros_like(x), [self.joint], np.full_like(x, self.dt), self.dt)
 
     def force(self, rate: Array, load: Callable[[], Array], stopping: Array) -> Array:
         """Return the force ``(...)`` at a mean rate; the force ``stopping`` would stop the joint within the step.
@@ -98,9 +94,6 @@ class Viscous(Force):
         size = self.amount(plant, abs(self.sizes[0]), f" per {rate}" if rate else "")
         return f"{plant.joint_name(self.joint)} has {more} viscous friction than M ({size})"
 
-    def mjcf(self, plant: Plant) -> str | None:
-        return _of_dof(plant, self.joint, "damping", "dof_damping", self.sizes[0])
-
 
 @dataclass(frozen=True)
 class Coulomb(Force):
@@ -113,9 +106,6 @@ class Coulomb(Force):
 
     def text(self, plant: Plant) -> str:
         return f"{plant.joint_name(self.joint)} sticks ({self.amount(plant, self.sizes[0])})"
-
-    def mjcf(self, plant: Plant) -> str | None:
-        return _of_dof(plant, self.joint, "frictionloss", "dof_frictionloss", self.sizes[0])
 
 
 @dataclass(frozen=True)
@@ -159,6 +149,16 @@ class LoadFriction(Force):
         return f"the friction of {name} depends on the load ({100 * self.sizes[0]:.3g} % of it{more})"
 
 
+def _accelerated(reached: Array, joints: Sequence[Joint], gained: Array, dt: float) -> Array:
+    """Return next states ``(..., n)`` in which the rates of joints have changed, and their positions accordingly."""
+    changed = np.array(reached)
+    for joint in joints:
+        changed[..., joint.rate] += gained[..., joint.rate]
+        if joint.position is not None:
+            changed[..., joint.position] += joint.share * dt * gained[..., joint.rate]
+    return changed
+
+
 @dataclass(frozen=True)
 class Inertia(Cause):
     """Joints have another inertia. Size: the inertia divided by that of M.
@@ -173,16 +173,10 @@ class Inertia(Cause):
     dt: float = 1.0
 
     def pushed(self, model: Model, x: Array, u: Array, free: Array, reached: Array) -> Array:
-        changed = np.array(reached)
-        for joint in self.joints:
-            gained = (1.0 / self.sizes[0] - 1.0) * (reached[..., joint.rate] - x[..., joint.rate])
-            changed[..., joint.rate] += gained
-            if joint.position is not None:
-                changed[..., joint.position] += joint.share * self.dt * gained
-        return changed
+        return _accelerated(reached, self.joints, (1.0 / self.sizes[0] - 1.0) * (reached - x), self.dt)
 
     def text(self, plant: Plant) -> str:
-        names = " and ".join(plant.joint_name(joint) for joint in self.joints)
+        names = " and ".join(map(plant.joint_name, self.joints))
         return f"{names} {'has' if len(self.joints) == 1 else 'have'} {self.sizes[0]:.3g} times the inertia of M"
 
 
@@ -202,17 +196,13 @@ class Gravity(Cause):
     dt: float = 1.0
 
     def pushed(self, model: Model, x: Array, u: Array, free: Array, reached: Array) -> Array:
-        still, changed = np.array(x), np.array(reached)
+        still = np.array(x)
         still[..., list(self.rates)] = 0.0
         pulled = (self.sizes[0] - 1.0) * np.asarray(model.step(still, np.zeros_like(u)))
-        for joint in self.joints:
-            changed[..., joint.rate] += pulled[..., joint.rate]
-            if joint.position is not None:
-                changed[..., joint.position] += joint.share * self.dt * pulled[..., joint.rate]
-        return changed
+        return _accelerated(reached, self.joints, pulled, self.dt)
 
     def text(self, plant: Plant) -> str:
-        names = " and ".join(plant.joint_name(joint) for joint in self.joints)
+        names = " and ".join(map(plant.joint_name, self.joints))
         return f"the weights (or the springs) that pull at {names} are {self.sizes[0]:.3g} times those of M"
 
 
@@ -230,8 +220,90 @@ class TimeStep(Cause):
         return f"one step of the system takes {taken:.4g} ms of M, and not {step:.4g} ms"
 
 
-def _of_dof(plant: Plant, joint: Joint, attribute: str, field: str, added: float) -> str | None:
-    if joint.dof is None:
-        return None
-    value = float(getattr(plant.model.compiled, field)[joint.dof]) + added  # type: ignore[attr-defined]
-    return f'<joint name="{plant.mjcf_name(joint)}" {attribute}="{value:.5g}"/>'
+@dataclass(frozen=True)
+class OfMuJoCo(Cause):
+    """An attribute of a MuJoCo model that differs."""
+
+    def change(self, compiled: Any) -> None:
+        """Change a copy of the compiled model, a ``mujoco.MjModel``."""
+        raise NotImplementedError
+
+    def model(self, model: Model) -> Model:
+        assert isinstance(model, MuJoCo)
+        return model.changed(self.change)
+
+
+@dataclass(frozen=True)
+class JointAttribute(OfMuJoCo):
+    """Damping, Coulomb friction or armature of a joint. Size: what is added to the value in M, in SI units.
+
+    Attributes:
+        attribute: ``damping``, ``frictionloss`` or ``armature``.
+    """
+
+    name: ClassVar[str] = "joint attribute"
+    attribute: str = "damping"
+    joint: Joint = Joint(0)  # noqa: RUF009  # it is frozen
+
+    def change(self, compiled: Any) -> None:
+        getattr(compiled, f"dof_{self.attribute}")[self.joint.dof] += self.sizes[0]
+
+    def text(self, plant: Plant) -> str:
+        name, unit, size = plant.joint_name(self.joint), plant.force_unit(self.joint), self.sizes[0]
+        if self.attribute == "frictionloss":
+            return f"{name} sticks ({size:.3g} {unit})"
+        more = "more" if size >= 0 else "less"
+        if self.attribute == "damping":
+            per = "s/rad" if unit == "N m" else "s/m"
+            return f"{name} has {more} viscous friction than M ({abs(size):.3g} {unit} {per})"
+        return f"{name} has {more} inertia of the rotor than M ({abs(size):.3g} {'kg m^2' if unit == 'N m' else 'kg'})"
+
+    def mjcf(self, plant: Plant) -> str | None:
+        value = float(getattr(plant.compiled, f"dof_{self.attribute}")[self.joint.dof]) + self.sizes[0]
+        return f'<joint name="{plant.joint_name(self.joint)}" {self.attribute}="{value:.5g}"/>'
+
+
+@dataclass(frozen=True)
+class BodyMass(OfMuJoCo):
+    """A body is heavier or lighter, with the same shape. Size: its mass divided by that in M."""
+
+    name: ClassVar[str] = "mass"
+    body: int = 1
+
+    def change(self, compiled: Any) -> None:
+        compiled.body_mass[self.body] *= self.sizes[0]
+        compiled.body_inertia[self.body] *= self.sizes[0]
+
+    def text(self, plant: Plant) -> str:
+        compiled = plant.compiled
+        name, mass = compiled.body(self.body).name or f"body {self.body}", float(compiled.body_mass[self.body])
+        return f"{name} has a mass of {self.sizes[0] * mass:.3g} kg and not of {mass:.3g} kg"
+
+    def mjcf(self, plant: Plant) -> str | None:
+        compiled = plant.compiled
+        mass = self.sizes[0] * float(compiled.body_mass[self.body])
+        inertia = " ".join(f"{self.sizes[0] * value:.5g}" for value in compiled.body_inertia[self.body])
+        place = " ".join(f"{value:.5g}" for value in compiled.body_ipos[self.body])
+        turn = " ".join(f"{value:.5g}" for value in compiled.body_iquat[self.body])
+        return f'<inertial mass="{mass:.5g}" diaginertia="{inertia}" pos="{place}" quat="{turn}"/>'
+
+
+@dataclass(frozen=True)
+class MassCentre(OfMuJoCo):
+    """The centre of mass of a body lies elsewhere. Size: the shift in metres along an axis of the body."""
+
+    name: ClassVar[str] = "centre of mass"
+    body: int = 1
+    axis: int = 0
+
+    def change(self, compiled: Any) -> None:
+        compiled.body_ipos[self.body, self.axis] += self.sizes[0]
+
+    def text(self, plant: Plant) -> str:
+        name = plant.compiled.body(self.body).name or f"body {self.body}"
+        return f"the centre of mass of {name} is shifted by {self.sizes[0]:.3g} m along its {'xyz'[self.axis]} axis"
+
+    def mjcf(self, plant: Plant) -> str | None:
+        place = np.array(plant.compiled.body_ipos[self.body])
+        place[self.axis] += self.sizes[0]
+        return f'<inertial pos="{" ".join(f"{value:.5g}" for value in place)}"/>'

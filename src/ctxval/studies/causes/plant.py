@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -11,9 +12,6 @@ from ctxval._util.arrays import Array
 from ctxval._util.representation import ShortRepr
 from ctxval.core.model import Model
 from ctxval.models import MuJoCo
-
-_MOVED = 0.2  # least effect of an input on a rate that it may be the force of, as a share of its largest effect
-_SAME = 0.05  # largest error of a position's change as the integral of a rate, as a share of that change
 
 
 @dataclass(frozen=True)
@@ -40,7 +38,6 @@ class Plant(ShortRepr):
     """What sentences, sizes and forces need to know of a model.
 
     Attributes:
-        dt: seconds.
         states, inputs: names with units.
         joints: one for each rate of a position; if no state is a position, one for each state.
         ports: where forces on joints may enter; a joint may have several.
@@ -65,40 +62,33 @@ class Plant(ShortRepr):
         """Return the name and the unit of an input."""
         return list(self.inputs.items())[index]
 
+    @property
+    def compiled(self) -> Any:
+        """The ``mujoco.MjModel`` of M; None if M is no model of MuJoCo."""
+        return getattr(self.model, "compiled", None)
+
     def joint_name(self, joint: Joint) -> str:
         """Return the name of a joint: that of MuJoCo, or of its position, or of its rate."""
         if joint.dof is not None:
-            return self.mjcf_name(joint)
+            number = int(self.compiled.dof_jntid[joint.dof])
+            return str(self.compiled.joint(number).name) or f"joint {number + 1}"
         return self.state(joint.rate if joint.position is None else joint.position)[0]
-
-    def mjcf_name(self, joint: Joint) -> str:
-        """Return the name of a joint in a MuJoCo model."""
-        assert isinstance(self.model, MuJoCo)
-        compiled = self.model.compiled
-        number = int(compiled.dof_jntid[joint.dof])
-        return str(compiled.joint(number).name) or f"joint {number + 1}"
 
     def force_unit(self, joint: Joint) -> str:
         """Return the unit in which forces on a joint are counted."""
         if joint.dof is not None:
-            hinge = self.model.compiled.jnt_type[self.model.compiled.dof_jntid[joint.dof]] == 3  # type: ignore[attr-defined]
-            return "N m" if hinge else "N"
+            return "N m" if self.compiled.jnt_type[self.compiled.dof_jntid[joint.dof]] == 3 else "N"
         if joint.input is not None:
             name, unit = self.input(joint.input)
             return unit or f"of {name}"
-        return _per_second(self.state(joint.rate)[1])
+        unit = self.state(joint.rate)[1]
+        return f"{unit.removesuffix('/s')}/s^2" if unit.endswith("/s") else f"{unit}/s" if unit else "per s"
 
     def rate_unit(self, joint: Joint) -> str:
         """Return the unit of a joint's rate."""
         if joint.dof is not None and not self.state(joint.rate)[1]:
             return "rad/s" if self.force_unit(joint) == "N m" else "m/s"
         return self.state(joint.rate)[1]
-
-
-def _per_second(unit: str) -> str:
-    if not unit:
-        return "per s"
-    return f"{unit.removesuffix('/s')}/s^2" if unit.endswith("/s") else f"{unit}/s"
 
 
 def plant_of(
@@ -112,24 +102,21 @@ def plant_of(
     changes = np.sqrt(((reached - x) ** 2).mean(axis=0))
     commanded = np.maximum(np.abs(u).max(axis=0, initial=0.0), 1e-9)
     if isinstance(model, MuJoCo):
-        joints = ports = _mujoco_joints(model)
+        compiled = model.compiled
+        driven = {
+            int(compiled.actuator_trnid[k, 0]): k for k in range(compiled.nu) if compiled.actuator_trntype[k] == 0
+        }
+        joints = ports = tuple(
+            Joint(compiled.nq + dof, position, 1.0, driven.get(number), dof)
+            for number, (kind, position, dof) in enumerate(
+                zip(compiled.jnt_type, compiled.jnt_qposadr.tolist(), compiled.jnt_dofadr.tolist(), strict=True)
+            )
+            if kind in (2, 3)  # slides and hinges
+        )
     else:
         joints = _joints(dt, x, reached)
         ports = _ports(model, x, u, reached, commanded, joints)
     return Plant(model, dt, states, inputs, joints, ports, np.maximum(changes, 1e-12), commanded)
-
-
-def _mujoco_joints(model: MuJoCo) -> tuple[Joint, ...]:
-    compiled = model.compiled
-    driven = {
-        int(compiled.actuator_trnid[k, 0]): k for k in range(compiled.nu) if int(compiled.actuator_trntype[k]) == 0
-    }
-    return tuple(
-        Joint(compiled.nq + int(compiled.jnt_dofadr[j]), int(compiled.jnt_qposadr[j]), 1.0, driven.get(j),
-              int(compiled.jnt_dofadr[j]))
-        for j in range(compiled.njnt)
-        if int(compiled.jnt_type[j]) in (2, 3)  # slides and hinges
-    )  # fmt: skip
 
 
 def _joints(dt: float, x: Array, reached: Array) -> tuple[Joint, ...]:
@@ -148,7 +135,7 @@ def _joints(dt: float, x: Array, reached: Array) -> tuple[Joint, ...]:
             share = float(np.clip(left @ gained / max(float(gained @ gained), 1e-300), 0.0, 1.0))
             errors.append((float(((left - share * gained) ** 2).mean()), rate, share))
         error, rate, share = min(errors)
-        if rate != position and size > 0 and error < _SAME**2 * size:
+        if rate != position and size > 0 and error < 0.05**2 * size:
             pairs[rate] = position, share
     positions = {position for position, _ in pairs.values()}
     rates = [i for i in range(n) if i not in positions]
@@ -172,7 +159,7 @@ def _ports(
         sizes = np.sqrt((effects**2).mean(axis=0))
         largest = float(sizes.max(initial=0.0))
         for j, joint in enumerate(joints):
-            if largest > 0 and sizes[j] > _MOVED * largest:
+            if largest > 0 and sizes[j] > 0.2 * largest:
                 ports.append(replace(joint, input=k))
                 if np.delete(sizes, j).max(initial=0.0) < 0.01 * sizes[j] and effects[:, j].std() < 0.01 * sizes[j]:
                     alone.add(joint.rate)

@@ -15,18 +15,13 @@ from ctxval.studies.causes.cause import Cause, Repaired
 from ctxval.studies.causes.evidence import Explanation
 from ctxval.studies.causes.plant import Plant
 
-_NOISY = 0.5  # share of noise in what is left of residuals, from which on closed loops follow noise rather than causes
-_PART = 0.5  # share of the deviations from which on a cause is called a part of the error
-
 
 @dataclass(frozen=True, eq=False)
 class Explained(ShortRepr):
-    """Causes that were tried in closed loop.
+    """Causes that were tried in closed loop, each execution predicted without itself.
 
     Attributes:
-        explanation: the causes with their sizes.
-        share: the share of the squared closed-loop deviations of M that the causes explain, each execution predicted
-            without itself.
+        share: the share of the squared closed-loop deviations of M that the causes explain.
         distance: the largest distance between an execution and its prediction.
         spreads: the range of each size if one execution is left out.
         structure: the share of what is no noise in the residuals of one step that the causes explain.
@@ -48,12 +43,8 @@ class Explained(ShortRepr):
     @property
     def complete(self) -> float:
         """The share that the causes explain: of deviations, or of residuals if most of what is left is noise."""
-        return max(self.share, self.structure) if self.is_noisy else self.share
-
-    @property
-    def is_noisy(self) -> bool:
-        """Whether most of what is left of the residuals is noise."""
-        return self.noise > _NOISY
+        # Closed loops then follow noise rather than causes.
+        return max(self.share, self.structure) if self.noise > 0.5 else self.share
 
 
 @dataclass(frozen=True)
@@ -61,10 +52,9 @@ class Separating(ShortRepr):
     """The task that tells two causes apart.
 
     Attributes:
-        task: its parameters.
-        distance: the distance between what the two causes predict of it.
+        distance, gap: between what the two causes predict of it: the distance, and the largest difference of a state in
+            shares of its range.
         other: the number of the second cause among those that were explained; the first one is 0.
-        gap: the largest difference of a state, in shares of its range.
     """
 
     task: Mapping[str, Any]
@@ -78,15 +68,12 @@ class CauseReport(ShortRepr):
     """Why a model fails.
 
     Attributes:
-        plant: the parts of the model that causes act on.
         explained: the most probable causes, and others that the executions do not tell from them; empty if no cause
             predicts held-out executions better than M.
         named: whether the first of these is the cause. Otherwise the answer is none of these, and ``explained`` is what
             comes nearest.
         tried: the number of causes in the dictionary.
-        executions: the number of executions that were learned from.
-        before: the largest distance of these executions from M.
-        units: of the distance.
+        executions, before: the number of executions that were learned from, and their largest distance from M.
         separating: the task that tells causes apart which these executions do not.
         ranked: the most probable causes alone, the best one first.
     """
@@ -129,14 +116,11 @@ class CauseReport(ShortRepr):
         )
         share = f"{np.floor(1e3 * first.share) / 10:.4g} % of the squared deviations"
         if not self.named:
-            less = "The largest part of the error that one explains" if first.share > _PART else "What comes nearest"
+            less = "The largest part of the error that one explains" if first.share > 0.5 else "What comes nearest"
             return f"None of these {self.tried} causes. {less}: {self._text(first)}. It explains {share}, and {effect}."
-        texts = [self._text(each) for each in self.explained]
-        what = (
-            texts[0]
-            if len(texts) == 1
-            else f"One of these, which the executions do not tell apart: {'; or '.join(texts)}"
-        )
+        what = "; or ".join(map(self._text, self.explained))
+        if len(self.explained) > 1:
+            what = f"One of these, which the executions do not tell apart: {what}"
         together = "both" if len(first.causes) == 2 else "this"
         return f"{what[0].upper()}{what[1:]}. With {together} in M, {effect}. This explains {share}."
 

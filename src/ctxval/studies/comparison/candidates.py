@@ -16,7 +16,7 @@ from ctxval._util.describe import describe, differences
 from ctxval._util.progress import stage
 from ctxval.campaign.campaign import Campaign
 from ctxval.campaign.choices import Choice, Execution
-from ctxval.campaign.execution import RetryPolicy, Schedule, execute_schedule
+from ctxval.campaign.execution import ExecutionLoop
 from ctxval.campaign.history import executed_trials, largest_distance
 from ctxval.core.plan import gives_inputs
 from ctxval.core.trajectory import Trajectory
@@ -37,13 +37,9 @@ OnTrial = Callable[[str, Trial], None]
 
 @dataclass(frozen=True)
 class Decision:
-    """A decision that one candidate has the smaller d*.
+    """A decision that one candidate has the smaller d*: its bound is at most an executed distance of the other one.
 
-    Attributes:
-        bound: what d* of the smaller one is at most.
-        distance: the executed distance of the larger one that this bound does not exceed.
-        certificate: the kind of the certificate of the bound.
-        executions: the number of executions of all candidates, when it was decided.
+    ``executions`` is the number of executions of all candidates, when it was decided.
     """
 
     smaller: str
@@ -60,10 +56,8 @@ class TrialNote:
 
     Attributes:
         step: the number of the execution among those of all candidates, from 0; a shared execution has one number.
-        question: the question that the execution answers.
         draw: the number of the task among the independent draws; None if the task is no draw.
-        predicted: the distance that was predicted for a draw before it was drawn; None if nothing was predicted.
-        centre: the mean of this prediction over other tasks.
+        predicted, centre: the distance that was predicted for a draw before it was drawn, and its mean over others.
         shared: the name of the candidate that executed the task and the number of its trial; None if this one did.
         decided: what had been decided about the largest distances.
     """
@@ -103,13 +97,13 @@ class Candidate:
     name: str
     campaign: Campaign
     seed: int
-    _last: tuple[tuple[int, ...], Prediction | None] | None = field(default=None, init=False)
 
     def __post_init__(self) -> None:
         validation = self.campaign.validation
         self.recorder = self.campaign.recorder
         self._space, self._study = validation.space, DynamicsStudy(validation, self.seed)
         self._batched = bool(getattr(validation.synthesizer, "batched", False))
+        self._last: tuple[tuple[int, ...], Prediction | None] | None = None
 
     @property
     def trials(self) -> tuple[Trial, ...]:
@@ -128,11 +122,14 @@ class Candidate:
 
     def executed(self, *, shared: bool = False) -> list[Trial]:
         """Return the trials whose execution has ended, with or without success: its own, or those of others."""
-        return [trial for trial in self.trials if trial.executed and is_shared(trial) == shared]
+        copied = {trial.number for trial, note in self.noted if note.shared is not None}
+        return [trial for trial in self.trials if trial.executed and (trial.number in copied) == shared]
 
-    def trajectories(self) -> list[tuple[Trial, Trajectory]]:
-        """Return the completed trials with a recorded trajectory; the store keeps what it has read."""
-        return executed_trials(self.campaign.store, self.trials)
+    def trajectories(self) -> list[tuple[Trial, TrialNote | None, Trajectory]]:
+        """Return the completed trials that are its own, with their notes and trajectories; the store keeps these."""
+        recorded = executed_trials(self.campaign.store, self.trials)
+        noted = [(trial, TrialNote.of(trial), trajectory) for trial, trajectory in recorded]
+        return [each for each in noted if each[1] is None or each[1].shared is None]
 
     def highest(self, executed: Executed) -> tuple[float, Array] | None:
         """Return the largest predicted distance and its task ``(d,)``; None if nothing can be predicted."""
@@ -180,26 +177,18 @@ class Candidate:
         return self._last[1]
 
 
-def is_shared(trial: Trial) -> bool:
-    """Return whether the execution of a trial is that of another candidate."""
-    note = TrialNote.of(trial)
-    return note is not None and note.shared is not None
-
-
 @dataclass(eq=False)
 class Executions:
     """Executes tasks one at a time, and records each execution for all candidates whose controllers agree.
 
     Attributes:
-        candidates: the candidates.
         most: a number that no distance can exceed; None if none is stated.
-        on_trial: called with each trial that has ended.
         decided: the decisions on d* so far, by the names of the candidates; each new trial keeps them in its note.
     """
 
     candidates: Sequence[Candidate]
-    most: float | None = None
-    on_trial: OnTrial | None = None
+    most: float | None
+    on_trial: OnTrial
     decided: dict[tuple[str, str], Decision] = field(default_factory=dict, init=False)
     _examined: set[tuple[str, int, str]] = field(default_factory=set, init=False)
     _hidden: Array | None = field(default=None, init=False)
@@ -220,22 +209,26 @@ class Executions:
         """The number of executions that this comparison has started."""
         return max((note.step + 1 for candidate in self.candidates for _, note in candidate.noted), default=0)
 
+    def require_possible(self) -> None:
+        """Check that no executed distance refutes the stated largest one, with which decisions would be false."""
+        largest = max(candidate.largest for candidate in self.candidates)
+        if self.most is not None and largest > self.most:
+            raise InputError(f"largest_possible is {self.most:g}, but a distance of {largest:.6g} was executed.")
+
     def history(self, without: Array | None = None) -> list[tuple[Array, Trajectory]]:
         """Return all executed tasks but one in the order in which they were executed, each execution once."""
-        executed = []
-        for row, candidate in enumerate(self.candidates):
-            for trial, trajectory in candidate.trajectories():
-                if (without is None or not np.array_equal(trial.unit_point, without)) and not is_shared(trial):
-                    note = TrialNote.of(trial)
-                    order = (-1 if note is None else note.step, row, trial.number)
-                    executed.append((order, trial.unit_point, trajectory))
-        return [(point, trajectory) for _, point, trajectory in sorted(executed, key=lambda item: item[0])]
+        executed = [
+            ((-1 if note is None else note.step, row, trial.number), (trial.unit_point, trajectory))
+            for row, candidate in enumerate(self.candidates)
+            for trial, note, trajectory in candidate.trajectories()
+            if without is None or not np.array_equal(trial.unit_point, without)
+        ]
+        return [item for _, item in sorted(executed, key=lambda pair: pair[0])]
 
     def predicted(self, candidate: Candidate, note: TrialNote, point: Array) -> TrialNote:
         """Return the note of a draw with what the executions of all other tasks predict for a candidate."""
         prediction = candidate.of_draw(self.history(without=point), point, note.draw or 0, self.most)
-        value, centre = prediction or (None, None)
-        return TrialNote(note.step, "mean", note.draw, value, centre)
+        return TrialNote(note.step, "mean", note.draw, *(prediction or ()))
 
     def execute(self, candidate: Candidate, choice: Choice, note: TrialNote, *, predicts: bool) -> None:
         """Execute one task, and record the execution for the others."""
@@ -256,24 +249,20 @@ class Executions:
 
     def _run(self, candidate: Candidate, choice: Choice | None, predicts: bool) -> None:
         waiting = [] if choice is None else [choice]
-        schedule = Schedule(candidate.recorder, lambda: waiting.pop() if waiting else None, expected=None)
         with candidate.recorder.predicting(predicts), self._hiding(None if choice is None else choice.unit_point):
-            execute_schedule(schedule, None, lambda trial: self._ended(candidate, trial), RetryPolicy())
-
-    def _ended(self, candidate: Candidate, trial: Trial) -> None:
-        if self.on_trial is not None:
-            self.on_trial(candidate.name, trial)
+            ExecutionLoop(
+                candidate.recorder,
+                lambda: waiting.pop() if waiting else None,
+                on_trial=partial(self.on_trial, candidate.name),
+            ).run()
 
     def _share_all(self) -> None:
         """Record executions for the candidates that would have given the system the same inputs."""
         for candidate in self.candidates:
-            for trial, trajectory in candidate.trajectories():
-                note = TrialNote.of(trial)
-                if note is None or note.shared is not None:
-                    continue
+            for trial, note, trajectory in candidate.trajectories():
                 for other in self.candidates:
                     key = (candidate.name, trial.number, other.name)
-                    if other is not candidate and key not in self._examined:
+                    if note is not None and other is not candidate and key not in self._examined:
                         self._examined.add(key)
                         self._share(trial, trajectory, replace(note, shared=key[:2]), other)
 
@@ -300,7 +289,7 @@ class Executions:
                 ended = other.recorder.close(copy, Execution(trajectory).measured(other.recorder.validation, plan))
             except DistanceError:  # it is stored as unmeasured
                 return
-        self._ended(other, ended)
+        self.on_trial(other.name, ended)
 
     @contextmanager
     def _hiding(self, point: Array | None) -> Iterator[None]:
@@ -312,15 +301,13 @@ class Executions:
             self._hidden = before
 
     def _elsewhere(self, candidate: Candidate) -> list[Trajectory]:
-        """Return the executions that are in no trial of a candidate."""
         copied = {note.shared for _, note in candidate.noted}
         return [
             trajectory
             for other in self.candidates
             if other is not candidate
-            for trial, trajectory in other.trajectories()
-            if not is_shared(trial)
-            and (other.name, trial.number) not in copied
+            for trial, _, trajectory in other.trajectories()
+            if (other.name, trial.number) not in copied
             and (self._hidden is None or not np.array_equal(trial.unit_point, self._hidden))
         ]
 

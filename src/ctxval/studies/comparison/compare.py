@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack
-from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
 from typing import Literal
@@ -12,8 +11,7 @@ from typing import Literal
 import numpy as np
 
 from ctxval._util.checked import NonNegativeInt, PositiveFloat, PositiveInt, Probability, checked
-from ctxval._util.progress import advance, stage
-from ctxval._util.progress_display import progress_shown
+from ctxval._util.progress import advance, progress_shown, stage
 from ctxval.campaign.campaign import Campaign
 from ctxval.certificates.options import CONFIDENCE, require_confidence
 from ctxval.core.experiment import Experiment
@@ -91,11 +89,26 @@ def compare(
     both: tuple[Question, ...] = ("worst", "mean") if made[0].campaign.validation.space.members is None else ("worst",)
     questions: tuple[Question, ...] = both if question == "both" else (question,)
     each = 1 - (1 - confidence) / len(questions)
-    executions = Executions(made, largest_possible, on_trial)
-    worst = WorstQuestion(executions, each, budget, stochastic)
-    race = _Race(questions, executions, worst, MeanQuestion(executions, each, seed), budget, confidence)
-    with progress_shown(progress):
-        return race.run()
+    executions = Executions(made, largest_possible, on_trial or (lambda name, trial: None))
+    worst, mean = WorstQuestion(executions, each, budget, stochastic), MeanQuestion(executions, each, seed)
+    executions.require_possible()
+    with progress_shown(progress), ExitStack() as stack:
+        for candidate in made:
+            stack.enter_context(candidate.campaign.store.sole_writer())
+        with stage("comparing", budget, "executions", done=executions.count):
+            executions.resume()
+            while _step(questions, worst, mean, budget):
+                advance()
+    asked: dict[Question, WorstQuestion | MeanQuestion] = {"worst": worst, "mean": mean}
+    return Comparison(
+        tuple(_result(candidate, worst, mean) for candidate in made),
+        tuple(asked[name].pair(*pair) for name in questions for pair in combinations(made, 2)),
+        confidence,
+        executions.count,
+        budget,
+        made[0].campaign.validation.labels.units,
+        tuple(_assumptions(questions, worst)),
+    )
 
 
 def store_name(name: str) -> str:
@@ -103,90 +116,61 @@ def store_name(name: str) -> str:
     return "".join(letter if letter.isalnum() or letter in "-_." else "-" for letter in name).strip(".") or "candidate"
 
 
-@dataclass(eq=False)
-class _Race:
-    """A comparison in progress. What it does next follows from the stores alone, so it can be interrupted."""
+def _step(questions: tuple[Question, ...], worst: WorstQuestion, mean: MeanQuestion, budget: int) -> bool:
+    """Execute the task that is expected to decide most; return False if nothing is left to do.
 
-    questions: tuple[Question, ...]
-    executions: Executions
-    worst: WorstQuestion
-    mean: MeanQuestion
-    budget: int
-    confidence: float
+    It follows from the stores alone, so that a comparison can be interrupted.
+    """
+    executions = worst.executions
+    executions.require_possible()
+    left = budget - executions.count
+    if left <= 0:
+        return False
+    of_worst, of_mean = "worst" in questions and bool(worst.undecided), "mean" in questions
+    noted = [pair for candidate in executions.candidates for pair in candidate.noted]
+    spent = sum(trial.executed and note.shared is None and note.question == "worst" for trial, note in noted)
+    # The question about d* has half of the budget before the other one is answered.
+    if of_worst and (not of_mean or spent < 0.5 * budget) and worst.step():
+        return True
+    return of_mean and (mean.step(left) or (of_worst and worst.step()))
 
-    def run(self) -> Comparison:
-        """Execute the task that is expected to decide most, until all pairs are decided or the budget is spent."""
-        executions, candidates = self.executions, self.executions.candidates
-        self._require_possible()
-        with ExitStack() as stack:
-            for candidate in candidates:
-                stack.enter_context(candidate.campaign.store.sole_writer())
-            with stage("comparing", self.budget, "executions", done=executions.count):
-                executions.resume()
-                while self._step():
-                    advance()
-        asked: dict[Question, WorstQuestion | MeanQuestion] = {"worst": self.worst, "mean": self.mean}
-        pairs = tuple(asked[name].pair(*pair) for name in self.questions for pair in combinations(candidates, 2))
-        results, units = tuple(map(self._result, candidates)), candidates[0].campaign.validation.labels.units
-        return Comparison(
-            results, pairs, self.confidence, executions.count, self.budget, units, tuple(self._assumptions())
+
+def _result(candidate: Candidate, worst: WorstQuestion, mean: MeanQuestion) -> CandidateResult:
+    largest = candidate.campaign.worst
+    bounds = [decision.bound for decision in worst.decisions if decision.smaller == candidate.name]
+    drawn = [trial.distance for trial, _ in mean.draws_of(candidate).values() if trial.distance is not None]
+    return CandidateResult(
+        candidate.name,
+        len(candidate.executed()),
+        len(candidate.executed(shared=True)),
+        len(candidate.campaign.failed),
+        None if largest is None else largest.distance,
+        None if largest is None else largest.parameters,
+        min(bounds, default=None),
+        len(drawn),
+        float(np.mean(drawn)) if drawn else None,
+    )
+
+
+def _assumptions(questions: tuple[Question, ...], worst: WorstQuestion) -> Iterator[str]:
+    yield "the candidates were fixed before the comparison, and the system does not change during it"
+    if "worst" in questions:
+        yield (
+            f"each bound on d* holds with confidence {worst.options.confidence:.6g} under the prior that its "
+            "certificate states (dynamics or posterior); it is a probability given the executions, so neither the "
+            "changing threshold nor the time of stopping costs confidence"
         )
-
-    def _step(self) -> bool:
-        """Execute one task; return False if nothing is left to do."""
-        self._require_possible()
-        left = self.budget - self.executions.count
-        if left <= 0:
-            return False
-        worst, mean = "worst" in self.questions and bool(self.worst.undecided), "mean" in self.questions
-        noted = [pair for candidate in self.executions.candidates for pair in candidate.noted]
-        spent = sum(trial.executed and note.shared is None and note.question == "worst" for trial, note in noted)
-        # The question about d* has half of the budget before the other one is answered.
-        if worst and (not mean or spent < 0.5 * self.budget) and self.worst.step():
-            return True
-        return mean and (self.mean.step(left) or (worst and self.worst.step()))
-
-    def _require_possible(self) -> None:
-        """Check that no executed distance refutes the stated largest one, with which decisions would be false."""
-        largest, most = max(candidate.largest for candidate in self.executions.candidates), self.executions.most
-        if most is not None and largest > most:
-            raise InputError(f"largest_possible is {most:g}, but a distance of {largest:.6g} was executed.")
-
-    def _result(self, candidate: Candidate) -> CandidateResult:
-        worst = candidate.campaign.worst
-        bounds = [decision.bound for decision in self.worst.decisions if decision.smaller == candidate.name]
-        drawn = [trial.distance for trial, _ in self.mean.draws_of(candidate).values() if trial.distance is not None]
-        return CandidateResult(
-            candidate.name,
-            len(candidate.executed()),
-            len(candidate.executed(shared=True)),
-            len(candidate.campaign.failed),
-            None if worst is None else worst.distance,
-            None if worst is None else worst.parameters,
-            min(bounds, default=None),
-            len(drawn),
-            float(np.mean(drawn)) if drawn else None,
+    if "mean" in questions:
+        most, described = worst.executions.most, worst.candidates[0].campaign.validation.space.distribution
+        over = "uniform over the task space" if described is None else distribution_text(described.describe())
+        yield f"tasks are independent draws ({over})"
+        yield (
+            f"no distance can exceed {most:g}; the decisions on expected distances are then valid for any number of "
+            "tasks"
+            if most is not None
+            else "no largest possible distance is stated, so the decisions on expected distances are exact only if "
+            "corrected differences are symmetric about their mean, and asymptotic otherwise: rare large distances "
+            "that were not drawn can make them wrong"
         )
-
-    def _assumptions(self) -> Iterator[str]:
-        yield "the candidates were fixed before the comparison, and the system does not change during it"
-        if "worst" in self.questions:
-            yield (
-                f"each bound on d* holds with confidence {self.worst.options.confidence:.6g} under the prior that its "
-                "certificate states (dynamics or posterior); it is a probability given the executions, so neither the "
-                "changing threshold nor the time of stopping costs confidence"
-            )
-        if "mean" in self.questions:
-            described = self.executions.candidates[0].campaign.validation.space.distribution
-            over = "uniform over the task space" if described is None else distribution_text(described.describe())
-            yield f"tasks are independent draws ({over})"
-            yield (
-                f"no distance can exceed {self.executions.most:g}; the decisions on expected distances are then valid "
-                "for any number of tasks"
-                if self.executions.most is not None
-                else "no largest possible distance is stated, so the decisions on expected distances are exact only if "
-                "corrected differences are symmetric about their mean, and asymptotic otherwise: rare large distances "
-                "that were not drawn can make them wrong"
-            )
-        if self.worst.stochastic:
-            yield "executions of one task may differ, and the questions are about expected distances of tasks"
+    if worst.stochastic:
+        yield "executions of one task may differ, and the questions are about expected distances of tasks"

@@ -30,8 +30,7 @@ from ctxval.core.trial import Trial
 from ctxval.studies.comparison.candidates import Candidate, Decision, Executions, TrialNote
 from ctxval.studies.comparison.result import PairResult
 
-# So many more executions than the better candidate the worse one may have to come near its predicted largest one.
-_INSIST = 3
+_INSIST = 3  # executions that the worse candidate may have beyond the better one, to come near its prediction
 
 
 @dataclass(eq=False)
@@ -95,19 +94,19 @@ class WorstQuestion:
     def pair(self, a: Candidate, b: Candidate) -> PairResult:
         """Return what is decided of a pair."""
         names = {a.name, b.name}
-        decision = next((kept for kept in self.decisions if {kept.smaller, kept.larger} == names), None)
-        if decision is None:
-            reason = (
-                f"the largest executed distances are {a.largest:.4g} ({a.name}) and {b.largest:.4g} ({b.name}), and no "
-                "bound separates them"
-            )
-        else:
-            reason = (
-                f"d* of {decision.smaller} is at most {decision.bound:.4g} by the {decision.certificate} bound, and an "
-                f"executed distance of {decision.larger} is {decision.distance:.4g}; decided after "
-                f"{decision.executions} executions"
-            )
-        return PairResult("worst", a.name, b.name, None if decision is None else decision.smaller, reason)
+        for known in self.decisions:
+            if {known.smaller, known.larger} == names:
+                reason = (
+                    f"d* of {known.smaller} is at most {known.bound:.4g} by the {known.certificate} bound, and an "
+                    f"executed distance of {known.larger} is {known.distance:.4g}; decided after {known.executions} "
+                    "executions"
+                )
+                return PairResult("worst", a.name, b.name, known.smaller, reason)
+        reason = (
+            f"the largest executed distances are {a.largest:.4g} ({a.name}) and {b.largest:.4g} ({b.name}), and no "
+            "bound separates them"
+        )
+        return PairResult("worst", a.name, b.name, None, reason)
 
     def _expected(self) -> dict[str, tuple[float, Array | None]]:
         """Return, by name, the largest executed or predicted distance, and its task if it is predicted."""
@@ -115,11 +114,8 @@ class WorstQuestion:
         expected: dict[str, tuple[float, Array | None]] = {}
         for candidate in self.candidates:
             highest = candidate.highest(history)
-            raised = [
-                (trial.distance or 0.0) / note.predicted
-                for trial, note in candidate.noted
-                if note.question == "worst" and note.predicted
-            ]
+            noted = [pair for pair in candidate.noted if pair[1].question == "worst" and pair[1].predicted]
+            raised = [(trial.distance or 0.0) / (note.predicted or 1.0) for trial, note in noted]
             # A prediction is used if one of the last executions that were to raise the largest distance came near it.
             trusted = len(raised) < _INSIST or max(raised[-_INSIST:]) >= TESTED
             value, task = highest if highest is not None and trusted else (0.0, None)
@@ -142,8 +138,7 @@ class WorstQuestion:
     def _certified(self, better: Candidate) -> bool:
         """Keep all decisions by the certificate of a candidate; return whether there is a new one."""
         new = False
-        above = [worse for first, worse in self.undecided if first is better]
-        for other in above:
+        for other in [worse for first, worse in self.undecided if first is better]:
             if other.largest <= max(better.largest, 0.0):
                 continue
             # Nobody has stated this threshold to the campaign.
@@ -214,14 +209,12 @@ class MeanQuestion:
     def pair(self, a: Candidate, b: Candidate) -> PairResult:
         """Return what is decided of a pair."""
         mean = self._difference(a, b)
-        smaller = None
-        if mean.sign:
-            smaller = b.name if mean.sign > 0 else a.name
-            reason = (
-                f"the expected distance of {a.name} minus that of {b.name} is between {mean.low:.3g} and "
-                f"{mean.high:.3g}; decided after {mean.decided_after} tasks"
-            )
-        else:
+        smaller = (b.name if mean.sign > 0 else a.name) if mean.sign else None
+        reason = (
+            f"the expected distance of {a.name} minus that of {b.name} is between {mean.low:.3g} and {mean.high:.3g}; "
+            f"decided after {mean.decided_after} tasks"
+        )
+        if smaller is None:
             undecided = f"after {mean.tasks} tasks the confidence sequence of the difference contains 0"
             reason = self._lost(a, b) or undecided
         interval = mean.estimate, mean.low, mean.high, mean.tasks, mean.variance_left

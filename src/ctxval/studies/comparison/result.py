@@ -33,14 +33,11 @@ class CandidateResult(ShortRepr):
     """What is known of one candidate; a value that is not known is None.
 
     Attributes:
-        executions: the number of executions with its controllers that were made for it.
+        executions, failed: the number of executions that were made for it, and of those that failed.
         shared: the number of executions of other candidates that count for it too, because its controllers agree.
-        failed: the number of executions that failed.
-        largest: the largest executed distance.
-        task: the parameters of this task, by name.
+        largest, task: the largest executed distance, and the parameters of this task.
         bound: what d* is at most, if a decision needed it.
-        draws: the number of its independent draws.
-        mean: the mean of the distances of these draws.
+        draws, mean: the number of its independent draws, and the mean of their distances.
     """
 
     name: str
@@ -66,14 +63,11 @@ class PairResult:
     """The decision on one question about two candidates.
 
     Attributes:
-        question: ``worst`` for d*, or ``mean`` for the expected distance.
-        first, second: the names of the two.
         smaller: the name of the one with the smaller value; None if this is not decided.
         reason: why, or what is missing, in one sentence.
-        estimate: the estimated expected distance of the first minus that of the second; None for other questions.
-        low, high: the ends of its confidence sequence; infinite if nothing is known.
+        estimate, low, high: the expected distance of the first minus that of the second, and its confidence sequence.
         tasks: the number of tasks that both have executed for it.
-        variance_left: the variance that the predictions leave of the differences, as a share; None if not known.
+        variance_left: the variance that the predictions leave of the differences, as a share.
     """
 
     question: Question
@@ -102,8 +96,7 @@ class PairResult:
     @property
     def cells(self) -> tuple[str, ...]:
         """The row of the table of pairs; the difference is that of the smaller one minus the other one."""
-        undecided = (f"{self.first} ? {self.second}", "undecided")
-        names = undecided if self.smaller is None else (self.smaller, self.larger)
+        names = self.smaller or f"{self.first} ? {self.second}", self.larger if self.smaller else "undecided"
         if self.question != "mean":
             return WORDS[self.question], *names, "-", "-", "-"
         sign = -1 if self.smaller == self.second else 1
@@ -121,10 +114,8 @@ class Comparison:
     """The result of a comparison.
 
     Attributes:
-        pairs: the decision on each pair, for each question.
         confidence: the probability with which all decisions and intervals hold together.
-        executions: the number of executions of the system; a shared execution counts once.
-        budget: the largest number of executions.
+        executions, budget: the number of executions of the system, and the largest one; a shared one counts once.
         units: the units of the distances.
         assumptions: what the decisions assume, one sentence each.
     """
@@ -149,10 +140,8 @@ class Comparison:
 
     def pair(self, question: Question, first: str, second: str) -> PairResult:
         """Return the decision on a pair, named in any order."""
-        for pair in self.pairs:
-            if pair.question == question and {pair.first, pair.second} == {first, second}:
-                return pair
-        raise KeyError(f"{question}: {first}, {second}")
+        by_names = {(pair.question, frozenset((pair.first, pair.second))): pair for pair in self.pairs}
+        return by_names[question, frozenset((first, second))]
 
     def ranking(self, question: Question) -> tuple[tuple[str, ...], ...]:
         """Return the candidates from the smallest value to the largest; those that are not told apart are together.
@@ -222,9 +211,9 @@ class Comparison:
         return figure
 
     def __repr__(self) -> str:
-        counts = {"executions": self.executions, "budget": self.budget, "decided": self.decided}
-        head = call(self, confidence=self.confidence, **counts)
-        return lines(head, *(f"{WORDS[question]}: {line(self.ranking_text(question))}" for question in self.questions))
+        known = {name: getattr(self, name) for name in ("confidence", "executions", "budget", "decided")}
+        rankings = (f"{WORDS[question]}: {line(self.ranking_text(question))}" for question in self.questions)
+        return lines(call(self, **known), *rankings)
 
     def _repr_html_(self) -> str:
         rows = [

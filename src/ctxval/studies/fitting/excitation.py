@@ -80,11 +80,9 @@ class Excitation(ShortRepr):
     Run k depends only on the seed and on k.
 
     Args:
-        validation: the map p -> d(p), whose system is executed.
         kind: ``random``, ``multisine`` or ``chirp``; see :func:`excitation`.
         amplitude: the largest magnitude of the signal for each input, shape ``(m,)``, or a number.
         limits: the limits of the inputs; by default those of the controllers.
-        seed: the seed.
     """
 
     def __init__(
@@ -141,7 +139,6 @@ class Excitation(ShortRepr):
             raise stopped
 
     def _excited(self, number: int) -> Plan:
-        """Return the plan of a run, whose controller adds the signal."""
         plan = self.plan(number)
         signal = excitation(self.kind, plan.task.horizon, self.amplitude, np.random.default_rng([self.seed, number, 1]))
         excited = Excited(plan.controller, signal, self.limits)

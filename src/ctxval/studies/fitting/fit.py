@@ -34,8 +34,7 @@ class FittedParameter(ShortRepr):
     """One parameter of a model.
 
     Attributes:
-        value: the estimate.
-        low, high: the confidence interval; infinite if the recordings do not determine the parameter.
+        value, low, high: the estimate and the confidence interval, which is infinite if the recordings determine none.
         note: what is unusual: the value is at a bound, or depends on others; empty otherwise.
     """
 
@@ -51,10 +50,9 @@ class FittedModel(ShortRepr):
     """A model that was learned from recordings.
 
     Attributes:
-        kind: its kind; ``given`` for a model that existed before.
-        model: the model, with the transitions that it was learned from.
-        errors: its errors on the held-out recordings.
-        parameters: the parameters of the user's function; none for other kinds.
+        kind: ``given`` for a model that existed before.
+        errors: those on the held-out recordings.
+        parameters: those of the user's function; none for other kinds.
         notes: sentences on the fit, such as how well the recordings determine a linear model.
     """
 
@@ -102,10 +100,7 @@ class FailedFit(ShortRepr):
 class FitReport(ShortRepr):
     """Models that were learned from the same recordings, with their errors on the same held-out recordings.
 
-    Attributes:
-        fitted: the models, the most accurate first: that with the smallest error after the largest number of steps.
-        failed: the kinds that could not be learned.
-        learned_from, held_out: the recordings that models were learned from, and those that were held out.
+    The most accurate model is the first: that with the smallest error after the largest number of steps.
     """
 
     fitted: tuple[FittedModel, ...]
@@ -119,16 +114,19 @@ class FitReport(ShortRepr):
             {
                 "kind": model.kind,
                 "errors": [{**asdict(error), "relative": error.relative} for error in model.errors],
-                "parameters": [asdict(parameter) for parameter in model.parameters],
-                "notes": list(model.notes),
+                "parameters": list(map(asdict, model.parameters)),
+                "notes": model.notes,
                 "useless": model.useless,
             }
             for model in self.fitted
         ]
         parts = {"learned_from": self.learned_from, "held_out": self.held_out}
         sizes = {name: {"recordings": len(part.runs), "steps": part.steps} for name, part in parts.items()}
-        report = plain_numbers({"fitted": fitted, "failed": [asdict(kind) for kind in self.failed], **sizes})
-        return {**report, "dt": self.held_out.dt, "notes": list(self.held_out.notes)}
+        about = {"dt": self.held_out.dt, "notes": self.held_out.notes}
+        report: dict[str, Any] = plain_numbers(
+            {"fitted": fitted, "failed": list(map(asdict, self.failed)), **sizes, **about}
+        )
+        return report
 
 
 def fit(
@@ -165,8 +163,7 @@ def fit(
     learned_from, held_out = split(recordings, hold_out, seed)
     data, _ = learned_from.transitions()
     recorded = RecordedSteps(held_out, range(len(held_out.runs)))
-    fitted: list[FittedModel] = []
-    failed: list[FailedFit] = []
+    fitted, failed = list[FittedModel](), list[FailedFit]()
 
     def add(kind: Kind, model: Model, parameters: tuple[FittedParameter, ...] = ()) -> None:
         notes = [identifiability(data, [*recordings.states, *recordings.inputs])] if kind == "linear" else []
@@ -272,7 +269,6 @@ def fit_parameters(
     Args:
         step: the user's function ``(x, u, theta) -> x_next``.
         bounds: the lower and upper bound of each parameter by name, in the order of theta.
-        data: the recorded transitions.
         vectorized: whether ``step`` takes whole batches.
         confidence: the confidence of each interval.
         seed: seed of the starting points.

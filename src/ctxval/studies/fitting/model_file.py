@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from ctxval._util.files import MADE_BY, write_text
-from ctxval._util.onnx_graph import GraphValue, require_onnx
+from ctxval._util.onnx_network import GraphValue, require_onnx
 from ctxval.core.model import Model
 from ctxval.errors import InputError
 from ctxval.models import Corrected, Correction, FeedforwardReLU, GaussianProcessModel, Linear, Parametric
@@ -95,7 +95,6 @@ def write_onnx(path: str | Path, model: Model) -> None:
 
 
 def _require_onnx(model: Model | None) -> None:
-    """Check that onnx is installed and that a model can be written."""
     require_onnx()
     while isinstance(model, Corrected):
         model = model.model

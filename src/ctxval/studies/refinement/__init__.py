@@ -1,6 +1,5 @@
 """Better models from executions: a model is learned again from what falsified it, and validated again."""
 
-from ctxval.studies.refinement.cause_repair import CauseRepair
 from ctxval.studies.refinement.held_out import (
     HeldOut,
     MeasuredResidual,
@@ -9,7 +8,15 @@ from ctxval.studies.refinement.held_out import (
     held_out,
     measure_residual,
 )
-from ctxval.studies.refinement.methods import Learned, Method, ParameterFit, Refit, ResidualCorrection, UserFit
+from ctxval.studies.refinement.methods import (
+    CauseRepair,
+    Learned,
+    Method,
+    ParameterFit,
+    Refit,
+    ResidualCorrection,
+    UserFit,
+)
 from ctxval.studies.refinement.refine import refine
 from ctxval.studies.refinement.rounds import Refinement, Round
 

@@ -14,8 +14,6 @@ from ctxval.models import Correction
 from ctxval.models.scaling import standard_deviations
 from ctxval.studies.refinement.held_out import Records
 
-_MANY = 50_000  # transitions of the first model from which on only a part is averaged
-
 
 def exact_correction(model: Model, records: Records, centres: int) -> Correction | None:
     """Return the mean of Gaussian processes of the residual, conditioned on transitions that represent the others.
@@ -50,7 +48,7 @@ def averaged_correction(model: Model, records: Records) -> Correction | None:
     """
     runs = [Record(run.states, run.inputs, run.states[0]) for run in records.executed]
     if records.own is not None:
-        own = records.own[:: max(1, len(records.own) // _MANY)]
+        own = records.own[:: max(1, len(records.own) // 50_000)]  # of more, only a part is averaged
         runs += [Record(np.stack([x, after]), u[None], x) for x, u, after in zip(own.x, own.u, own.x_next, strict=True)]
     data = records.transitions
     k = data.x.shape[1] + data.u.shape[1]

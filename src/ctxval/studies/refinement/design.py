@@ -28,9 +28,8 @@ class SameControllers:
     deterministic. The model has learned from them, so they can falsify it, and they never count for it.
 
     Attributes:
-        tasks: number of executed tasks that were compared.
-        same: number of those whose controller is numerically the same.
-        worst: the largest distance of the refined model on them; None if there are none.
+        tasks, same: number of executed tasks that were compared, and of those with numerically the same controller.
+        worst: the largest distance of the refined model on the latter; None if there are none.
     """
 
     tasks: int = 0

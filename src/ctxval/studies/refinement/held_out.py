@@ -14,6 +14,7 @@ import numpy as np
 from ctxval._util.arrays import Array, Mask, Rows
 from ctxval._util.representation import ShortRepr
 from ctxval._util.texts import aligned
+from ctxval.core.labels import labels_of
 from ctxval.core.model import Model
 from ctxval.core.trajectory import Trajectory, Transitions
 from ctxval.errors import CtxvalError, InputError
@@ -24,12 +25,7 @@ _LATER = 10  # steps after which the errors choose corrections
 
 @dataclass(frozen=True, eq=False)
 class Records(ShortRepr):
-    """Executions of the system, and transitions that belong to none of them.
-
-    Attributes:
-        executed: the trajectories of the system, in the order of the rounds.
-        own: the data of the first model; None if it has none.
-    """
+    """Executions of the system in the order of the rounds, and the data of the first model, which belong to none."""
 
     executed: tuple[Trajectory, ...]
     own: Transitions | None = None
@@ -76,14 +72,11 @@ class Records(ShortRepr):
                 raise InputError("the only execution has one step: too few to hold a part out.")
             first, second = (Records((part_of(run, *ends),)) for ends in ((0, middle), (middle, run.horizon)))
             return [(first, second), (second, first)]
-        parts = min(count, 10)  # of more executions, some are held out together
-        return [
-            (
-                replace(self, executed=tuple(run for k, run in enumerate(self.executed) if k % parts != part)),
-                Records(self.executed[part::parts]),
-            )
-            for part in range(parts)
-        ]
+        folds, parts = [], min(count, 10)  # of more executions, some are held out together
+        for part in range(parts):
+            others = tuple(run for k, run in enumerate(self.executed) if k % parts != part)
+            folds.append((replace(self, executed=others), Records(self.executed[part::parts])))
+        return folds
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,8 +85,7 @@ class HeldOut(ShortRepr):
 
     Attributes:
         pairs: the states and inputs, shape ``(N, n + m)``.
-        errors: those of the learned model, shape ``(N, n)``.
-        before: those of the first model, shape ``(N, n)``.
+        errors, before: those of the learned model and of the first one, shapes ``(N, n)``.
         changes: the recorded changes of the states in one step, shape ``(N, n)``.
         later, later_before: errors after ten steps along held-out executions, of both models, shapes ``(K, n)``. They
             choose corrections, because noise of the records hides in one step what adds up in several.
@@ -174,8 +166,8 @@ def held_out(learn: Callable[[Records], Model], before: Model, records: Records)
 
 def _compared(data: Transitions, runs: Sequence[Trajectory], model: Model, before: Model) -> HeldOut:
     with np.errstate(all="ignore"):
-        errors, first = (data.x_next - compared.step(data.x, data.u) for compared in (model, before))
-        later, later_first = (_errors_later(compared, runs, data.x.shape[1]) for compared in (model, before))
+        errors, first = (data.x_next - each.step(data.x, data.u) for each in (model, before))
+        later, later_first = (_errors_later(each, runs, data.x.shape[1]) for each in (model, before))
     usable, later_usable = (np.isfinite(array).all(axis=1) for array in (first, later_first))
     errors, later = np.where(np.isfinite(errors), errors, first), np.where(np.isfinite(later), later, later_first)
     pairs, changes = np.concatenate([data.x, data.u], axis=1), data.x_next - data.x
@@ -210,8 +202,7 @@ class ResidualRegion(ShortRepr):
     Attributes:
         low, high: the box of states and inputs, shapes ``(n + m,)``; infinite where it has no end.
         steps: number of held-out transitions in it.
-        quantile: 0.95 quantile of the residual of each state in one step, shape ``(n,)``.
-        largest: its maximum, shape ``(n,)``.
+        quantile, largest: 0.95 quantile and maximum of the residual of each state in one step, shapes ``(n,)``.
     """
 
     low: Array
@@ -228,7 +219,6 @@ class MeasuredResidual(ShortRepr):
     It is measured and not guaranteed: another state or input may have a larger one.
 
     Attributes:
-        states, inputs: the names of states and inputs with their units.
         whole: the residual in all regions together, whose box is the range of the records.
         left_out: the residual of models that were learned without a part of the records, on that part; it is larger if
             the records are few. None if no execution was new to M', so that ``whole`` and the regions are of these.
@@ -244,12 +234,13 @@ class MeasuredResidual(ShortRepr):
     @property
     def text(self) -> str:
         """The table as plain text."""
-        units = [f"{name} [{unit}]" if unit else name for name, unit in self.states.items()]
+        units = labels_of(self.states)
         rows = [["region", "steps", *(f"{unit}: 95 %" for unit in units), *(f"{unit}: largest" for unit in units)]]
-        listed = [(region, self._where(region)) for region in self.regions]
-        listed.append((self.whole, "all records" if self.left_out is None else "all that is new to the model"))
-        listed += [(region, "left out in turn") for region in [self.left_out] if region is not None]
-        for region, where in listed:
+        listed = [(self._where(region), region) for region in self.regions]
+        listed.append(("all records" if self.left_out is None else "all that is new to the model", self.whole))
+        if self.left_out is not None:
+            listed.append(("left out in turn", self.left_out))
+        for where, region in listed:
             sizes = (*region.quantile.tolist(), *region.largest.tolist())
             rows.append([where, str(region.steps), *(f"{value:.3g}" for value in sizes)])
         return aligned(rows, right=True)
@@ -266,12 +257,10 @@ class MeasuredResidual(ShortRepr):
     def _where(self, region: ResidualRegion) -> str:
         parts = []
         for name, low, high in self._ends(region):
-            if np.isfinite(low) and np.isfinite(high):
-                parts.append(f"{low:.3g} < {name} <= {high:.3g}")
+            if np.isfinite(high):
+                parts.append(f"{low:.3g} < {name} <= {high:.3g}" if np.isfinite(low) else f"{name} <= {high:.3g}")
             elif np.isfinite(low):
                 parts.append(f"{name} > {low:.3g}")
-            elif np.isfinite(high):
-                parts.append(f"{name} <= {high:.3g}")
         return ", ".join(parts) or "everywhere"
 
     def to_dict(self) -> dict[str, Any]:
@@ -304,20 +293,20 @@ def measure_residual(held: HeldOut, states: dict[str, str], inputs: dict[str, st
     state. ``states`` and ``inputs`` are names with their units.
     """
     counted = held.counted
-    pairs, magnitudes = held.pairs[counted], np.abs(held.errors)
 
-    def region(of: Array, inside: Mask, low: Array, high: Array) -> ResidualRegion:
-        chosen = of[inside]
-        return ResidualRegion(low, high, len(chosen), np.quantile(chosen, 0.95, axis=0), chosen.max(axis=0))
+    def region(errors: Array, low: Array, high: Array) -> ResidualRegion:
+        sizes = np.abs(errors)
+        return ResidualRegion(low, high, len(sizes), np.quantile(sizes, 0.95, axis=0), sizes.max(axis=0))
 
     def whole(rows: Mask) -> ResidualRegion:
-        return region(magnitudes, rows, held.pairs[rows].min(axis=0), held.pairs[rows].max(axis=0))
+        return region(held.errors[rows], held.pairs[rows].min(axis=0), held.pairs[rows].max(axis=0))
 
-    sizes = np.maximum(held.changes.std(axis=0), 1e-300)
-    error = np.sqrt(((held.errors[counted] / sizes) ** 2).mean(axis=1))
+    typical = np.maximum(held.changes.std(axis=0), 1e-300)
+    errors = held.errors[counted]
+    error = np.sqrt(((errors / typical) ** 2).mean(axis=1))
     logs = np.log(np.maximum(error, 1e-12 * max(float(error.max(initial=0.0)), 1e-300)))
-    regions = [region(magnitudes[counted], *box) for box in _split(pairs, logs)]
-    ordered = sorted(regions, key=lambda item: float((item.quantile / sizes).max()))
+    regions = [region(errors[inside], low, high) for inside, low, high in _split(held.pairs[counted], logs)]
+    ordered = sorted(regions, key=lambda item: float((item.quantile / typical).max()))
     left_out = None if counted.all() else whole(~counted)
     return MeasuredResidual(states, inputs, whole(counted), tuple(ordered), left_out)
 
@@ -329,9 +318,8 @@ def _split(pairs: Array, logs: Array) -> list[tuple[Mask, Array, Array]]:
     # A split must explain a share of the spread, and more than rounding.
     least = max(0.1 * _spread(logs), 1e-6 * len(logs))
     while len(boxes) < 6:
-        splits = [_best_split(pairs, logs, box[0]) for box in boxes]
-        best = max(range(len(boxes)), key=lambda i: splits[i][0])
-        gain, column, place = splits[best]
+        splits = [(*_best_split(pairs, logs, box[0]), i) for i, box in enumerate(boxes)]
+        gain, column, place, best = max(splits, key=lambda split: split[0])
         if not gain > least:
             break
         inside, low, high = boxes.pop(best)

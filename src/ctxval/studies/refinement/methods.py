@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
+import functools
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import numpy as np
 
 from ctxval._util.arrays import Mask, single_threaded
 from ctxval._util.representation import ShortRepr
 from ctxval._util.texts import reason_of
+from ctxval.campaign.campaign import Campaign
 from ctxval.core.model import Model, Step, as_model
 from ctxval.core.trajectory import Transitions
 from ctxval.errors import CtxvalError, InputError, ModelError, UnknownNameError
 from ctxval.models import Corrected, Correction, FeedforwardReLU, GaussianProcessModel, Linear, Parametric
 from ctxval.models.parametric import ParametricStep
+from ctxval.studies.causes import CauseReport, Repaired, evidence, find_causes
 from ctxval.studies.fitting import FittedParameter, fit_parameters
 from ctxval.studies.fitting.fit import as_bounds, learned_model
 from ctxval.studies.refinement.corrections import averaged_correction, exact_correction
@@ -24,10 +27,12 @@ from ctxval.studies.refinement.held_out import HeldOut, Records, held_out
 from ctxval.studies.replay.accuracy import stepped
 
 _CENTRES = 300  # largest number of transitions that a correction is conditioned on
-_MUCH = 0.1  # share of the error that a correction leaves on held-out executions, from which on another one is tried
 
 RefitKind = Literal["linear", "network", "gaussian-process"]
-NAMES = ("residual", "causes", *get_args(RefitKind), "parameters", "fit")
+_KINDS: dict[str, type[Model]] = {
+    "linear": Linear, "network": FeedforwardReLU, "gaussian-process": GaussianProcessModel
+}  # fmt: skip
+NAMES = ("residual", "causes", *_KINDS, "parameters", "fit")
 """The names of the methods on the command line."""
 
 
@@ -78,28 +83,22 @@ class ResidualCorrection(ShortRepr, Method):
     makes = Corrected
 
     def learn(self, model: Model, records: Records) -> Learned:
-        """Return the corrected model."""
-
-        def left_by(correction: Callable[[Records], Correction | None]) -> HeldOut:
+        def left_by(correction: Callable[[Model, Records], Correction | None]) -> HeldOut:
             def corrected(some: Records) -> Model:
-                learned = correction(some)
+                learned = correction(model, some)
                 return model if learned is None else Corrected(model, learned)
 
             return held_out(corrected, model, records)
 
-        def exact(some: Records) -> Correction | None:
-            return exact_correction(model, some, self.centres)
-
-        def averaged(some: Records) -> Correction | None:
-            return averaged_correction(model, some)
-
-        correction, errors = exact, left_by(exact)
-        if errors.left > _MUCH:
-            other = left_by(averaged)
-            if other.left < errors.left:
-                correction, errors = averaged, other
+        exact = functools.partial(exact_correction, centres=self.centres)
+        correction: Callable[[Model, Records], Correction | None] = exact
+        errors = left_by(correction)
+        if errors.left > 0.1:  # much of the error
+            averaged = left_by(averaged_correction)
+            if averaged.left < errors.left:
+                correction, errors = averaged_correction, averaged
         better = errors.better
-        whole = correction(records)
+        whole = correction(model, records)
         if whole is None or not better.any():
             raise InputError(
                 "no state can be corrected: on executions that were held out, the residual of the model is not "
@@ -113,9 +112,43 @@ class ResidualCorrection(ShortRepr, Method):
         return Learned(learned, errors.kept(better), (note,) if rows else ())
 
 
-class _Replacement(Method):
-    """A method whose model takes the place of the first one."""
+@dataclass(frozen=True, eq=False)
+class CauseRepair(ShortRepr, Method):
+    """The first model with the causes that executions of its campaign name, with sizes fitted to all executions."""
 
+    campaign: Campaign
+    name: str = field(default="causes", init=False)
+    makes = Repaired
+
+    @functools.cached_property
+    def report(self) -> CauseReport:
+        """The causes, which a model can have."""
+        report = find_causes(self.campaign)
+        if report.repaired is None:
+            raise InputError(f"no cause is known that a model could have. {report.sentence}")
+        if not report.repaired.complete:
+            raise InputError(
+                f"a step of a model depends on state and input alone, so it cannot have this cause. {report.sentence}"
+            )
+        return report
+
+    def learn(self, model: Model, records: Records) -> Learned:
+        if self.campaign.validation.outputs is not None:
+            raise InputError("the method 'causes' needs recorded states of M, and only outputs are recorded.")
+        best = self.report.explained[0].explanation
+
+        def repaired(some: Records) -> Repaired:
+            if not some.executed:
+                raise InputError("the method 'causes' needs executions with trajectories.")
+            with single_threaded():
+                return evidence.explained(evidence.Records(model, some.executed), best.candidates, best.sizes).repaired
+
+        learned = repaired(records)
+        note = " and ".join(cause.text(self.report.plant) for cause in learned.causes)
+        return Learned(learned, held_out(repaired, model, records), (note,))
+
+
+class _Replacement(Method):
     @abstractmethod
     def _fit(self, model: Model, data: Transitions) -> tuple[Model, tuple[FittedParameter, ...]]: ...
 
@@ -136,20 +169,13 @@ class Refit(ShortRepr, _Replacement):
 
     kind: RefitKind
     seed: int = 0
+    name: str = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        if self.kind not in get_args(RefitKind):
-            raise UnknownNameError.among("kind of model", str(self.kind), get_args(RefitKind))
-
-    @property
-    def name(self) -> str:  # type: ignore[override]
-        """Its kind."""
-        return self.kind
-
-    @property
-    def makes(self) -> type[Model]:  # type: ignore[override]
-        """The type of the models of its kind."""
-        return {"linear": Linear, "network": FeedforwardReLU, "gaussian-process": GaussianProcessModel}[self.kind]
+        if self.kind not in _KINDS:
+            raise UnknownNameError.among("kind of model", str(self.kind), _KINDS)
+        object.__setattr__(self, "name", self.kind)
+        object.__setattr__(self, "makes", _KINDS[self.kind])
 
     def _fit(self, model: Model, data: Transitions) -> tuple[Model, tuple[FittedParameter, ...]]:
         with single_threaded():
@@ -215,12 +241,13 @@ def method_of(method: str | Method | Callable[[Transitions], Any], *, seed: int 
         return UserFit(method)
     if method == "residual":
         return ResidualCorrection()
-    if method in get_args(RefitKind):
+    if method in _KINDS:
         return Refit(method, seed)  # type: ignore[arg-type]
-    if method == "parameters":
-        raise InputError("the method 'parameters' needs bounds: give refinement.ParameterFit({'mass': (0.5, 2.0)}).")
-    if method == "causes":
-        raise InputError("the method 'causes' needs the campaign: give refinement.CauseRepair(campaign).")
-    if method == "fit":
-        raise InputError("the method 'fit' needs a function: give the function fit(data) -> model itself.")
+    needs = {
+        "parameters": "bounds: give refinement.ParameterFit({'mass': (0.5, 2.0)})",
+        "causes": "the campaign: give refinement.CauseRepair(campaign)",
+        "fit": "a function: give the function fit(data) -> model itself",
+    }
+    if method in needs:
+        raise InputError(f"the method {method!r} needs {needs[method]}.")
     raise UnknownNameError.among("method of refinement", method, NAMES)

@@ -5,13 +5,12 @@ from __future__ import annotations
 import copy
 import functools
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from ctxval._util.checked import PositiveFloat, PositiveInt, checked
-from ctxval._util.progress import stage
-from ctxval._util.progress_display import progress_shown
+from ctxval._util.progress import progress_shown, stage
 from ctxval.campaign.campaign import Campaign
 from ctxval.campaign.history import executed_trials
 from ctxval.certificates import CertificateOptions
@@ -21,8 +20,8 @@ from ctxval.core.trajectory import Trajectory, Transitions
 from ctxval.core.trial import Trial
 from ctxval.core.validation import Validation
 from ctxval.errors import CtxvalError, InputError
-from ctxval.learning.recorded import closed_loops_on_model
-from ctxval.learning.state_estimates import StateEstimates, with_states_of_model
+from ctxval.learning.extended import estimates_by_loops_on_model, with_states_of_model
+from ctxval.learning.state_estimates import StateEstimates
 from ctxval.models import Refined, read_refined, write_model
 from ctxval.models.corrected import before_refinement
 from ctxval.models.saved import is_savable, read_note
@@ -99,12 +98,13 @@ class _Loop:
     options: CertificateOptions
     open_round: OpensRound
     execution: dict[str, Any]
-    rounds: list[Round] = field(default_factory=list)
-    _last: tuple[int, Learned] | None = field(default=None, init=False)
 
     def __post_init__(self) -> None:
+        self.rounds = list[Round]()
         # The model that is corrected or replaced; of a model that was refined before, the one before.
         self._base = before_refinement(self.first.validation.model)
+        self._of_states = with_states_of_model(self.first.validation)
+        self._last: tuple[int, Learned] | None = None
 
     @property
     def spent(self) -> int:
@@ -118,18 +118,28 @@ class _Loop:
         ended = self._why_ended()
         while ended is None:
             ended = self._next_round() or self._why_ended()
+        units, confidence = self.first.validation.labels.units, self.options.confidence
+        refinement = Refinement(tuple(self.rounds), self.threshold, confidence, self.budget, ended, units=units)
         last = self.rounds[-1]
-        learned = self._measured(last) if last.number else None
-        labels, confidence = self.first.validation.labels, self.options.confidence
-        refinement = Refinement(tuple(self.rounds), self.threshold, confidence, self.budget, ended, units=labels.units)
-        if learned is None:
+        if not last.number:
             return refinement
-        errors, n = learned.errors, learned.errors.errors.shape[1]
+        with stage("measuring the residual"):
+            try:
+                learned = self._learned(last.number)
+            except CtxvalError:  # the file of the model is there, but its executions are not
+                return refinement
+            before = len(list(self._executed(self.rounds[:-1])))
+            executed = self._with_states(self.rounds, judged=before)[before:]
+            errors = learned.errors.with_executions(last.model, self._base, executed)
+        n = errors.errors.shape[1]
         states, inputs = self._of_states.names(n, errors.pairs.shape[1] - n)
         rms = zip(errors.rms_before.tolist(), errors.rms.tolist(), strict=True)
-        accuracy = dict(zip(states, rms, strict=False))
-        residual = measure_residual(errors, states, inputs)
-        return replace(refinement, residual=residual, accuracy=accuracy, parameters=learned.parameters)
+        return replace(
+            refinement,
+            residual=measure_residual(errors, states, inputs),
+            accuracy=dict(zip(states, rms, strict=False)),
+            parameters=learned.parameters,
+        )
 
     def _judged(self, campaign: Campaign, options: CertificateOptions) -> Verdict:
         """Execute tasks of a campaign until it is decided or the budget ends; people execute theirs themselves."""
@@ -161,7 +171,14 @@ class _Loop:
         options = replace(self.options, confidence=confidence)
         file = self._beside(number, ".npz")
         if file is not None and file.exists():
-            model, notes = self._stored(number, file)
+            note = read_note(file)
+            if note.get("method") != self.method.name:
+                raise InputError(
+                    f"{file} was learned by the method {note.get('method')!r}: give this method, or move the files of "
+                    "the rounds away."
+                )
+            stored, notes = read_refined(file, self._base), tuple(map(str, note.get("notes", [])))
+            model = Refined(stored, stored.data or self._records(number).transitions, self._base)
         else:
             try:
                 model, notes, file = self._learned_model(number, file)
@@ -182,18 +199,6 @@ class _Loop:
         verdict, name = self._judged(campaign, options), self.method.name
         self.rounds.append(Round(number, name, campaign, verdict, confidence, len(model.data), file, notes, same))
         return None
-
-    def _stored(self, number: int, file: Path) -> tuple[Refined, tuple[str, ...]]:
-        """Return the model of a round from its file, with its notes."""
-        note = read_note(file)
-        if note.get("method") != self.method.name:
-            raise InputError(
-                f"{file} was learned by the method {note.get('method')!r}: give this method, or move the files of the "
-                "rounds away."
-            )
-        model = read_refined(file, self._base)
-        data = model.data or self._records(number).transitions
-        return Refined(model, data, self._base), tuple(map(str, note.get("notes", [])))
 
     def _learned_model(self, number: int, file: Path | None) -> tuple[Refined, tuple[str, ...], Path | None]:
         """Return the model of a round, learned from the executions before, with its notes; write its file."""
@@ -219,7 +224,6 @@ class _Loop:
         return self._last[1]
 
     def _records(self, before: int) -> Records:
-        """Return what the rounds before a number have recorded."""
         return Records.of(self.first.validation.model, self._with_states(self.rounds[:before]))
 
     def _with_states(self, rounds: list[Round], judged: int | None = None) -> list[Trajectory]:
@@ -241,31 +245,11 @@ class _Loop:
 
     @functools.cached_property
     def _estimates(self) -> StateEstimates | None:
-        validation, loops = self.first.validation, closed_loops_on_model(self._of_states)
-        if loops is None or validation.outputs is None:
-            return None
-        return StateEstimates(validation, validation.outputs, loops.states)
-
-    @functools.cached_property
-    def _of_states(self) -> Validation:
-        """The validation whose trajectories have the states of M."""
-        return with_states_of_model(self.first.validation)
+        return estimates_by_loops_on_model(self.first.validation)
 
     def _beside(self, number: int, suffix: str) -> Path | None:
-        """Return the path of a file of a round, next to the store of the first model."""
         store = self.first.store.path
         return None if store is None else store.with_name(f"{store.stem}.round-{number}{suffix}")
-
-    def _measured(self, last: Round) -> Learned | None:
-        """Return what the last model was learned with, and its errors also on executions that it did not learn from."""
-        with stage("measuring the residual"):
-            try:
-                learned = self._learned(last.number)
-            except CtxvalError:  # the file of the model is there, but its executions are not
-                return None
-            before = len(list(self._executed(self.rounds[:-1])))
-            executed = self._with_states(self.rounds, judged=before)[before:]
-            return replace(learned, errors=learned.errors.with_executions(last.model, self._base, executed))
 
 
 def confidence_of_round(confidence: float, number: int) -> float:

@@ -28,12 +28,10 @@ class Round(ShortRepr):
     """One model, and what its executions showed.
 
     Attributes:
-        number: 0 for the first model, then 1, 2, ...
-        method: the method by which the model was learned; ``given`` for the first one.
+        number, method: 0 and ``given`` for the first model; then 1, 2, ... and the method by which it was learned.
         campaign: the campaign of the model, whose store belongs to it alone.
-        verdict: the verdict on the model, with the confidence of this round.
+        verdict, confidence: the verdict on the model, and the confidence of this round.
         learned_from: number of transitions that the model was learned from.
-        model_file: the file of the model; None if there is none.
         notes: sentences on the model.
         unchanged: executed tasks of earlier rounds whose controllers have not changed.
     """
@@ -102,15 +100,13 @@ class Refinement:
 
     Attributes:
         rounds: the first model and the refined ones.
-        threshold: tau, in the units of the distance.
+        threshold, units: tau, and the units of the distance.
         confidence: the confidence of the whole sequence.
         budget: the largest total number of executions.
         ended: why the sequence ended, in one sentence.
         residual: the measured residual of the last model; None if no model was learned.
-        accuracy: the one-step errors on held-out executions, before and after, for each state; empty if no model was
-            learned.
+        accuracy: the one-step errors on held-out executions, before and after, for each state.
         parameters: the parameters of the user's function in the last model; none for other methods.
-        units: the units of the distance.
     """
 
     rounds: tuple[Round, ...]
@@ -147,10 +143,10 @@ class Refinement:
     @property
     def statement(self) -> str:
         """What the last verdict means: the executions that it counts, and its confidence after several rounds."""
-        others = self.executions - self.last.executions
+        last, others = self.last.executions, self.executions - self.last.executions
         counts = (
-            f"The verdict on the model of round {self.last.number} counts "
-            f"{counted(self.last.executions, 'execution')} under its own controllers"
+            f"The verdict on the model of round {self.last.number} counts {counted(last, 'execution')} under its own "
+            "controllers"
         )
         if others:
             counts += (

@@ -20,13 +20,10 @@ class StepError(ShortRepr):
     """The error of one state after a number of steps.
 
     Attributes:
-        rms: root mean square of the error.
-        lowest, highest: the smallest and the largest root mean square over the recordings.
+        rms: root mean square of the error; ``lowest`` and ``highest`` are the smallest and largest over the recordings.
         median, upper, largest: median, 0.95 quantile and maximum of the magnitude of the error.
-        change: root mean square of the recorded change of the state over the steps. A model that predicts no change
-            has this error.
-        count: number of predictions.
-        diverged: share of the predictions in which the model diverged; they are left out of the numbers above.
+        change: root mean square of the recorded change of the state, which is the error of a model that predicts none.
+        count, diverged: number of predictions, and the share that diverged, which is left out of the numbers above.
     """
 
     state: str
@@ -50,11 +47,9 @@ class StepError(ShortRepr):
 
 @dataclass(frozen=True)
 class Region(ShortRepr):
-    """The one-step error in a range of one state or input.
+    """The one-step error in a range of one state or input, with so many recorded steps.
 
     Attributes:
-        variable, unit: the state or input and its unit.
-        count: number of recorded steps in it.
         error: root mean square over the states of the one-step error, as a share of the typical change of each state.
         ratio: this error, divided by that over all steps.
     """
@@ -100,8 +95,7 @@ class Windows:
     """The places in recordings from which so many steps before and after are recorded.
 
     Attributes:
-        runs, places: the recording, and the step in it, shape ``(N,)``.
-        groups: the part of the recordings in which each lies, shape ``(N,)``.
+        runs, places, groups: the recording, the step in it, and the part of the recordings, shapes ``(N,)``.
     """
 
     recorded: RecordedSteps

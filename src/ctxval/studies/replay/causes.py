@@ -25,14 +25,12 @@ class ResidualShare(ShortRepr):
     """How much of the one-step residual of a state can be explained, measured on held-out recordings.
 
     Attributes:
-        state, unit: the state and its unit.
-        rms: root mean square of the residual.
+        rms, rest: root mean square of the residual, and of what state and input do not explain.
         linear: share of its mean square that an affine function of state and input explains; at least 0.
         explained: share that a Gaussian process of state and input explains, or the affine function if that is more;
             at least 0.
         history: share of the rest that the previous state, input and residual explain; at least 0. If it is large, the
             system has a state that is not recorded, or a delay.
-        rest: root mean square of what state and input do not explain.
     """
 
     state: str
@@ -57,7 +55,6 @@ def residual_shares(model: Model, recorded: RecordedSteps, seed: int) -> tuple[R
         return ()
 
     def left_by(predict: Callable[[Mask], Array], targets: Array) -> Array:
-        """Return what is left of targets if those of each fold are predicted from the other folds."""
         left = np.zeros_like(targets)
         for fold in np.unique(folds):
             held = folds == fold
@@ -71,7 +68,6 @@ def residual_shares(model: Model, recorded: RecordedSteps, seed: int) -> tuple[R
     history = left_by(lambda held: _affine(past, rest, held), rest)
 
     def share(errors: Array, size: float) -> float:
-        """Return which share of a mean square is explained if these errors are left."""
         return max(0.0, 1.0 - float((errors**2).mean()) / size) if size > 0 else 0.0
 
     sizes, left = (residuals**2).mean(axis=0).tolist(), (rest**2).mean(axis=0).tolist()
@@ -94,7 +90,6 @@ def _affine(features: Array, targets: Array, held: Mask) -> Array:
 
 
 def _learned(model: Model, where: Windows, folds: Rows, held: Mask, seed: int) -> Array:
-    """Return the residual that a Gaussian process predicts for held-out steps."""
     transitions = Transitions(where.states(), where.inputs(), where.states(1))
     rows = np.flatnonzero(~held)
     if len(rows) > 1500:
@@ -114,10 +109,8 @@ class Suggestion(ShortRepr):
     """A change of timing with which the model predicts held-out recordings clearly better.
 
     Attributes:
-        kind: ``delay`` or ``time step``.
-        value: the delay in seconds, or the time step of the model in seconds.
+        value: the delay, or the time step of the model, in seconds.
         ratio: the held-out one-step error with the change, divided by that without it.
-        sentence: what it means.
     """
 
     kind: Literal["delay", "time step"]
@@ -183,7 +176,6 @@ def _delay(model: Model, recorded: RecordedSteps) -> Suggestion | None:
 
 
 def _time_step(model: Model, recorded: RecordedSteps) -> Suggestion | None:
-    """Suggest another time step of the model if it then predicts better."""
     multiples = (2, 3, 4, 5, 10)
     where = recorded.windows(0, max(multiples), 8000)
     if not len(where):

@@ -24,11 +24,8 @@ from ctxval.studies.replay.accuracy import squared, stepped
 
 EXPLAINS = 0.5  # least share of the error with which a fault is named as its cause
 
-_TURNS = (2 * np.pi, 360.0)
-_FROZEN = 10  # least number of equal values in a row
-_LONGER = 8.0  # times as many as usual
-_SPIKE = 10.0  # times the 0.9 quantile of the distance of a value from the middle of its neighbours
-_ODD = 3.0  # times by which an affine model of the other files errs more in a file than in these
+
+FaultKind = Literal["turn", "frozen", "spike", "file"]
 
 
 @dataclass(frozen=True)
@@ -36,15 +33,13 @@ class Fault(ShortRepr):
     """A fault of recordings, and its part in the one-step error of a model.
 
     Attributes:
-        kind: ``turn``, ``frozen``, ``spike`` or ``file``.
         state: the state concerned; empty for a file.
-        source: the first file concerned.
-        steps: number of steps concerned.
+        source, steps: the first file concerned, and the number of steps.
         share: their share of the model's squared one-step error, of states in units of their typical changes.
         sentence: what it is, and what would help.
     """
 
-    kind: Literal["turn", "frozen", "spike", "file"]
+    kind: FaultKind
     state: str
     source: str
     steps: int
@@ -68,27 +63,28 @@ def faults(model: Model, recordings: Recordings, used: Sequence[int]) -> tuple[F
     results = []
     for number, (name, unit) in enumerate(recordings.states.items()):
         columns = [run.states[:, number] for run in whole]
-        for kind, marked in (
-            ("turn", _turns(columns)),
-            ("frozen", _frozen(columns, [np.delete(run.states, number, axis=1) for run in whole])),
-            ("spike", _spikes(columns)),
-        ):
+        others = [np.delete(run.states, number, axis=1) for run in whole]
+        kinds: dict[FaultKind, list[Mask]] = {
+            "turn": _turns(columns), "frozen": _frozen(columns, others), "spike": _spikes(columns)
+        }  # fmt: skip
+        for kind, marked in kinds.items():
             count = int(sum(mask.sum() for mask in marked))
-            if count:
-                share = sum(float(error[mask].sum()) for error, mask in zip(errors, marked, strict=True)) / total
-                first = next(k for k, mask in enumerate(marked) if mask.any())
-                at = runs[first].start + recordings.dt * int(np.argmax(marked[first]))
-                where, (state,) = f"{runs[first].source}, {at:.4g} s", labels_of({name: unit})
-                what = {
-                    "turn": f"{state} jumps by a whole turn in {counted(count, 'step')} (first at {where}): state "
-                    "angle = true for its field in the mapping",
-                    "frozen": f"{state} keeps exactly one value for {count * recordings.dt:.3g} s while other states "
-                    f"move (first at {where}): a frozen sensor; leave this part out",
-                    "spike": f"{state} has values far from those before and after them, around "
-                    f"{counted(count, 'step')} (first at {where}): leave them out, or mark them as missing",
-                }[kind]
-                sentence = f"{what}; {100 * share:.0f} % of the squared one-step error lies there"
-                results.append(Fault(kind, name, runs[first].source, count, share, sentence))  # type: ignore[arg-type]
+            if not count:
+                continue
+            share = sum(float(error[mask].sum()) for error, mask in zip(errors, marked, strict=True)) / total
+            first = next(k for k, mask in enumerate(marked) if mask.any())
+            at = runs[first].start + recordings.dt * int(np.argmax(marked[first]))
+            where, (state,) = f"{runs[first].source}, {at:.4g} s", labels_of({name: unit})
+            what = {
+                "turn": f"{state} jumps by a whole turn in {counted(count, 'step')} (first at {where}): state angle = "
+                "true for its field in the mapping",
+                "frozen": f"{state} keeps exactly one value for {count * recordings.dt:.3g} s while other states move "
+                f"(first at {where}): a frozen sensor; leave this part out",
+                "spike": f"{state} has values far from those before and after them, around {counted(count, 'step')} "
+                f"(first at {where}): leave them out, or mark them as missing",
+            }[kind]
+            sentence = f"{what}; {100 * share:.0f} % of the squared one-step error lies there"
+            results.append(Fault(kind, name, runs[first].source, count, share, sentence))
     by_run = dict(zip(used, (float(error.sum()) / total for error in errors), strict=True))
     results += _files(recordings.runs, by_run)
     return tuple(sorted(results, key=lambda fault: -fault.share))
@@ -98,7 +94,7 @@ def _turns(columns: Sequence[Array]) -> list[Mask]:
     """Return the steps of each recording in which a state jumps by a turn and otherwise hardly changes."""
     steps = [np.diff(column) for column in columns]
     every, span = np.abs(np.concatenate(steps)), float(np.ptp(np.concatenate(columns)))
-    for turn in _TURNS:
+    for turn in (2 * np.pi, 360.0):
         jumps = [np.abs(np.abs(step) - turn) < 0.25 * turn for step in steps]
         others = every[np.abs(every - turn) >= 0.25 * turn]
         if any(jump.any() for jump in jumps) and span <= 1.05 * turn and others.max(initial=0.0) < 0.4 * turn:
@@ -117,8 +113,7 @@ def _frozen(columns: Sequence[Array], others: Sequence[Array]) -> list[Mask]:
     spread = np.maximum(np.concatenate(others).std(axis=0), 1e-300)
     for mask, each, beside in zip(marked, segments, others, strict=True):
         for first, last in each:
-            is_long = last - first >= max(_FROZEN, _LONGER * usual)
-            if is_long and (beside[first:last].std(axis=0) > 0.1 * spread).any():
+            if last - first >= max(10, 8 * usual) and (beside[first:last].std(axis=0) > 0.1 * spread).any():
                 mask[max(first - 1, 0) : last] = True
     return marked
 
@@ -129,7 +124,7 @@ def _spikes(columns: Sequence[Array]) -> list[Mask]:
     every = np.concatenate(away)
     low, high = np.quantile(np.concatenate(columns), [0.01, 0.99])
     # A corner of a signal that moves fast is no spike.
-    limit = max(_SPIKE * float(np.quantile(every, 0.9)), 0.05 * float(high - low)) if len(every) else 0.0
+    limit = max(10 * float(np.quantile(every, 0.9)), 0.05 * float(high - low)) if len(every) else 0.0
     marked = []
     for column, far in zip(columns, away, strict=True):
         mask = np.zeros(len(column) - 1, dtype=bool)
@@ -149,12 +144,11 @@ def _files(runs: Sequence[Recording], shares: Mapping[int, float]) -> Iterator[F
     if len(of) < 3:
         return
     ratios = {}
-    for source, own in of.items():
-        rest = [runs[k].trajectory for k in range(len(runs)) if k not in own]
-        mine = [runs[k].trajectory for k in own]
-        ratios[source] = _affine_ratio(rest, mine)
+    for source, inside in of.items():
+        rest = [run.trajectory for k, run in enumerate(runs) if k not in inside]
+        ratios[source] = _affine_ratio(rest, [runs[k].trajectory for k in inside])
     source, (ratio, relative) = max(ratios.items(), key=lambda item: item[1][0])
-    if ratio < _ODD or relative < 0.1:
+    if ratio < 3 or relative < 0.1:
         return
     share = sum(shares.get(k, 0.0) for k in of[source])
     steps = sum(runs[k].trajectory.horizon for k in of[source])
@@ -165,7 +159,7 @@ def _files(runs: Sequence[Recording], shares: Mapping[int, float]) -> Iterator[F
     yield Fault("file", "", source, steps, share, sentence)
 
 
-def _affine_ratio(rest: Sequence[Trajectory], own: Sequence[Trajectory]) -> tuple[float, float]:
+def _affine_ratio(rest: Sequence[Trajectory], others: Sequence[Trajectory]) -> tuple[float, float]:
     """Return how much more an affine model of some runs errs in others, and this error as a share of their change.
 
     It is the smaller one of the ratio of medians and that of root mean squares: a part of a file with another fault
@@ -174,7 +168,7 @@ def _affine_ratio(rest: Sequence[Trajectory], own: Sequence[Trajectory]) -> tupl
     Z, changes = _regression(rest)
     weights = np.linalg.lstsq(Z, changes, rcond=1e-10)[0]
     inside = np.abs(Z @ weights - changes)
-    Z, changes = _regression(own)
+    Z, changes = _regression(others)
     outside, size = np.abs(Z @ weights - changes), np.sqrt((changes**2).mean(axis=0))
     ratios, shares = [], []
     for of in (lambda errors: np.median(errors, axis=0), lambda errors: np.sqrt((errors**2).mean(axis=0))):

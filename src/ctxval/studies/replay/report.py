@@ -33,10 +33,8 @@ class RecordedData(ShortRepr):
     Attributes:
         sources: the files and episodes.
         recordings, steps: the numbers of recordings and of steps.
-        dt: length of a step, seconds.
         states, inputs: the names of the states and inputs with their units.
-        breaks: where logs were split, and why.
-        notes: sentences on how the logs were read.
+        breaks, notes: where logs were split and why, and sentences on how they were read.
         seen: number of recordings that are in the data from which the model was learned. They are left out of the
             errors, unless all recordings are.
     """
@@ -57,12 +55,10 @@ class ReplayReport(ShortRepr):
     """What recordings show of a model.
 
     Attributes:
-        data: the recordings.
         errors: the error of each state after each number of steps.
         regions: the one-step error in ranges of each state and input.
         residuals: how much of the one-step residual of each state can be explained.
-        suggestions: changes of timing with which the model predicts held-out recordings clearly better.
-        faults: faults of the recordings that look like errors of the model.
+        suggestions, faults: changes of timing, and faults of the recordings, that explain errors.
         tasks: what the recordings predict of the tasks of an experiment; None without an experiment, or if the
             recordings teach nothing.
         insights: what follows, in sentences, the most important one first.
@@ -97,7 +93,6 @@ def replay(
     """Compare a model with recordings of its system. Nothing is executed.
 
     Args:
-        model: the model M, with the time step of the recordings.
         steps: numbers of steps after which errors are computed.
         validation: an experiment with this model, whose tasks are then judged too; its system is never executed.
         executions: number of executions of the experiment that are proposed.
@@ -107,8 +102,8 @@ def replay(
     if validation is not None:
         _require_same_step(validation, recordings)
     require_time_step(model, recordings.dt, "the recording")
-    seen, every = _seen(model, recordings), range(len(recordings.runs))
-    used = [number for number in every if number not in seen] or list(every)
+    new = unseen(model, recordings)
+    used = new or list(range(len(recordings.runs)))
     recorded = RecordedSteps(recordings, used)
     with single_threaded():
         errors = step_errors(model, recorded, sorted(set(steps)))
@@ -124,9 +119,9 @@ def replay(
     sources = tuple(dict.fromkeys(run.source for run in recordings.runs))
     names = recordings.states, recordings.inputs
     counts = len(recordings.runs), recordings.steps, recordings.dt
-    data = RecordedData(sources, *counts, *names, recordings.breaks, recordings.notes, len(seen))
+    data = RecordedData(sources, *counts, *names, recordings.breaks, recordings.notes, counts[0] - len(new))
     report = ReplayReport(data, errors, where, residuals, changes, wrong, tasks, ())
-    sentences = [*_insights(report, len(used)), *_insights_of_tasks([*data.states, *data.inputs], tasks)]
+    sentences = [*_insights(report, len(used)), *_insights_of_tasks(report)]
     if validation is not None and tasks is None:
         sentences.append(
             "nothing is predicted of the tasks: the model explains the recordings, or no controller can be designed "
@@ -135,11 +130,11 @@ def replay(
     return replace(report, insights=tuple(sentences))
 
 
-def _seen(model: Model, recordings: Recordings) -> set[int]:
-    """Return the recordings most of whose steps are in the data from which the model was learned."""
+def unseen(model: Model, recordings: Recordings) -> list[int]:
+    """Return the recordings most of whose steps are not in the data from which the model was learned."""
     data, sizes = getattr(model, "data", None), (len(recordings.states), len(recordings.inputs))
     if not isinstance(data, Transitions) or (data.x.shape[1], data.u.shape[1]) != sizes:
-        return set()
+        return list(range(len(recordings.runs)))
 
     def rows(transitions: Transitions) -> list[bytes]:
         """Return transitions as texts that agree if the numbers agree to single precision."""
@@ -148,7 +143,7 @@ def _seen(model: Model, recordings: Recordings) -> set[int]:
 
     known = set(rows(data))
     recorded = [rows(run.trajectory.transitions()) for run in recordings.runs]
-    return {k for k, steps in enumerate(recorded) if sum(step in known for step in steps) > len(steps) / 2}
+    return [k for k, steps in enumerate(recorded) if sum(step in known for step in steps) <= len(steps) / 2]
 
 
 def _require_same_step(validation: Validation, recordings: Recordings) -> None:
@@ -251,7 +246,8 @@ def _causes(residual: ResidualShare) -> Iterator[str]:
         )
 
 
-def _insights_of_tasks(names: Sequence[str], tasks: PredictedTasks | None) -> Iterator[str]:
+def _insights_of_tasks(report: ReplayReport) -> Iterator[str]:
+    tasks, names = report.tasks, [*report.data.states, *report.data.inputs]
     if tasks is None or not tasks.worst:
         return
     worst = tasks.worst[0]

@@ -22,7 +22,6 @@ class PredictedTask(ShortRepr):
     """The predicted distance of one task.
 
     Attributes:
-        parameters: the task parameters.
         median, low, high: median, 0.05 and 0.95 quantile of the distance over posterior samples of the dynamics.
         resolved: for a proposed execution, the share of the variance of the distances of likely worst tasks that it and
             those before it resolve; None for others.
@@ -45,9 +44,8 @@ class PredictedTasks(ShortRepr):
         executions: the executions that would tell most of the largest distance, in this order.
         draws: number of posterior samples of the dynamics.
         unplanned: share of the tasks for which no controller can be designed, or on which the model diverges.
-        beyond: how far the closed loops of the tasks lead beyond all records of one state or input, as a share of the
-            range that they visit.
-        beyond_of: the index of this state or input; states come before inputs.
+        beyond, beyond_of: how far the closed loops of the tasks lead beyond all records of one state or input, as a
+            share of the range that they visit, and the index of this state or input; states come before inputs.
     """
 
     worst: tuple[PredictedTask, ...]

@@ -14,8 +14,7 @@ from typing import Any
 import numpy as np
 
 from ctxval._util.checked import NonNegativeInt, PositiveInt, checked
-from ctxval._util.progress import stage
-from ctxval._util.progress_display import progress_shown
+from ctxval._util.progress import progress_shown, stage
 from ctxval._util.representation import ShortRepr, Shown, call, lines
 from ctxval._util.texts import parted
 from ctxval.campaign.campaign import Campaign
@@ -151,7 +150,7 @@ def judged_by(experiment: Experiment, distance: UnsafeMargin) -> Experiment:
     places = range(len(labels)) if components is None else [i for i in components if isinstance(i, int)]
     found = {labels[i] for i in places if -len(labels) <= i < len(labels)}
     units = found.pop() if len(found) == 1 else ""
-    validation = given.with_labels(replace(given.labels, units=units))
+    validation = given.with_parts(labels=replace(given.labels, units=units))
     return replace(experiment, validation=validation, threshold=distance.margin, truth=None, units=units)
 
 

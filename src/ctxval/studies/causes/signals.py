@@ -1,7 +1,8 @@
-"""Causes in the actuators: what acts is not what is commanded."""
+"""Causes in actuators and sensors: what acts is not what is commanded, and what is recorded is not the state."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -13,15 +14,17 @@ from ctxval.studies.causes.cause import Cause
 from ctxval.studies.causes.plant import Plant
 
 
-def _at(u: Array, index: int | None, size: float, elsewhere: float = 0.0) -> Array:
-    """Return an array ``(m,)`` with a size at one input of ``u``, or at all of them if it is None."""
-    sizes = np.full(u.shape[-1], elsewhere)
+def _at(values: Array, index: int | list[int] | None, size: float, elsewhere: float = 0.0) -> Array:
+    """Return an array of the last axis of values with a size at some places, or everywhere if the index is None."""
+    sizes = np.full(values.shape[-1], elsewhere)
     sizes[slice(None) if index is None else index] = size
     return sizes
 
 
-def _with_unit(value: float, unit: str) -> str:
-    return f"{value:.3g} {unit}".strip()
+def _exchanged(values: Array, first: Sequence[int], second: Sequence[int]) -> Array:
+    order = np.arange(values.shape[-1])
+    order[[*first, *second]] = [*second, *first]
+    return values[..., order]
 
 
 @dataclass(frozen=True)
@@ -43,11 +46,10 @@ class InputGain(Cause):
         return f"{which} {self.sizes[0]:.3g} times the effect that M has"
 
     def mjcf(self, plant: Plant) -> str | None:
-        compiled = getattr(plant.model, "compiled", None)
-        if compiled is None or self.input is None:
+        if plant.compiled is None or self.input is None:
             return None
-        gear = self.sizes[0] * float(compiled.actuator_gear[self.input, 0])
-        return f'<motor name="{compiled.actuator(self.input).name}" gear="{gear:.5g}"/>'
+        gear = self.sizes[0] * float(plant.compiled.actuator_gear[self.input, 0])
+        return f'<motor name="{plant.compiled.actuator(self.input).name}" gear="{gear:.5g}"/>'
 
 
 @dataclass(frozen=True)
@@ -62,7 +64,7 @@ class InputOffset(Cause):
 
     def text(self, plant: Plant) -> str:
         name, unit = plant.input(self.input)
-        return f"{name} has an offset of {_with_unit(self.sizes[0], unit)}"
+        return f"{name} has an offset of {self.sizes[0]:.3g} {unit}".rstrip()
 
 
 @dataclass(frozen=True)
@@ -78,14 +80,13 @@ class Saturation(Cause):
 
     def text(self, plant: Plant) -> str:
         name, unit = plant.input(self.input)
-        return f"{name} saturates at {_with_unit(self.sizes[0], unit)}"
+        return f"{name} saturates at {self.sizes[0]:.3g} {unit}".rstrip()
 
     def mjcf(self, plant: Plant) -> str | None:
-        compiled = getattr(plant.model, "compiled", None)
-        if compiled is None:
+        if plant.compiled is None:
             return None
         limit = f'ctrllimited="true" ctrlrange="{-self.sizes[0]:.5g} {self.sizes[0]:.5g}"'
-        return f'<motor name="{compiled.actuator(self.input).name}" {limit}/>'
+        return f'<motor name="{plant.compiled.actuator(self.input).name}" {limit}/>'
 
 
 @dataclass(frozen=True)
@@ -101,7 +102,7 @@ class DeadZone(Cause):
 
     def text(self, plant: Plant) -> str:
         name, unit = plant.input(self.input)
-        return f"{name} has a dead zone of {_with_unit(self.sizes[0], unit)}"
+        return f"{name} has a dead zone of {self.sizes[0]:.3g} {unit}".rstrip()
 
 
 @dataclass(frozen=True)
@@ -119,7 +120,7 @@ class Backlash(Cause):
 
     def text(self, plant: Plant) -> str:
         name, unit = plant.input(self.input)
-        return f"{name} has backlash of {_with_unit(2 * self.sizes[0], unit)}"
+        return f"{name} has backlash of {2 * self.sizes[0]:.3g} {unit}".rstrip()
 
 
 @dataclass(frozen=True)
@@ -165,9 +166,7 @@ class SwappedInputs(Cause):
     second: int = 1
 
     def follow(self, u: Array, memory: Any) -> tuple[Array, Any]:
-        order = np.arange(u.shape[-1])
-        order[[self.first, self.second]] = self.second, self.first
-        return u[..., order], None
+        return _exchanged(u, [self.first], [self.second]), None
 
     def text(self, plant: Plant) -> str:
         return f"the inputs {plant.input(self.first)[0]} and {plant.input(self.second)[0]} are exchanged"
@@ -186,3 +185,66 @@ class ReversedInput(Cause):
 
     def text(self, plant: Plant) -> str:
         return f"{plant.input(self.input)[0]} acts with the opposite sign"
+
+
+@dataclass(frozen=True)
+class SensorOffset(Cause):
+    """A state is recorded with an offset. Size: what is recorded minus the state."""
+
+    name: ClassVar[str] = "sensor offset"
+    state: int = 0
+
+    def true(self, recorded: Array) -> Array:
+        return recorded - _at(recorded, self.state, self.sizes[0])
+
+    def recorded(self, x: Array) -> Array:
+        return x + _at(x, self.state, self.sizes[0])
+
+    def text(self, plant: Plant) -> str:
+        name, unit = plant.state(self.state)
+        size = f"{abs(self.sizes[0]):.3g} {unit}".rstrip()
+        return f"the sensor of {name} reads {size} too {'much' if self.sizes[0] > 0 else 'little'}"
+
+
+@dataclass(frozen=True)
+class SensorScale(Cause):
+    """A position and its rate are recorded with a wrong scale. Size: what is recorded, divided by the state.
+
+    Attributes:
+        states: indices of the states that are scaled.
+    """
+
+    name: ClassVar[str] = "sensor scale"
+    states: tuple[int, ...] = (0,)
+
+    def true(self, recorded: Array) -> Array:
+        return recorded / _at(recorded, list(self.states), self.sizes[0], 1.0)
+
+    def recorded(self, x: Array) -> Array:
+        return x * _at(x, list(self.states), self.sizes[0], 1.0)
+
+    def text(self, plant: Plant) -> str:
+        return f"the sensor of {plant.state(self.states[0])[0]} reads {self.sizes[0]:.3g} times the value"
+
+
+@dataclass(frozen=True)
+class SwappedJoints(Cause):
+    """The recorded states of two joints are exchanged.
+
+    Attributes:
+        first, second: indices of their states, in the same order.
+    """
+
+    sizes: tuple[float, ...] = ()
+    name: ClassVar[str] = "swapped joints"
+    first: tuple[int, ...] = (0,)
+    second: tuple[int, ...] = (1,)
+
+    def true(self, recorded: Array) -> Array:
+        return _exchanged(recorded, self.first, self.second)
+
+    def recorded(self, x: Array) -> Array:
+        return self.true(x)
+
+    def text(self, plant: Plant) -> str:
+        return f"the sensors of {plant.state(self.first[0])[0]} and {plant.state(self.second[0])[0]} are exchanged"

@@ -15,7 +15,7 @@ from ctxval.core.task import Task as CoreTask
 from ctxval.core.trajectory import Transitions
 from ctxval.errors import InputError, UnknownNameError
 from ctxval.learning import DynamicsStudy
-from ctxval.learning.physical import with_parameters, with_parameters_as_states, without_parameters
+from ctxval.learning.extended import ExtendedValidation
 from ctxval.learning.replays import replay_executed
 
 H, DT = 30, 0.1
@@ -72,10 +72,12 @@ def test_names_are_those_of_task_parameters() -> None:
 
 def test_without_physical_parameters_nothing_changes() -> None:
     validation = loaded_cart(())
-    assert with_parameters_as_states(validation) is validation
+    extended = ExtendedValidation(validation)
+    assert extended.validation is validation
     trajectory = validation.execute(validation.plan(np.array([1.0, 0.5])))
-    assert with_parameters(validation, np.array([0.3, 0.5]), trajectory) is trajectory
-    assert without_parameters(validation, trajectory) is trajectory
+    ((_, longer),) = extended.executions([(np.array([0.3, 0.5]), trajectory)], 1) or []
+    assert longer is trajectory
+    assert extended.recorded(trajectory) is trajectory
 
 
 @pytest.mark.parametrize(
@@ -84,7 +86,8 @@ def test_without_physical_parameters_nothing_changes() -> None:
 def test_controllers_model_and_distance_are_those_of_the_user(synthesizer: Any) -> None:
     """The loops of M and the distances of a trajectory are the same with the parameter as a state and without."""
     validation = loaded_cart(synthesizer=synthesizer)
-    extended, unit = with_parameters_as_states(validation), np.array([[0.2, 0.9], [0.7, 0.1]])
+    both, unit = ExtendedValidation(validation), np.array([[0.2, 0.9], [0.7, 0.1]])
+    extended = both.validation
     points = validation.space.from_unit(unit)
     for row, point in zip(unit, points, strict=True):
         plan, beside = validation.plan(point), extended.plan(point)
@@ -92,13 +95,13 @@ def test_controllers_model_and_distance_are_those_of_the_user(synthesizer: Any) 
         np.testing.assert_allclose(states[:, :2], plan.model_trajectory.states, rtol=1e-12)
         np.testing.assert_array_equal(states[:, 2], point[1])
         trajectory = validation.execute(plan)
-        longer = with_parameters(validation, row, trajectory)
-        np.testing.assert_array_equal(without_parameters(validation, longer).states, trajectory.states)
+        ((_, longer),) = both.executions([(row, trajectory)], 1) or []
+        np.testing.assert_array_equal(both.recorded(longer).states, trajectory.states)
         assert extended.measure(beside, longer) == pytest.approx(validation.measure(plan, trajectory), rel=1e-12)
 
 
 def test_a_batch_is_planned_as_its_tasks_are() -> None:
-    extended = with_parameters_as_states(loaded_cart())
+    extended = ExtendedValidation(loaded_cart()).validation
     points = extended.space.from_unit(np.array([[0.2, 0.9], [0.7, 0.1], [1.0, 0.0]]))
     for plan, point in zip(extended.plans(points), points, strict=True):
         np.testing.assert_allclose(
@@ -107,11 +110,11 @@ def test_a_batch_is_planned_as_its_tasks_are() -> None:
 
 
 def test_states_keep_their_names_and_a_parameter_of_the_same_name_gets_another() -> None:
-    labels = with_parameters_as_states(loaded_cart()).labels
+    labels = ExtendedValidation(loaded_cart()).validation.labels
     assert labels.states == ("x0", "x1", "load [kg]")
     validation = loaded_cart()
-    named = validation.with_labels(type(validation.labels)(states=("load [N]", "speed [m/s]")))
-    assert with_parameters_as_states(named).labels.states == ("load [N]", "speed [m/s]", "task load [kg]")
+    named = validation.with_parts(labels=type(validation.labels)(states=("load [N]", "speed [m/s]")))
+    assert ExtendedValidation(named).validation.labels.states == ("load [N]", "speed [m/s]", "task load [kg]")
 
 
 @pytest.mark.slow
@@ -130,7 +133,7 @@ def test_dynamics_that_depend_on_a_stated_parameter_are_validated_by_a_bound_tha
     assert verdict.certificate is not None
     assert verdict.certificate.details["physical"] == ["load"]
     # A campaign that is opened again with another statement does not count predictions of the first one.
-    without = Campaign(validation.with_physical(()), store=store, seed=0)
+    without = Campaign(validation.with_parts(physical=()), store=store, seed=0)
     assert without.executions == campaign.executions
     assert without.recorder.dynamics.stored_prediction(campaign.trials[-1]) is None
 
@@ -161,7 +164,7 @@ def random_executions(validation: Validation, count: int) -> list[tuple[Array, A
 
 def test_nothing_is_suspected_if_state_and_input_explain_the_executions() -> None:
     validation = loaded_cart().with_system(systems.Simulated(lambda x, u: cart(x, u, np.array(0.3)), vectorized=True))
-    study = DynamicsStudy(validation.with_physical(()))
+    study = DynamicsStudy(validation.with_parts(physical=()))
     learned = study.learn(random_executions(validation, 8))
     assert learned is not None
     assert learned.study is study

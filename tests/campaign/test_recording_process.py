@@ -6,12 +6,14 @@ import os
 import pickle
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
-from ctxval._util.confinement import may_confine
-from ctxval.campaign.recording_file import RecordingFile
+from ctxval._util.cores import may_confine
+from ctxval.campaign.telling import ToldResult
+from ctxval.core.trajectory import Trajectory
 from ctxval.data import LogMapping
 from ctxval.errors import InputError
 from rig_logs import run, write_bag, write_bag1, write_mat, write_mcap_json, write_parquet
@@ -35,11 +37,12 @@ FIELDS = {
 }
 
 
-def recording(path: Path, *, uploaded: bool = True) -> RecordingFile:
+def read(path: Path, *, confined: bool = True, uploaded: bool = True) -> Trajectory:
     table = FIELDS.get(path.name)
     mapping = None if table is None else LogMapping.from_table(table)
     named = {"position": "m", "speed": "m/s"}, {"force": "N"}
-    return RecordingFile(path, *named, ONE.times, mapping=mapping, uploaded=uploaded)
+    told = ToldResult(path, mapping=mapping, uploaded=uploaded)
+    return (told.read_confined if confined else told.read_file)(path, *named, ONE.times)
 
 
 def write(path: Path) -> None:
@@ -62,8 +65,8 @@ def write(path: Path) -> None:
 @pytest.mark.parametrize("name", FIELDS)
 def test_a_confined_process_reads_what_this_one_reads(name: str, tmp_path: Path) -> None:
     write(tmp_path / name)
-    found = recording(tmp_path / name).read_confined()
-    np.testing.assert_array_equal(found.states, recording(tmp_path / name).read().states)
+    found = read(tmp_path / name)
+    np.testing.assert_array_equal(found.states, read(tmp_path / name, confined=False).states)
 
 
 @pytest.mark.slow
@@ -71,20 +74,20 @@ def test_the_storage_of_a_bag_is_read_in_a_confined_process(tmp_path: Path) -> N
     write_bag(tmp_path / "bag", ONE)
     (storage,) = (tmp_path / "bag").glob("*.db3")
     FIELDS[storage.name] = FIELDS["run.bag"]
-    assert recording(storage).read_confined().horizon == ONE.horizon
+    assert read(storage).horizon == ONE.horizon
 
 
-class Probe(RecordingFile):
+class Probe(ToldResult):
     """Does what an attacker would do who took over the process; what it learns is in the reason of the failure."""
 
-    def read(self) -> None:  # type: ignore[override]
+    def read_file(self, file: Path, *_: Any) -> None:  # type: ignore[override]
         learned = []
-        for path in (self.path.with_name("key"), Path("/etc/passwd"), Path("/proc/self/environ"), Path.home()):
+        for path in (file.with_name("key"), Path("/etc/passwd"), Path("/proc/self/environ"), Path.home()):
             try:
                 learned.append(os.listdir(path) if path.is_dir() else path.read_bytes())
             except OSError:
                 continue
-        for path in (self.path, self.path.with_name("new")):
+        for path in (file, file.with_name("new")):
             try:
                 path.write_text("changed")
                 learned.append(path)
@@ -106,20 +109,20 @@ def test_a_process_that_is_taken_over_learns_and_changes_nothing(
     (tmp_path / "home").mkdir()
     (tmp_path / "key").write_text(CANARY)
     (tmp_path / "run.csv").write_text("t,position")
-    probe = Probe(tmp_path / "run.csv", {"position": "m"}, {}, ONE.times)
-    monkeypatch.setattr(sys.modules[__name__], "__name__", "test_recording_file")
-    monkeypatch.setattr(Probe, "__module__", "test_recording_file")
-    monkeypatch.setitem(sys.modules, "test_recording_file", sys.modules[Probe.__module__])
-    assert pickle.loads(pickle.dumps(probe)).path == probe.path
+    probe = Probe(tmp_path / "run.csv")
+    monkeypatch.setattr(sys.modules[__name__], "__name__", "test_recording_process")
+    monkeypatch.setattr(Probe, "__module__", "test_recording_process")
+    monkeypatch.setitem(sys.modules, "test_recording_process", sys.modules[Probe.__module__])
+    assert pickle.loads(pickle.dumps(probe)).recording == probe.recording
     with pytest.raises(InputError, match=r"^learned: \[\]$"):
-        probe.read_confined()
+        probe.read_confined(tmp_path / "run.csv", {"position": "m"}, {}, ONE.times)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["home", "key", "run.csv"]
 
 
 class Greedy(Probe):
     """Needs more than it may have."""
 
-    def read(self) -> None:  # type: ignore[override]
+    def read_file(self, *_: Any) -> None:  # type: ignore[override]
         hoard = [b"x" * 2**28 for _ in range(64)]
         raise InputError(f"{len(hoard)} times 256 MiB")
 
@@ -127,10 +130,10 @@ class Greedy(Probe):
 @pytest.mark.slow
 def test_a_process_that_needs_too_much_memory_ends(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(Path(__file__).parent), str(Path(__file__).parents[1])]))
-    monkeypatch.setattr(Greedy, "__module__", "test_recording_file")
-    monkeypatch.setitem(sys.modules, "test_recording_file", sys.modules[__name__])
+    monkeypatch.setattr(Greedy, "__module__", "test_recording_process")
+    monkeypatch.setitem(sys.modules, "test_recording_process", sys.modules[__name__])
     with pytest.raises(InputError, match=r"cannot be read within 60 s and \d+ bytes of memory"):
-        Greedy(tmp_path / "run.csv", {"position": "m"}, {}, ONE.times, uploaded=True).read_confined()
+        Greedy(uploaded=True).read_confined(tmp_path / "run.csv", {"position": "m"}, {}, ONE.times)
 
 
 @pytest.mark.slow
@@ -148,7 +151,7 @@ def test_a_process_that_needs_too_much_memory_ends(tmp_path: Path, monkeypatch: 
 def test_a_sentence_about_an_upload_has_nothing_of_the_file(name: str, content: str, tmp_path: Path) -> None:
     (tmp_path / name).write_text(content)
     with pytest.raises(InputError) as refused:
-        recording(tmp_path / name).read_confined()
+        read(tmp_path / name)
     assert CANARY not in str(refused.value)
     assert "\x1b" not in str(refused.value)
     assert "position [m], speed [m/s], force [N] are needed" in str(refused.value)
@@ -158,6 +161,6 @@ def test_a_sentence_about_an_upload_has_nothing_of_the_file(name: str, content: 
 def test_the_line_of_a_wrong_cell_of_an_upload_is_named(tmp_path: Path) -> None:
     (tmp_path / "run.csv").write_text(f"t,position,speed,force\n0,1,2,3\n0.1,{CANARY},2,3\n0.2,1,2,3\n")
     with pytest.raises(InputError, match=r"run\.csv, line 3: it is not a recording of this trial"):
-        recording(tmp_path / "run.csv").read_confined()
+        read(tmp_path / "run.csv")
     with pytest.raises(InputError, match=CANARY):  # whoever names a file may know what is in it
-        recording(tmp_path / "run.csv", uploaded=False).read_confined()
+        read(tmp_path / "run.csv", uploaded=False)
