@@ -328,7 +328,7 @@ class DynamicsEvidence(ShortRepr):
                 "physical": tuple(values["physical"]),
             }
             return cls(**{**values, **parts})
-        except (KeyError, TypeError, ValueError):
+        except (AttributeError, KeyError, TypeError, ValueError):
             return None
 
 
