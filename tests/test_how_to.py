@@ -27,9 +27,10 @@ NEEDS |= {"gymnasium-and-network": ["gymnasium", "mujoco", "sklearn"]}
 NEEDS |= {"fit": ["mujoco", "sklearn", "onnx"]}
 NEEDS |= {"clusters": ["submitit", "ray", "distributed"]}
 NEEDS |= {"operate": ["starlette", "uvicorn", "jinja2", "python_multipart"]}
-LONG = ("aspect1", "clusters", "compare-controllers", "controllers", "fit", "gymnasium-and-network")
-LONG += ("noise", "noisy-environment", "read-certificate", "retrain", "workers")
-"""Pages that only `make docs` and `make thorough` run: campaigns on several models, with noise or in many processes."""
+LONG = ("aspect1", "causes", "clusters", "compare-controllers", "controllers", "envelope", "fit")
+LONG += ("gymnasium-and-network", "noise", "noisy-environment", "outputs", "read-certificate", "retrain", "safety")
+LONG += ("workers",)
+"""Pages that only `make docs` and `make thorough` run: long campaigns, several of them, or many processes."""
 CTXVAL = ["-c", "from ctxval.cli import main; main()"]
 
 

@@ -11,6 +11,7 @@ import pytest
 from test_kill import content
 
 from ctxval import Store
+from rig_thorough import more
 
 SCRIPT = Path(__file__).parents[1] / ("rig_processor.py")
 OLD, NEW = "Nehalem", "Haswell"
@@ -31,7 +32,7 @@ def run(store: Path, search: str, budget: int, processor: str) -> str:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("search", ["gp-ucb", "auto"])
+@pytest.mark.parametrize("search", ["auto", *more("gp-ucb")])
 def test_a_campaign_goes_on_upon_another_processor(search: str, tmp_path: Path) -> None:
     moved, unmoved = tmp_path / "moved.sqlite", tmp_path / "unmoved.sqlite"
     kernels = run(moved, search, 5, OLD)
