@@ -182,12 +182,12 @@ class KindRegistry(Registry[CertificateKind]):
     def register(self, kind: Kind) -> Kind:
         """Add a kind; a decorator of its class. A cell that is run again replaces its own class."""
         name = _required(kind).name
-        known = self._built_in.get(name, kind)
+        known = self._exported.get(name, kind)
         if (known.__module__, known.__qualname__) != (kind.__module__, kind.__qualname__):
             raise InputError(f"there is a kind of certificate called {name!r} already: {known.__qualname__}.")
-        if name in self._registered or name not in self._built_in:
+        if name in self._registered or name not in self._exported:
             self._registered.add(name)
-            self._built_in[name] = kind
+            self._exported[name] = kind
         return kind
 
     def is_data(self, name: Any) -> bool:
