@@ -95,7 +95,7 @@ def test_workers_never_run_the_same_task_at_the_same_time(seed: int) -> None:
 def test_spare_workers_that_decide_execute_different_tasks() -> None:
     validation = linear(2)
     pool, campaign = Pool(validation, 4), Campaign(validation, search=searches.Auto("fast"))
-    decides = IntervalSearch(campaign.recorder, CertificateOptions.or_automatic(None, 0.95, False, 0.1), 10)
+    decides = IntervalSearch(campaign.recorder, CertificateOptions.or_automatic(None, 0.95, 0.1), 10)
     with campaign.recorder.predicting(decides.predicts):
         found = points(run(campaign, pool, 10, decides.choose))
     for together in pool.together:
