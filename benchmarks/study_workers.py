@@ -215,7 +215,7 @@ def study(one: tuple[str, str, int, int]) -> dict[str, Any]:
         decides = None
         if mode == "decide":
             decides = IntervalSearch(
-                recorder, CertificateOptions.or_automatic(None, 0.95, False, 0.1), 1000, within=WITHIN
+                recorder, CertificateOptions.or_automatic(None, 0.95, 0.1), 1000, within=WITHIN
             )
 
         def rule() -> Choice | None:
