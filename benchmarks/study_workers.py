@@ -214,9 +214,7 @@ def study(one: tuple[str, str, int, int]) -> dict[str, Any]:
         recorder, pool = campaign.recorder, SimulatedPool(validation.system, workers, seed)
         decides = None
         if mode == "decide":
-            decides = IntervalSearch(
-                recorder, CertificateOptions.or_automatic(None, 0.95, 0.1), 1000, within=WITHIN
-            )
+            decides = IntervalSearch(recorder, CertificateOptions.or_automatic(None, 0.95, 0.1), 1000, within=WITHIN)
 
         def rule() -> Choice | None:
             over = pool.now >= LONGEST or len(ended) + recorder.executing >= MOST
