@@ -82,6 +82,7 @@ def main() -> None:
     """Print all ratios, or report the figures of one case."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--tests", type=int, default=TESTS, help="tests at drawn tasks of the present code")
+    parser.add_argument("--only", nargs="*", help="measure these cases alone")
     parser.add_argument("--case", choices=["demo", *CASES], help="report the seconds of one case")
     add_store_option(parser)
     options = parser.parse_args()
@@ -90,6 +91,7 @@ def main() -> None:
         report(demo(options.tests) if options.case == "demo" else campaign(options.case, options.tests))
         return
     wanted = [("demo", 5.0), *((name, case[3]) for name, case in CASES.items())]
+    wanted = [pair for pair in wanted if not options.only or pair[0] in options.only]
     for (name, least), tests in itertools.product(wanted, (0, TESTS)):
         arguments = ("--case", name, "--tests", str(tests))
         repeats = 1 if name.startswith("quadrotor") else REPEATS
@@ -99,7 +101,7 @@ def main() -> None:
         seconds = [[one[0] for one in figures] for figures in (earlier, now)]
         figure = f"until the verdict, {name}" + (f", {tests} tests on top" if tests else "")
         Ratio("bench_verdicts", figure, *seconds, least=None if tests else least).tell(options.store)
-    for name in ("linear 10-D", "Dubins 11-D", "arm"):
+    for name in (name for name, _ in wanted if name in ("linear 10-D", "Dubins 11-D", "arm")):
         decided, suggested = suggestions(name)
         figure = f"an execution until decided over a suggestion, {name}"
         Ratio("bench_verdicts", figure, [decided], [suggested], most=MOST_SUGGESTIONS).tell(options.store)

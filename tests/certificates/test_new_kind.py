@@ -76,7 +76,7 @@ class Lipschitz(CertificateKind):
 def recipe(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     """Import the file of the recipe, and forget the kind afterwards."""
     monkeypatch.setattr(KINDS, "_registered", set(KINDS._registered))
-    monkeypatch.setattr(KINDS, "_exported", dict(KINDS._built_in))
+    monkeypatch.setattr(KINDS, "_exported", dict(KINDS._exported))
     (tmp_path / "lipschitz.py").write_text(RECIPE)
     monkeypatch.syspath_prepend(str(tmp_path))
     monkeypatch.delitem(sys.modules, "lipschitz", raising=False)
