@@ -5,7 +5,7 @@ import pytest
 
 from ctxval._util.arrays import Array
 from ctxval.errors import InputError
-from ctxval.gp.kernels import factorise, tenfold
+from ctxval.gp.cholesky import factorise, tenfold
 
 
 def covariance(n: int = 7) -> Array:

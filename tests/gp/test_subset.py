@@ -10,7 +10,8 @@ from scipy.spatial.distance import cdist
 
 from ctxval import searches
 from ctxval._util.arrays import Array
-from ctxval.gp.kernels import Matern, pivoted_cholesky, pivoted_rows
+from ctxval.gp.cholesky import pivoted_cholesky, pivoted_rows
+from ctxval.gp.kernels import Matern
 from ctxval.gp.surrogate import LONG, kept_rows
 from rig_thorough import more
 

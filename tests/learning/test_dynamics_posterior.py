@@ -7,7 +7,7 @@ import pytest
 
 from ctxval import Transitions, models
 from ctxval._util.arrays import Array
-from ctxval.gp.kernels import factorise
+from ctxval.gp.cholesky import factorise
 from ctxval.learning.dynamics_posterior import DynamicsPosterior, PosteriorSettings, learn_posterior
 from ctxval.learning.hyperparameters import FAMILIES, Hyperparameters, ResidualKernel
 from ctxval.learning.kernel_expansion import Component, draw_functions

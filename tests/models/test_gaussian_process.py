@@ -9,7 +9,7 @@ import pytest
 
 from ctxval import Task, Transitions, controllers, models, testing
 from ctxval.errors import InputError, ShapeError
-from ctxval.models import scaling as gaussian_process
+from ctxval.models import gaussian_process
 
 LENGTH_SCALES = np.array([1.2, 3.0, 2.0])
 

@@ -19,7 +19,8 @@ from ctxval._util.arrays import Array, ArrayLike
 from ctxval._util.boxes import climb, farthest_rows, polish
 from ctxval._util.representation import ShortRepr
 from ctxval.errors import InputError
-from ctxval.gp.kernels import CholeskyFactor, Matern, factorise
+from ctxval.gp.cholesky import CholeskyFactor, factorise
+from ctxval.gp.kernels import Matern
 
 EXACT = 1e-10
 """Noise variance, relative to sigma^2, of values without noise: it keeps the Cholesky factor safe."""

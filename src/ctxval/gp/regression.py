@@ -12,7 +12,8 @@ from scipy.optimize import minimize
 
 from ctxval._util.arrays import Array, Rows
 from ctxval.errors import InputError
-from ctxval.gp.kernels import Bounds, CholeskyFactor, Kernel, factorise
+from ctxval.gp.cholesky import CholeskyFactor, factorise
+from ctxval.gp.kernels import Bounds, Kernel
 
 Mean = Callable[[Array], Array]
 """A prior mean: points ``(n, d)`` -> values ``(n,)``."""

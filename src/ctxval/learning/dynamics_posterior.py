@@ -21,7 +21,7 @@ from ctxval._util.representation import ShortRepr
 from ctxval.core.model import Model
 from ctxval.core.trajectory import Transitions
 from ctxval.errors import InputError
-from ctxval.gp.kernels import pivoted_rows
+from ctxval.gp.cholesky import pivoted_rows
 from ctxval.learning.draws import DynamicsDraws, bounded
 from ctxval.learning.hyperparameters import (
     FAMILIES,

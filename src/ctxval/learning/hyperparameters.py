@@ -18,7 +18,8 @@ from scipy.special import gammaln, logsumexp
 
 from ctxval._util.arrays import Array, Rows
 from ctxval.errors import InputError
-from ctxval.gp.kernels import Bounds, CholeskyFactor, Covariance, Linear, Matern, Towards, factorise, pivoted_rows
+from ctxval.gp.cholesky import CholeskyFactor, factorise, pivoted_rows
+from ctxval.gp.kernels import Bounds, Covariance, Linear, Matern, Towards
 from ctxval.gp.regression import most_likely
 
 FAMILIES = ((2.5, 0.0), (2.5, 1.0), (1.5, 0.0))

@@ -13,7 +13,7 @@ from itertools import groupby, product
 import numpy as np
 
 from ctxval._util.arrays import Array, Mask, Rows
-from ctxval.gp.kernels import CholeskyFactor, factorise, pivoted_cholesky, tenfold
+from ctxval.gp.cholesky import CholeskyFactor, factorise, pivoted_cholesky, tenfold
 from ctxval.learning.hyperparameters import Hyperparameters, ResidualKernel
 
 

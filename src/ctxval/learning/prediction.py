@@ -23,7 +23,8 @@ from ctxval._util.progress import advance
 from ctxval.core.distance import ComposedDistance
 from ctxval.core.trajectory import Trajectory
 from ctxval.errors import ShapeError
-from ctxval.gp.kernels import Linear, Matern, Sum, tenfold
+from ctxval.gp.cholesky import tenfold
+from ctxval.gp.kernels import Linear, Matern, Sum
 from ctxval.gp.regression import MultiOutputProcess, log_likelihood_of_outputs, most_likely
 from ctxval.learning.closed_loops import LoopPlanner, halved
 from ctxval.learning.draws import DynamicsDraws

@@ -17,8 +17,10 @@ from ctxval.core.model import Model
 from ctxval.core.trajectory import Transitions
 from ctxval.errors import InputError
 from ctxval.models.corrected import Corrected, Correction, Refined
+from ctxval.models.gaussian_process import GaussianProcessModel, SquaredExponential
 from ctxval.models.linear import Linear
-from ctxval.models.scaling import FeedforwardReLU, GaussianProcessModel, IncrementScaling, SquaredExponential
+from ctxval.models.neural_network import FeedforwardReLU
+from ctxval.models.scaling import IncrementScaling
 
 _FORMAT = "ctxval model"
 _SCALING = ("shift_in", "scale_in", "shift_out", "scale_out")

@@ -8,7 +8,8 @@ from ctxval._util.registry import Registry
 from ctxval.searches.base import BaseSearch, Costs, Note, Prediction, Search, SequentialSearch
 from ctxval.searches.bayesian_optimisation import BayesianOptimisation
 from ctxval.searches.cma_es import CMAES
-from ctxval.searches.gp_ucb import GPUCB, Random, SamplingDiscarding
+from ctxval.searches.gp_ucb import GPUCB
+from ctxval.searches.random import Random, SamplingDiscarding
 from ctxval.searches.repeated import Repeated
 from ctxval.searches.trust_region import Auto, TrustRegion
 

@@ -1,11 +1,11 @@
-"""The paper's searches: GP-UCB, and two random baselines (Sec. IV-A)."""
+"""The paper's search: GP-UCB."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from ctxval._util.arrays import Array, single_threaded
-from ctxval._util.checked import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
+from ctxval._util.checked import NonNegativeFloat, PositiveFloat, PositiveInt
 from ctxval._util.registry import part
 from ctxval.gp.acquisition import Uncertainty, UpperConfidenceBound, maximise
 from ctxval.gp.kernels import Kernel, Matern
@@ -65,25 +65,3 @@ class GPUCB(SequentialSearch):
         points, values = self.points, self.values
         rows = kept_rows(points, values, 500)
         return fit_surrogate(points[rows], values[rows], self.kernel, noise=self.noise, prior_mean=self.prior_mean)
-
-
-@part("random")
-class Random(SequentialSearch):
-    """Independent uniform points: scenario optimisation, SC. The estimate of d* is the largest distance."""
-
-    iid = True
-
-    def propose(self, rng: np.random.Generator) -> Array:
-        return rng.random(self.dimension)
-
-
-@part("sampling-discarding")
-class SamplingDiscarding(Random):
-    """Independent uniform points; the estimate of d* leaves out the largest distances: sampling and discarding, SD.
-
-    Args:
-        discard: number of the largest distances that the estimate of d* leaves out, the paper's k.
-    """
-
-    def __init__(self, discard: NonNegativeInt = 5) -> None:
-        self.discard = discard

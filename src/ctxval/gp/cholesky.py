@@ -1,0 +1,131 @@
+"""Cholesky factors: everything that conditions a Gaussian process on data factorises its covariance matrix here.
+
+LAPACK is called directly, without the checks of scipy.linalg, which cost more than a small solve.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg.blas import dtrmm
+from scipy.linalg.lapack import dpotrf, dpotri, dpotrs, dtrtrs
+
+from ctxval._util.arrays import Array, Rows
+from ctxval.errors import InputError
+from ctxval.gp.kernels import Covariance
+
+
+@dataclass(frozen=True, eq=False)
+class CholeskyFactor:
+    """The factor L of a positive definite matrix ``K = L L'``; make one with :func:`factorise`."""
+
+    L: Array  # lower triangular, with zeros above its diagonal (n, n)
+
+    def solve(self, right: Array) -> Array:
+        """Return ``K^-1 right`` in the shape of ``right``, ``(n,)`` or ``(n, k)``."""
+        return np.asarray(dpotrs(self.L, right, lower=1)[0])
+
+    def whiten(self, right: Array) -> Array:
+        """Return ``L^-1 right``; if a column of ``right`` has covariance K, that of the result is the identity."""
+        return np.asarray(dtrtrs(self.L, right, lower=1)[0])
+
+    def whiten_many(self, right: Array) -> Array:
+        """Return ``L^-1 right`` for many columns, by a product with the inverse factor, which is faster.
+
+        The columns of ``right`` are contiguous, and may be overwritten.
+        """
+        return np.asarray(dtrmm(1.0, self.inverse_factor, right, lower=1, overwrite_b=1))
+
+    def inverse(self) -> Array:
+        """Return ``K^-1``, shape ``(n, n)``."""
+        lower = dpotri(self.L, lower=1)[0]  # L is zero above its diagonal, and stays so
+        inverse = lower + lower.T
+        inverse.ravel("K")[:: len(inverse) + 1] *= 0.5  # its diagonal
+        return np.asarray(inverse)
+
+    @functools.cached_property
+    def inverse_factor(self) -> Array:
+        """``L^-1``, shape ``(n, n)``."""
+        return self.whiten(np.eye(len(self.L)))
+
+    @functools.cached_property
+    def precisions(self) -> Array:
+        """The diagonal of ``K^-1``, shape ``(n,)``: inverse variances of each observation given all others."""
+        return np.asarray((self.inverse_factor**2).sum(axis=0))
+
+    def precisions_of(self, rows: Rows) -> Array:
+        """Return some entries of the diagonal of ``K^-1``, which takes less time than all of them."""
+        units = np.zeros((len(self.L), len(rows)), order="F")
+        units[rows, np.arange(len(rows))] = 1.0
+        return np.asarray((self.whiten(units) ** 2).sum(axis=0))
+
+    def half_log_determinant(self) -> float:
+        """Return ``log(det K) / 2``."""
+        return float(np.log(np.diag(self.L)).sum())
+
+
+def factorise(covariance: Array, noises: float | Iterable[float]) -> CholeskyFactor:
+    """Return the Cholesky factor of ``covariance + noise I``, shape ``(n, n)``; several noises are tried in turn."""
+    tried = [noises] if isinstance(noises, float) else noises
+    for noise in tried:
+        noisy = np.array(covariance, order="F")
+        noisy.ravel("K")[:: len(noisy) + 1] += noise  # its diagonal
+        L, info = dpotrf(noisy, lower=1, clean=1, overwrite_a=1)
+        if not info and not np.isnan(np.trace(L)):  # some LAPACKs let NaN pass
+            return CholeskyFactor(np.asarray(L))
+    raise InputError(
+        f"the covariance of {len(covariance)} observations is not positive definite; raise the noise variance."
+    )
+
+
+def tenfold(noise: float) -> Iterator[float]:
+    """Yield a noise variance, then ten times as much, and so on, up to 1e30 times as much."""
+    for _ in range(31):
+        yield noise
+        noise *= 10
+
+
+def pivoted_rows(kernel: Covariance, theta: Array, X: Array, count: int, least: float) -> Rows:
+    """Return at most ``count`` rows by pivoted Cholesky: each has the largest variance given the rows before it.
+
+    The choice ends if no remaining variance is larger than ``least``.
+    """
+    towards = kernel.towards(theta, X)
+    return pivoted_cholesky(kernel.diagonal(theta, X), lambda row: towards(X[row : row + 1])[0], count, least).rows
+
+
+@dataclass(frozen=True, eq=False)
+class PivotedCholesky:
+    """A part of a positive semidefinite matrix of which each row has the largest variance given the rows before it."""
+
+    rows: Rows  # (k,)
+    L: Array  # the Cholesky factor of the matrix of these rows (k, k)
+    left: Array  # the variances of all n rows given these (n,)
+
+
+def pivoted_cholesky(
+    variances: Array, covariances: Callable[[int], Array], count: int, least: float
+) -> PivotedCholesky:
+    """Return the Cholesky factor of those rows of a covariance matrix that represent all of it.
+
+    The matrix has the diagonal ``variances`` ``(n,)``, and ``covariances`` returns one of its rows in an array that may
+    be overwritten; count and least are as in :func:`pivoted_rows`.
+    """
+    left = np.array(variances)
+    columns = np.empty((min(count, len(left)), len(left)))
+    chosen: list[int] = []
+    for k, column in enumerate(columns):
+        pivot = int(left.argmax())
+        if left[pivot] <= least:
+            break
+        row = covariances(pivot)
+        row -= columns[:k, pivot] @ columns[:k]
+        np.divide(row, np.sqrt(left[pivot]), out=column)
+        left -= np.square(column, out=row)
+        left[pivot] = 0.0
+        chosen.append(pivot)
+    rows = np.array(chosen, dtype=np.intp)
+    return PivotedCholesky(rows, np.tril(columns[: len(rows)][:, rows].T), np.maximum(left, 0.0))
