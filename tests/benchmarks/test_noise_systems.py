@@ -51,3 +51,14 @@ def test_the_table_counts_answers_by_imperfection(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(calibrate_noise.STORED, "select", lambda **_: results)
     rows = calibrate_noise.table("development").splitlines()
     assert rows[2:] == ["| lag 2 | 1, 0, 0 | 1 of 1, 13 | 0 of 1 |", "| all | 1, 0, 0 | 1 of 1, 13 | 0 of 1 |"]
+
+
+def test_the_readme_has_the_numbers_of_the_stored_campaigns() -> None:
+    def counts(share: float) -> str:
+        lines = calibrate_noise.STORED.select(rule=calibrate_noise.RULE, share=share)
+        answers = [line["answer"] for line in lines if line["plant"] in HALVES["reporting"]]
+        return f"{answers.count('validated')} of {len(answers)}"
+
+    page = " ".join((Path(__file__).parents[2] / "README.md").read_text(encoding="utf-8").split())
+    assert f"{counts(0.95)} campaigns were validated 5 % below the true worst case" in page
+    assert f"{counts(1.25)} were validated 25 % above it" in page
