@@ -30,6 +30,8 @@ CASES: dict[str, tuple[str, dict[str, Any], float, float]] = {
     "arm": ("arm", {"model": "linear"}, 1.1 * 0.17746, 4.0),
     "quadrotor, iLQR with limits": ("quadrotor", {}, 0.35, 3.0),
 }
+SUGGESTED = ("linear 10-D", "Dubins 11-D", "arm")
+"""Cases of which an execution until decided is compared with a suggestion."""
 MOST_SUGGESTIONS = 6.0
 
 
@@ -101,7 +103,9 @@ def main() -> None:
         seconds = [[one[0] for one in figures] for figures in (earlier, now)]
         figure = f"until the verdict, {name}" + (f", {tests} tests on top" if tests else "")
         Ratio("bench_verdicts", figure, *seconds, least=None if tests else least).tell(options.store)
-    for name in (name for name, _ in wanted if name in ("linear 10-D", "Dubins 11-D", "arm")):
+    for name in SUGGESTED:
+        if options.only and name not in options.only:
+            continue
         decided, suggested = suggestions(name)
         figure = f"an execution until decided over a suggestion, {name}"
         Ratio("bench_verdicts", figure, [decided], [suggested], most=MOST_SUGGESTIONS).tell(options.store)

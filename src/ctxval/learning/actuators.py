@@ -98,7 +98,11 @@ def found_actuator(
     if not live.any():
         return None
     inputs = records[0].inputs.shape[-1]
-    rows = learning_rows((Z - Z.mean(axis=0)) / standard_deviations(Z), inputs, _LEARNED_FROM)
+
+    def standardised(Z: Array) -> Array:
+        return np.asarray((Z - Z.mean(axis=0)) / standard_deviations(Z))
+
+    rows = learning_rows(standardised(Z), inputs, _LEARNED_FROM)
 
     def data(actuator: Actuator) -> tuple[Array, Array]:
         """Return states and acting inputs ``(N, n + m)``, and residuals over their sizes if inputs act at once."""
@@ -107,12 +111,11 @@ def found_actuator(
 
     def mode_of(actuator: Actuator) -> Mode:
         Z, E = data(actuator)
-        scaled = (Z - Z.mean(axis=0)) / standard_deviations(Z)
-        return HyperparameterPosterior.given(scaled, E, inputs, FAMILIES[:1]).highest
+        return HyperparameterPosterior.given(standardised(Z), E, inputs, FAMILIES[:1]).highest
 
     def height_at(mode: Mode, actuator: Actuator) -> float:
         Z, E = data(actuator)
-        return log_posterior(mode.kernel, mode.place, (Z - Z.mean(axis=0)) / standard_deviations(Z), E)[0]
+        return log_posterior(mode.kernel, mode.place, standardised(Z), E)[0]
 
     def refined(start: Actuator, mode: Mode) -> Actuator:
         """Return the most likely actuator near one, with the hyperparameters that are most probable for that one."""

@@ -46,10 +46,7 @@ def with_states_of_model(validation: Validation) -> Validation:
 
 def estimates_by_loops_on_model(validation: Validation) -> StateEstimates | None:
     """Return the estimates of states for a validation; None if no task can be planned, or if it has no outputs."""
-    if validation.outputs is None:
-        return None
-    loops = closed_loops_on_model(with_states_of_model(validation))
-    return None if loops is None else StateEstimates(validation, validation.outputs, loops.states)
+    return ExtendedValidation(validation.with_parts(physical=())).estimates
 
 
 class ExtendedValidation:
@@ -138,7 +135,7 @@ class ExtendedValidation:
         """
         acting = [(point, self._actuated(trajectory)) for point, trajectory in executed]
         if self.given.outputs is not None:
-            states = None if self._estimates is None else self._estimates.of(acting, some)
+            states = None if self.estimates is None else self.estimates.of(acting, some)
             if states is None:
                 return None
             acting = [(point, trajectory) for (point, _), trajectory in zip(acting, states, strict=True)]
@@ -163,10 +160,11 @@ class ExtendedValidation:
 
     def of(self, given: Validation) -> ExtendedValidation:
         """Return the same with other physical parameters; the states of M along executions are the same."""
-        return ExtendedValidation(given, self.actuator, self.inputs, self._estimates)
+        return ExtendedValidation(given, self.actuator, self.inputs, self.estimates)
 
     @functools.cached_property
-    def _estimates(self) -> StateEstimates | None:
+    def estimates(self) -> StateEstimates | None:
+        """The estimates of the states of M; None if no task can be planned, or if there are no outputs."""
         if self.given.outputs is None or self.loops is None or self._known is not None:
             return self._known
         states = self.loops.states[..., : self.loops.states.shape[-1] - len(self._columns)]
