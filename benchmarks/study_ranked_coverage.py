@@ -24,8 +24,8 @@ from calibrate_strangers import BUDGET
 from ctxval import Campaign
 from ctxval._util.arrays import Array, single_threaded
 from ctxval._util.json_lines import JsonLines
+from ctxval.core.coverage import StateInputCoverage
 from ctxval.learning import LearnedDynamics
-from ctxval.learning.coverage import Coverage
 from ctxval.learning.tolerance import pushed
 from strangers_development import DEVELOPMENT
 from study_drawn_tests import truth
@@ -38,13 +38,13 @@ CONCLUSION = "So far nothing was gained by it, in few campaigns, and the farthes
 STORED = JsonLines(RESULTS / "ranked_coverage.jsonl", ("entry", "seed", "share", "ranked"))
 
 
-def ranked_coverage(learned: LearnedDynamics) -> Coverage:
+def ranked_coverage(learned: LearnedDynamics) -> StateInputCoverage:
     """Return the coverage with the task that is ranked first by pushes; it is computed once."""
     known: dict[str, Any] = learned.__dict__
     if "_ranked" not in known:
         coverage = learned._on_pool[1]
         known["_ranked"] = coverage if learned.noisy is not None else replace(coverage, task=most_changed(learned))
-    ranked: Coverage = known["_ranked"]
+    ranked: StateInputCoverage = known["_ranked"]
     return ranked
 
 

@@ -208,7 +208,6 @@ def evidence() -> certificates.DynamicsEvidence:
 
 RECORDED = Transitions(DATA.x, DATA.u, nonlinear(DATA.x, DATA.u))
 CHECKED = certificates.CheckedPrediction(3, 0.5, 0.52, 0.53, 0.5)
-LEARNED_GAP = learning.coverage.Gap(0.1, (1,), np.zeros(8))
 GAP = certificates.StateInputGap(0.1, ("u[0]",), {"x[0]": 1.0, "u[0]": 3.0})
 COVERED = certificates.StateInputCoverage(GAP, GAP, None, {"x[0]": 0.1, "u[0]": 0.2}, np.zeros(2), 1024)
 BY_POSTERIOR = certificates.CertificateOptions.posterior()
@@ -345,7 +344,6 @@ EXAMPLES: dict[str, Callable[[], object]] = {
     "distances.RelativeDeviation": lambda: distances.RelativeDeviation(least=[0.1, 1.0]),
     "distances.StateNorm": lambda: distances.StateNorm(2, weights=[1.0, 2.0], angles=[0]),
     "distances.WholeTrajectory": distances.WholeTrajectory,
-    "learning.Coverage": lambda: learning.Coverage(LEARNED_GAP, LEARNED_GAP, None, np.zeros(11), np.ones(8), 1024),
     "learning.DynamicsDraws": lambda: learned().posterior.mean,
     "learning.DynamicsPosterior": lambda: learned().posterior,
     "learning.DynamicsStudy": lambda: learned().study,

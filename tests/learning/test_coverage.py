@@ -9,8 +9,9 @@ from hypothesis import strategies as st
 
 from ctxval import Task, TaskSpace, Trajectory, Transitions, Validation, controllers, distances, models, systems
 from ctxval._util.arrays import Array
+from ctxval.core.coverage import StateInputCoverage
 from ctxval.learning.closed_loops import LoopPlanner
-from ctxval.learning.coverage import MOST_COORDINATES, Coverage, largest_pocket
+from ctxval.learning.coverage import MOST_COORDINATES, largest_pocket
 from ctxval.learning.coverage import coverage as coverage_of
 from ctxval.learning.dynamics_posterior import DynamicsPosterior, PosteriorSettings, learn_posterior
 
@@ -40,9 +41,10 @@ def learn(planner: LoopPlanner, x: Array, u: Array) -> DynamicsPosterior:
     return found
 
 
-def coverage(planner: LoopPlanner, posterior: DynamicsPosterior, tasks: Array) -> Coverage:
+def coverage(planner: LoopPlanner, posterior: DynamicsPosterior, tasks: Array) -> StateInputCoverage:
     planned = planner.plan(tasks)
-    return coverage_of(posterior, tasks, planned, planner.run(posterior.mean, planned))
+    labels = [f"z{i}" for i in range(posterior.data.pairs.shape[1])]
+    return coverage_of(posterior, tasks, planned, planner.run(posterior.mean, planned), labels)
 
 
 def visited(planner: LoopPlanner, posterior: DynamicsPosterior) -> Array:
@@ -73,9 +75,9 @@ def test_gaps_are_those_of_all_pairs_compared(reach: float) -> None:
     assert found.pair is not None
     assert found.pair.size == pytest.approx(paired.max(), rel=1e-6)
     for gap, of in ((found.marginal, marginal), (found.beyond, beyond)):
-        assert gap.coordinates == (np.unravel_index(of.argmax(), of.shape)[1],)
-        np.testing.assert_allclose(gap.place, there.reshape(-1, 3)[of.max(axis=1).argmax()], rtol=1e-6)
-    np.testing.assert_allclose(found.resolution, marginal.max(axis=0) * width, rtol=1e-6)
+        assert gap.coordinates == (f"z{np.unravel_index(of.argmax(), of.shape)[1]}",)
+        np.testing.assert_allclose(list(gap.place.values()), there.reshape(-1, 3)[of.max(axis=1).argmax()], rtol=1e-6)
+    np.testing.assert_allclose(list(found.resolution.values()), marginal.max(axis=0) * width, rtol=1e-6)
     of_gaps = (marginal.max(axis=1) + 0.3 * paired).reshape(there.shape[:2]).max(axis=1)
     of_range = 10 * beyond.max(axis=1).reshape(there.shape[:2]).max(axis=1)
     np.testing.assert_array_equal(found.task, TASKS[(of_gaps + of_range).argmax()])
@@ -100,8 +102,8 @@ def test_an_input_that_was_never_used_is_named() -> None:
     x = np.stack(np.meshgrid(np.linspace(-3, 3, 12), np.linspace(-2, 2, 12)), axis=-1).reshape(-1, 2)
     posterior = learn(planner, x + 1e-3 * rng.normal(size=x.shape), 1e-3 * rng.normal(size=(144, 1)))
     found = coverage(planner, posterior, TASKS)
-    assert found.marginal.coordinates == (2,)
-    assert found.resolution[2] == pytest.approx(abs(found.marginal.place[2]), abs=0.01)
+    assert found.marginal.coordinates == ("z2",)
+    assert found.resolution["z2"] == pytest.approx(abs(found.marginal.place["z2"]), abs=0.01)
 
 
 def test_with_many_coordinates_pairs_are_not_compared() -> None:
@@ -120,7 +122,8 @@ def test_of_long_loops_steps_from_start_to_end_are_compared() -> None:
     starts = planner.validation.space.from_unit(TASKS)
     # Only the starts are far from what is recorded near the origin.
     found = coverage(planner, posterior, TASKS)
-    assert np.abs(starts - found.marginal.place[:2]).max(axis=1).min() < 1e-9 or found.marginal.coordinates == (2,)
+    there = found.marginal.place["z0"], found.marginal.place["z1"]
+    assert np.abs(starts - there).max(axis=1).min() < 1e-9 or found.marginal.coordinates == ("z2",)
 
 
 def test_one_recorded_coordinate_that_never_changes_is_allowed() -> None:
@@ -159,13 +162,13 @@ def test_the_largest_pocket_of_a_plane_is_a_circle_around_a_place_that_loops_vis
     rng = np.random.default_rng(4)
     visited = np.column_stack([rng.uniform([-1, -0.5], [1, 0.5], (3000, 2)), 0.1 * rng.normal(size=(3000, 2))])
     around = [[-1.0, -0.5, 0, 0], [1.0, -0.5, 0, 0], [1.0, 0.5, 0, 0], [-1.0, 0.5, 0, 0], [-1.0, -0.5, 0, 0]]
-    found = largest_pocket(visited, [trajectory(*around)], ["m", "m", "m/s", "m/s"])
+    found = largest_pocket(visited, [trajectory(*around)], ["x [m]", "y [m]", "vx [m/s]", "vy [m/s]"])
     assert found is not None
-    assert found.states == (0, 1)
-    assert found.within[0] == found.within[1]
-    assert found.within[0] == pytest.approx(0.5, abs=0.03)  # half of the shorter side
-    assert abs(found.place[1]) < 0.02
-    assert (visited[:, :2] == found.place).all(axis=1).any()
+    assert list(found.place) == ["x [m]", "y [m]"]
+    assert found.within["x [m]"] == found.within["y [m]"]
+    assert found.within["x [m]"] == pytest.approx(0.5, abs=0.03)  # half of the shorter side
+    assert abs(found.place["y [m]"]) < 0.02
+    assert (visited[:, :2] == list(found.place.values())).all(axis=1).any()
 
 
 @given(st.integers(0, 2**32 - 1), st.sampled_from([["m"] * 3, ["", "", ""], ["m", "rad", "m/s"], ["m/s", "m/s", "m"]]))
@@ -173,22 +176,24 @@ def test_no_execution_came_nearer_to_a_pocket(seed: int, units: list[str]) -> No
     rng = np.random.default_rng(seed)
     visited = rng.normal(size=(500, 3)) * [1, 20, 300]
     executed = [trajectory(*(rng.normal(size=(6, 3)) * [1, 20, 300]).tolist()) for _ in range(3)]
-    found = largest_pocket(visited, executed, units)
+    labels = [f"x{i} [{unit}]" if unit else f"x{i}" for i, unit in enumerate(units)]
+    found = largest_pocket(visited, executed, labels)
     assert found is not None
-    recorded = np.concatenate([each.states for each in executed])[:, list(found.states)]
-    nearest = np.sqrt((((recorded - found.place) / found.within) ** 2).sum(axis=1)).min()
+    place, within = (np.array(list(of.values())) for of in (found.place, found.within))
+    recorded = np.concatenate([each.states for each in executed])[:, [labels.index(label) for label in found.place]]
+    nearest = np.sqrt((((recorded - place) / within) ** 2).sum(axis=1)).min()
     assert nearest >= 1 - 1e-9
     assert nearest <= 20
-    assert (found.within > 0).all()
+    assert (within > 0).all()
 
 
 def test_where_an_execution_moves_in_one_step_there_is_no_pocket() -> None:
     visited = np.column_stack([np.linspace(-1, 1, 400), np.zeros(400)])
-    found = largest_pocket(visited, [trajectory([-1.0, 0.0], [1.0, 0.0])], ["m", "m"])
+    found = largest_pocket(visited, [trajectory([-1.0, 0.0], [1.0, 0.0])], ["x [m]", "y [m]"])
     assert found is not None
     assert found.size < 0.2
 
 
 def test_one_state_has_no_pocket_and_neither_has_what_was_not_executed() -> None:
-    assert largest_pocket(np.zeros((9, 1)), [trajectory([0.0], [1.0])], ["m"]) is None
-    assert largest_pocket(np.zeros((9, 2)), [], ["m", "m"]) is None
+    assert largest_pocket(np.zeros((9, 1)), [trajectory([0.0], [1.0])], ["x [m]"]) is None
+    assert largest_pocket(np.zeros((9, 2)), [], ["x [m]", "y [m]"]) is None

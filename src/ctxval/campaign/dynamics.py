@@ -21,13 +21,9 @@ from ctxval.certificates.dynamics_evidence import (
     CheckedPrediction,
     DynamicsEvidence,
     PushedDistances,
-    StateInputCoverage,
-    StateInputGap,
-    StatePocket,
     UntriedParameter,
 )
 from ctxval.certificates.prediction_tests import DRAWN
-from ctxval.core.labels import labels_of
 from ctxval.core.quantiles import QUANTILE
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import REDEFINED, Trial
@@ -35,7 +31,6 @@ from ctxval.core.validation import Validation
 from ctxval.errors import CertificateError
 from ctxval.learning import DynamicsStudy, ExecutionPrediction, LearnedDynamics
 from ctxval.learning.closed_loops import LoopPlanner
-from ctxval.learning.coverage import Coverage, Gap
 from ctxval.learning.prediction import Executed
 from ctxval.learning.tolerance import LEVELS
 from ctxval.learning.worst_case import WorstCase, is_kinked
@@ -222,17 +217,11 @@ class CampaignDynamics:
             return evidence
         # Many closed loops, which only matter to a bound that nothing else withdraws.
         evidence = _with_jumps(evidence, learned, bound)
-        labels = self._coordinates(learned)
-        names = [parted(label)[1] for label in labels]
-        states = len(learned.posterior.data.sizes)
-        if (pocket := learned.pocket(names[:states])) is not None:
-            of = [labels[i] for i in pocket.states]
-            place, within = (dict(zip(of, each.tolist(), strict=True)) for each in (pocket.place, pocket.within))
-            evidence = replace(evidence, pocket=StatePocket(pocket.size, place, within))
+        evidence = replace(evidence, pocket=learned.pocket())
         if learned.noisy is not None:
             return evidence  # a push is compared with residuals of state and input, which do not hold here
         push, rates = learned.push_response, []
-        for name, unit in (parted(labels[i]) for i in push.states):
+        for name, unit in (parted(learned.labels[i]) for i in push.states):
             per_second = f"{unit}^2" if unit.endswith("/s") else f"{unit}/s"
             rates.append(f"{name} [{per_second}]" if unit else name)
         residuals = dict(zip(rates, push.residuals.tolist(), strict=True))
@@ -257,7 +246,7 @@ class CampaignDynamics:
             worst.left_out,
             0.0,
             tuple(predictions),
-            _coverage(learned.coverage, self._coordinates(learned)),
+            learned.coverage,
             unplanned=worst.unplanned,
             untried=None if untried is None else UntriedParameter(names[untried[0]], *untried[1:]),
             sharpness=worst.sharpness,
@@ -268,18 +257,6 @@ class CampaignDynamics:
             physical=learned.study.given.physical,
             without_data=not learned.with_data,
             estimated=learned.study.given.outputs is not None,
-        )
-
-    def _coordinates(self, learned: LearnedDynamics) -> tuple[str, ...]:
-        """Return the labels of the states and inputs, with units; ``x[0], ..., u[0], ...`` for those without names."""
-        inputs = learned.posterior.data.inputs
-        states = len(learned.coverage.resolution) - inputs
-        coordinates = [*(("x", i) for i in range(states)), *(("u", i) for i in range(inputs))]
-        labels = [label for names in learned.study.validation.names(states, inputs) for label in labels_of(names)]
-        twice = len(set(labels)) < len(labels)  # a state and an input of the same name
-        return tuple(
-            f"{letter}[{i}]" if twice or label == f"{letter}{i}" else label
-            for (letter, i), label in zip(coordinates, labels, strict=True)
         )
 
     def checked(self, trials: Sequence[Trial]) -> tuple[CheckedPrediction, ...]:
@@ -383,15 +360,3 @@ def _with_jumps(evidence: DynamicsEvidence, learned: LearnedDynamics, bound: flo
         return evidence
     elites = np.concatenate([points[values.argmax()][None], evidence.elites])
     return replace(evidence, missed=float(high / evidence.highest), highest=float(high), elites=elites)
-
-
-def _coverage(coverage: Coverage, names: Sequence[str]) -> StateInputCoverage:
-    def named(values: Array) -> dict[str, float]:
-        return dict(zip(names, values.tolist(), strict=True))
-
-    def gap(of: Gap) -> StateInputGap:
-        return StateInputGap(of.size, tuple(names[i] for i in of.coordinates), named(of.place))
-
-    pair = None if coverage.pair is None else gap(coverage.pair)
-    marginal, beyond = gap(coverage.marginal), gap(coverage.beyond)
-    return StateInputCoverage(marginal, beyond, pair, named(coverage.resolution), coverage.task, coverage.tasks)

@@ -16,8 +16,6 @@ from ctxval.certificates.dynamics_evidence import (
     CheckedPrediction,
     DynamicsEvidence,
     LearnedDistance,
-    StateInputCoverage,
-    StateInputGap,
     UntriedParameter,
 )
 from ctxval.certificates.expiry import WatchState
@@ -41,6 +39,7 @@ from ctxval.certificates.scenario import (
 from ctxval.certificates.stopping import StoppingDecision, StoppingRule
 from ctxval.certificates.suite import WholeSuite
 from ctxval.certificates.verdict import Assessment, Verdict, assess, judge, judge_by
+from ctxval.core.coverage import StateInputCoverage, StateInputGap
 
 __all__ = [
     "KINDS",

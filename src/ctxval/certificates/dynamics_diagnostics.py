@@ -12,8 +12,9 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from ctxval.certificates.bounds import with_units
-from ctxval.certificates.dynamics_evidence import CheckedPrediction, DynamicsEvidence, StateInputGap
+from ctxval.certificates.dynamics_evidence import CheckedPrediction, DynamicsEvidence
 from ctxval.certificates.prediction_tests import DRAWN
+from ctxval.core.coverage import StateInputGap
 
 # Limits; docs/theory.md has the reason for each.
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from ctxval.learning.coverage import Coverage
 from ctxval.learning.draws import DynamicsDraws
 from ctxval.learning.dynamics_posterior import DynamicsPosterior, PosteriorSettings, learn_posterior
 from ctxval.learning.dynamics_study import DynamicsStudy
@@ -12,7 +11,6 @@ from ctxval.learning.prediction import predict_composed, predict_distance
 from ctxval.learning.replays import Replay, replay_executed
 
 __all__ = [
-    "Coverage",
     "DynamicsDraws",
     "DynamicsPosterior",
     "DynamicsStudy",

@@ -7,14 +7,14 @@ has entered: a post could stand there.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from ctxval._util.arrays import Array, Rows
-from ctxval._util.representation import ShortRepr
+from ctxval._util.texts import parted
+from ctxval.core.coverage import StateInputCoverage, StateInputGap, StatePocket
 from ctxval.core.trajectory import Trajectory
 from ctxval.learning.closed_loops import Loops, PlannedTasks
 from ctxval.learning.dynamics_posterior import DynamicsPosterior
@@ -24,33 +24,17 @@ MOST_COORDINATES = 6
 _FARTHEST = 1e3  # standardised coordinates are limited to this magnitude
 
 
-@dataclass(frozen=True, eq=False)
-class Gap:
-    """A gap between what closed loops visit and what is recorded."""
-
-    size: float  # its size, as a share of the visited range
-    coordinates: tuple[int, ...]  # the indices of its coordinates; states come before inputs
-    place: Array  # the visited state-input pair, in the system's units, (n + m,)
-
-
-@dataclass(frozen=True, eq=False)
-class Coverage(ShortRepr):
-    """The largest gaps between what closed loops visit and what is recorded."""
-
-    marginal: Gap  # the largest gap in a single coordinate
-    beyond: Gap  # the largest excess over the largest record of a single coordinate, or below its smallest one
-    # the largest gap in two coordinates together; None if there are too many coordinates to compare pairs
-    pair: Gap | None
-    task: Array  # the task whose closed loop leads farthest from the records, a point of the unit cube (d,)
-    resolution: Array  # the largest gap of each coordinate, in the system's units, (n + m,)
-    # the number of tasks that were compared with the range of the records; gaps are looked for in a part of them
-    tasks: int
-
-
 def coverage(
-    posterior: DynamicsPosterior, tasks: Array, planned: Sequence[PlannedTasks], loops: Sequence[Loops]
-) -> Coverage:
-    """Return how well the records cover the closed loops of tasks ``(q, d)`` on the posterior mean."""
+    posterior: DynamicsPosterior,
+    tasks: Array,
+    planned: Sequence[PlannedTasks],
+    loops: Sequence[Loops],
+    labels: Sequence[str],
+) -> StateInputCoverage:
+    """Return how well the records cover the closed loops of tasks ``(q, d)`` on the posterior mean.
+
+    States and inputs have these labels.
+    """
     visited, rows = _visited(posterior, loops), np.concatenate([tasks.rows for tasks in planned])
     width = _widths(visited)
     recorded, scaled = posterior.data.pairs / width, visited / width
@@ -59,26 +43,29 @@ def coverage(
     compared = _some(len(scaled), 256)
     some = scaled[compared][:, _some(scaled.shape[1], 40)]
     gaps = np.stack([_nearest(recorded[:, i], some[..., i]) for i in range(len(width))], axis=-1)
-    pairs, couples = None, list(combinations(range(len(width)), 2))
+    pairs, couples = None, list(map(list, combinations(range(len(width)), 2)))
     if len(width) <= MOST_COORDINATES:
-        trees = [(cKDTree(recorded[:, list(two)]), list(two)) for two in couples]
+        trees = [(cKDTree(recorded[:, two]), two) for two in couples]
         pairs = np.stack([tree.query(some[..., two], p=np.inf)[0] for tree, two in trees], axis=-1)
     # What is beyond all records weighs ten times as much as a gap in one coordinate, and a gap in two of them less.
     far = 10.0 * beyond.max(axis=(1, 2))
     far[compared] += (gaps.max(axis=-1) + (0.0 if pairs is None else 0.3 * pairs.max(axis=-1))).max(axis=1)
 
-    def largest(of: Array, coordinates: Sequence[tuple[int, ...]], where: Array) -> Gap:
+    def named(values: Array) -> dict[str, float]:
+        return dict(zip(labels, values.tolist(), strict=True))
+
+    def largest(of: Array, coordinates: Sequence[tuple[str, ...]], where: Array) -> StateInputGap:
         at = np.unravel_index(int(of.argmax()), of.shape)
         place = where[at[:-1]] * width * posterior.data.scale + posterior.data.shift
-        return Gap(float(of[at]), coordinates[int(at[-1])], place)
+        return StateInputGap(float(of[at]), coordinates[int(at[-1])], named(place))
 
-    single = [(i,) for i in range(len(width))]
-    return Coverage(
+    single = [(label,) for label in labels]
+    return StateInputCoverage(
         largest(gaps, single, some),
         largest(beyond, single, scaled),
-        None if pairs is None else largest(pairs, couples, some),
+        None if pairs is None else largest(pairs, list(combinations(labels, 2)), some),
+        named(np.maximum(gaps.max(axis=(0, 1)), beyond.max(axis=(0, 1))) * width * posterior.data.scale),
         tasks[rows[int(far.argmax())]],
-        np.maximum(gaps.max(axis=(0, 1)), beyond.max(axis=(0, 1))) * width * posterior.data.scale,
         len(rows),
     )
 
@@ -127,19 +114,7 @@ def _nearest(recorded: Array, visited: Array) -> Array:
 # Pockets
 
 
-@dataclass(frozen=True, eq=False)
-class Pocket(ShortRepr):
-    """The largest region of two states that closed loops of tasks enter, and that no execution has entered."""
-
-    size: float  # its radius, as a share of the visited ranges
-    states: tuple[int, int]  # the indices of the two states
-    place: Array  # its centre, which a loop visits, in the system's units, (2,)
-    # its radius in each of the two states, in the system's units, (2,); they are equal if the states are places with
-    # one unit
-    within: Array
-
-
-def largest_pocket(visited: Array, executed: Sequence[Trajectory], units: Sequence[str]) -> Pocket | None:
+def largest_pocket(visited: Array, executed: Sequence[Trajectory], labels: Sequence[str]) -> StatePocket | None:
     """Return the largest pocket; None if there are no two states, or nothing was executed.
 
     Two states with one unit that is no rate are places, and distances in their plane mean something. If there are such
@@ -148,7 +123,7 @@ def largest_pocket(visited: Array, executed: Sequence[Trajectory], units: Sequen
     Args:
         visited: states that closed loops of tasks visit, in the system's units, shape ``(N, n)``.
         executed: the executed trajectories.
-        units: the unit of each state; empty if it is not known.
+        labels: the label of each state, with its unit if that is known.
     """
     low, high = np.quantile(visited, [1e-3, 1 - 1e-3], axis=0)
     usual = visited[((visited >= low) & (visited <= high)).all(axis=1)]
@@ -160,7 +135,8 @@ def largest_pocket(visited: Array, executed: Sequence[Trajectory], units: Sequen
         fine = np.linspace(0, steps[-1], 8 * int(steps[-1]) + 1)
         parts.append(np.stack([np.interp(fine, steps, column) for column in trajectory.states.T], axis=-1))
     entered = np.concatenate(parts)
-    widths, couples = np.maximum(high - low, 1e-9), list(combinations(range(len(units)), 2))
+    widths, couples = np.maximum(high - low, 1e-9), list(combinations(range(len(labels)), 2))
+    units = [parted(label)[1] for label in labels]
     places = [(i, j) for i, j in couples if units[i] == units[j] and units[i] and "/" not in units[i]]
     pockets = []
     for i, j in places or couples:
@@ -168,5 +144,7 @@ def largest_pocket(visited: Array, executed: Sequence[Trajectory], units: Sequen
         scale = np.full(2, width.max()) if places else width
         away, _ = cKDTree(entered[:, [i, j]] / scale).query(some[:, [i, j]] / scale)
         at = int(away.argmax())
-        pockets.append(Pocket(float(away[at]), (i, j), some[at, [i, j]], away[at] * scale))
+        place, within = some[at, [i, j]].tolist(), (away[at] * scale).tolist()
+        names = labels[i], labels[j]
+        pockets.append(StatePocket(float(away[at]), *(dict(zip(names, of, strict=True)) for of in (place, within))))
     return max(pockets, key=lambda pocket: pocket.size, default=None)

@@ -11,9 +11,11 @@ import numpy as np
 
 from ctxval._util.arrays import Array, single_threaded
 from ctxval._util.representation import ShortRepr
+from ctxval.core.coverage import StateInputCoverage, StatePocket
+from ctxval.core.labels import labels_of
 from ctxval.core.trajectory import Trajectory
 from ctxval.learning.closed_loops import AnyDraws, distances_of, loop_pairs
-from ctxval.learning.coverage import Coverage, Pocket, beyond_records, coverage, largest_pocket
+from ctxval.learning.coverage import beyond_records, coverage, largest_pocket
 from ctxval.learning.dynamics_posterior import DynamicsPosterior
 from ctxval.learning.execution_prediction import ExecutionPrediction, predict_execution
 from ctxval.learning.noisy_draws import SETTLED, NoisyDraws, NoisyPosterior
@@ -163,13 +165,28 @@ class LearnedDynamics(ShortRepr):
         tasks = [self.worst_of_mean.elites[:16], self.executed, search.pool[:16]]
         return push_response(self.study.planner, self.posterior, np.concatenate(tasks))
 
-    def pocket(self, units: Sequence[str]) -> Pocket | None:
-        """Return the largest region of two states, with these units, that loops enter and no execution has entered."""
-        planner = self.study.planner
+    @functools.cached_property
+    def labels(self) -> tuple[str, ...]:
+        """The labels of the states and inputs, with units; ``x[0], ..., u[0], ...`` for those without names."""
+        inputs = self.posterior.data.inputs
+        states = self.posterior.data.pairs.shape[1] - inputs
+        coordinates = [*(f"x[{i}]" for i in range(states)), *(f"u[{i}]" for i in range(inputs))]
+        labels = [label for names in self.study.validation.names(states, inputs) for label in labels_of(names)]
+        if len(set(labels)) < len(labels):  # a state and an input of the same name
+            return tuple(coordinates)
+        return tuple(
+            index if label == f"{index[0]}{index[2:-1]}" else label
+            for index, label in zip(coordinates, labels, strict=True)
+        )
+
+    def pocket(self) -> StatePocket | None:
+        """Return the largest region of two states that loops enter and no execution has entered."""
+        planner, states = self.study.planner, len(self.posterior.data.sizes)
         with single_threaded():
             loops = planner.run(self.posterior.mean, planner.plan(self.study.search.pool[:256]))
-        visited = np.concatenate([each.states.reshape(-1, len(units)) for each in loops])
-        return largest_pocket(visited[np.isfinite(visited).all(axis=1)], self.trajectories_of_system, units)
+        visited = np.concatenate([each.states.reshape(-1, states) for each in loops])
+        finite = visited[np.isfinite(visited).all(axis=1)]
+        return largest_pocket(finite, self.trajectories_of_system, self.labels[:states])
 
     @property
     def untried_parameter(self) -> tuple[int, float, Array] | None:
@@ -190,12 +207,12 @@ class LearnedDynamics(ShortRepr):
         return j, gap, task
 
     @property
-    def coverage(self) -> Coverage:
+    def coverage(self) -> StateInputCoverage:
         """How well the records cover the closed loops of the tasks, in states and inputs."""
         return self._on_pool[1]
 
     @functools.cached_property
-    def _on_pool(self) -> tuple[Array, Coverage]:
+    def _on_pool(self) -> tuple[Array, StateInputCoverage]:
         """The distances of the pool's tasks on the posterior mean, and the coverage of their closed loops."""
         search, planner = self.study.search, self.study.planner
         with single_threaded():
@@ -203,7 +220,7 @@ class LearnedDynamics(ShortRepr):
             loops = planner.run(silent, search.plans)
             noisy = loops if searched is silent else planner.run(searched, search.plans)
             (distances,) = distances_of(searched, noisy, search.plans, len(search.pool))
-            return distances, coverage(self.posterior, search.pool, search.plans, loops)
+            return distances, coverage(self.posterior, search.pool, search.plans, loops, self.labels)
 
     def predict(self, point: Array) -> ExecutionPrediction | None:
         """Return the prediction of the execution of a task, a point ``(d,)``; None if it cannot be planned."""

@@ -105,7 +105,7 @@ def predicted_tasks(
         len(maxima),
         worst.unplanned,
         learned.coverage.beyond.size,
-        learned.coverage.beyond.coordinates[0],
+        learned.labels.index(learned.coverage.beyond.coordinates[0]),
     )
 
 
