@@ -33,7 +33,7 @@ from ctxval.core.model import Step
 from ctxval.core.rollout import rollout
 from ctxval.learning.closed_loops import LoopPlanner, loop_pairs
 from ctxval.learning.dynamics_posterior import PosteriorSettings, learn_posterior
-from ctxval.learning.hyperparameters import Hyperparameters, draw_prior
+from ctxval.learning.hyperparameters import ResidualHyperparameters, draw_prior
 from ctxval.models.scaling import standard_deviations
 
 KEY = ("design", "states", "seed")
@@ -65,7 +65,7 @@ class PriorResidual:
         rng: the source of the function.
     """
 
-    def __init__(self, hyperparameters: Hyperparameters, states: int, rng: np.random.Generator) -> None:
+    def __init__(self, hyperparameters: ResidualHyperparameters, states: int, rng: np.random.Generator) -> None:
         self._kernel, self._theta, self._rng = hyperparameters.kernel, hyperparameters.theta, rng
         constant, slope = np.exp(0.5 * self._theta[-2:])
         self._constant = constant * rng.standard_normal(states)

@@ -69,7 +69,7 @@ COPIED = ("src", "benchmarks", "docs", "tests", "pyproject.toml", "README.md", "
 TESTS = (
     "tests/test_architecture.py",
     "tests/test_public.py",
-    "tests/_util/test_part_registry.py",
+    "tests/_util/test_registry.py",
     "tests/benchmarks/test_parts_page.py",
 )
 """Tests that hold any part against what all parts must be."""

@@ -2,14 +2,28 @@
 
 from __future__ import annotations
 
+import math
+from pathlib import Path
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
+from ctxval import Trajectory
 from ctxval._util.arrays import held_means
-from ctxval._util.columns import column_of, in_seconds, sentinels, time_column, unit_advice
+from ctxval._util.columns import (
+    CsvTable,
+    column_of,
+    conversion,
+    in_seconds,
+    named_unit,
+    sentinels,
+    time_column,
+    unit_advice,
+)
+from ctxval.data import LogMapping, read_recordings
 from ctxval.errors import InputError
 
 
@@ -92,3 +106,116 @@ def test_means_of_held_values_are_their_integrals(
     fine = (edges[:-1, None] + dt * (np.arange(4000) + 0.5) / 4000).ravel()
     held = values[np.searchsorted(times, fine, side="right") - 1].reshape(4, 4000, 2)
     np.testing.assert_allclose(held_means(times, values, edges, 0.0), held.mean(axis=1), atol=6 * len(times) / 4000)
+
+
+# The one reader of CSV files
+
+
+@pytest.mark.parametrize("separator", [",", ";", "\t"])
+def test_the_separator_is_found_in_the_header(separator: str, tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text(f'\n"x,y;z"{separator}t\n1{separator}2\n\n   \n3{separator}4\n')
+    table = CsvTable(tmp_path / "a.csv")
+    assert table.names == ("x,y;z", "t")
+    assert [(line, [float(cell) for cell in row]) for line, row in table.rows()] == [(3, [1, 2]), (6, [3, 4])]
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ("t,x0,u0,x0\n0,1,2,3\n1,1,,3\n", "a.csv has two columns 'x0': each name must be there once"),
+        ("t,x0 [m],u0,x0 [mm]\n0,1,2,3\n1,1,,3\n", "a.csv has two columns 'x0'"),
+        (
+            "t,x0,u0\n0,1,0,2,0\n0,1,1,0,\n",
+            "a.csv, line 2: the row must have 3 cells, as the header has, got 5. If com",
+        ),
+        ("t,x0,u0\n0,1,2\n1,1\n2,1,\n", "a.csv, line 3: the row must have 3 cells, as the header has, got 2"),
+        ("t;x0;u0\n0,0;1,5;2\n0.5;1,5;\n", "has decimal commas (line 2) and points (line 3) in numbers"),
+        ("t;x0;u0\n0;1.234,5;2\n1;1;\n", "a.csv, line 2: x0 must be a number, got '1.234,5'"),
+        ("t,x0,u0\n0,1_0,2\n1,1,\n", "a.csv, line 2: x0 must be a number, got '1_0'"),
+    ],
+)
+def test_a_table_that_could_be_misread_is_refused_by_all_readers(text: str, sentence: str, tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text(text)
+    mapping = LogMapping.from_table({"states": ["x0"], "inputs": ["u0"]})
+    for read in (
+        Trajectory.from_csv,
+        lambda path: read_recordings([path]),
+        lambda path: read_recordings([path], mapping),
+    ):
+        with pytest.raises(InputError) as caught:
+            read(tmp_path / "a.csv")
+        assert sentence in str(caught.value)
+
+
+def test_decimal_commas_are_read_between_semicolons(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text("t;x0 [mm];u0\n0,0;1,5;-2e-1\n0,1;2,5;\n")
+    one = Trajectory.from_csv(tmp_path / "a.csv", states=["x0 [m]"], inputs=["u0"])
+    assert one.times.tolist() == [0, 0.1]
+    assert one.states[:, 0].tolist() == pytest.approx([0.0015, 0.0025])
+    assert one.inputs.tolist() == [[-0.2]]
+
+
+def test_a_file_with_several_recordings_is_no_trajectory(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text("t,x0,u0,episode\n0,1,2,0\n1,1,2,0\n2,5,2,1\n")
+    with pytest.raises(InputError, match=r"a\.csv has several recordings, which a column numbers"):
+        Trajectory.from_csv(tmp_path / "a.csv")
+
+
+# Units, and the names of columns that state them
+
+
+@pytest.mark.parametrize(
+    ("recorded", "wanted", "factor"),
+    [
+        ("deg", "rad", math.pi / 180),
+        ("°/s²", "rad/s^2", math.pi / 180),
+        ("rpm", "rad/s", math.pi / 30),
+        ("rev/min", "rpm", 1.0),
+        ("N m", "Nm", 1.0),
+        ("mN·m", "N m", 1e-3),
+        ("kg m/s^2", "N", 1.0),
+        ("km/h", "m/s", 1 / 3.6),
+        ("mm/s2", "m/s^2", 1e-3),
+        ("g", "m/s^2", 9.80665),
+        ("usec", "s", 1e-6),
+        ("furlong", "furlong", 1.0),
+    ],
+)
+def test_units_are_converted(recorded: str, wanted: str, factor: float) -> None:
+    assert conversion(recorded, wanted) == pytest.approx(factor, rel=1e-14)
+    assert conversion(wanted, recorded) == pytest.approx(1 / factor, rel=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("recorded", "wanted"),
+    [("Hz", "rad/s"), ("deg", ""), ("deg", "1"), ("mg", "m/s^2"), ("m/s kg", "N"), ("ms", "m/s"), ("furlong", "m")],
+)
+def test_units_that_do_not_measure_the_same_are_refused(recorded: str, wanted: str) -> None:
+    with pytest.raises(InputError, match="no known factor"):
+        conversion(recorded, wanted)
+
+
+@pytest.mark.parametrize(
+    ("column", "name", "unit"),
+    [
+        ("angle [deg]", "angle", "deg"),
+        ("angle[deg]", "angle", "deg"),
+        ("time (us)", "time", "us"),
+        ("rate_deg_s", "rate", "deg/s"),
+        ("a_m_per_s2", "a", "m/s^2"),
+        ("t_ms", "t", "ms"),
+        ("x[2]", "x[2]", ""),
+        ("x_min", "x_min", ""),
+        ("state", "state", ""),
+        ("torque [N m]", "torque", "N m"),
+    ],
+)
+def test_a_column_states_its_unit(column: str, name: str, unit: str) -> None:
+    assert named_unit(column)[:2] == (name, unit)
+
+
+@given(st.text(max_size=300))
+def test_every_name_is_read(column: str) -> None:
+    name, unit, weak = named_unit(column)
+    assert len(name) + len(unit) <= len(column) + 2
+    assert unit or not weak

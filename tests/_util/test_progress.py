@@ -1,11 +1,30 @@
 from __future__ import annotations
 
+import io
+import re
 import threading
+from typing import Any
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from rich.console import Console
 
+from ctxval._util import progress as progress_display
 from ctxval._util.cores import can_fork, on_all_cores
-from ctxval._util.progress import Progress, advance, also_listening, expect, is_heard, listening, stage
+from ctxval._util.progress import (
+    Progress,
+    advance,
+    also_listening,
+    amount,
+    duration,
+    expect,
+    is_heard,
+    is_screen,
+    listening,
+    progress_shown,
+    stage,
+)
 
 
 def work(parts: int = 3) -> None:
@@ -101,3 +120,123 @@ def test_child_processes_are_mute_and_their_results_are_reported_as_they_come() 
     done = [p.done for p in heard if not p.ended]
     assert done[-1] == 4
     assert found in ([False] * 4, [True] * 4)  # with one core, this process does the work
+
+
+# Progress as people see it. The screens are those of a pseudo-terminal
+
+
+def console(*, terminal: bool) -> Console:
+    return Console(file=io.StringIO(), force_terminal=terminal, width=100, force_jupyter=False)
+
+
+def text(of: Console) -> str:
+    """Return what was printed, without codes for colours and the cursor."""
+    assert isinstance(of.file, io.StringIO)
+    return re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", of.file.getvalue())
+
+
+def executions(notes: list[str], of: Console) -> None:
+    with progress_shown(True, of), stage("executions", 3):
+        for note in notes:
+            advance(1, note)
+
+
+def test_a_log_has_a_line_for_each_note() -> None:
+    log = console(terminal=False)
+    executions(["trial 0 has distance 1", "trial 1 failed: \x1b[2Jbad\nexecutions: 3/3"], log)
+    assert text(log).splitlines() == [
+        "trial 0 has distance 1",
+        r"trial 1 failed: \x1b[2Jbad executions: 3/3",
+    ]
+
+
+def test_a_log_says_that_long_work_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = iter(range(0, 1000, 20))
+    monkeypatch.setattr(progress_display.time, "monotonic", lambda: float(next(clock)))
+    log = console(terminal=False)
+    with progress_shown(True, log), stage("choosing a task", 100, "designs"):
+        for _ in range(4):
+            advance(10)
+    lines = text(log).splitlines()
+    assert lines[0].startswith("choosing a task: 10/100 designs, ")
+    assert len(lines) == 2
+
+
+def test_a_screen_keeps_all_notes_and_forgets_the_stages(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(progress_display, "_DELAY", 0.0)
+    screen = console(terminal=True)
+    with progress_shown(True, screen), stage("executions", 3):
+        with stage("choosing a task", 10, "designs"):
+            advance(4)
+        advance(1, "trial 0 has distance 1")
+        advance(1, "trial 1 has distance 2")
+    shown = text(screen)
+    assert [line.strip() for line in shown.splitlines() if "distance" in line] == [
+        "trial 0 has distance 1",
+        "trial 1 has distance 2",
+    ]
+    assert isinstance(screen.file, io.StringIO)
+    erased = screen.file.getvalue().rpartition("executions")[2]
+    assert "\x1b[2K" in erased
+
+
+def test_a_short_stage_is_not_shown() -> None:
+    screen = console(terminal=True)
+    with progress_shown(True, screen):
+        for _ in range(3):
+            with stage("blinking"):
+                advance()
+    assert "blinking" not in text(screen)
+
+
+def test_text_of_users_cannot_control_the_screen() -> None:
+    screen = console(terminal=True)
+    executions(["[red]x[/red] \x1b]0;owned\x07"], screen)
+    assert "[red]x[/red]" in text(screen)
+    assert isinstance(screen.file, io.StringIO)
+    assert "\x1b]0" not in screen.file.getvalue()
+
+
+@pytest.mark.parametrize("wanted", [None, False])
+def test_nothing_is_shown_in_a_program_unless_it_is_asked_for(wanted: bool | None, capfd: Any) -> None:
+    assert not is_screen()
+    with progress_shown(wanted), stage("executions", 1):
+        advance(1, "done")
+    assert capfd.readouterr() == ("", "")
+
+
+def test_whoever_listens_already_goes_on_listening() -> None:
+    heard: list[Progress] = []
+    with listening(heard.append):
+        with progress_shown(None), stage("a"):
+            pass
+        with progress_shown(True), stage("b"):
+            pass
+        with progress_shown(False), stage("c"):
+            assert is_heard()
+    assert {p.stage for p in heard} == {"a", "b"}
+
+
+@given(st.floats(0, 1e6), st.one_of(st.none(), st.floats(0, 1e6)), st.floats(0, 1e6))
+def test_every_amount_has_a_text(done: float, expected: float | None, elapsed: float) -> None:
+    if expected is not None and done > expected:
+        expected = None
+    found = amount(Progress("s", done, expected, "designs"), elapsed)
+    told = expected is not None and done > 0 and (done >= 0.1 * expected or elapsed >= 60.0)
+    assert ("left" in found) == told
+
+
+def test_the_time_that_is_left_is_told_once_some_work_is_done() -> None:
+    def shown(done: float, elapsed: float) -> str:
+        return amount(Progress("s", done, 200.0, "designs"), elapsed)
+
+    assert shown(12, 2.0) == "12/200 designs"
+    assert shown(50, 2.0) == "50/200 designs, 6 s left"
+    assert shown(12, 60.0) == "12/200 designs, 16 min left"
+
+
+@pytest.mark.parametrize(
+    ("seconds", "shown"), [(0.2, "0 s"), (99, "99 s"), (150, "2 min"), (5999, "100 min"), (7200, "2.0 h")]
+)
+def test_a_duration_has_one_unit(seconds: float, shown: str) -> None:
+    assert duration(seconds) == shown

@@ -166,7 +166,7 @@ def test_names_in_a_trajectory_are_guarded_and_read_back(tmp_path: Path) -> None
 def test_a_guarded_reason_in_a_table_of_runs_is_what_was_meant(tmp_path: Path) -> None:
     (tmp_path / "runs.csv").write_text("goal,failed,trajectory\n1.5,'=E12: overcurrent,\n2.5,'twas loose,\n")
     runs = read_runs([tmp_path / "runs.csv"], None, TaskSpace(goal=(-3.0, 3.0)))
-    assert [run.told.failed for run in runs] == ["=E12: overcurrent", "'twas loose"]
+    assert [run.result.failed for run in runs] == ["=E12: overcurrent", "'twas loose"]
 
 
 def test_columns_are_as_wide_as_their_longest_cell() -> None:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from ctxval.learning.hyperparameters import Hyperparameters, ResidualKernel
+from ctxval.learning.hyperparameters import ResidualHyperparameters, ResidualKernel
 
 BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
 sys.path.insert(0, str(BENCHMARKS))
@@ -20,7 +20,7 @@ import study_posterior_ranks as study  # noqa: E402
 
 @pytest.mark.parametrize("growth", [0.0, 1.0])
 def test_functions_of_the_prior_have_its_covariance_also_if_drawn_in_parts(growth: float) -> None:
-    own = Hyperparameters(ResidualKernel(2.5, growth, 1), np.log([1.0, 2.0, 0.5, 0.3]), 1e-6)
+    own = ResidualHyperparameters(ResidualKernel(2.5, growth, 1), np.log([1.0, 2.0, 0.5, 0.3]), 1e-6)
     Z, states = np.random.default_rng(0).normal(size=(5, 2)), 20_000
     drawn = study.PriorResidual(own, states, np.random.default_rng(1))
     values = np.concatenate([drawn(part) for part in np.split(Z, [2, 3])])
@@ -30,7 +30,7 @@ def test_functions_of_the_prior_have_its_covariance_also_if_drawn_in_parts(growt
 
 
 def test_a_function_of_the_prior_keeps_the_values_that_it_had() -> None:
-    own = Hyperparameters(ResidualKernel(1.5, 1.0, 1), np.log([1.0, 2.0, 3.0, 0.5, 0.3]), 1e-6)
+    own = ResidualHyperparameters(ResidualKernel(1.5, 1.0, 1), np.log([1.0, 2.0, 3.0, 0.5, 0.3]), 1e-6)
     Z = np.random.default_rng(0).normal(size=(20, 3))
     drawn = study.PriorResidual(own, 2, np.random.default_rng(1))
     np.testing.assert_allclose(drawn(Z), drawn(Z), atol=1e-3)

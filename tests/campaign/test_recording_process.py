@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from ctxval._util.cores import may_confine
-from ctxval.campaign.telling import ToldResult
+from ctxval.campaign.telling import SuppliedResult
 from ctxval.core.trajectory import Trajectory
 from ctxval.data import LogMapping
 from ctxval.errors import InputError
@@ -41,7 +41,7 @@ def read(path: Path, *, confined: bool = True, uploaded: bool = True) -> Traject
     table = FIELDS.get(path.name)
     mapping = None if table is None else LogMapping.from_table(table)
     named = {"position": "m", "speed": "m/s"}, {"force": "N"}
-    told = ToldResult(path, mapping=mapping, uploaded=uploaded)
+    told = SuppliedResult(path, mapping=mapping, uploaded=uploaded)
     return (told.read_confined if confined else told.read_file)(path, *named, ONE.times)
 
 
@@ -77,7 +77,7 @@ def test_the_storage_of_a_bag_is_read_in_a_confined_process(tmp_path: Path) -> N
     assert read(storage).horizon == ONE.horizon
 
 
-class Probe(ToldResult):
+class Probe(SuppliedResult):
     """Does what an attacker would do who took over the process; what it learns is in the reason of the failure."""
 
     def read_file(self, file: Path, *_: Any) -> None:  # type: ignore[override]

@@ -14,7 +14,7 @@ import pytest
 from conftest import make_validation
 from ctxval import Campaign, Experiment, Store, Trajectory, Validation, searches
 from ctxval.campaign.by_hand import parameters_of_trial, result_sentence, tell_result
-from ctxval.campaign.telling import ToldResult
+from ctxval.campaign.telling import SuppliedResult
 from ctxval.core.trial import Trial
 from ctxval.data import LogMapping
 from ctxval.errors import InputError
@@ -30,10 +30,10 @@ def test_a_report_of_each_kind_is_stored(campaign: Campaign, tmp_path: Path) -> 
     by_file, by_distance, failed = (campaign.ask() for _ in range(3))
     run = campaign.validation.system.execute(by_file.plan.controller, by_file.plan.task)
     run.to_csv(tmp_path / "run.csv")
-    told = tell_result(campaign, made, by_file.number, ToldResult(tmp_path / "run.csv"))
+    told = tell_result(campaign, made, by_file.number, SuppliedResult(tmp_path / "run.csv"))
     assert told.distance == pytest.approx(campaign.validation.accept(by_file.plan, run).distance)
-    assert tell_result(campaign, made, by_distance, ToldResult(distance=0.25)).distance == 0.25
-    assert tell_result(campaign, made, failed.number, ToldResult(failed="cut out")).failure == "cut out"
+    assert tell_result(campaign, made, by_distance, SuppliedResult(distance=0.25)).distance == 0.25
+    assert tell_result(campaign, made, failed.number, SuppliedResult(failed="cut out")).failure == "cut out"
     assert result_sentence(campaign.trials[1], "rad") == "trial 1 has the distance 0.25 rad"
     assert result_sentence(campaign.trials[2]) == "trial 2 failed: cut out"
 
@@ -48,7 +48,7 @@ def test_a_failure_needs_no_controller(tmp_path: Path) -> None:
 
     campaign.validation.synthesizer.design = refuse  # type: ignore[method-assign]
     made = Experiment("pendulum", campaign.validation)
-    assert tell_result(campaign, made, opened.number, ToldResult(failed="cut out")).state == "failed"
+    assert tell_result(campaign, made, opened.number, SuppliedResult(failed="cut out")).state == "failed"
     store.close()
 
 
@@ -150,4 +150,4 @@ def test_a_result_is_not_estimated_by_an_observer(campaign: Campaign, tmp_path: 
     mapping = LogMapping({"x": "x"}, observer=lambda y, u, dt: y)
     trial, made = campaign.ask(), Experiment("pendulum", campaign.validation)
     with pytest.raises(InputError, match="names an observer, which is for replay, fit and start"):
-        tell_result(campaign, made, trial.number, ToldResult(tmp_path / "run.csv", mapping=mapping))
+        tell_result(campaign, made, trial.number, SuppliedResult(tmp_path / "run.csv", mapping=mapping))

@@ -4,10 +4,12 @@ import json
 
 import numpy as np
 import pytest
+from scipy.stats import kstest, t
 
 from ctxval import Trial
-from ctxval.certificates import MadeGood, Maxima, Sample, certify_posterior, draw_maxima
+from ctxval.certificates import MadeGood, Maxima, Sample, certify_posterior, diagnose, draw_maxima
 from ctxval.errors import CertificateError
+from ctxval.gp.hyperposterior import EXACT, Conditioned, Hyperparameters, condition
 
 
 def sample(n: int = 9, d: int = 1, origin: str = "acquisition", factor: float = 1.0) -> Sample:
@@ -23,7 +25,7 @@ def quick(trials: Sample, seed: int = 0, stochastic: bool = False) -> Maxima:
 
 def test_a_certificate_says_everything_and_is_ready_for_json() -> None:
     trials = sample()
-    certificate = certify_posterior(trials, 0.9, found=quick(trials))
+    certificate = certify_posterior(trials, 0.9, drawn=quick(trials))
     back = json.loads(json.dumps(certificate.to_json(), allow_nan=False))
     assert (back["kind"], back["confidence"], back["volume"], back["trials"]) == ("posterior", 0.9, 0.0, 9)
     assert back["details"]["best"] == trials.best
@@ -38,7 +40,7 @@ def test_a_certificate_says_everything_and_is_ready_for_json() -> None:
 def test_a_certificate_says_its_error() -> None:
     trials = sample(6)
     maxima = quick(trials)
-    certificate = certify_posterior(trials, 0.8, found=maxima, resolution=1)
+    certificate = certify_posterior(trials, 0.8, drawn=maxima, resolution=1)
     assert certificate.error == certificate.details["error"] == maxima.error(0.8) > 0
     assert "±" in certificate.statement
     assert "standard error of the random draws" in certificate.statement
@@ -58,12 +60,12 @@ def made_good(because: str | None) -> Sample:
 @pytest.mark.parametrize("stochastic", [False, True])
 def test_a_failure_made_good_for_no_stated_reason_withdraws_the_bound(stochastic: bool) -> None:
     found = quick(sample(), stochastic=stochastic)
-    certificate = certify_posterior(made_good(None), 0.9, found=found, resolution=1)
+    certificate = certify_posterior(made_good(None), 0.9, drawn=found, resolution=1)
     assert not certificate.covers(1e9)
     assert certificate.doubt is not None
     assert "trial 2 failed and trial 7 executed the same task with success, for no stated reason" in certificate.doubt
     assert '--again 2 --because "what was changed"' in certificate.doubt
-    explained = certify_posterior(made_good("fuse replaced"), 0.9, found=found, resolution=1)
+    explained = certify_posterior(made_good("fuse replaced"), 0.9, drawn=found, resolution=1)
     assert explained.covers(1e9)
     assert any("fuse replaced" in sentence for sentence in explained.assumptions)
     assert explained.details["failures"]["made_good"] == [{"trial": 2, "by": 7, "because": "fuse replaced"}]
@@ -99,7 +101,7 @@ def test_the_order_of_imported_rows_changes_nothing(spike: float) -> None:
         trials = Sample.of(imported(order, spike))
         for stochastic in (False, True):
             maxima = quick(trials, stochastic=stochastic)
-            made = certify_posterior(trials, 0.8, found=maxima)
+            made = certify_posterior(trials, 0.8, drawn=maxima)
             found.append((stochastic, made.upper_bound, made.error, made.doubt is None))
     assert len(set(found)) == 2
     assert {one[0]: one[3] for one in found}[False] == (spike == 0)
@@ -121,7 +123,174 @@ def test_the_test_of_unordered_trials_sees_as_much_as_that_of_trials_in_order() 
         ):
             trials = Sample(X[rows][:, None], y[rows], [origin] * 25, ["completed"] * 25)  # type: ignore[list-item]
             fired[name] += (
-                certify_posterior(trials, 0.8, found=draw_maxima(trials, draws=12, paths=1)).doubt is not None
+                certify_posterior(trials, 0.8, drawn=draw_maxima(trials, draws=12, paths=1)).doubt is not None
             )
     assert fired["worst first"] == 0
     assert fired["unordered"] >= max(4, fired["in order"])
+
+
+# Posterior diagnostics
+
+
+GRID = np.linspace(0, 1, 121)[:, None]
+KNOWN = Hyperparameters(1.5, np.array([np.log(0.3)]), float(np.log(EXACT)))
+
+
+def adaptive(hyper: Hyperparameters, rng: np.random.Generator, n: int = 10) -> tuple[np.ndarray, np.ndarray]:
+    """Points and values of a path, each point chosen from the values before it: near the best, or far from all."""
+    K = hyper.kernel(GRID, GRID) + 1e-9 * np.eye(len(GRID))
+    path = 5 + 3 * np.linalg.cholesky(K) @ rng.normal(size=len(GRID))
+    rows = [int(rng.integers(len(GRID)))]
+    while len(rows) < n:
+        free = [row for row in range(len(GRID)) if row not in rows]
+        best = rows[int(np.argmax(path[rows]))]
+        far = [min(abs(row - known) for known in rows) for row in free]
+        near = [abs(row - best) for row in free]
+        rows.append(free[int(np.argmin(near)) if len(rows) % 2 else int(np.argmax(far))])
+    return GRID[rows], path[rows]
+
+
+def surprises(hyper: Hyperparameters, assumed: Hyperparameters) -> list[float]:
+    drawn = [adaptive(hyper, np.random.default_rng([4, seed])) for seed in range(250)]
+    return [diagnose([condition(assumed, X, y)], X).surprise for X, y in drawn]
+
+
+@pytest.mark.thorough
+def test_surprises_of_the_process_itself_are_uniform_whatever_chose_the_tasks() -> None:
+    assert kstest(surprises(KNOWN, KNOWN), "uniform").pvalue > 1e-3
+
+
+def test_of_independent_values_the_surprise_is_the_t_tests_of_each_against_those_before() -> None:
+    X, y = np.linspace(0, 1, 7)[:, None], np.random.default_rng(3).normal(size=7)
+    independent = Hyperparameters(1.5, np.array([np.log(1e-4)]), float(np.log(EXACT)))
+    tails = [t(k - 1).sf((y[k] - y[:k].mean()) / (y[:k].std(ddof=1) * np.sqrt(1 + 1 / k))) for k in range(2, len(y))]
+    diagnosis = diagnose([condition(independent, X, y)], X)
+    assert diagnosis.surprise == pytest.approx(1 - (1 - min(tails)) ** len(tails), rel=1e-6)
+    assert diagnosis.trial == 2 + int(np.argmin(tails))
+
+
+@pytest.mark.slow
+def test_surprises_of_another_process_are_not() -> None:
+    rough = Hyperparameters(1.5, np.array([np.log(0.02)]), float(np.log(EXACT)))
+    assert kstest(surprises(rough, KNOWN), "uniform").pvalue < 1e-6
+
+
+def spiked(height: float) -> tuple[np.ndarray, np.ndarray]:
+    X = np.append(np.linspace(0, 1, 24), 0.5)[:, None]
+    y = np.sin(3 * X[:, 0])
+    y[-1] += height
+    return X, y
+
+
+@pytest.mark.parametrize(("height", "believed"), [(0.0, True), (20.0, False)])
+def test_a_spike_that_nothing_announced_withdraws_the_bound(height: float, believed: bool) -> None:
+    X, y = spiked(height)
+    sample = Sample(X, y, ["acquisition"] * len(y), ["completed"] * len(y))
+    certificate = certify_posterior(sample, 0.9, drawn=draw_maxima(sample, draws=12, paths=2))
+    assert (certificate.doubt is None) == believed
+    assert certificate.covers(1e6) == believed
+    if not believed:
+        assert certificate.doubt is not None
+        assert f"trial {len(y) - 1} " in certificate.doubt  # as trials are numbered, from 0
+        assert "withdrawn" in certificate.doubt
+
+
+def test_a_value_that_is_surprisingly_low_withdraws_nothing() -> None:
+    X, y = spiked(-5.0)
+    assert diagnose([condition(KNOWN, X, y)], X).doubt is None
+
+
+def test_the_leave_one_out_error_is_that_of_leaving_each_out() -> None:
+    rng = np.random.default_rng(1)
+    X, hyper = rng.random((9, 2)), Hyperparameters(2.5, np.log([0.5, 0.7]), float(np.log(0.01)))
+    y = np.sin(4 * X).sum(axis=1)
+    seen = condition(hyper, X, y)
+    squares = []
+    for row in range(len(y)):
+        others = np.arange(len(y)) != row
+        K = hyper.kernel(X[others], X[others]) + 0.01 * np.eye(8)
+        k = hyper.kernel(X[row : row + 1], X[others])[0]
+        mean = seen.mean + k @ np.linalg.solve(K, y[others] - seen.mean)
+        variance = seen.scale2 * (1.01 - k @ np.linalg.solve(K, k))
+        squares.append((y[row] - mean) ** 2 / variance)
+    assert diagnose([seen], X).left_out == pytest.approx(np.sqrt(np.mean(squares)), rel=1e-8)
+
+
+def test_many_draws_of_hyperparameters_are_averaged() -> None:
+    X, y = adaptive(KNOWN, np.random.default_rng(2))
+    other = Hyperparameters(2.5, np.array([np.log(0.6)]), float(np.log(EXACT)))
+
+    def of(*hypers: Hyperparameters) -> float:
+        conditioned: list[Conditioned] = [condition(hyper, X, y) for hyper in hypers]
+        return diagnose(conditioned, X).surprise
+
+    low, high = sorted([of(KNOWN), of(other)])
+    assert of(KNOWN, KNOWN) == pytest.approx(of(KNOWN))
+    assert low - 1e-12 <= of(KNOWN, other) <= high + 0.5
+
+
+def test_a_diagnosis_is_ready_for_json() -> None:
+    X, y = spiked(1.0)
+    diagnosis = diagnose([condition(KNOWN, X, y)], X)
+    assert set(json.loads(json.dumps(diagnosis.to_json()))) >= {"surprise", "trial", "left_out"}
+    assert 0 <= diagnosis.surprise <= 1
+
+
+def test_units_do_not_matter() -> None:
+    X, y = spiked(1.0)
+    plain, moved = (diagnose([condition(KNOWN, X, values)], X) for values in (y, 1000 * y - 7))
+    assert moved.surprise == pytest.approx(plain.surprise, rel=1e-3)
+    assert (moved.trial, moved.left_out) == (plain.trial, pytest.approx(plain.left_out, rel=1e-3))
+
+
+# Trials whose order means nothing
+
+
+def test_left_out_alone_the_surprise_is_the_t_test_of_each_against_all_others() -> None:
+    X, y = np.linspace(0, 1, 7)[:, None], np.random.default_rng(3).normal(size=7)
+    independent = Hyperparameters(1.5, np.array([np.log(1e-4)]), float(np.log(EXACT)))
+    tails = []
+    for k in range(7):
+        others = np.delete(y, k)
+        tails.append(t(5).sf((y[k] - others.mean()) / (others.std(ddof=1) * np.sqrt(1 + 1 / 6))))
+    diagnosis = diagnose([condition(independent, X, y)], X, unordered=np.ones(7, dtype=bool))
+    assert diagnosis.surprise == pytest.approx(1 - (1 - min(tails)) ** 7, rel=1e-6)
+    assert diagnosis.trial == int(np.argmin(tails))
+
+
+@pytest.mark.thorough
+def test_left_out_surprises_of_the_process_itself_are_as_rare_as_stated() -> None:
+    found = []
+    for seed in range(400):
+        rng = np.random.default_rng([6, seed])
+        X = rng.random((12, 1))
+        K = KNOWN.kernel(X, X) + EXACT * np.eye(12)
+        y = np.linalg.cholesky(K) @ rng.normal(size=12)
+        found.append(diagnose([condition(KNOWN, X, y)], X, unordered=np.ones(12, dtype=bool)).surprise)
+    for level in (0.01, 0.05, 0.2):
+        assert np.mean(np.array(found) < level) <= level + 3 * np.sqrt(level * (1 - level) / 400)
+
+
+@pytest.mark.parametrize("order", ["as they come", "worst first", "worst last", "shuffled"])
+def test_a_spike_among_unordered_trials_is_seen_in_any_order(order: str) -> None:
+    X, y = spiked(20.0)
+    rows = {
+        "as they come": np.arange(len(y)),
+        "worst first": np.argsort(-y),
+        "worst last": np.argsort(y),
+        "shuffled": np.random.default_rng(2).permutation(len(y)),
+    }[order]
+    unordered = np.ones(len(y), dtype=bool)
+    found = diagnose([condition(KNOWN, X[rows], y[rows])], X[rows], rows.tolist(), unordered=unordered)
+    assert found.trial == len(y) - 1
+    assert found.doubt is not None
+    assert "above what the other trials predict" in found.doubt
+
+
+def test_unordered_trials_are_predicted_from_all_and_the_others_in_order() -> None:
+    X, y = adaptive(KNOWN, np.random.default_rng(7))
+    unordered = np.arange(len(y)) < 4
+    seen = [condition(KNOWN, X, y)]
+    mixed, all_in_order = diagnose(seen, X, unordered=unordered), diagnose(seen, X)
+    assert 0 < mixed.surprise < 1
+    assert diagnose(seen, X, unordered=np.zeros(len(y), dtype=bool)).surprise == all_in_order.surprise

@@ -2,12 +2,15 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.linalg import solve_discrete_are
 
-from ctxval import Task
-from ctxval.controllers import LQR, StationaryLQR
+from ctxval import Task, testing
+from ctxval._util.arrays import Array
+from ctxval.controllers import ILQR, LQR, StationaryLQR
+from ctxval.controllers.lqr import LinearGains, QuadraticCost, linear_gains
 from ctxval.core.model import Function, linearize
 from ctxval.core.rollout import rollout
-from ctxval.errors import InputError, ShapeError
+from ctxval.errors import DesignError, InputError, ShapeError
 from ctxval.models import Linear
 
 SIZES = [(1, 1, 3), (2, 1, 10), (3, 2, 7), (4, 4, 5), (2, 3, 12)]
@@ -168,3 +171,133 @@ def test_a_model_without_inputs_needs_another_synthesizer() -> None:
             synthesizer.design(task, model)
     with pytest.raises(ShapeError, match=r"R must be a diagonal or a square matrix, not empty, got shape \(0,\)"):
         LQR([1, 1], [])
+
+
+# Gains of linear models against scipy, and the conditions under which they are computed again
+
+
+A, B = np.array([[1.0, 0.1], [0.3, 0.9]]), np.array([[0.0], [0.1]])
+COST = QuadraticCost([1.0, 0.1], [0.01])
+
+
+def test_the_first_gain_of_a_long_horizon_is_the_stationary_gain() -> None:
+    P = solve_discrete_are(A, B, COST.Q, COST.R)
+    stationary = -np.linalg.solve(COST.R + B.T @ P @ B, B.T @ P @ A)
+    found = linear_gains(COST, A, B, 400)
+    np.testing.assert_allclose(found.gains[0], stationary, rtol=1e-10)
+    np.testing.assert_allclose(found.closed[0], A + B @ stationary, rtol=1e-10)
+    np.testing.assert_allclose(found.curvatures[0], P, rtol=1e-10)
+    np.testing.assert_allclose(found.inverses[0] @ (COST.R + B.T @ P @ B), np.eye(1), rtol=1e-10)
+
+
+def test_equal_numbers_are_computed_once() -> None:
+    again = linear_gains(QuadraticCost([1.0, 0.1], [0.01]), A.copy(), np.asfortranarray(B), 20)
+    assert linear_gains(COST, A, B, 20) is again
+
+
+@pytest.mark.parametrize(
+    ("cost", "A_", "B_", "horizon"),
+    [
+        (COST, A + 1e-12, B, 20),
+        (COST, A, B * (1 + 1e-12), 20),
+        (COST, A, B, 21),
+        (QuadraticCost([1.0, 0.2], [0.01]), A, B, 20),
+        (QuadraticCost([1.0, 0.1], [0.02]), A, B, 20),
+        (QuadraticCost([1.0, 0.1], [0.01], [5.0, 5.0]), A, B, 20),
+    ],
+)
+def test_other_numbers_have_gains_of_their_own(
+    cost: QuadraticCost, A_: np.ndarray, B_: np.ndarray, horizon: int
+) -> None:
+    def differs(one: LinearGains, other: LinearGains) -> bool:
+        return one.gains.shape != other.gains.shape or not np.array_equal(one.gains, other.gains)
+
+    assert differs(linear_gains(cost, A_, B_, horizon), linear_gains(COST, A, B, 20))
+
+
+@pytest.mark.parametrize("synthesizer", [LQR([1.0, 0.1], [0.01]), ILQR([1.0, 0.1], [0.01])])
+def test_a_model_that_is_changed_in_place_gets_new_gains(synthesizer: LQR | ILQR) -> None:
+    task = Task([1.0, 0.0], horizon=20, dt=0.1)
+    model = Linear(A.copy(), B.copy())
+    before = synthesizer.design(task, model).gains.copy()
+    model.A[0, 1] = 0.2
+    changed = synthesizer.design(task, model).gains
+    np.testing.assert_array_equal(changed, synthesizer.design(task, Linear(model.A.copy(), B)).gains)
+    assert np.abs(changed - before).max() > 1e-3
+
+
+def test_gains_that_controllers_share_cannot_be_changed() -> None:
+    task, model = Task([[1.0, 2.0], 0.0], horizon=20, dt=0.1), Linear(A, B)
+    controller = LQR([1.0, 0.1], [0.01]).design(task, model)
+    assert controller.gains is LQR([1.0, 0.1], [0.01]).design(task, model).gains
+    with pytest.raises(ValueError, match="read-only"):
+        controller.gains[0] = 0.0
+
+
+# The stationary regulator against the Riccati recursion, python-control and what equilibria need
+
+
+CART = Linear([[1.0, 0.1], [0.0, 0.95]], [[0.0], [0.1]])
+WEIGHTS = ([10.0, 1.0], [0.1])
+
+
+def swing(x: Array, u: Array) -> Array:
+    rate = x[..., 1] + 0.05 * (9.81 * np.sin(x[..., 0]) + 2 * u[..., 0])
+    return np.stack([x[..., 0] + 0.05 * rate, rate], axis=-1)
+
+
+PENDULUM = Function(swing, vectorized=True)
+
+
+def test_it_is_the_recursion_far_from_the_end() -> None:
+    task = Task([1.0, 0.0], horizon=400, dt=0.1)
+    K = StationaryLQR(*WEIGHTS).design(task, CART).gains
+    assert K.shape == (400, 1, 2)
+    np.testing.assert_array_equal(K[0], K[-1])
+    np.testing.assert_allclose(K[0], LQR(*WEIGHTS).design(task, CART).gains[0], rtol=0, atol=1e-10)
+
+
+def test_it_is_that_of_python_control() -> None:
+    control = pytest.importorskip("control")
+    K = control.dlqr(CART.A, CART.B, np.diag(WEIGHTS[0]), np.diag(WEIGHTS[1]))[0]
+    np.testing.assert_allclose(StationaryLQR(*WEIGHTS).design(Task([1.0, 0.0], horizon=3, dt=0.1), CART).gains[0], -K)
+
+
+@pytest.mark.parametrize("goal", [0.0, 0.5, 2.5])
+def test_a_goal_is_reached_and_held_with_the_input_that_it_needs(goal: float) -> None:
+    task = Task([goal + 0.2, 0.0], goal=[goal, 0.0], horizon=200, dt=0.05)
+    controller = StationaryLQR(*WEIGHTS).design(task, PENDULUM)
+    np.testing.assert_allclose(controller.inputs[0], [-9.81 * np.sin(goal) / 2], atol=1e-9)
+    np.testing.assert_allclose(rollout(PENDULUM.step, controller, task).final_state, [goal, 0.0], atol=1e-8)
+
+
+def test_it_follows_a_reference() -> None:
+    reference = np.stack([np.linspace(0, 1, 101), np.full(101, 0.1)], axis=-1)
+    task = Task([0.0, 0.1], reference=reference, horizon=100, dt=0.1)
+    states = rollout(CART.step, StationaryLQR(*WEIGHTS).design(task, CART), task).states
+    assert np.abs(states[:, 0] - reference[:, 0]).max() < 0.03
+
+
+def test_a_batch_is_the_loop_over_it_with_its_own_gains() -> None:
+    tasks = Task([np.linspace(-1, 1, 4), 0.0], goal=[np.linspace(0, 2, 4), 0.0], horizon=20, dt=0.05)
+    testing.check_synthesizer(StationaryLQR(*WEIGHTS, limits=8.0), tasks, PENDULUM)
+    testing.check_synthesizer(StationaryLQR(*WEIGHTS), tasks, CART)
+    gains = StationaryLQR(*WEIGHTS).design(tasks, PENDULUM).gains
+    assert gains.shape == (4, 20, 1, 2)
+    assert not np.allclose(gains[0], gains[3])
+
+
+def test_limits_clip() -> None:
+    task = Task([1.0, 0.0], horizon=60, dt=0.1)
+    inputs = rollout(CART.step, StationaryLQR(*WEIGHTS, limits=0.5).design(task, CART), task).inputs
+    assert np.abs(inputs).max() == 0.5
+
+
+def test_what_cannot_be_stabilised_is_said() -> None:
+    lame = Linear([[1.1, 0.0], [0.0, 0.5]], [[0.0], [1.0]])
+    with pytest.raises(DesignError, match="no stationary feedback stabilises the model at the goal"):
+        StationaryLQR(*WEIGHTS).design(Task([1.0, 0.0], horizon=5, dt=0.1), lame)
+    with pytest.raises(ShapeError, match="must weigh the task's 3 states"):
+        StationaryLQR(*WEIGHTS).design(Task(np.zeros(3), horizon=5, dt=0.1), CART)
+    with pytest.raises(InputError, match="R must be positive definite"):
+        StationaryLQR([1.0, 1.0], [0.0])

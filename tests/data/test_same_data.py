@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ctxval import Experiment, Plan, Task, TaskSpace, Trajectory, Validation, controllers, distances, models, systems
-from ctxval.campaign.telling import ToldResult
+from ctxval.campaign.telling import SuppliedResult
 from ctxval.data import LogMapping
 from ctxval.errors import InputError
 from rig_logs import write_bag, write_bag1
@@ -219,9 +219,9 @@ def written(folder: Path, worn: Clothes) -> tuple[Path, LogMapping | None, bool]
 
 
 def read(path: Path, mapping: LogMapping | None) -> Trajectory:
-    """Read a recording in this process; tests of ``ToldResult`` show that a confined process reads the same."""
+    """Read a recording in this process; tests of ``SuppliedResult`` show that a confined process reads the same."""
     made, plan = experiment()
-    return ToldResult(mapping=mapping).read_file(path, *made.names(2, 1), plan.task.times)
+    return SuppliedResult(mapping=mapping).read_file(path, *made.names(2, 1), plan.task.times)
 
 
 @pytest.mark.slow

@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 
 from ctxval._util.arrays import Array
-from ctxval.learning.hyperparameters import Hyperparameters, ResidualKernel
+from ctxval.learning.hyperparameters import ResidualHyperparameters, ResidualKernel
 from ctxval.learning.kernel_expansion import KernelExpansion, joined
 
 
 def expansion(nu: float, growth: float, functions: int, inputs: int = 1) -> KernelExpansion:
     rng = np.random.default_rng(0)
     theta = np.log([0.5, 2.0, 10.0, 0.3, 4.0])
-    own = Hyperparameters(ResidualKernel(nu, growth, inputs), theta, 1e-6)
+    own = ResidualHyperparameters(ResidualKernel(nu, growth, inputs), theta, 1e-6)
     return KernelExpansion.of(own, rng.normal(size=(17, 3)), rng.normal(size=(functions, 17, 2)))
 
 
@@ -53,7 +53,7 @@ def test_joined_functions_are_the_same_functions() -> None:
     """Their centres differ in number and hyperparameters, and one has another family."""
     rng, parts = np.random.default_rng(2), []
     for nu, functions, centres in ((2.5, 2, 17), (2.5, 3, 11), (1.5, 1, 17)):
-        own = Hyperparameters(ResidualKernel(nu, 0.0, 1), rng.normal(size=5), 1e-6)
+        own = ResidualHyperparameters(ResidualKernel(nu, 0.0, 1), rng.normal(size=5), 1e-6)
         parts.append(KernelExpansion.of(own, rng.normal(size=(centres, 3)), rng.normal(size=(functions, centres, 2))))
     together = joined(parts)
     assert [len(one.weights) for one in together] == [5, 1]

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ctxval import TaskSpace, TaskSuite
-from ctxval.campaign.telling import ToldResult
+from ctxval.campaign.telling import SuppliedResult
 from ctxval.errors import InputError
 from ctxval.web.forms import recording_in, result, task_request
 from ctxval.web.jobs import TaskRequest
@@ -59,10 +59,10 @@ def test_a_request_that_cannot_be_used_is_refused(fields: dict[str, str], senten
 
 def test_results_of_every_kind() -> None:
     path = Path("run.csv")
-    assert result("failure", {"reason": " cut out "}, None) == ToldResult(failed="cut out")
-    assert result("distance", {"distance": "0.5"}, None) == ToldResult(distance=0.5)
-    assert result("recording", {"tolerance": ""}, path) == ToldResult(path, uploaded=True)
-    assert result("recording", {"resample": "on", "tolerance": "0.2"}, path) == ToldResult(
+    assert result("failure", {"reason": " cut out "}, None) == SuppliedResult(failed="cut out")
+    assert result("distance", {"distance": "0.5"}, None) == SuppliedResult(distance=0.5)
+    assert result("recording", {"tolerance": ""}, path) == SuppliedResult(path, uploaded=True)
+    assert result("recording", {"resample": "on", "tolerance": "0.2"}, path) == SuppliedResult(
         path, resample=True, start_tolerance=0.2, uploaded=True
     )
     why = {"replace": "wrong file", "reason": "cut out", "distance": "0.5"}
@@ -74,7 +74,7 @@ def test_results_of_every_kind() -> None:
 def test_no_form_is_too_odd(fields: dict[str, str]) -> None:
     for read in (lambda: task_request(fields, SPACE), lambda: result("distance", fields, None)):
         with contextlib.suppress(InputError):
-            assert isinstance(read(), TaskRequest | ToldResult)
+            assert isinstance(read(), TaskRequest | SuppliedResult)
 
 
 @given(st.text())

@@ -40,7 +40,16 @@ def describe(value: Any, depth: int = 6) -> Any:
         listed = value.size <= 100 and value.dtype.kind in "biufO"
         return describe(value.tolist(), value.ndim + 1) if listed else {"shape": list(value.shape)}
     if inspect.isroutine(value) or isinstance(value, functools.partial | type):
-        return _of_callable(value, depth)
+        name = getattr(value, "__qualname__", type(value).__qualname__)
+        known: dict[str, Any] = {}
+        if isinstance(value, functools.partial) and is_own(value.func):
+            name, known = value.func.__qualname__, {"args": value.args, "keywords": value.keywords}
+        elif inspect.ismethod(value) and is_own(value):
+            known = {"of": value.__self__}
+        elif inspect.isfunction(value) and is_own(value):
+            known = dict(zip(value.__code__.co_freevars, enclosed(value), strict=True))
+        described = {key: describe(item, depth - 1) for key, item in known.items()}
+        return {"function": name, **described, **_source(value)}
     if not is_library(type(value)):
         return {"type": type(value).__qualname__, **_source(value)}
     if isinstance(value, Mapping):
@@ -57,19 +66,6 @@ def describe(value: Any, depth: int = 6) -> Any:
         fields = getattr(value, "__dataclass_fields__", None) or getattr(value, "__dict__", {})
         settings = {name: getattr(value, name) for name in fields if not name.startswith("_")}
     return {"type": type(value).__qualname__, **{str(key): describe(item, depth - 1) for key, item in settings.items()}}
-
-
-def _of_callable(value: Any, depth: int) -> Any:
-    name = getattr(value, "__qualname__", type(value).__qualname__)
-    known: dict[str, Any] = {}
-    if isinstance(value, functools.partial) and is_own(value.func):
-        name, known = value.func.__qualname__, {"args": value.args, "keywords": value.keywords}
-    elif inspect.ismethod(value) and is_own(value):
-        known = {"of": value.__self__}
-    elif inspect.isfunction(value) and is_own(value):
-        known = dict(zip(value.__code__.co_freevars, enclosed(value), strict=True))
-    described = {key: describe(item, depth - 1) for key, item in known.items()}
-    return {"function": name, **described, **_source(value)}
 
 
 def _source(value: Any) -> dict[str, str]:

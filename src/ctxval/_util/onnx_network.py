@@ -96,7 +96,7 @@ class OnnxNetwork(ShortRepr):
             outputs = self._run(rows)
         else:
             each = [self._run([row[i : i + 1] for row in rows]) for i in range(count)]
-            outputs = [np.array([one[k].reshape(-1) for one in each]) for k in range(len(self._outputs))]
+            outputs = [np.array([row[k].reshape(-1) for row in each]) for k in range(len(self._outputs))]
         for output in outputs:
             if output.ndim != 2 or len(output) != count:
                 raise ShapeError(f"the network must return one row for each of {count} rows, got shape {output.shape}.")

@@ -122,7 +122,19 @@ def shown(value: Any, depth: int = 3) -> str:
         opening, closing = "{}" if isinstance(value, Mapping) else "[]" if isinstance(value, list) else "()"
         single = "," if opening == "(" and len(value) == 1 else ""
         return cut(f"{opening}{', '.join([*texts, *_rest(len(value))])}{single}{closing}", 2 * _VALUE)
-    return _object(value)
+    # What an object says of itself in one line, of ours the first; its class if that is nothing readable.
+    kind: Any = type(value)
+    if kind.__repr__ is object.__repr__:
+        return name_of(kind)
+    try:
+        short = kind.__repr__ is ShortRepr.__repr__
+        text = _called(kind.__name__, [], fields_of(value)) if short else plain(repr(value))
+    except Exception:
+        return name_of(kind)
+    if re.search(r" at 0x|\barray\(", text):  # an address in memory, or raw numbers, which tell a reader nothing
+        return name_of(kind)
+    is_ours = str(kind.__module__).partition(".")[0] == __name__.partition(".")[0]
+    return cut(line(text.partition("\n")[0] if is_ours else text, 4 * _VALUE), 2 * _VALUE)
 
 
 def number(value: Any) -> str:
@@ -190,22 +202,6 @@ def name_of(function: Any) -> Shown:
 
 def _rest(count: int) -> list[str]:
     return [f"... {count - _ITEMS} more"] if count > _ITEMS else []
-
-
-def _object(value: Any) -> str:
-    """Return what an object says of itself in one line, of ours the first; its class if that is nothing readable."""
-    kind: Any = type(value)
-    if kind.__repr__ is object.__repr__:
-        return name_of(kind)
-    try:
-        short = kind.__repr__ is ShortRepr.__repr__
-        text = _called(kind.__name__, [], fields_of(value)) if short else plain(repr(value))
-    except Exception:
-        return name_of(kind)
-    if re.search(r" at 0x|\barray\(", text):  # an address in memory, or raw numbers, which tell a reader nothing
-        return name_of(kind)
-    is_ours = str(kind.__module__).partition(".")[0] == __name__.partition(".")[0]
-    return cut(line(text.partition("\n")[0] if is_ours else text, 4 * _VALUE), 2 * _VALUE)
 
 
 # HTML

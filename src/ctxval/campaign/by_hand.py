@@ -14,7 +14,7 @@ from ctxval._util.columns import CsvTable, column_of, conversion
 from ctxval._util.texts import shortened, unguarded
 from ctxval.campaign.campaign import Campaign
 from ctxval.campaign.choices import Execution, OpenTrial
-from ctxval.campaign.telling import ToldResult, require_file
+from ctxval.campaign.telling import SuppliedResult, require_file
 from ctxval.core.controller import AffineFeedback
 from ctxval.core.exchange import write_controller, write_task
 from ctxval.core.experiment import Experiment
@@ -68,15 +68,15 @@ class KnownRun(NamedTuple):
 
     where: str
     parameters: Mapping[str, Any]
-    told: ToldResult
+    result: SuppliedResult
 
     def checked(self, validation: Validation, experiment: Experiment) -> tuple[Plan, Execution]:
         """Return the plan of the task and the measured execution; nothing is stored."""
         try:
             plan = validation.plan(validation.space.point(self.parameters))
-            recording = self.told.read(experiment, plan)
-            execution = Execution.reported(recording, self.told.distance, self.told.failed)
-            return plan, execution.measured(validation, plan, self.told.start_tolerance)
+            recording = self.result.read(experiment, plan)
+            execution = Execution.reported(recording, self.result.distance, self.result.failed)
+            return plan, execution.measured(validation, plan, self.result.start_tolerance)
         except InputError as error:
             raise InputError(f"{self.where}: {error}") from error
 
@@ -88,12 +88,12 @@ def read_runs(
 
     A table is a CSV file with a column for each task parameter (``name[0]``, ... for a vector), and the columns
     trajectory (a path relative to the folder of the table), distance or failed. Each row has a value in exactly one of
-    these three columns. Keywords are options of each :class:`ToldResult` for the reading of recordings.
+    these three columns. Keywords are options of each :class:`SuppliedResult` for the reading of recordings.
     """
     if parameters is not None:
         if len(files) != 1:
             raise InputError(f"--set gives the parameters of one trajectory, got {len(files)} files.")
-        return [KnownRun(str(files[0]), parameters, ToldResult(files[0], **reading))]
+        return [KnownRun(str(files[0]), parameters, SuppliedResult(files[0], **reading))]
     return [run for path in files for run in _table(path, space, reading)]
 
 
@@ -126,7 +126,7 @@ def _table(path: Path, space: TaskSpace, reading: Mapping[str, Any]) -> list[Kno
         if len(given["trajectory"]) >= 255 or not file.resolve().is_relative_to(path.parent.resolve()):
             got = shortened(given["trajectory"], 60)
             raise InputError(f"{where}: trajectory must be a file in the folder of the table, got {got!r}.")
-        result = ToldResult(
+        result = SuppliedResult(
             file if given["trajectory"] else None,
             table.number(line, "distance", given["distance"]) if given["distance"] else None,
             given["failed"] or None,
@@ -197,19 +197,19 @@ def _value(name: str, text: str, space: TaskSpace) -> float | list[float]:
     return numbers if is_list or len(numbers) > 1 else numbers[0]
 
 
-def tell_result(campaign: Campaign, experiment: Experiment, trial: OpenTrial | int, told: ToldResult) -> Trial:
+def tell_result(campaign: Campaign, experiment: Experiment, trial: OpenTrial | int, result: SuppliedResult) -> Trial:
     """Check and store the result of an open trial."""
     recording = None
-    if told.recording is not None:
-        trial = trial if isinstance(trial, OpenTrial) else campaign.reopen(trial, ended=told.replace is not None)
-        recording = told.read(experiment, trial.plan)
+    if result.recording is not None:
+        trial = trial if isinstance(trial, OpenTrial) else campaign.reopen(trial, ended=result.replace is not None)
+        recording = result.read(experiment, trial.plan)
     return campaign.tell(
         trial,
         recording,
-        distance=told.distance,
-        failed=told.failed,
-        start_tolerance=told.start_tolerance,
-        replace=told.replace,
+        distance=result.distance,
+        failed=result.failed,
+        start_tolerance=result.start_tolerance,
+        replace=result.replace,
     )
 
 

@@ -352,7 +352,7 @@ class Campaign:
         With ``ended``, return a trial whose result was told, to replace the result.
         """
         self.refresh()
-        trial = self.recorder.trial(number, told=ended)
+        trial = self.recorder.trial(number, ended=ended)
         return OpenTrial(trial, self.recorder.plan(trial))
 
     @checked
@@ -384,13 +384,13 @@ class Campaign:
         self.refresh()
         if replace is not None and not replace.strip():
             raise InputError('replace needs a reason, such as "wrong file".')
-        recorder, told = self.recorder, replace is not None
-        trial = recorder.trial(opened.number if isinstance(opened, OpenTrial) else opened, told=told)
+        recorder, ended = self.recorder, replace is not None
+        trial = recorder.trial(opened.number if isinstance(opened, OpenTrial) else opened, ended=ended)
         if isinstance(opened, OpenTrial) and not np.array_equal(opened.trial.unit_point, trial.unit_point):
             raise InputError(f"the open trial {opened.number} belongs to another campaign.")
         execution = Execution.reported(trajectory, distance, failed)
         with recorder.not_executing(trial):
-            trial = recorder.trial(trial.number, told=told)
+            trial = recorder.trial(trial.number, ended=ended)
             if trajectory is not None:
                 plan = opened.plan if isinstance(opened, OpenTrial) else recorder.plan(trial)
                 execution = execution.measured(self.validation, plan, start_tolerance)

@@ -91,7 +91,11 @@ def identify(
     with store.snapshot():
         stored, trials = store.description(), store.trials()
     differing = list(differences(stored, description))
-    samples = _samples(trials)
+    # The trials to recompute: the first, the worst and the last that has ended.
+    ended = [trial for trial in trials if trial.executed or trial.state == "open"]
+    worst = max((t for t in ended if t.distance is not None), key=lambda t: t.distance or 0.0, default=None)
+    chosen = {t.number: t for t in (*ended[:1], *ended[-1:], *([] if worst is None else [worst]))}
+    samples = [chosen[number] for number in sorted(chosen)]
 
     def refuse(difference: str, advice: str) -> NoReturn:
         raise StoreMismatchError(f"{store.name} was made by another experiment: {difference}; {advice}.")
@@ -128,14 +132,6 @@ def identify(
         if remeasuring:  # the stored values are still those of the earlier distance
             description = with_distance(description, stored["validation"]["distance"])
         store.describe_anew(description, change)
-
-
-def _samples(trials: Sequence[Trial]) -> list[Trial]:
-    """Return the trials to recompute: the first, the worst and the last that has ended."""
-    ended = [trial for trial in trials if trial.executed or trial.state == "open"]
-    worst = max((t for t in ended if t.distance is not None), key=lambda t: t.distance or 0.0, default=None)
-    chosen = {t.number: t for t in (*ended[:1], *ended[-1:], *([] if worst is None else [worst]))}
-    return [chosen[number] for number in sorted(chosen)]
 
 
 def _changed_loop(store: Store, validation: Validation, samples: Sequence[Trial]) -> str | None:
@@ -214,7 +210,7 @@ def remeasure(store: Store, validation: Validation, description: dict[str, Any])
                 # A distance without trajectories was told in another definition.
                 alone = [t.distance is not None and store.trajectory(t.number, "system") is None for t in after]
                 unknown: dict[str, Any] = {"state": "unmeasured", "distance": None, "failure": TOLD_ALONE}
-                after = [replace(t, **unknown) if told else t for t, told in zip(after, alone, strict=True)]
+                after = [replace(t, **unknown) if by_hand else t for t, by_hand in zip(after, alone, strict=True)]
             changed = [(old, new) for old, new in zip(before, after, strict=True) if _measured(old) != _measured(new)]
             trials, outcomes = [new for _, new in changed], {str(old.number): _measured(old) for old, _ in changed}
             change = Change("remeasured", REDEFINED if redefined else "asked for", {"before": outcomes})

@@ -131,7 +131,12 @@ class IntervalSearch:
             if self.is_falsified:
                 return None
         if isinstance(kind, AnytimeAudit):
-            return self._by_draws(kind)
+            # The next independent draw of an anytime audit, which may end whenever its bound suffices.
+            if any(trial.origin == "iid" for trial in self._ended):
+                certificate, _ = kind.certify_against(Sample.of(self._ended), self.limit, self.options.confidence)
+                if certificate.covers(self.limit, self.options.volume):
+                    return None
+            return Choice(self.recorder.draw(), "iid", planned_draws=0)
         if (test := self._next_test()) is not None:
             return test
         evidence = self._evidence()
@@ -189,14 +194,6 @@ class IntervalSearch:
         chances = [0.0 if noise is None else noise.chance_of_more(self.limit) for noise in noises]
         likeliest = int(np.argmax(chances))
         return Choice.tested(tasks[likeliest]) if chances[likeliest] > 1 - quantile else None
-
-    def _by_draws(self, kind: AnytimeAudit) -> Choice | None:
-        """Return the next independent draw of an anytime audit, which may end whenever its bound suffices."""
-        if any(trial.origin == "iid" for trial in self._ended):
-            certificate, _ = kind.certify_against(Sample.of(self._ended), self.limit, self.options.confidence)
-            if certificate.covers(self.limit, self.options.volume):
-                return None
-        return Choice(self.recorder.draw(), "iid", planned_draws=0)
 
     def _next_test(self) -> Choice | None:
         """Return the next test if the last one held and more are missing: nothing needs to be searched for that."""

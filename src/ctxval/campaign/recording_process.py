@@ -23,11 +23,11 @@ def main() -> None:
     from ctxval.campaign.telling import REFUSED
     from ctxval.errors import CtxvalError
 
-    told, (path, *names), seconds = pickle.loads(Path(sys.argv[1], "request").read_bytes())
+    supplied, (path, *names), seconds = pickle.loads(Path(sys.argv[1], "request").read_bytes())
     limit(seconds)
     read_only([path])
     try:
-        content, status = told.read_file(path, *names).to_npz(), 0
+        content, status = supplied.read_file(path, *names).to_npz(), 0
     except CtxvalError as error:
         content, status = str(error).encode(errors="replace"), REFUSED
     sys.stdout.buffer.write(content)

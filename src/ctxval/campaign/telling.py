@@ -34,7 +34,7 @@ Names = Mapping[str, str]
 
 
 @dataclass(frozen=True)
-class ToldResult:
+class SuppliedResult:
     """The result of a trial, before it is checked. Exactly one of recording, distance and failed is given.
 
     Attributes:

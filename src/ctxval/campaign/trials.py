@@ -90,14 +90,14 @@ class TrialRecorder:
         remaining = remaining_tasks(self.validation, self._trials)
         return remaining is None or len(remaining) > 0
 
-    def trial(self, number: int, *, told: bool = False) -> Trial:
-        """Return an open trial, or with ``told`` one whose result a person has told; refuse other trials."""
+    def trial(self, number: int, *, ended: bool = False) -> Trial:
+        """Return an open trial, or with ``ended`` one whose result a person has told; refuse other trials."""
         if not 0 <= number < len(self._trials):
             raise InputError(f"there is no trial {number}; the campaign has {len(self._trials)}.")
         trial = self._trials[number]
-        if told and not trial.told:
+        if ended and not trial.told:
             raise InputError(f"trial {number} has no result that was told by a person, so none can be replaced.")
-        if not told and trial.state != "open":
+        if not ended and trial.state != "open":
             raise InputError(f"trial {number} is {trial.state}, so nothing more can be told of it.")
         return trial
 

@@ -10,7 +10,7 @@ import numpy as np
 from ctxval._util.progress import advance, stage
 from ctxval.campaign.choices import Execution
 from ctxval.campaign.history import executed_trials
-from ctxval.certificates.expiry import EXCEEDED, FEWEST, Channel, Statistic, WatchState
+from ctxval.certificates.expiry import EXCEEDED, FEWEST, Statistic, WatchedChannel, WatchState
 from ctxval.core.trajectory import COMPLETE, Trajectory
 from ctxval.core.trial import Trial
 from ctxval.errors import CertificateError, InputError
@@ -160,12 +160,12 @@ class Watch:
         return f"Watch({self.state.sentence})"
 
 
-def _channel(name: str, certified: Sequence[RunStatistic], has_noise: bool) -> Channel:
+def _channel(name: str, certified: Sequence[RunStatistic], has_noise: bool) -> WatchedChannel:
     """Return the channel of a statistic before the first later run."""
     freedom = float(np.median([each.freedom for each in certified])) if has_noise else None
     known = [each.information for each in certified if each.information is not None]
     information = np.sum(known, axis=0) if known else None
-    return Channel(name, tuple(each.value for each in certified), freedom, information)
+    return WatchedChannel(name, tuple(each.value for each in certified), freedom, information)
 
 
 def _is_same_watch(state: WatchState, begun: WatchState) -> bool:

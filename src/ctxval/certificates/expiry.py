@@ -45,7 +45,7 @@ class Statistic:
 
 
 @dataclass(frozen=True)
-class Channel(ShortRepr):
+class WatchedChannel(ShortRepr):
     """One kind of statistics.
 
     Attributes:
@@ -113,7 +113,7 @@ class WatchState(ShortRepr):
 
     threshold: float
     false_alarms: float
-    channels: tuple[Channel, ...]
+    channels: tuple[WatchedChannel, ...]
     runs: tuple[str, ...] = ()
     distances: tuple[float | None, ...] = ()
     evidence: float = 0.0
@@ -191,7 +191,7 @@ class WatchState(ShortRepr):
 
         try:
             channels = tuple(
-                Channel(
+                WatchedChannel(
                     str(each["name"]),
                     tuple(float(value) for value in each["certified"]),
                     None if each["freedom"] is None else float(each["freedom"]),

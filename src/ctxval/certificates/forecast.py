@@ -39,7 +39,7 @@ class Forecast:
 
 
 def forecast(
-    sample: Sample, found: Maxima, threshold: float, confidence: float, *, seed: int = 0, futures: int = 32
+    sample: Sample, maxima: Maxima, threshold: float, confidence: float, *, seed: int = 0, futures: int = 32
 ) -> Forecast:
     """Return how many more executions of GP-UCB decide whether d* is at most the threshold, from draws of d*.
 
@@ -51,11 +51,11 @@ def forecast(
     rng = np.random.default_rng(seed)
     lengths, kept = [], 0
     with single_threaded():
-        in_the_way = found.owners[found.draws > threshold]
-        owners = found.owners if not len(in_the_way) else in_the_way
+        in_the_way = maxima.owners[maxima.draws > threshold]
+        owners = maxima.owners if not len(in_the_way) else in_the_way
         for k in range(futures):
-            conditioned = found.conditioned[owners[k * len(owners) // futures]]
-            length, validated = _future(sample, found, conditioned, threshold, confidence, rng)
+            conditioned = maxima.conditioned[owners[k * len(owners) // futures]]
+            length, validated = _future(sample, maxima, conditioned, threshold, confidence, rng)
             lengths.append(length)
             kept += validated
     decided = np.isfinite(lengths)

@@ -131,17 +131,13 @@ def settle_maxima(sample: Sample, threshold: float, confidence: float, *, seed: 
     while len(chains) < _MOST and abs(pooled.upper(confidence) - threshold) < ERRORS * pooled.error(confidence):
         more = range(len(chains), 2 * len(chains))
         chains += [draw_maxima(sample, seed=1_000_003 * chain + seed) for chain in more]
-        pooled = _pooled(chains)
+        draws, points = (np.concatenate([getattr(chain, name) for chain in chains]) for name in ("draws", "points"))
+        before = np.cumsum([0, *(len(chain.conditioned) for chain in chains[:-1])])
+        owners = np.concatenate([chain.owners + first for chain, first in zip(chains, before, strict=True)])
+        order = np.argsort(draws, kind="stable")
+        conditioned = [process for chain in chains for process in chain.conditioned]
+        pooled = Maxima(draws[order], points[order], conditioned, owners[order], chains[0].stochastic)
     return pooled
-
-
-def _pooled(chains: list[Maxima]) -> Maxima:
-    draws, points = (np.concatenate([getattr(chain, name) for chain in chains]) for name in ("draws", "points"))
-    before = np.cumsum([0, *(len(chain.conditioned) for chain in chains[:-1])])
-    owners = np.concatenate([chain.owners + first for chain, first in zip(chains, before, strict=True)])
-    order = np.argsort(draws, kind="stable")
-    conditioned = [process for chain in chains for process in chain.conditioned]
-    return Maxima(draws[order], points[order], conditioned, owners[order], chains[0].stochastic)
 
 
 def _require_bounding(sample: Sample) -> None:

@@ -23,7 +23,7 @@ from ctxval.campaign.by_hand import (
 from ctxval.campaign.choices import Execution
 from ctxval.campaign.storage.other_stores import STORE_SUFFIXES
 from ctxval.campaign.storage.store import Store
-from ctxval.campaign.telling import ToldResult
+from ctxval.campaign.telling import SuppliedResult
 from ctxval.cli.base import command, out, print_verdict, status_of
 from ctxval.cli.config.settings import Settings
 from ctxval.cli.config.stored_settings import Opened, budget_of, limit_of, open_store, open_target, trusted_settings
@@ -150,7 +150,7 @@ def tell(
     require("start tolerance", NonNegativeFloat | None, start_tolerance)
     opened = open_store(store, allowed)
     campaign, file, mapping = opened.campaign, trajectory or npz, opened.settings.log_mapping
-    result = ToldResult(file, distance, failed, npz is not None, resample, start_tolerance, mapping, replace)
+    result = SuppliedResult(file, distance, failed, npz is not None, resample, start_tolerance, mapping, replace)
     ended = tell_result(campaign, opened.experiment, trial, result)
     out.say(result_sentence(ended, opened.experiment.units, campaign.start_offset(ended)))
     return _ended(ended, campaign.executions, store)

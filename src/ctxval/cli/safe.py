@@ -67,8 +67,8 @@ def safe(
     failures = failures_of(campaign.failed)
     print_failures(failures)
     out.say(f"store: {path}")
-    found = {**report.to_dict(), "drawn": drawn and vars(drawn), "budget": total, "failures": failures}
-    return {**found, "store": str(path)}, FALSIFIED if report.answer == "falsified" else 0
+    summary = {**report.to_dict(), "drawn": drawn and vars(drawn), "budget": total, "failures": failures}
+    return {**summary, "store": str(path)}, FALSIFIED if report.answer == "falsified" else 0
 
 
 def _has_another_margin(path: Path, settings: Settings) -> bool:
@@ -105,7 +105,7 @@ def _print(report: SafetyReport, drawn: DrawnTasks | None) -> None:
         rows["safe by the largest deviation"] = f"{100 * report.share_by_deviation:.1f} %"
     if report.tightened is not None:
         if report.tightened.avoid:
-            rows["avoid on the model"] = enumerated([repr(one) for one in report.tightened.avoid], 6)
+            rows["avoid on the model"] = enumerated([repr(part) for part in report.tightened.avoid], 6)
         if report.tightened.reach is not None:
             rows["reach on the model"] = repr(report.tightened.reach)
     elif report.d_b_bound is not None and isinstance(report.spec, ReachAvoid):

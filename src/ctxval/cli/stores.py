@@ -279,16 +279,16 @@ def why(store: Path, allowed: Allowed, most: int = 2) -> Any:
 
     campaign = open_store(store, allowed).campaign
     digest = campaign.store.digest()
-    found = find_causes(campaign, most=most)
+    causes = find_causes(campaign, most=most)
     with suppress(StoreError):  # a store that cannot be written has no report with it
-        campaign.store.keep_computed(CAUSE, found.sentence, digest)
-    out.say((found.sentence, "bold" if found.named else ""), wrap=True)
-    if found.separating_sentence is not None:
-        out.say(found.separating_sentence, wrap=True)
-    if found.python is not None:
+        campaign.store.keep_computed(CAUSE, causes.sentence, digest)
+    out.say((causes.sentence, "bold" if causes.named else ""), wrap=True)
+    if causes.separating_sentence is not None:
+        out.say(causes.separating_sentence, wrap=True)
+    if causes.python is not None:
         out.say("")
-        for row in found.python.splitlines():
+        for row in causes.python.splitlines():
             out.say(row)
-    for row in found.mjcf:
+    for row in causes.mjcf:
         out.say(row)
-    return {**found.to_dict(), "store": str(store)}
+    return {**causes.to_dict(), "store": str(store)}

@@ -54,7 +54,7 @@ def flips(points: Array, inputs: Sequence[Array]) -> Flips | None:
 
 
 @dataclass(frozen=True, eq=False)
-class Saturation:
+class InputSaturation:
     """How often inputs are at their limits: the share of the steps for each input, shape ``(m,)``.
 
     The limits are ``known`` if the synthesizer states them; otherwise they are taken from the inputs themselves.
@@ -64,7 +64,7 @@ class Saturation:
     known: bool
 
 
-def saturation(inputs: Sequence[Array], synthesizer: Synthesizer | None) -> Saturation | None:
+def saturation(inputs: Sequence[Array], synthesizer: Synthesizer | None) -> InputSaturation | None:
     """Return how often inputs are at their limits; None if there are no inputs.
 
     The inputs of each task have shape ``(H, m)``. If the synthesizer has no attribute ``limits``, or is not known, the
@@ -78,11 +78,11 @@ def saturation(inputs: Sequence[Array], synthesizer: Synthesizer | None) -> Satu
     if given is not None:
         limits = Limits.of(given, together.shape[-1])
         at_limit = (together <= limits.low + 1e-6 * spans) | (together >= limits.high - 1e-6 * spans)
-        return Saturation(at_limit.mean(axis=0), True)
+        return InputSaturation(at_limit.mean(axis=0), True)
     low, high = together.min(axis=0) + 1e-9 * spans, together.max(axis=0) - 1e-9 * spans
     ends = [(signal <= low, signal >= high) for signal in signals]
     held = [np.logical_or(*(at & (at.sum(axis=0) >= 3) for at in at_ends)) & (low < high) for at_ends in ends]
-    return Saturation(np.concatenate(held).mean(axis=0), False)
+    return InputSaturation(np.concatenate(held).mean(axis=0), False)
 
 
 @dataclass(frozen=True, eq=False)

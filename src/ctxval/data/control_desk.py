@@ -103,7 +103,7 @@ def _named(structure: Mapping[str, Any]) -> list[Mapping[str, Any]]:
 def _elements(structure: Mapping[str, Any], name: str) -> list[Mapping[str, Any]]:
     value = structure.get(name)
     given = [value] if isinstance(value, Mapping) else value
-    return [one for one in given if isinstance(one, Mapping)] if isinstance(given, list | np.ndarray) else []
+    return [part for part in given if isinstance(part, Mapping)] if isinstance(given, list | np.ndarray) else []
 
 
 def _text(element: Mapping[str, Any], name: str) -> str:

@@ -112,8 +112,11 @@ def _elements(h5py: Any, file: Any, checked: Mapping[str, Any], path: str) -> li
         if not item.get_type().equal(h5py.h5t.STD_REF_OBJ) or math.prod(item.shape) > _MOST:
             return []
         # What was not checked, such as a structure in the place of numbers, has no value.
-        opened = [h5py.h5r.dereference(one, file.id) if one else None for one in h5py.Dataset(item)[()].ravel()]
-        targets = [one and by_address.get(h5py.h5o.get_info(one).addr) for one in opened]
+        opened = [
+            h5py.h5r.dereference(reference, file.id) if reference else None
+            for reference in h5py.Dataset(item)[()].ravel()
+        ]
+        targets = [place and by_address.get(h5py.h5o.get_info(place).addr) for place in opened]
         columns[name] = [np.zeros(0) if target is None else _value(h5py, target) for target in targets]
     if len({len(column) for column in columns.values()}) > 1:
         return []  # cells in one structure

@@ -67,7 +67,7 @@ class UnsafeMargin(ShortRepr):
         return replace(self, spec=self.spec.with_states(names)) if isinstance(self.spec, NamedStates) else self
 
     def __call__(self, model_trajectory: Trajectory, system_trajectory: Trajectory, task: Task) -> Array:
-        of_model, of_system = (self.spec.robustness(one, task) for one in (model_trajectory, system_trajectory))
+        of_model, of_system = (self.spec.robustness(loop, task) for loop in (model_trajectory, system_trajectory))
         if self.margin is not None:
             return np.asarray(np.maximum(np.minimum(of_model, self.margin - of_system), 0.0))
         return np.asarray(np.maximum(of_model - self.penalty * np.maximum(of_system, 0.0), 0.0))

@@ -52,8 +52,8 @@ class Evaluations:
         asked = points[: max(0, self.left)] if self.strict else points
         values = np.full(len(points), -np.inf)
         if len(asked):
-            found = np.asarray(self._function(asked), dtype=np.float64)
-            values[: len(asked)] = np.where(np.isfinite(found), found, -np.inf)
+            known = np.asarray(self._function(asked), dtype=np.float64)
+            values[: len(asked)] = np.where(np.isfinite(known), known, -np.inf)
             self._points.append(asked)
             self._values.append(values[: len(asked)])
         return values

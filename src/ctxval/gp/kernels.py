@@ -72,15 +72,15 @@ class Matern(Kernel):
 
     def towards(self, theta: Array, Z: Array) -> Towards:
         variance, scales = np.exp(theta[0]), np.exp(theta[1:])
-        own = Z / scales
+        scaled = Z / scales
 
         def covariances(X: Array) -> Array:
-            s = cdist(X / scales, own)
+            s = cdist(X / scales, scaled)
             s *= np.sqrt(2 * self.nu)
-            found: Array = np.exp(-s)
-            found *= self._polynomial(s)
-            found *= variance
-            return found
+            covariance: Array = np.exp(-s)
+            covariance *= self._polynomial(s)
+            covariance *= variance
+            return covariance
 
         return covariances
 
@@ -158,12 +158,12 @@ class Linear(Kernel):
 
     def towards(self, theta: Array, Z: Array) -> Towards:
         constant, slope = np.exp(theta)
-        own = (Z - self.centre).T
+        centred = (Z - self.centre).T
 
         def covariances(X: Array) -> Array:
-            found = (slope * (X - self.centre)) @ own
-            found += constant
-            return np.asarray(found)
+            covariance = (slope * (X - self.centre)) @ centred
+            covariance += constant
+            return np.asarray(covariance)
 
         return covariances
 
@@ -201,9 +201,9 @@ class Sum(Kernel):
         first, second = self.first.towards(a, Z), self.second.towards(b, Z)
 
         def covariances(X: Array) -> Array:
-            found = first(X)
-            found += second(X)
-            return found
+            covariance = first(X)
+            covariance += second(X)
+            return covariance
 
         return covariances
 

@@ -206,5 +206,7 @@ def most_likely(
     if best_start:
         starts = starts[[np.argmin([negative(start)[0] for start in starts])]]
     options: Any = {"maxiter": iterations, **({} if tolerance is None else {"ftol": tolerance})}
-    found = [minimize(negative, start, jac=True, method="L-BFGS-B", bounds=bounds, options=options) for start in starts]
-    return np.asarray(min(found, key=lambda climb: float(climb.fun)).x)
+    climbs = [
+        minimize(negative, start, jac=True, method="L-BFGS-B", bounds=bounds, options=options) for start in starts
+    ]
+    return np.asarray(min(climbs, key=lambda climb: float(climb.fun)).x)

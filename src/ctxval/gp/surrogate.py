@@ -16,7 +16,9 @@ from ctxval.gp.hyperposterior import Warp
 from ctxval.gp.kernels import Kernel, Linear, Matern, Sum
 from ctxval.gp.regression import NOISE, GaussianProcess, LogDensity, Mean, condition, fit, zero_mean
 
-_KERNEL = Sum(Matern(1.5, ard=True, length_scale=(0.02, 100.0)), Linear())  # the kernel of :class:`Learned`
+_KERNEL = Sum(
+    Matern(1.5, ard=True, length_scale=(0.02, 100.0)), Linear()
+)  # the kernel of :class:`SurrogateHyperparameters`
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +84,7 @@ def _with_imputed(process: GaussianProcess, points: Array) -> GaussianProcess:
 
 
 @dataclass(frozen=True, eq=False)
-class Learned(ShortRepr):
+class SurrogateHyperparameters(ShortRepr):
     """Learned hyperparameters, with which a process can be conditioned on the same values and on later ones."""
 
     theta: Array  # logarithms of the hyperparameters of a Matern 3/2 kernel and a linear kernel
@@ -104,7 +106,7 @@ class Learned(ShortRepr):
         return _with_imputed(process, points[~known])
 
 
-def learn(points: Array, values: Array) -> Learned:
+def learn(points: Array, values: Array) -> SurrogateHyperparameters:
     """Return the most likely hyperparameters given known values ``(n,)`` at unit-cube points ``(n, d)``.
 
     Length-scales have a log-normal prior whose median grows with the root of the dimension (Hvarfner, Hellsten and
@@ -121,7 +123,7 @@ def learn(points: Array, values: Array) -> Learned:
     return learned
 
 
-def _learn_on(points: Array, values: Array, warp: Warp) -> tuple[float, Learned]:
+def _learn_on(points: Array, values: Array, warp: Warp) -> tuple[float, SurrogateHyperparameters]:
     """Return the summed log density of each value given all others, on one scale, and the learned hyperparameters."""
     warped = warp.forward(values)
     shift = float(warped.mean())
@@ -133,7 +135,7 @@ def _learn_on(points: Array, values: Array, warp: Warp) -> tuple[float, Learned]
     process = fit(_KERNEL, points, y, log_prior=log_prior, starts=np.stack([centre, centre + rougher]))
     mean, variance = process.left_out()
     score = -0.5 * (np.log(variance) + (y - mean) ** 2 / variance).sum() - len(y) * np.log(scale)
-    return float(score) + warp.log_slope(values), Learned(process.theta, warp, shift, scale)
+    return float(score) + warp.log_slope(values), SurrogateHyperparameters(process.theta, warp, shift, scale)
 
 
 def _prior(d: int) -> tuple[Array, LogDensity]:

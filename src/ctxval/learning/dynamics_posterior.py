@@ -27,7 +27,7 @@ from ctxval.learning.hyperparameters import (
     FAMILIES,
     SMOOTHER_FAMILIES,
     HyperparameterPosterior,
-    Hyperparameters,
+    ResidualHyperparameters,
     learning_rows,
 )
 from ctxval.learning.kernel_expansion import Component, KernelExpansion, draw_functions, joined, weights_without
@@ -66,7 +66,7 @@ class LearnedCovariances(ShortRepr):
     seed: tuple[int, ...]
 
     @functools.cached_property
-    def drawn(self) -> list[Hyperparameters]:
+    def drawn(self) -> list[ResidualHyperparameters]:
         """The draws of the hyperparameters; the first one is their mode."""
         rng = np.random.default_rng(self.seed)
         with single_threaded():
@@ -113,7 +113,7 @@ class DynamicsPosterior(ShortRepr):
     def _components(self, rows: Iterable[int]) -> tuple[Component, ...]:
         """Return the most probable one and those of some draws of the hyperparameters.
 
-        Hyperparameters whose covariance matrix is not positive definite are left out.
+        ResidualHyperparameters whose covariance matrix is not positive definite are left out.
         """
         components, drawn = [self.most_probable], self.covariances.drawn
         last = drawn[0]
@@ -138,11 +138,11 @@ class DynamicsPosterior(ShortRepr):
                 most.kernel, most.theta, self.data.pairs, self.settings.centres, least=_PIVOT * most.noise
             )
 
-    def _component(self, drawn: Hyperparameters, rng: np.random.Generator) -> Component:
+    def _component(self, drawn: ResidualHyperparameters, rng: np.random.Generator) -> Component:
         with single_threaded():
             return Component.conditioned(self._rescaled(drawn), *self._known(self.rows), rng)
 
-    def _rescaled(self, drawn: Hyperparameters) -> Hyperparameters:
+    def _rescaled(self, drawn: ResidualHyperparameters) -> ResidualHyperparameters:
         """Return hyperparameters in the units of these data."""
         theta = drawn.theta.copy()
         theta[:-2] += np.log(self.covariances.scale / self.data.scale)

@@ -142,7 +142,16 @@ class DynamicsStudy(ShortRepr):
                 if without is not None and without.left_out_error < min(_WELL, learned.left_out_error / _CLEARLY):
                     learned = without
             if not logged and len(executed) >= _FEWEST_TOLD and learned.left_out_error > _WELL:
-                parameter = self._found_parameter(executed)
+                # A task parameter that explains the errors of predictions; asked in each doubling of the executions.
+                some = _FEWEST_TOLD
+                while 2 * some <= len(executed):
+                    some *= 2
+                key = digest(trajectory for _, trajectory in executed[:some])
+                if key not in self._found:
+                    name, with_it, without_it = self._most_telling(executed[:some])
+                    # If errors remain, it may be a sign of noise, or of a state that is not recorded.
+                    self._found[key] = name if with_it < min(_WELL, without_it / _CLEARLY) else None
+                parameter = self._found[key]
                 learned = learned if parameter is None else self._with_parameter(parameter).learn(executed)
         return learned
 
@@ -267,18 +276,6 @@ class DynamicsStudy(ShortRepr):
         data = self._data if with_data and self.actuator is None else None
         loops = [replace(loop, inputs=self.extended.acting(loop)) for _, loop in executed]
         return recorded_transitions(data, loops, self._loops, logged)
-
-    def _found_parameter(self, executed: Executed) -> str | None:
-        """Return a task parameter that explains the errors of predictions; asked in each doubling of the executions."""
-        some = _FEWEST_TOLD
-        while 2 * some <= len(executed):
-            some *= 2
-        key = digest(trajectory for _, trajectory in executed[:some])
-        if key not in self._found:
-            name, with_it, without_it = self._most_telling(executed[:some])
-            # If errors remain, it may be a sign of noise, or of a state that is not recorded.
-            self._found[key] = name if with_it < min(_WELL, without_it / _CLEARLY) else None
-        return self._found[key]
 
     def _with_parameter(self, name: str) -> DynamicsStudy:
         """Return the study with another task parameter as a state; it is kept."""

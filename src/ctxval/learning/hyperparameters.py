@@ -107,7 +107,7 @@ class ResidualKernel(Covariance):
 
 
 @dataclass(frozen=True, eq=False)
-class Hyperparameters:
+class ResidualHyperparameters:
     """One draw of the hyperparameters."""
 
     kernel: ResidualKernel
@@ -183,11 +183,11 @@ class HyperparameterPosterior:
         return max((mode for family in self.families for mode in family), key=lambda mode: mode.height)
 
     @functools.cached_property
-    def mode(self) -> Hyperparameters:
+    def mode(self) -> ResidualHyperparameters:
         """The most probable hyperparameters."""
-        return Hyperparameters(self.highest.kernel, *_within(self.highest.kernel, self.highest.place))
+        return ResidualHyperparameters(self.highest.kernel, *_within(self.highest.kernel, self.highest.place))
 
-    def draw(self, count: int, rng: np.random.Generator) -> list[Hyperparameters]:
+    def draw(self, count: int, rng: np.random.Generator) -> list[ResidualHyperparameters]:
         """Return ``count`` draws; hyperparameters that are drawn again are the same object, and follow each other."""
         places, weights = [], []
         for family in self.families:
@@ -199,15 +199,15 @@ class HyperparameterPosterior:
             weights.append(np.array(heights) - density)
         chosen = _resampled(np.concatenate(weights), count, rng).tolist()
         # What follows from the same object is computed once.
-        draws = {row: Hyperparameters(places[row][0], *_within(*places[row])) for row in chosen}
+        draws = {row: ResidualHyperparameters(places[row][0], *_within(*places[row])) for row in chosen}
         return [draws[row] for row in chosen]
 
 
-def draw_prior(dimension: int, inputs: int, rng: np.random.Generator) -> Hyperparameters:
+def draw_prior(dimension: int, inputs: int, rng: np.random.Generator) -> ResidualHyperparameters:
     """Return hyperparameters from the prior, such as those of a system on which a posterior is tested."""
     nu, growth = FAMILIES[rng.integers(len(FAMILIES))]
     kernel, (centres, deviations) = ResidualKernel(nu, growth, inputs), _prior(dimension + 3)
-    return Hyperparameters(kernel, *_within(kernel, centres + deviations * rng.standard_normal(dimension + 3)))
+    return ResidualHyperparameters(kernel, *_within(kernel, centres + deviations * rng.standard_normal(dimension + 3)))
 
 
 def highest_log_posterior(Z: Array, Y: Array, inputs: int) -> float:

@@ -14,7 +14,7 @@ import numpy as np
 
 from ctxval._util.arrays import Array, Mask, Rows
 from ctxval.gp.cholesky import CholeskyFactor, factorise, pivoted_cholesky, tenfold
-from ctxval.learning.hyperparameters import Hyperparameters, ResidualKernel
+from ctxval.learning.hyperparameters import ResidualHyperparameters, ResidualKernel
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,7 +27,7 @@ class KernelExpansion:
     weights: Array  # shape (S, M, n)
 
     @classmethod
-    def of(cls, hyperparameters: Hyperparameters, centres: Array, weights: Array) -> KernelExpansion:
+    def of(cls, hyperparameters: ResidualHyperparameters, centres: Array, weights: Array) -> KernelExpansion:
         """Return functions ``(S, M, n)`` that share hyperparameters and centres ``(M, k)``."""
         S, theta = len(weights), hyperparameters.theta
         shared = np.broadcast_to(theta, (S, *theta.shape)), np.broadcast_to(centres, (S, *centres.shape))
@@ -159,7 +159,7 @@ def weights_without(covariance: Array, noise: float, outputs: Array, gone: Mask)
 class Component:
     """The posterior of r for one draw of the hyperparameters."""
 
-    hyperparameters: Hyperparameters
+    hyperparameters: ResidualHyperparameters
     centres: Array  # standardised pairs that it is conditioned on, (M, k)
     factor: CholeskyFactor  # Cholesky factor of their covariance with noise
     weights: Array  # weights of the mean, (M, n)
@@ -167,7 +167,9 @@ class Component:
     amplitudes: Array  # standard deviations of the states' residuals, relative to the covariance, (n,)
 
     @classmethod
-    def conditioned(cls, hyperparameters: Hyperparameters, Z: Array, Y: Array, rng: np.random.Generator) -> Component:
+    def conditioned(
+        cls, hyperparameters: ResidualHyperparameters, Z: Array, Y: Array, rng: np.random.Generator
+    ) -> Component:
         """Return the process conditioned on pairs ``(M, k)``, with amplitudes drawn from their posterior."""
         kernel, theta = hyperparameters.kernel, hyperparameters.theta
         factor = factorise(kernel(theta, Z, Z), tenfold(hyperparameters.noise))

@@ -109,7 +109,7 @@ class NoisyRuns:
         for features, weights, _ in draws.groups:
             loops = np.flatnonzero((self._of_draw >= first) & (self._of_draw < first + len(weights)))
             draw = self._of_draw[loops] - first
-            each = [(np.flatnonzero(draw == k), features.function(own)) for k, own in enumerate(weights)]
+            each = [(np.flatnonzero(draw == k), features.function(of_draw)) for k, of_draw in enumerate(weights)]
             if len(loops):
                 self._parts.append((features, loops, each))
             first += len(weights)

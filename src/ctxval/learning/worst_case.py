@@ -292,8 +292,8 @@ class WorstCaseSearch:
         near = _NEARBY / _NEARER if is_kinked(self.planner.validation.distance) else _NEARBY
         moves = rng.uniform(-near, near, (len(peaks), self.settings.nearby, self.dimension))
         tasks = np.concatenate([peaks[:, None], np.clip(peaks[:, None] + moves, 0, 1)], axis=1)
-        found = self._distances(mean, tasks.reshape(-1, self.dimension))[0]
-        distances = np.maximum(found.reshape(tasks.shape[:2]), 0.0)
+        flat = self._distances(mean, tasks.reshape(-1, self.dimension))[0]
+        distances = np.maximum(flat.reshape(tasks.shape[:2]), 0.0)
         peak, next_to_it = distances[:, 0], np.median(distances[:, 1:], axis=1)
         lost = np.divide(peak - next_to_it, peak, out=np.zeros(len(peak)), where=peak > 0)
         return float(max(lost.max(initial=0.0), 0.0))
@@ -321,7 +321,14 @@ class WorstCaseSearch:
                 points, best = _better(points, best, np.broadcast_to(shown, (len(best), *shown.shape)), distances)
                 loops += distances.size
             some, at, highest = draws[searched], points[searched], best[searched]
-            moved = self._moves(at, second[searched], share, rng)
+            # The moves of each point: to bounds, 2 d of them, and at random around it and around another one.
+            others = second[searched]
+            to_bounds = moves_to_bounds(at, np.zeros(self.dimension), np.ones(self.dimension))
+            shape = (len(at), self.settings.moves, self.dimension)
+            around = np.where(rng.random((*shape[:2], 1)) < 0.7, at[:, None], others[:, None])
+            few = (rng.random(shape) < 0.5) | (rng.random((*shape[:2], 1)) < 0.5)
+            random = np.clip(around + share * few * rng.normal(size=shape), 0, 1)
+            moved = np.concatenate([to_bounds, random], axis=1)
             distances = _finite(self.planner.own_distances(some, moved))
             together = _together(at, highest, moved, distances)[:, None]
             known = np.concatenate([at[:, None], moved], axis=1)
@@ -356,15 +363,6 @@ class WorstCaseSearch:
         chosen = np.flatnonzero(may_be_worst)
         values[np.ix_(others, chosen)] = self._distances(draws[others], tasks[chosen])
         return values, len(first) * len(tasks) + len(others) * len(chosen)
-
-    def _moves(self, points: Array, others: Array, share: float, rng: np.random.Generator) -> Array:
-        """Return the moves of each point: to bounds, 2 d of them, and at random around it and around another one."""
-        to_bounds = moves_to_bounds(points, np.zeros(self.dimension), np.ones(self.dimension))
-        shape = (len(points), self.settings.moves, self.dimension)
-        around = np.where(rng.random((*shape[:2], 1)) < 0.7, points[:, None], others[:, None])
-        few = (rng.random(shape) < 0.5) | (rng.random((*shape[:2], 1)) < 0.5)
-        random = np.clip(around + share * few * rng.normal(size=shape), 0, 1)
-        return np.concatenate([to_bounds, random], axis=1)
 
 
 def _bend(distances: Array) -> Array:

@@ -12,7 +12,7 @@ import numpy as np
 from ctxval._util.arrays import Array, single_threaded
 from ctxval.core.trial import Trial
 from ctxval.gp.regression import GaussianProcess
-from ctxval.gp.surrogate import Learned, learn, spread_rows
+from ctxval.gp.surrogate import SurrogateHyperparameters, learn, spread_rows
 
 
 def distance_of(trial: Trial) -> float:
@@ -43,7 +43,7 @@ class DistanceModel:
 
     points: Array
     values: Array
-    learned: Learned
+    learned: SurrogateHyperparameters
     process: GaussianProcess
     suite: Array | None = None
 

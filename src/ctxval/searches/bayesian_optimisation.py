@@ -21,7 +21,7 @@ from ctxval._util.boxes import Box
 from ctxval._util.checked import NonNegativeFloat, PositiveInt
 from ctxval._util.registry import part
 from ctxval.gp.acquisition import Acquisition, LogExpectedImprovement, UpperConfidenceBound, maximise
-from ctxval.gp.surrogate import Learned, kept_rows, learn
+from ctxval.gp.surrogate import SurrogateHyperparameters, kept_rows, learn
 from ctxval.searches.base import Note, SequentialSearch, best_first
 
 _WORTH = 0.005
@@ -66,7 +66,7 @@ class BayesianOptimisation(SequentialSearch):
 
     def reset(self, dimension: int, seed: int) -> None:
         super().reset(dimension, seed)
-        self._memo: tuple[bytes, Learned] | None = None
+        self._memo: tuple[bytes, SurrogateHyperparameters] | None = None
 
     def propose(self, rng: np.random.Generator) -> Array:
         point, self._last_note = self.choose(self.points, self.values, rng)
@@ -111,7 +111,7 @@ class BayesianOptimisation(SequentialSearch):
             "logarithm": bool(np.isfinite(learned.warp.offset)),
         }
 
-    def _learned(self, points: Array, values: Array) -> Learned:
+    def _learned(self, points: Array, values: Array) -> SurrogateHyperparameters:
         """Return hyperparameters learned from the first values; a fixed schedule says how many of them are used.
 
         They are learned at each new value up to 40, at every second value up to 80, and so on.
@@ -126,7 +126,7 @@ class BayesianOptimisation(SequentialSearch):
         return self._memo[1]
 
 
-def _worthwhile(learned: Learned, values: Array, best: float) -> float:
+def _worthwhile(learned: SurrogateHyperparameters, values: Array, best: float) -> float:
     """Return the value to improve on, in the process's units."""
     margin = _WORTH * float(np.nanmax(values) - np.nanmedian(values))
     return float(learned.standardised(np.array([best + margin]))[0])

@@ -126,17 +126,17 @@ class TrustRegion(SequentialSearch):
         while prediction is not None:
             with single_threaded():
                 doubtful = self._why_not(prediction, surrogate_error)
-                found, region = self._promising(prediction, rng) if doubtful is None else (None, _Region())
-            if found is not None:
+                candidate, region = self._promising(prediction, rng) if doubtful is None else (None, _Region())
+            if candidate is not None:
                 self._last_note = {
                     "engine": _ENGINE,
                     "climb": region.number,
                     "radius": region.radius,
-                    "expected": found.expected,
-                    "doubt": found.doubt,
+                    "expected": candidate.expected,
+                    "doubt": candidate.doubt,
                 }
                 why_hedge = self._why_hedge()
-                return found.point if why_hedge is None else self._without_prediction(rng, why_hedge)
+                return candidate.point if why_hedge is None else self._without_prediction(rng, why_hedge)
             why = doubtful or "nothing is predicted anywhere"
             prediction = None if prediction.otherwise is None else prediction.otherwise()
         return self._without_prediction(rng, why)
@@ -202,9 +202,9 @@ class TrustRegion(SequentialSearch):
         waiting = np.isnan(values) & (points[:, None] == pending.points).all(axis=2).any(axis=1)
         ended = [note for note, waits in zip(notes, waiting, strict=True) if not waits]
         known = _History(points[~waiting], values[~waiting], tuple(ended), points[np.isnan(values) & ~waiting])
-        found, region = self._next(prediction, known, rng)
-        if found is None or self._is_new(found.point[None], whole)[0]:
-            return found, region
+        candidate, region = self._next(prediction, known, rng)
+        if candidate is None or self._is_new(candidate.point[None], whole)[0]:
+            return candidate, region
         expected = values.copy()
         expected[waiting] = prediction.expected(points[waiting])[0]
         as_if = pending.prediction()

@@ -26,7 +26,7 @@ from ctxval.certificates.verdict import Verdict
 from ctxval.core.controller import converged_of
 from ctxval.core.distance import Distance
 from ctxval.core.plan import Plan
-from ctxval.core.soundness import Flips, Saturation, aimed_states, flips, saturation
+from ctxval.core.soundness import Flips, InputSaturation, aimed_states, flips, saturation
 from ctxval.core.task import Task
 from ctxval.core.validation import Validation
 from ctxval.distances import GoalError, MeanDeviation, StateNorm, TrackingError
@@ -78,7 +78,7 @@ class Aspect1Report:
     distribution: str | None
     flips: Flips | None
     flipped: tuple[dict[str, Any], dict[str, Any]] | None
-    saturation: Saturation | None
+    saturation: InputSaturation | None
     inputs: tuple[str, ...]
     not_converged: tuple[dict[str, Any], ...]
     designs: int

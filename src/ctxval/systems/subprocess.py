@@ -46,7 +46,18 @@ def run_supervised(
     Return the exit status, negative for a signal; None if the command did not end in time and was killed.
     """
     if os.name != "posix":
-        return _run_alone(command, folder, stdout, stderr, timeout)
+        # Run a command on a system without process groups; processes that it starts may outlive it.
+        try:
+            process = subprocess.Popen(command, cwd=folder, stdin=subprocess.DEVNULL, stdout=stdout, stderr=stderr)
+        except OSError as error:
+            raise ExecutionError(f"the command cannot be started: {error}") from error
+        try:
+            return process.wait(timeout)
+        except subprocess.TimeoutExpired:
+            return None
+        finally:
+            process.kill()
+            process.wait()
     descriptors = stdout.fileno(), stderr.fileno()
     # -I, because modules in the folder of the program have the same names as other modules. A session of its own,
     # because Ctrl-C is for the campaign, which ends after the running executions.
@@ -105,23 +116,6 @@ def _end(supervisor: subprocess.Popen[bytes], child: int) -> None:
         if child and supervisor.returncode:
             with contextlib.suppress(OSError):
                 os.killpg(child, signal.SIGKILL)
-
-
-def _run_alone(
-    command: Sequence[str], folder: Path | None, stdout: IO[bytes], stderr: IO[bytes], timeout: float
-) -> int | None:
-    """Run a command on a system without process groups; processes that it starts may outlive it."""
-    try:
-        process = subprocess.Popen(command, cwd=folder, stdin=subprocess.DEVNULL, stdout=stdout, stderr=stderr)
-    except OSError as error:
-        raise ExecutionError(f"the command cannot be started: {error}") from error
-    try:
-        return process.wait(timeout)
-    except subprocess.TimeoutExpired:
-        return None
-    finally:
-        process.kill()
-        process.wait()
 
 
 @part(runs_code=True, folder="folder")

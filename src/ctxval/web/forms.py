@@ -10,7 +10,7 @@ from typing import TypeVar
 import numpy as np
 
 from ctxval._util.checked import NonNegativeFloat, require
-from ctxval.campaign.telling import ToldResult
+from ctxval.campaign.telling import SuppliedResult
 from ctxval.core.space import TaskSpace
 from ctxval.core.task_suite import TASK, TaskSuite
 from ctxval.errors import InputError
@@ -48,22 +48,22 @@ def task_request(fields: Fields, space: TaskSpace) -> TaskRequest:
     raise InputError("choose how the next task is to be found.")
 
 
-def result(kind: str, fields: Fields, recording: Path | None) -> ToldResult:
+def result(kind: str, fields: Fields, recording: Path | None) -> SuppliedResult:
     """Return what an operator reports of a trial, with the reason if it replaces an earlier result."""
     replace = fields.get("replace")
     if kind == "failure":
         reason = fields.get("reason", "").strip()
         if not reason:
             raise InputError('a failure needs a reason, such as "the motor cut out".')
-        return ToldResult(failed=reason, replace=replace)
+        return SuppliedResult(failed=reason, replace=replace)
     if kind == "distance":
-        return ToldResult(distance=_number(fields, "distance", "the distance"), replace=replace)
+        return SuppliedResult(distance=_number(fields, "distance", "the distance"), replace=replace)
     if recording is None:
         raise InputError("choose the file of the recording.")
     tolerance = _number(fields, "tolerance", "the start tolerance") if fields.get("tolerance", "").strip() else None
     require("the start tolerance", NonNegativeFloat | None, tolerance)
     resample = "resample" in fields
-    return ToldResult(recording, resample=resample, start_tolerance=tolerance, replace=replace, uploaded=True)
+    return SuppliedResult(recording, resample=resample, start_tolerance=tolerance, replace=replace, uploaded=True)
 
 
 def _number(fields: Fields, field: str, name: str) -> float:

@@ -18,7 +18,7 @@ from typing import Any, TypeVar
 from ctxval._util.progress import Listener, listening, stage
 from ctxval._util.texts import reason_of
 from ctxval.campaign.by_hand import tell_result
-from ctxval.campaign.telling import ToldResult
+from ctxval.campaign.telling import SuppliedResult
 from ctxval.core.trial import Trial
 from ctxval.errors import CampaignError, CtxvalError, DistanceError, InputError
 from ctxval.web import jobs
@@ -80,7 +80,7 @@ class CampaignService(PageState):
         self.update(choosing=Work.begun("choosing a task"), choice_error=None, chosen=None, enough=False)
         self._spawn(self._choose(request))
 
-    async def tell(self, number: int, result: ToldResult, submission: str) -> Trial:
+    async def tell(self, number: int, result: SuppliedResult, submission: str) -> Trial:
         """Record the result of an open trial, or replace an earlier result, once for each submitted form."""
 
         def record() -> None:

@@ -47,7 +47,17 @@ def part(kind: str, given: str | Mapping[str, Any], folder: Path | None = None) 
     what = f"the {kind} {name}"
     if ":" in name:
         arguments = {key: argument(value, folder) for key, value in table.items()}
-        return _referenced(registry, what, reference(name, folder), arguments, folder)
+        named = reference(name, folder)
+        # A model or a distance may be a function itself, rather than a function that makes one.
+        count = {"model": 2, "distance": 3}.get(registry.kind)
+        makes = inspect.isfunction(named) and (bool(arguments) or count is None or not accepts(named, count))
+        if isinstance(named, type) or (makes and not arguments and not accepts(named, 0)):
+            require_part(registry, what, named)  # raises an error with the reason
+        if isinstance(named, type) or makes:
+            named = _built(registry.kind, what, named, arguments, folder)
+        elif arguments:
+            raise InputError(f"{what} is an object already, so it takes no arguments, got {', '.join(arguments)}.")
+        return require_part(registry, what, named)
     build = registry.find(name)
     declared = declaration_of(build) or Declaration(name)
     placed = dict(table)
@@ -65,23 +75,6 @@ def part(kind: str, given: str | Mapping[str, Any], folder: Path | None = None) 
         if key in declared.functions and isinstance(table[key], Mapping) and not isinstance(value, Model):
             require_function(f"{key} of {what}", value, declared.functions[key])
     return registry.require_made(name, _built(kind, what, build, arguments, folder))
-
-
-def _referenced(registry: Registry[Any], what: str, named: Any, arguments: dict[str, Any], folder: Path | None) -> Any:
-    """Return the part that a reference names, or that the named class or function makes.
-
-    The class or function is checked before it is called.
-    """
-    # A model or a distance may be a function itself, rather than a function that makes one.
-    count = {"model": 2, "distance": 3}.get(registry.kind)
-    makes = inspect.isfunction(named) and (bool(arguments) or count is None or not accepts(named, count))
-    if isinstance(named, type) or (makes and not arguments and not accepts(named, 0)):
-        require_part(registry, what, named)  # raises an error with the reason
-    if isinstance(named, type) or makes:
-        named = _built(registry.kind, what, named, arguments, folder)
-    elif arguments:
-        raise InputError(f"{what} is an object already, so it takes no arguments, got {', '.join(arguments)}.")
-    return require_part(registry, what, named)
 
 
 def _built(kind: str, what: str, build: Any, arguments: dict[str, Any], folder: Path | None) -> Any:

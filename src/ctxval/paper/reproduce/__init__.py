@@ -106,17 +106,13 @@ def table_text(out: Path, studies: Sequence[Study], results: Results, scale: Sca
         lines += [f"Data: [{study.name}.csv]({out.name}/{study.name}.csv)"]
     lines += ["", "## Free parameters", "", "The paper gives few of them. These values are used here, with reasons:"]
     for case in dict.fromkeys(study.case for study in studies):
-        lines += ["", f"### {case}", "", *_parameters(case)]
+        module = importlib.import_module(f"ctxval.paper.cases.{case}")
+        fields = dataclasses.fields(module.Settings)
+        values = [f"`{field.name}` = {field.default}" for field in fields]
+        for name, variant in getattr(module, "VARIANTS", {}).items():
+            others = [field.name for field in fields if getattr(variant, field.name) != field.default]
+            if others:
+                values.append(f"in the variant `{name}` " + ", ".join(f"`{n}` = {getattr(variant, n)}" for n in others))
+        reasons = [line.strip() for line in (module.Settings.__doc__ or "").splitlines()]
+        lines += ["", f"### {case}", "", *["; ".join(values), "", "```text", *reasons, "```"]]
     return "\n".join(lines) + "\n"
-
-
-def _parameters(case: str) -> list[str]:
-    module = importlib.import_module(f"ctxval.paper.cases.{case}")
-    fields = dataclasses.fields(module.Settings)
-    values = [f"`{field.name}` = {field.default}" for field in fields]
-    for name, variant in getattr(module, "VARIANTS", {}).items():
-        others = [field.name for field in fields if getattr(variant, field.name) != field.default]
-        if others:
-            values.append(f"in the variant `{name}` " + ", ".join(f"`{n}` = {getattr(variant, n)}" for n in others))
-    reasons = [line.strip() for line in (module.Settings.__doc__ or "").splitlines()]
-    return ["; ".join(values), "", "```text", *reasons, "```"]

@@ -116,7 +116,18 @@ def run_job(job: Job) -> Result:
         experiment = job.experiment()
         validation = experiment.validation
         if job.kind == "search":
-            return _searched(job, experiment)
+            # The points and distances of one campaign in order, or only the records for independent draws.
+            search = _informed(job) if job.search in INFORMED else searches.by_name(job.search)
+            if searches.BaseSearch.of(search).iid:
+                # The points do not depend on the distances, so all of them are executed in one batch.
+                search.reset(experiment.validation.space.dimension, job.seed)
+                points = experiment.validation.space.from_unit(search.ask(job.budget))
+                return {"executions": job.budget, "records": records(experiment.validation.distances(points))}
+            campaign = Campaign(experiment.validation, search=search, seed=job.seed, name=experiment.name)
+            campaign.run(job.budget, explore=True)
+            points = experiment.validation.space.from_unit(np.array([trial.unit_point for trial in campaign.trials]))
+            distances = [np.nan if trial.distance is None else trial.distance for trial in campaign.trials]
+            return {"points": points.tolist(), "distances": distances}
         if job.kind == "truth":
             assert experiment.truth is not None  # each case of the paper has one
             truth = experiment.truth()
@@ -135,21 +146,6 @@ def run_job(job: Job) -> Result:
             "apart": float(gap.max()),
             "end": float(gap[-1].sum()),
         }
-
-
-def _searched(job: Job, experiment: Experiment) -> Result:
-    """Return the points and distances of one campaign in order, or only the records for independent draws."""
-    search = _informed(job) if job.search in INFORMED else searches.by_name(job.search)
-    if searches.BaseSearch.of(search).iid:
-        # The points do not depend on the distances, so all of them are executed in one batch.
-        search.reset(experiment.validation.space.dimension, job.seed)
-        points = experiment.validation.space.from_unit(search.ask(job.budget))
-        return {"executions": job.budget, "records": records(experiment.validation.distances(points))}
-    campaign = Campaign(experiment.validation, search=search, seed=job.seed, name=experiment.name)
-    campaign.run(job.budget, explore=True)
-    points = experiment.validation.space.from_unit(np.array([trial.unit_point for trial in campaign.trials]))
-    distances = [np.nan if trial.distance is None else trial.distance for trial in campaign.trials]
-    return {"points": points.tolist(), "distances": distances}
 
 
 def _aspects(job: Job, validation: Validation) -> Result:

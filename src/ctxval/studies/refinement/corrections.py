@@ -48,8 +48,11 @@ def averaged_correction(model: Model, records: Records) -> Correction | None:
     """
     runs = [Record(run.states, run.inputs, run.states[0]) for run in records.executed]
     if records.own is not None:
-        own = records.own[:: max(1, len(records.own) // 50_000)]  # of more, only a part is averaged
-        runs += [Record(np.stack([x, after]), u[None], x) for x, u, after in zip(own.x, own.u, own.x_next, strict=True)]
+        of_model = records.own[:: max(1, len(records.own) // 50_000)]  # of more, only a part is averaged
+        runs += [
+            Record(np.stack([x, after]), u[None], x)
+            for x, u, after in zip(of_model.x, of_model.u, of_model.x_next, strict=True)
+        ]
     data = records.transitions
     k = data.x.shape[1] + data.u.shape[1]
     try:

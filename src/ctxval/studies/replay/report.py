@@ -100,7 +100,19 @@ def replay(
     if not steps or not all(isinstance(k, int) and not isinstance(k, bool) and k >= 1 for k in steps):
         raise InputError(f"steps must be positive integers, got {list(steps)}.")
     if validation is not None:
-        _require_same_step(validation, recordings)
+        validation.require_states("a replay")
+        space = validation.space
+        task = validation.task_at(space.parameters(0.5 * (space.low + space.high)))
+        if task.initial_state.shape[-1] != len(recordings.states):
+            raise InputError(
+                f"the tasks have {task.initial_state.shape[-1]} states and the recordings have "
+                f"{len(recordings.states)}: {', '.join(recordings.states)}."
+            )
+        if not np.isclose(task.dt, recordings.dt, rtol=1e-3, atol=0):
+            raise InputError(
+                f"the tasks have steps of {task.dt:g} s and the recordings have steps of {recordings.dt:g} s: "
+                f"{unit_advice(recordings.dt, task.dt) or f'give dt = {task.dt:g} in the mapping of the recordings'}."
+            )
     require_time_step(model, recordings.dt, "the recording")
     new = unseen(model, recordings)
     used = new or list(range(len(recordings.runs)))
@@ -144,22 +156,6 @@ def unseen(model: Model, recordings: Recordings) -> list[int]:
     known = set(rows(data))
     recorded = [rows(run.trajectory.transitions()) for run in recordings.runs]
     return [k for k, steps in enumerate(recorded) if sum(step in known for step in steps) <= len(steps) / 2]
-
-
-def _require_same_step(validation: Validation, recordings: Recordings) -> None:
-    validation.require_states("a replay")
-    space = validation.space
-    task = validation.task_at(space.parameters(0.5 * (space.low + space.high)))
-    if task.initial_state.shape[-1] != len(recordings.states):
-        raise InputError(
-            f"the tasks have {task.initial_state.shape[-1]} states and the recordings have {len(recordings.states)}: "
-            f"{', '.join(recordings.states)}."
-        )
-    if not np.isclose(task.dt, recordings.dt, rtol=1e-3, atol=0):
-        raise InputError(
-            f"the tasks have steps of {task.dt:g} s and the recordings have steps of {recordings.dt:g} s: "
-            f"{unit_advice(recordings.dt, task.dt) or f'give dt = {task.dt:g} in the mapping of the recordings'}."
-        )
 
 
 def plain_numbers(value: Any) -> Any:
