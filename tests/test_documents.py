@@ -29,7 +29,7 @@ from ctxval.certificates import (
     certify_region,
     draw_maxima,
 )
-from ctxval.certificates.expiry import Channel, Statistic, WatchState
+from ctxval.certificates.expiry import Statistic, WatchedChannel, WatchState
 from ctxval.cli.config.settings import Settings
 from ctxval.core.trial import Origin, State
 from ctxval.data import Break, LogMapping, MemoryTable, recordings_of
@@ -158,7 +158,7 @@ def test_the_glossary_explains_what_refine_says() -> None:
 
 
 def test_the_glossary_explains_what_a_watch_says() -> None:
-    channel = Channel("rate residuals", (1.0, 1.1, 0.9), 4.0, np.eye(2))
+    channel = WatchedChannel("rate residuals", (1.0, 1.1, 0.9), 4.0, np.eye(2))
     state = WatchState(0.5, 1e-3, (channel,))
     state = state.after("a.csv", {"rate residuals": Statistic(1.0, np.zeros(2), np.eye(2))})
     explained = re.findall(r"`([^`]+)`", (ROOT / "docs" / "glossary.md").read_text())

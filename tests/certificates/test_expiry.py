@@ -7,14 +7,16 @@ import json
 import numpy as np
 import pytest
 
-from ctxval.certificates.expiry import EXCEEDED, Channel, Statistic, WatchState
+from ctxval.certificates.expiry import EXCEEDED, Statistic, WatchedChannel, WatchState
 from ctxval.errors import InputError
 
 
 def begun(channels: int = 2, false_alarms: float = 1e-3) -> WatchState:
     certified = np.random.default_rng(0).chisquare(4, (channels, 12)) / 4
     names = ["rate residuals", "errors of the predicted distance", "angle residuals"]
-    listed = [Channel(name, tuple(row), 4.0, 12.0 * np.eye(2)) for name, row in zip(names, certified, strict=False)]
+    listed = [
+        WatchedChannel(name, tuple(row), 4.0, 12.0 * np.eye(2)) for name, row in zip(names, certified, strict=False)
+    ]
     return WatchState(0.5, false_alarms, tuple(listed))
 
 
@@ -95,7 +97,7 @@ def test_other_data_is_refused(change: dict[str, object]) -> None:
 
 def test_an_executed_distance_above_the_threshold_is_a_fact_unless_there_is_noise() -> None:
     statistics = {"rate residuals": Statistic(1.0)}
-    exact = WatchState(0.5, 1e-3, (Channel("rate residuals", (1.0, 1.1, 0.9)),))
+    exact = WatchState(0.5, 1e-3, (WatchedChannel("rate residuals", (1.0, 1.1, 0.9)),))
     state = exact.after("a", statistics, 0.5).after("b", statistics, 0.75)
     assert (state.alarm, state.cause, state.ratio) == (2, EXCEEDED, 1.5)
     assert state.sentence == "expired: run 2 has the distance 0.75, above the threshold 0.5"

@@ -25,7 +25,7 @@ def quick(trials: Sample, seed: int = 0, stochastic: bool = False) -> Maxima:
 
 def test_a_certificate_says_everything_and_is_ready_for_json() -> None:
     trials = sample()
-    certificate = certify_posterior(trials, 0.9, drawn=quick(trials))
+    certificate = certify_posterior(trials, 0.9, found=quick(trials))
     back = json.loads(json.dumps(certificate.to_json(), allow_nan=False))
     assert (back["kind"], back["confidence"], back["volume"], back["trials"]) == ("posterior", 0.9, 0.0, 9)
     assert back["details"]["best"] == trials.best
@@ -40,7 +40,7 @@ def test_a_certificate_says_everything_and_is_ready_for_json() -> None:
 def test_a_certificate_says_its_error() -> None:
     trials = sample(6)
     maxima = quick(trials)
-    certificate = certify_posterior(trials, 0.8, drawn=maxima, resolution=1)
+    certificate = certify_posterior(trials, 0.8, found=maxima, resolution=1)
     assert certificate.error == certificate.details["error"] == maxima.error(0.8) > 0
     assert "±" in certificate.statement
     assert "standard error of the random draws" in certificate.statement
@@ -60,12 +60,12 @@ def made_good(because: str | None) -> Sample:
 @pytest.mark.parametrize("stochastic", [False, True])
 def test_a_failure_made_good_for_no_stated_reason_withdraws_the_bound(stochastic: bool) -> None:
     found = quick(sample(), stochastic=stochastic)
-    certificate = certify_posterior(made_good(None), 0.9, drawn=found, resolution=1)
+    certificate = certify_posterior(made_good(None), 0.9, found=found, resolution=1)
     assert not certificate.covers(1e9)
     assert certificate.doubt is not None
     assert "trial 2 failed and trial 7 executed the same task with success, for no stated reason" in certificate.doubt
     assert '--again 2 --because "what was changed"' in certificate.doubt
-    explained = certify_posterior(made_good("fuse replaced"), 0.9, drawn=found, resolution=1)
+    explained = certify_posterior(made_good("fuse replaced"), 0.9, found=found, resolution=1)
     assert explained.covers(1e9)
     assert any("fuse replaced" in sentence for sentence in explained.assumptions)
     assert explained.details["failures"]["made_good"] == [{"trial": 2, "by": 7, "because": "fuse replaced"}]
@@ -101,7 +101,7 @@ def test_the_order_of_imported_rows_changes_nothing(spike: float) -> None:
         trials = Sample.of(imported(order, spike))
         for stochastic in (False, True):
             maxima = quick(trials, stochastic=stochastic)
-            made = certify_posterior(trials, 0.8, drawn=maxima)
+            made = certify_posterior(trials, 0.8, found=maxima)
             found.append((stochastic, made.upper_bound, made.error, made.doubt is None))
     assert len(set(found)) == 2
     assert {one[0]: one[3] for one in found}[False] == (spike == 0)

@@ -16,9 +16,7 @@ from ctxval.gp.hyperposterior import Warp
 from ctxval.gp.kernels import Kernel, Linear, Matern, Sum
 from ctxval.gp.regression import NOISE, GaussianProcess, LogDensity, Mean, condition, fit, zero_mean
 
-_KERNEL = Sum(
-    Matern(1.5, ard=True, length_scale=(0.02, 100.0)), Linear()
-)  # the kernel of :class:`SurrogateHyperparameters`
+_KERNEL = Sum(Matern(1.5, ard=True, length_scale=(0.02, 100.0)), Linear())  # of SurrogateHyperparameters
 
 
 @dataclass(frozen=True, eq=False)
