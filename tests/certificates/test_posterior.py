@@ -123,7 +123,7 @@ def test_the_test_of_unordered_trials_sees_as_much_as_that_of_trials_in_order() 
         ):
             trials = Sample(X[rows][:, None], y[rows], [origin] * 25, ["completed"] * 25)  # type: ignore[list-item]
             fired[name] += (
-                certify_posterior(trials, 0.8, drawn=draw_maxima(trials, draws=12, paths=1)).doubt is not None
+                certify_posterior(trials, 0.8, found=draw_maxima(trials, draws=12, paths=1)).doubt is not None
             )
     assert fired["worst first"] == 0
     assert fired["unordered"] >= max(4, fired["in order"])
@@ -186,7 +186,7 @@ def spiked(height: float) -> tuple[np.ndarray, np.ndarray]:
 def test_a_spike_that_nothing_announced_withdraws_the_bound(height: float, believed: bool) -> None:
     X, y = spiked(height)
     sample = Sample(X, y, ["acquisition"] * len(y), ["completed"] * len(y))
-    certificate = certify_posterior(sample, 0.9, drawn=draw_maxima(sample, draws=12, paths=2))
+    certificate = certify_posterior(sample, 0.9, found=draw_maxima(sample, draws=12, paths=2))
     assert (certificate.doubt is None) == believed
     assert certificate.covers(1e6) == believed
     if not believed:

@@ -12,7 +12,7 @@ from ctxval.errors import InputError
 from ctxval.gp import regression
 from ctxval.gp.cholesky import pivoted_cholesky, pivoted_rows
 from ctxval.gp.kernels import Linear, Matern
-from ctxval.gp.surrogate import LONG, Learned, fit_surrogate, kept_rows, learn
+from ctxval.gp.surrogate import LONG, SurrogateHyperparameters, fit_surrogate, kept_rows, learn
 from rig_thorough import more
 
 
@@ -105,7 +105,7 @@ def test_a_prior_mean_without_one_finite_value_a_point_is_refused(prior: regress
         fit_surrogate(*data(), prior_mean=prior)
 
 
-# Learned once, conditioned often
+# SurrogateHyperparameters once, conditioned often
 
 
 def many(d: int = 6, n: int = 40, seed: int = 0) -> np.ndarray:
@@ -150,7 +150,7 @@ def test_the_process_goes_through_known_values_and_believes_what_it_predicts_els
 @pytest.mark.parametrize("values", [np.zeros(5), np.full(5, 3.0), np.array([0.0, 0.0, 0.0, 0.0, 1.0])])
 def test_values_that_say_nothing_are_learned_from_without_harm(values: np.ndarray) -> None:
     learned = learn(many(2, 5), values)
-    assert isinstance(learned, Learned)
+    assert isinstance(learned, SurrogateHyperparameters)
     assert np.isfinite(learned.condition(many(2, 5), values).predict(where())[0]).all()
 
 

@@ -62,7 +62,7 @@ class Posterior(CertificateKind):
         """Return the certificate from enough draws for the threshold, and a forecast if its bound is above that."""
         _require_covered(sample, self.resolution)
         drawn = settle_maxima(sample, threshold, confidence)
-        certificate = certify_posterior(sample, confidence, resolution=self.resolution, drawn=drawn)
+        certificate = certify_posterior(sample, confidence, resolution=self.resolution, found=drawn)
         if certificate.doubt is not None or certificate.upper_bound <= threshold:
             return certificate, None  # a process that the trials contradict predicts nothing
         return certificate, forecast(representative(sample), drawn, threshold, confidence)
@@ -75,15 +75,15 @@ def certify_posterior(
     *,
     resolution: PositiveFloat = RESOLUTION,
     seed: int = 0,
-    drawn: Maxima | None = None,
+    found: Maxima | None = None,
 ) -> Certificate:
     """Return the bound that d* stays below with the confidence, under the prior and given the trials.
 
-    ``resolution`` is that of :class:`Posterior`; ``drawn`` are draws of d* from the same trials, made before.
+    ``resolution`` is that of :class:`Posterior`; ``found`` are draws of d* from the same trials, made before.
     """
     used = representative(sample)
     _require_covered(sample, resolution)
-    drawn = draw_maxima(sample, seed=seed) if drawn is None else drawn
+    drawn = draw_maxima(sample, seed=seed) if found is None else found
     stochastic = drawn.stochastic
     upper, error = drawn.upper(confidence), drawn.error(confidence)
     unordered, d = np.array([origin == "manual" for origin in used.origins]), sample.points.shape[1]

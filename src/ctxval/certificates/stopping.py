@@ -108,7 +108,7 @@ class StoppingRule(ShortRepr):
         confidence = self.options.confidence
         drawn = settle_maxima(sample, self.threshold, confidence)
         # Coverage is left aside: its resolution is the whole task space.
-        certificate = certify_posterior(sample, confidence, resolution=1.0, drawn=drawn)
+        certificate = certify_posterior(sample, confidence, resolution=1.0, found=drawn)
         return drawn, certificate.covers(self.threshold)
 
     def _is_surely_too_high(self, sample: Sample) -> bool:
