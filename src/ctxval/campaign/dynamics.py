@@ -44,6 +44,12 @@ NEAR = 0.02
 """A task that differs from an executed one by less than this in every coordinate is no new one."""
 
 
+def prediction_in(note: Mapping[str, Any] | None) -> ExecutionPrediction | None:
+    """Return the prediction of an execution in the note of its trial, of whichever distance; None if there is none."""
+    stored = (note or {}).get(PREDICTION)
+    return ExecutionPrediction.from_json(stored) if isinstance(stored, dict) else None
+
+
 class CampaignDynamics:
     """The dynamics learned from the trials of a campaign. The system is never executed.
 
@@ -296,9 +302,8 @@ class CampaignDynamics:
     def stored_prediction(self, trial: Trial) -> ExecutionPrediction | None:
         """Return the prediction that was stored before an execution, if it is one of the present distance."""
         note = (trial.note or {}).get(PREDICTION)
-        if not isinstance(note, dict) or note.get("experiment") != self.experiment:
-            return None
-        return ExecutionPrediction.from_json(note)
+        present = isinstance(note, dict) and note.get("experiment") == self.experiment
+        return prediction_in(trial.note) if present else None
 
     def to_note(self, prediction: ExecutionPrediction) -> dict[str, Any]:
         """Return a prediction as it is stored, with what identifies the experiment that it belongs to."""

@@ -12,7 +12,6 @@ from typing import Any
 
 from rich.progress import Progress, TextColumn
 
-from ctxval import cases as known_cases
 from ctxval._util.files import write_text
 from ctxval.cli.base import BAD_INPUT, FALSIFIED, command, err, out, print_table
 from ctxval.cli.config.check import aspect1_findings, check_experiment
@@ -21,6 +20,7 @@ from ctxval.cli.config.settings import read_settings
 from ctxval.cli.options import named_values
 from ctxval.core.experiment import UnitsWarning
 from ctxval.errors import InputError
+from ctxval.paper import cases as known_cases
 from ctxval.studies import aspect1 as model_alone
 from ctxval.studies.safety.draws import spec_distance
 
@@ -119,7 +119,7 @@ def cases(name: str | None = None) -> Any:
 def reproduce(
     name: str, quick: bool = False, out_: Path = Path("reproduction"), results: Path | None = None, workers: int = 2
 ) -> None:
-    from ctxval import reproduce as paper  # imported here: the other commands do not need it
+    from ctxval.paper import reproduce as paper  # imported here: the other commands do not need it
 
     with Progress(TextColumn("runs"), *Progress.get_default_columns(), console=err) as progress:
         line = progress.add_task("")

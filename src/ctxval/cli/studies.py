@@ -8,9 +8,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from ctxval import plot
 from ctxval._util.files import write_text
 from ctxval._util.texts import reason_of
+from ctxval.campaign import plot
 from ctxval.campaign.campaign import Campaign
 from ctxval.certificates import CertificateOptions
 from ctxval.certificates.options import CONFIDENCE

@@ -16,7 +16,7 @@ from scipy.spatial import KDTree
 from ctxval._util.arrays import Array
 from ctxval._util.representation import ShortRepr, counted
 from ctxval._util.texts import enumerated, reason_of
-from ctxval.campaign.dynamics import PREDICTION
+from ctxval.campaign.dynamics import prediction_in
 from ctxval.certificates import RESOLUTION
 from ctxval.certificates.bounds import at_most, of_tasks
 from ctxval.certificates.covering import bare_corners, farthest_task
@@ -180,8 +180,7 @@ def smooth(context: ReportContext) -> Answer | None:
 
 def stored_predictions(context: ReportContext) -> list[tuple[Trial, ExecutionPrediction]]:
     """Return the trials whose execution was predicted beforehand, with the predictions."""
-    notes = [(trial, (trial.note or {}).get(PREDICTION)) for trial in context.completed]
-    read = [(trial, ExecutionPrediction.from_json(note)) for trial, note in notes if isinstance(note, dict)]
+    read = [(trial, prediction_in(trial.note)) for trial in context.completed]
     return [(trial, prediction) for trial, prediction in read if prediction is not None]
 
 

@@ -14,11 +14,10 @@ from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescap
 from ctxval._util.representation import counted, line, number
 from ctxval._util.texts import shortened, visible
 from ctxval.campaign.by_hand import result_sentence
-from ctxval.campaign.dynamics import PREDICTION
+from ctxval.campaign.dynamics import prediction_in
 from ctxval.certificates.bounds import with_error
 from ctxval.core.task_suite import TaskSuite
 from ctxval.core.trial import Trial
-from ctxval.learning import ExecutionPrediction
 from ctxval.web.jobs import Files
 from ctxval.web.security import MOST_UPLOAD
 from ctxval.web.state import PageState
@@ -165,8 +164,7 @@ def why(trial: Trial, units: str) -> list[str]:
         sentences.append(f"The search does not use the prediction of the learned dynamics: {text(note['why'])}.")
     if trial.because is not None:
         sentences.append(f"Since the last execution of this task: {text(trial.because)}.")
-    stored = note.get(PREDICTION)
-    prediction = ExecutionPrediction.from_json(stored) if isinstance(stored, dict) else None
+    prediction = prediction_in(note)
     if prediction is not None and math.isfinite(prediction.median):
         median, upper = (f"{number(value)} {text(units)}".rstrip() for value in (prediction.median, prediction.upper))
         sentences.append(f"Predicted distance: {median}; below {upper} with probability 0.95.")

@@ -15,7 +15,7 @@ from pydantic import ConfigDict, TypeAdapter, ValidationError
 from pydantic.errors import PydanticUserError
 from pydantic_core import SchemaError
 
-from ctxval import cases, controllers, distances, models, systems
+from ctxval import controllers, distances, models, systems
 from ctxval._util.files import Archive, read_bytes
 from ctxval._util.registry import Declaration, Registry, construct, declaration_of
 from ctxval.cli.config.references import accepts, is_function, reference, require_function, require_part
@@ -29,6 +29,7 @@ from ctxval.core.validation import Validation
 from ctxval.data import LogMapping, read_recordings
 from ctxval.errors import CtxvalError, InputError, ShapeError, UnknownNameError
 from ctxval.models.saved import stored_transitions
+from ctxval.paper import cases
 
 REGISTRIES: dict[str, Registry[Any]] = {
     registry.kind: registry
