@@ -16,7 +16,7 @@ from calibrate import RESULTS, all_of
 from ctxval import Campaign
 from ctxval._util.arrays import single_threaded
 from ctxval._util.json_lines import JsonLines
-from ctxval.certificates.verdict_sentences import tolerances
+from ctxval.certificates.sentences.verdicts import tolerances
 from dynamics_truths import digest
 from strangers_development import DEVELOPMENT
 from strangers_diagnostics import JudgedRun

@@ -28,8 +28,8 @@ from ctxval.certificates.bounds import NO_UNITS
 from ctxval.certificates.dynamics import bound_of
 from ctxval.certificates.dynamics_diagnostics import ACCURATE, GAP, PREDICTIONS
 from ctxval.certificates.dynamics_evidence import PushedDistances, StatePocket
+from ctxval.certificates.sentences.verdicts import undecided
 from ctxval.certificates.verdict import judge, judge_by
-from ctxval.certificates.verdict_sentences import undecided
 from ctxval.errors import CertificateError
 from rig_evidence import COVERED, GOOD, gap, prediction
 

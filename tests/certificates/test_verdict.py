@@ -22,7 +22,7 @@ from ctxval.certificates import (
     certify_scenario,
 )
 from ctxval.certificates.covering import resolved_volume
-from ctxval.certificates.provenance import REFINED
+from ctxval.certificates.sentences.withdrawals import REFINED
 from ctxval.certificates.stopping import StoppingRule
 from ctxval.certificates.verdict import counterexample, judge, judge_by
 from ctxval.core.trial import Origin, State, StatedThreshold, designs_sentence

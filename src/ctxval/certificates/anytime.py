@@ -30,7 +30,7 @@ from ctxval._util.registry import part
 from ctxval.certificates.base import Certificate, CertificateKind
 from ctxval.certificates.forecast import Forecast
 from ctxval.certificates.sample import Sample
-from ctxval.certificates.sentences import ABOUT_DRAWS, ONE_CAMPAIGN, distributed, share_above
+from ctxval.certificates.sentences.statements import ABOUT_DRAWS, ONE_CAMPAIGN, distributed, share_above
 from ctxval.errors import CertificateError
 
 _NO_VIOLATION = 0.75

@@ -18,8 +18,8 @@ from ctxval.certificates.forecast import Forecast
 from ctxval.certificates.posterior import Posterior
 from ctxval.certificates.prediction_tests import DRAWN, TESTS, shown_by_tests
 from ctxval.certificates.sample import Sample
+from ctxval.certificates.sentences.verdicts import supported as supported_by
 from ctxval.certificates.suite import WholeSuite
-from ctxval.certificates.verdict_sentences import supported as supported_by
 from ctxval.core.quantiles import QUANTILE
 from ctxval.errors import CertificateError
 

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeVar
 from ctxval._util.registry import Registry
 from ctxval._util.representation import ShortRepr, Shown, call, line, lines, table
 from ctxval._util.version import VERSION
-from ctxval.certificates import verdict_sentences as sentences
 from ctxval.certificates.bounds import ERRORS, as_text, at_most, with_error
 from ctxval.certificates.sample import Sample
+from ctxval.certificates.sentences import verdicts as sentences
 from ctxval.core.space import TaskSpace
 from ctxval.core.trial import Origin
 from ctxval.errors import CertificateError, InputError, UnknownNameError

@@ -39,7 +39,7 @@ from ctxval.certificates.dynamics_evidence import DynamicsEvidence
 from ctxval.certificates.forecast import Forecast
 from ctxval.certificates.prediction_tests import DRAWN, TESTS, shown_by_tests
 from ctxval.certificates.sample import Sample, advice_to_remeasure, listed, require_learned
-from ctxval.certificates.sentences import (
+from ctxval.certificates.sentences.statements import (
     ONE_CAMPAIGN,
     both_outcomes,
     dynamics_assumptions,

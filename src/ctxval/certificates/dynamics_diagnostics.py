@@ -14,6 +14,7 @@ import numpy as np
 from ctxval.certificates.bounds import with_units
 from ctxval.certificates.dynamics_evidence import CheckedPrediction, DynamicsEvidence
 from ctxval.certificates.prediction_tests import DRAWN
+from ctxval.certificates.sentences import withdrawals as sentences
 from ctxval.core.coverage import StateInputGap
 
 # Limits; docs/theory.md has the reason for each.
@@ -173,7 +174,7 @@ def only_a_failed_test(evidence: DynamicsEvidence, best: float, bound: float, li
     return outlived and not uncovered(evidence) and not untested(evidence, best, bound)
 
 
-# Reasons to withdraw the bound, each beside its test
+# Reasons to withdraw the bound
 
 
 def doubt_of(evidence: DynamicsEvidence, best: float, bound: float) -> str | None:
@@ -189,59 +190,31 @@ def doubts(evidence: DynamicsEvidence, best: float, bound: float) -> Iterator[st
     if (missing := tests_missing(evidence)) is not None:
         yield missing
     if not evidence.dense and jumps(evidence, bound):
-        what = f"the predicted distance jumps by up to {100 * evidence.jump / bound:.2g} % of the bound"
+        what = sentences.JUMP.format(percent=100 * evidence.jump / bound)
         if evidence.sharpness > SHARP:
-            what = f"one of the largest predicted distances falls by {100 * evidence.sharpness:.0f} %"
-        yield (
-            f"{what} if a task changes by a thousandth of its ranges, so a search may miss the largest distance: the "
-            "controllers change abruptly from task to task, as those of a model with kinks do, or the closed loop "
-            "does; use a smoother model, or an audit"
-        )
+            what = sentences.NEEDLE.format(percent=100 * evidence.sharpness)
+        yield sentences.JUMPS.format(what=what)
     share = max(evidence.missed - 1, evidence.disagreement)
     if share > AGREE:
-        yield (
-            f"searches of the learned dynamics find largest distances that differ by {100 * share:.0f} %, because the "
-            "controllers or the closed loop change abruptly from task to task; an execution of the task of the largest "
-            "one helps (`ctxval run` executes it), or use a smoother model, or an audit"
-        )
+        yield sentences.SEARCHES_DIFFER.format(percent=100 * share)
 
 
 def unlearned(evidence: DynamicsEvidence, bound: float) -> Iterator[str]:
     """Yield why too little is known of the dynamics."""
     fewest = fewest_executions(evidence)
     if evidence.executions < fewest:
-        yield (
-            f"the dynamics are learned from {evidence.executions} executed trajectories, and the bound needs at least "
-            f"{fewest}; execute more tasks"
-        )
+        yield sentences.FEW_EXECUTIONS.format(executions=evidence.executions, fewest=fewest)
     if evidence.unplanned:
-        yield (
-            f"for {100 * evidence.unplanned:.2g} % of the tasks no controller can be designed, or the model diverges: "
-            "nothing is known there; make the task space smaller, so that every task can be executed"
-        )
+        yield sentences.NOT_PLANNED.format(percent=100 * evidence.unplanned)
     checked = len(counted(evidence, bound))
     if checked < PREDICTIONS:
-        yield (
-            f"{checked} executions of different tasks were predicted from earlier ones, and the bound needs "
-            f"{PREDICTIONS} predictions that hold; execute more tasks"
-        )
+        yield sentences.FEW_PREDICTIONS.format(checked=checked, needed=PREDICTIONS)
     if evidence.quantile is None and evidence.noise > NOISE:
-        yield (
-            f"noise is learned with {100 * evidence.noise:.2g} % of the variance of the residual, and at most "
-            f"{100 * NOISE:g} % is allowed: the system is not deterministic in the recorded state and input; record "
-            "more states or reduce the noise, or use --kind posterior"
-        )
+        yield sentences.NOISY.format(percent=100 * evidence.noise, most=100 * NOISE)
     if (against := e_value(evidence)) > EVIDENCE:
-        yield (
-            f"the last executions contradict the learned noise (evidence {against:.0f}, and at most {EVIDENCE:g} is "
-            "allowed): it may be correlated, rare, or larger in some tasks, or a state that is not recorded acts; "
-            "execute more tasks, or record more states"
-        )
+        yield sentences.NOISE_CONTRADICTED.format(against=against, most=EVIDENCE)
     if evidence.left_out > LEFT_OUT:
-        yield (
-            f"the posterior samples of the dynamics leave out {100 * evidence.left_out:.0f} % of the largest variance, "
-            f"more than {100 * LEFT_OUT:g} %; more executions reduce this variance"
-        )
+        yield sentences.LEFT_OUT.format(percent=100 * evidence.left_out, most=100 * LEFT_OUT)
 
 
 def uncovered(evidence: DynamicsEvidence) -> list[str]:
@@ -249,15 +222,15 @@ def uncovered(evidence: DynamicsEvidence) -> list[str]:
 
     def at(gap: StateInputGap) -> str:
         coordinates, place = " and ".join(gap.coordinates), with_units(gap.place)
-        return f"{coordinates} by {100 * gap.size:.2g} % (at {place}); `ctxval run` executes a task that goes there"
+        return sentences.GAP_AT.format(coordinates=coordinates, percent=100 * gap.size, place=place)
 
     coverage, pair, missing = evidence.coverage, evidence.coverage.pair, []
     if coverage.beyond.size > most_beyond(evidence):
-        missing.append(f"predicted runs leave the recorded range of {at(coverage.beyond)}")
+        missing.append(sentences.BEYOND.format(gap=at(coverage.beyond)))
     if coverage.marginal.size > GAP:
-        missing.append(f"predicted runs enter a gap in the records of {at(coverage.marginal)}")
+        missing.append(sentences.GAP.format(gap=at(coverage.marginal)))
     if pair is not None and pair.size > PAIR_GAP:
-        missing.append(f"predicted runs enter a gap in the joint records of {at(pair)}")
+        missing.append(sentences.PAIR_GAP.format(gap=at(pair)))
     untried = untried_parameter(evidence)
     return missing if untried is None else [*missing, untried]
 
@@ -272,11 +245,7 @@ def untried_parameter(evidence: DynamicsEvidence) -> str | None:
     untried = evidence.untried
     if untried is None or untried.gap <= GAP:
         return None
-    return (
-        f"the parameter {untried.name} hardly changes the closed loops of the model, so what it changes in the system "
-        f"cannot be learned from states and inputs, and some of its values are {100 * untried.gap:.0f} % of its range "
-        "away from every executed one; an execution there helps (`ctxval run` executes it)"
-    )
+    return sentences.UNTRIED.format(name=untried.name, percent=100 * untried.gap)
 
 
 def untested(evidence: DynamicsEvidence, best: float, bound: float, allowed: float | None = None) -> list[str]:
@@ -285,19 +254,12 @@ def untested(evidence: DynamicsEvidence, best: float, bound: float, allowed: flo
     if evidence.quantile is not None:
         least = NOISY_TESTED * min(evidence.highest, float(np.median(evidence.maxima)))
     if best < least:
-        reasons.append(
-            f"the largest distance is predicted to be {evidence.highest:.4g}, but the largest executed one is "
-            f"{best:.4g}: the prediction is not tested where it matters; an execution of that task helps "
-            "(`ctxval run` executes it)"
-        )
+        reasons.append(sentences.NOT_TESTED.format(highest=evidence.highest, best=best))
     # Most executions of a noisy task are far below the bound on a quantile, however well it is known.
     size, what = (bound, "bound") if evidence.quantile is None else (evidence.highest, "largest predicted distance")
     large = [prediction for prediction in counted(evidence, bound) if prediction.distance >= MATTERS * size]
     if not any(held(prediction, bound if allowed is None else allowed) for prediction in large):
-        reasons.append(
-            f"no prediction held at a distance of at least {100 * MATTERS:g} % of the {what}: small distances hardly "
-            "test it; an execution of another task with a large distance helps (`ctxval run` executes it)"
-        )
+        reasons.append(sentences.NONE_HELD.format(percent=100 * MATTERS, what=what))
     return reasons
 
 
@@ -306,7 +268,5 @@ def tests_missing(evidence: DynamicsEvidence) -> str | None:
     missing = missing_tests(evidence.predictions, evidence.tests)
     if not missing:
         return None
-    return (
-        f"at least {missing} more {'execution' if missing == 1 else 'executions'} must be predicted beforehand, at "
-        "tasks drawn over the whole task space (`ctxval run` executes them; --tests 0 leaves them out)"
-    )
+    executions = "execution" if missing == 1 else "executions"
+    return sentences.TESTS_MISSING.format(missing=missing, executions=executions)

@@ -20,6 +20,7 @@ from scipy.special import logsumexp
 from ctxval._util.arrays import Array
 from ctxval._util.representation import ShortRepr
 from ctxval.certificates.change_bets import SCALES, WIDER, ScaleBets, SlopeBets
+from ctxval.certificates.sentences import withdrawals
 from ctxval.errors import InputError
 
 EXCEEDED = "distances above the threshold"
@@ -154,13 +155,12 @@ class WatchState(ShortRepr):
         """What the runs say, in one sentence without its full stop."""
         if self.cause == EXCEEDED and self.alarm is not None:
             distance = self.distances[self.alarm - 1]
-            return f"expired: run {self.alarm} has the distance {distance:.4g}, above the threshold {self.threshold:g}"
+            return withdrawals.EXCEEDED.format(run=self.alarm, distance=distance, threshold=self.threshold)
         if self.ratio is not None and self.expired:
             times = f"{self.ratio:.2g}" if self.ratio < 100 else f"{self.ratio:.0f}"
-            return f"expired: {self.cause} since run {self.since} are {times} times those certified"
+            return withdrawals.CHANGED.format(cause=self.cause, since=self.since, times=times)
         agree = "1 run agrees" if len(self.runs) == 1 else f"{len(self.runs)} runs agree"
-        limit = f"{1 / self.false_alarms:.4g}"
-        return f"holds: {agree} with the certified ones (evidence of a change {self.evidence:.2g}, alarm at {limit})"
+        return withdrawals.HOLDS.format(agree=agree, evidence=self.evidence, limit=1 / self.false_alarms)
 
     def to_json(self) -> dict[str, Any]:
         """Return all attributes and the sentence, ready for JSON."""

@@ -9,7 +9,7 @@ import numpy as np
 from ctxval._util.arrays import Array, single_threaded
 from ctxval.certificates.maxima import Maxima
 from ctxval.certificates.sample import Sample
-from ctxval.certificates.verdict_sentences import outlook
+from ctxval.certificates.sentences.verdicts import outlook
 from ctxval.gp.hyperposterior import Conditioned
 
 HORIZON = 200

@@ -29,7 +29,13 @@ from ctxval.certificates.covering import RESOLUTION, bare_corners, covering, far
 from ctxval.certificates.forecast import Forecast, forecast
 from ctxval.certificates.maxima import MOST, Maxima, draw_maxima, representative, settle_maxima
 from ctxval.certificates.sample import Sample
-from ctxval.certificates.sentences import ONE_CAMPAIGN, both_outcomes, posterior_assumptions, posterior_statement
+from ctxval.certificates.sentences import withdrawals
+from ctxval.certificates.sentences.statements import (
+    ONE_CAMPAIGN,
+    both_outcomes,
+    posterior_assumptions,
+    posterior_statement,
+)
 from ctxval.errors import CertificateError, InputError
 from ctxval.gp.acquisition import UpperConfidenceBound, maximise
 from ctxval.gp.hyperposterior import Conditioned
@@ -216,24 +222,15 @@ def diagnose(
     covering_points = X if covered is None else covered
     farthest, d, doubt = farthest_task(covering_points), X.shape[1], None
     if surprise < LEVEL:
-        doubt = (
-            f"trial {trial} came out {-ndtri(max(exceed[worst], 1e-300)):.1f} standard deviations above what the "
-            f"{others} predict: the distance is not as smooth as the bound assumes, so the bound is withdrawn"
-        )
+        deviations = -ndtri(max(exceed[worst], 1e-300))
+        doubt = withdrawals.SURPRISING.format(trial=trial, deviations=deviations, others=others)
     elif farthest > resolution:
         missing = covering(covering_points, resolution, 100)
         many = "more than 100" if missing is None else f"{len(missing)}"
-        doubt = (
-            f"some task is {farthest:.2g} of the task space's diagonal away from every trial, more than the resolution "
-            f"of {resolution:g}, so the bound is withdrawn; {many} more executions would come near to every task "
-            "(`ctxval run` makes them), or an audit bounds how many tasks are worse"
-        )
+        doubt = withdrawals.FAR_TASK.format(farthest=farthest, resolution=resolution, many=many)
     elif bare := len(bare_corners(covering_points, resolution)):
         where = "ends of the task parameter's range" if d == 1 else "corners of the task space"
-        doubt = (
-            f"no trial is at or next to {bare} of the {2**d} {where}, towards which the distance may rise unseen, so "
-            f"the bound is withdrawn; {bare} more executions would be there (`ctxval run` makes them)"
-        )
+        doubt = withdrawals.BARE_CORNERS.format(bare=bare, corners=2**d, where=where)
     return Diagnosis(surprise, trial, left_out, farthest, doubt)
 
 

@@ -8,11 +8,12 @@ from pathlib import Path
 from typing import Any
 
 from ctxval._util.representation import ShortRepr
-from ctxval.certificates import verdict_sentences as sentences
 from ctxval.certificates.base import Certificate
 from ctxval.certificates.bounds import Quantities
 from ctxval.certificates.dynamics_evidence import LearnedDistance
 from ctxval.certificates.sample import Sample
+from ctxval.certificates.sentences import verdicts as sentences
+from ctxval.certificates.sentences import withdrawals
 from ctxval.core.space import DISTRIBUTION, TaskSpace
 from ctxval.core.task_distribution import distribution_text
 from ctxval.core.task_suite import SUITE, TaskSuite
@@ -76,7 +77,7 @@ class Provenance(ShortRepr):
         distribution = described.get(DISTRIBUTION)
         return cls(
             space=_space_of(described),
-            remarks=(*([REFINED] if refined else []), *remarks_on(changes)),
+            remarks=(*([withdrawals.REFINED] if refined else []), *remarks_on(changes)),
             distribution=None if distribution is None else distribution_text(distribution),
             thresholds=thresholds,
             beside=tuple(beside),
@@ -119,7 +120,7 @@ class Provenance(ShortRepr):
     @property
     def stated(self) -> tuple[str, ...]:
         """The remarks that are the user's word, on which a validation rests."""
-        return tuple(remark for remark in self.remarks if remark != REFINED)
+        return tuple(remark for remark in self.remarks if remark != withdrawals.REFINED)
 
     def sample(self, trials: Sequence[Trial]) -> Sample:
         """Return trials as a certificate sees them, with what is known here."""
@@ -133,23 +134,14 @@ def remarks_on(changes: Iterable[Change]) -> tuple[str, ...]:
     for change in changes:
         if change.what == "accepted":
             different = "; ".join(change.content.get("differences", [])[:1]) or "nothing that is described"
-            remarks.append(
-                f"what was changed after {change.content.get('trials', 'some')} trials makes no difference to them, as "
-                f"you state: {change.why!r} ({different})"
-            )
+            trials = change.content.get("trials", "some")
+            remarks.append(withdrawals.ACCEPTED.format(trials=trials, why=change.why, differences=different))
         elif change.what == "remeasured":
-            remarks.append(f"the distances are those measured anew: {change.why!r}")
+            remarks.append(withdrawals.MEASURED_ANEW.format(why=change.why))
         elif change.what == "replaced":
             numbers = ", ".join(change.content.get("before", {}))
-            remarks.append(f"the result of trial {numbers} that was told first is wrong, as you state: {change.why!r}")
+            remarks.append(withdrawals.REPLACED.format(numbers=numbers, why=change.why))
     return tuple(remarks)
-
-
-REFINED = (
-    "the model was learned again from executions of earlier models: these are data of the model and no trials of it, "
-    "so only executions under its own controllers are counted"
-)
-"""What a certificate says of a model that was refined."""
 
 
 def _space_of(described: Mapping[str, Any]) -> TaskSpace | None:

@@ -29,7 +29,7 @@ from ctxval.certificates.bounds import at_most, of_tasks
 from ctxval.certificates.forecast import Forecast
 from ctxval.certificates.sample import Sample, advice_to_remeasure, require_learned
 from ctxval.certificates.scenario import countable_draws, require_more, volume_bound
-from ctxval.certificates.sentences import ABOUT_DRAWS, FROZEN, ONE_CAMPAIGN, how_drawn, margin_and_map
+from ctxval.certificates.sentences.statements import ABOUT_DRAWS, FROZEN, ONE_CAMPAIGN, how_drawn, margin_and_map
 from ctxval.errors import CertificateError
 
 _OF_MAP = 0.05

@@ -27,7 +27,7 @@ from ctxval._util.registry import part
 from ctxval.certificates.base import Certificate, CertificateKind
 from ctxval.certificates.bounds import at_most
 from ctxval.certificates.sample import Sample, advice_to_remeasure
-from ctxval.certificates.sentences import (
+from ctxval.certificates.sentences.statements import (
     ABOUT_DRAWS,
     NO_BOUND,
     ONE_CAMPAIGN,

@@ -9,7 +9,7 @@ from ctxval._util.registry import part
 from ctxval._util.representation import counted
 from ctxval.certificates.base import Certificate, CertificateKind
 from ctxval.certificates.sample import Sample
-from ctxval.certificates.sentences import EXECUTED_AGAIN
+from ctxval.certificates.sentences.statements import EXECUTED_AGAIN
 from ctxval.errors import CertificateError
 
 

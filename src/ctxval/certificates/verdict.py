@@ -10,13 +10,13 @@ import numpy as np
 
 from ctxval._util.checked import PositiveFloat, checked
 from ctxval._util.representation import ShortRepr, call, line, lines, shown, table
-from ctxval.certificates import verdict_sentences as sentences
 from ctxval.certificates.base import KINDS, Certificate, CertificateKind, certified
 from ctxval.certificates.bets import bets_against
 from ctxval.certificates.bounds import NO_UNITS, Quantities
 from ctxval.certificates.forecast import Forecast
 from ctxval.certificates.options import CONFIDENCE, CertificateOptions, require_confidence, require_volume
 from ctxval.certificates.provenance import Provenance
+from ctxval.certificates.sentences import verdicts as sentences
 from ctxval.core.quantiles import QUANTILE
 from ctxval.core.trial import Trial, designs_sentence
 from ctxval.errors import CertificateError

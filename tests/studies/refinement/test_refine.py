@@ -16,7 +16,7 @@ import pytest
 
 import ctxval
 from ctxval import Campaign, Store, Trajectory, Transitions, models, searches, systems
-from ctxval.certificates.provenance import REFINED
+from ctxval.certificates.sentences.withdrawals import REFINED
 from ctxval.errors import InputError, ModelError
 from ctxval.studies.refinement import ParameterFit, Refinement, Refit, ResidualCorrection, UserFit, refine
 from ctxval.studies.refinement.methods import method_of

@@ -1,7 +1,4 @@
-"""What certificates state and assume, in sentences; those of verdicts are in ``verdict_sentences``.
-
-Why a bound is withdrawn stands beside the test that withdraws it, in the diagnostics.
-"""
+"""What certificates state and assume, in sentences."""
 
 from __future__ import annotations
 

@@ -23,7 +23,7 @@ from ctxval.certificates.bounds import (
 from ctxval.certificates.covering import RESOLUTION
 from ctxval.certificates.dynamics_evidence import PushedDistances, Tolerance
 from ctxval.certificates.sample import executions_of
-from ctxval.certificates.sentences import condition_on_dynamics, conditions_on_dynamics
+from ctxval.certificates.sentences.statements import condition_on_dynamics, conditions_on_dynamics
 from ctxval.core.space import TaskSpace
 from ctxval.core.trial import Trial
 

@@ -1,0 +1,98 @@
+"""Why bounds are withdrawn, what remarks a store makes on them, and when they expire: texts with places for numbers.
+
+Those of a withdrawal say what is wrong and what would help.
+"""
+
+# Learned dynamics
+
+FEW_EXECUTIONS = (
+    "the dynamics are learned from {executions} executed trajectories, and the bound needs at least {fewest}; execute "
+    "more tasks"
+)
+NOT_PLANNED = (
+    "for {percent:.2g} % of the tasks no controller can be designed, or the model diverges: nothing is known there; "
+    "make the task space smaller, so that every task can be executed"
+)
+FEW_PREDICTIONS = (
+    "{checked} executions of different tasks were predicted from earlier ones, and the bound needs {needed} "
+    "predictions that hold; execute more tasks"
+)
+NOISY = (
+    "noise is learned with {percent:.2g} % of the variance of the residual, and at most {most:g} % is allowed: the "
+    "system is not deterministic in the recorded state and input; record more states or reduce the noise, or use "
+    "--kind posterior"
+)
+NOISE_CONTRADICTED = (
+    "the last executions contradict the learned noise (evidence {against:.0f}, and at most {most:g} is allowed): it "
+    "may be correlated, rare, or larger in some tasks, or a state that is not recorded acts; execute more tasks, or "
+    "record more states"
+)
+LEFT_OUT = (
+    "the posterior samples of the dynamics leave out {percent:.0f} % of the largest variance, more than {most:g} %; "
+    "more executions reduce this variance"
+)
+BEYOND = "predicted runs leave the recorded range of {gap}"
+GAP = "predicted runs enter a gap in the records of {gap}"
+PAIR_GAP = "predicted runs enter a gap in the joint records of {gap}"
+GAP_AT = "{coordinates} by {percent:.2g} % (at {place}); `ctxval run` executes a task that goes there"
+UNTRIED = (
+    "the parameter {name} hardly changes the closed loops of the model, so what it changes in the system cannot be "
+    "learned from states and inputs, and some of its values are {percent:.0f} % of its range away from every executed "
+    "one; an execution there helps (`ctxval run` executes it)"
+)
+NOT_TESTED = (
+    "the largest distance is predicted to be {highest:.4g}, but the largest executed one is {best:.4g}: the prediction "
+    "is not tested where it matters; an execution of that task helps (`ctxval run` executes it)"
+)
+NONE_HELD = (
+    "no prediction held at a distance of at least {percent:g} % of the {what}: small distances hardly test it; an "
+    "execution of another task with a large distance helps (`ctxval run` executes it)"
+)
+TESTS_MISSING = (
+    "at least {missing} more {executions} must be predicted beforehand, at tasks drawn over the whole task space "
+    "(`ctxval run` executes them; --tests 0 leaves them out)"
+)
+JUMPS = (
+    "{what} if a task changes by a thousandth of its ranges, so a search may miss the largest distance: the "
+    "controllers change abruptly from task to task, as those of a model with kinks do, or the closed loop does; use a "
+    "smoother model, or an audit"
+)
+JUMP = "the predicted distance jumps by up to {percent:.2g} % of the bound"
+NEEDLE = "one of the largest predicted distances falls by {percent:.0f} %"
+SEARCHES_DIFFER = (
+    "searches of the learned dynamics find largest distances that differ by {percent:.0f} %, because the controllers "
+    "or the closed loop change abruptly from task to task; an execution of the task of the largest one helps (`ctxval "
+    "run` executes it), or use a smoother model, or an audit"
+)
+
+# The posterior of the distance
+
+SURPRISING = (
+    "trial {trial} came out {deviations:.1f} standard deviations above what the {others} predict: the distance is not "
+    "as smooth as the bound assumes, so the bound is withdrawn"
+)
+FAR_TASK = (
+    "some task is {farthest:.2g} of the task space's diagonal away from every trial, more than the resolution of "
+    "{resolution:g}, so the bound is withdrawn; {many} more executions would come near to every task (`ctxval run` "
+    "makes them), or an audit bounds how many tasks are worse"
+)
+BARE_CORNERS = (
+    "no trial is at or next to {bare} of the {corners} {where}, towards which the distance may rise unseen, so the "
+    "bound is withdrawn; {bare} more executions would be there (`ctxval run` makes them)"
+)
+
+# Remarks on later changes of a store
+
+ACCEPTED = "what was changed after {trials} trials makes no difference to them, as you state: {why!r} ({differences})"
+MEASURED_ANEW = "the distances are those measured anew: {why!r}"
+REPLACED = "the result of trial {numbers} that was told first is wrong, as you state: {why!r}"
+REFINED = (
+    "the model was learned again from executions of earlier models: these are data of the model and no trials of it, "
+    "so only executions under its own controllers are counted"
+)
+
+# Whether a certificate still holds
+
+EXCEEDED = "expired: run {run} has the distance {distance:.4g}, above the threshold {threshold:g}"
+CHANGED = "expired: {cause} since run {since} are {times} times those certified"
+HOLDS = "holds: {agree} with the certified ones (evidence of a change {evidence:.2g}, alarm at {limit:.4g})"
