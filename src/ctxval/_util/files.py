@@ -33,7 +33,6 @@ from ctxval.errors import InputError
 
 MOST_BYTES = 256 * 2**20  # largest size of a file in bytes, enough for 33 million numbers of a trajectory
 
-MOST_JSON = 16 * 2**20  # largest size of a JSON file in bytes; reading it takes twenty times as much memory
 
 MADE_BY = "Made by ctxval"
 """What every file contains that an option of a command names, so that the next run may replace it."""
@@ -81,7 +80,8 @@ def read_bytes(path: str | Path, most: int = MOST_BYTES) -> bytes:
 
 
 def read_json(path: str | Path) -> Any:
-    content = read_bytes(path, MOST_JSON)
+    # Largest size of a JSON file in bytes; reading it takes twenty times as much memory.
+    content = read_bytes(path, 16 * 2**20)
     try:
         return json.loads(content.decode("utf-8"))
     except RecursionError as error:

@@ -34,13 +34,8 @@ from ctxval.core.trial import Trial
 from ctxval.errors import InputError
 from ctxval.learning import LearnedDynamics
 
-_BOUNDARY = 512  # tasks next to the boundary at which closed loops are run, beside those of the pool
 _CANDIDATES = 8192  # tasks among which these are chosen
-_NOISY, _NOISY_BOUNDARY = 192, 64  # the same numbers for the pool and the boundary if each draw has sequences of noise
-_CHECKS, _NOISY_CHECKS = 256, 64  # further tasks that check the interpolation between these
 _SCREENED = 256  # tasks of the pool among which the next one is chosen
-_SPREADS = 3.0  # spreads above the mean within which a task is uncertain
-_SETTLED = 0.03  # share of the tasks predicted below the threshold that may be uncertain or uncovered at the end
 
 
 class EnvelopeSearch:
@@ -78,7 +73,8 @@ class EnvelopeSearch:
                 return withdrawn(space, threshold, confidence, doubt)
             executed = [(trial.unit_point, float(trial.distance or 0.0)) for trial in trials]
             # Each further task of a planner without batches costs a design of its own.
-            checks = (_CHECKS if evidence.quantile is None else _NOISY_CHECKS) if learned.study.planner.batched else 0
+            # Further tasks that check the interpolation between these.
+            checks = (256 if evidence.quantile is None else 64) if learned.study.planner.batched else 0
             at = partial(self._at, learned) if checks else None
             try:
                 drawn = self._drawn(learned, evidence)
@@ -109,10 +105,12 @@ class EnvelopeSearch:
         pool, is_suite = learned.study.search.pool, recorder.validation.space.members is not None
         drawn = self._at(learned, pool if is_suite else pool[:_SCREENED], settled=False)
         below = drawn.mean <= self._threshold
-        straddle = _SPREADS * drawn.spread(self._threshold) - np.abs(drawn.mean - self._threshold)  # Bryan et al. 2006
+        # Within three spreads above the mean, a task is uncertain.
+        straddle = 3.0 * drawn.spread(self._threshold) - np.abs(drawn.mean - self._threshold)  # Bryan et al. 2006
         uncertain, uncovered = below & (straddle > 0), below & (drawn.beyond > most_beyond(evidence))
         few = evidence.executions < fewest_executions(evidence)
-        if few or (uncertain | uncovered).sum() > _SETTLED * below.sum():
+        # Share of the tasks predicted below the threshold that may be uncertain or uncovered at the end.
+        if few or (uncertain | uncovered).sum() > 0.03 * below.sum():
             leading = np.where(uncovered, drawn.beyond, -np.inf)
             score = straddle if uncertain.sum() >= uncovered.sum() else leading
             executed = np.array([trial.unit_point for trial in recorder.trials])
@@ -140,11 +138,13 @@ class EnvelopeSearch:
         if space.members is not None:
             return self._at(learned, pool)
         noisy = evidence.quantile is not None
-        drawn = self._at(learned, np.concatenate([pool[:_NOISY] if noisy else pool, learned.executed]))
+        # The same numbers for the pool and the boundary if each draw has sequences of noise.
+        drawn = self._at(learned, np.concatenate([pool[:192] if noisy else pool, learned.executed]))
         if not learned.study.planner.batched:
             return drawn  # each further task costs a design of its own
         candidates = np.random.default_rng(1).random((_CANDIDATES, space.dimension))
-        count = _NOISY_BOUNDARY if noisy else _BOUNDARY
+        # Tasks next to the boundary at which closed loops are run, beside those of the pool.
+        count = 64 if noisy else 512
         nearest = boundary_tasks(drawn, evidence, self._threshold, self._confidence, candidates, count)
         return drawn.and_others(self._at(learned, nearest))
 

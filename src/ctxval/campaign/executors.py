@@ -20,8 +20,6 @@ from ctxval.core.plan import Plan
 from ctxval.core.system import System
 from ctxval.errors import CampaignError, InputError
 
-_SHORT = 5.0  # seconds of the longest execution behind which another one may wait
-
 
 @runtime_checkable
 class Executor(Protocol):
@@ -47,7 +45,8 @@ class ExecutorPool(WorkerPool):
     @property
     def ahead(self) -> int:
         # Half a second of work, for which Ctrl-C waits; with a time limit none, as it is not known when they start.
-        short = self.timeout is None and self._seconds <= _SHORT
+        # Seconds of the longest execution behind which another one may wait.
+        short = self.timeout is None and self._seconds <= 5.0
         return self.size * min(8, math.ceil(AHEAD / self._seconds)) if short else 0
 
     def start(self, number: int, plan: Plan) -> None:

@@ -50,8 +50,6 @@ from ctxval.errors import CertificateError, InputError
 from ctxval.learning.worst_case import is_kinked
 
 _FAILING = 6  # of so many last predictions, at least half must hold
-_REPEATED = 2  # times that a noisy task is repeated in any case if its distance exceeds the limit
-_PATIENCE = 16  # executions, besides tests, after which `auto` uses the posterior bound if the dynamics decide nothing
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,7 +156,8 @@ class IntervalSearch:
                     return None
         if isinstance(kind, Automatic) and evidence.quantile is None and self._suite is None:
             known = self._points(self.recorder.trials)
-            patient = sum(trial.origin not in DRAWN for trial in self.recorder.trials) < _PATIENCE
+            # Executions, besides tests, after which `auto` uses the posterior bound if the dynamics decide nothing.
+            patient = sum(trial.origin not in DRAWN for trial in self.recorder.trials) < 16
             # In few dimensions, executions soon cover the tasks, and the posterior bound of the distance may decide.
             if not patient or covering(known, kind.posterior.resolution, 0) is not None:
                 choice = self._by_distance()
@@ -187,7 +186,8 @@ class IntervalSearch:
             return None
         worst = max((trial for trial in trials if trial.distance is not None), key=lambda trial: trial.distance or 0.0)
         alike = (trial for trial in trials if trial.distance is not None or trial.state == "open")
-        if sum(np.abs(trial.unit_point - worst.unit_point).max() <= 1e-9 for trial in alike) <= _REPEATED:
+        # Times that a noisy task is repeated in any case if its distance exceeds the limit.
+        if sum(np.abs(trial.unit_point - worst.unit_point).max() <= 1e-9 for trial in alike) <= 2:
             return Choice.tested(worst.unit_point)
         tasks = [worst.unit_point, learned.worst_of_mean.elites[0]]
         noises = [None if (predicted := learned.predict(task)) is None else predicted.noise for task in tasks]

@@ -22,7 +22,6 @@ from ctxval.core.quantiles import QUANTILE, chance_of_more
 from ctxval.core.trial import Trial
 
 _BOLDEST = 0.9  # largest predicted probability that is bet on; an execution that stays below must not ruin the bets
-_UNKNOWN = 0.5  # probability of an excess if nothing was predicted
 
 
 @dataclass(frozen=True)
@@ -76,4 +75,4 @@ def _predicted_chance(trial: Trial, threshold: float) -> float:
             return float(np.mean([each is None or float(each) > threshold for each in listed]))
     except (KeyError, TypeError, ValueError):  # the note of a store
         pass
-    return _UNKNOWN
+    return 0.5  # probability of an excess if nothing was predicted

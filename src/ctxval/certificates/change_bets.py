@@ -37,8 +37,6 @@ WIDER = np.array([3.0, 10.0, 30.0, 100.0])
 """Alternatives for the variance of changed coefficients, relative to what the certified runs left uncertain."""
 
 _FREEDOMS = np.geomspace(0.25, 64.0, 17)  # m; more would call statistics that a floor makes equal surprising
-_EXPECTED = 40.0  # runs that prior knowledge of noise weighs as much as
-_SPREAD = 0.5  # standard deviation of the logarithm of m around what is known beforehand
 _OUTLIERS = 0.005  # share of runs that may be anything although nothing has changed
 _WINDOW = 200  # latest runs at which a change may have begun; fewer starts make the sum smaller
 
@@ -62,8 +60,9 @@ class KnownStatistics:
         a, K, k = 0.5 * _FREEDOMS, self.count, 0.0
         prior = np.zeros(len(a))
         if self.freedom is not None:
-            k = _EXPECTED
-            prior = a * k * math.log(k) - gammaln(a * k) - 0.5 * (np.log(_FREEDOMS / self.freedom) / _SPREAD) ** 2
+            k = 40.0  # runs that prior knowledge of noise weighs as much as
+            # Standard deviation of the logarithm of m around what is known beforehand.
+            prior = a * k * math.log(k) - gammaln(a * k) - 0.5 * (np.log(_FREEDOMS / self.freedom) / 0.5) ** 2
         scale = -a * (K + k) * np.log(self.sums + k)[..., None]
         return np.asarray(prior + gammaln(a * (K + k)) - K * gammaln(a) + scale + a * self.logs[..., None])
 

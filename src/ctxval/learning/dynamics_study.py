@@ -35,8 +35,6 @@ from ctxval.searches import Prediction
 
 _FEWEST_TOLD = 6  # executions from which on a task parameter is suspected of changing the dynamics
 _FEWEST_AGAINST = 3  # executions from which on the data that M was made from may be left out
-_ESTIMATED = 5  # latest executions from which an actuator is found if their states are estimated
-_EXACTLY = 0.02  # left-out error below which nobody asks whether inputs act late
 _WELL = 0.1  # left-out error below which neither these data nor task parameters are asked about
 _CLEARLY = 3.0  # factor by which predictions must err less without these data, or with a parameter, and err little
 _SLOW = 0.02  # seconds: if a single closed loop on M takes longer, closed loops are distributed over the cores
@@ -296,7 +294,8 @@ class DynamicsStudy(ShortRepr):
         if key not in self._actuators:
             estimated = self.given.outputs is not None
             # Estimates of states cost as much as hundreds of steps, so few executions have to suffice.
-            among = executed[max(0, some - _ESTIMATED) : some] if estimated else executed[:some]
+            # Latest executions from which an actuator is found if their states are estimated.
+            among = executed[max(0, some - 5) : some] if estimated else executed[:some]
             inputs = among[0][1].inputs.shape[-1]
 
             def records_of(actuator: Actuator) -> list[Record]:
@@ -311,7 +310,8 @@ class DynamicsStudy(ShortRepr):
                 if learned is None or some < len(executed):
                     extended = self._executions(executed[:some])
                     learned = None if extended is None else self._learn(extended, (), with_data=True)
-                if learned is None or not learned.left_out_error > _EXACTLY:
+                # Left-out error below which nobody asks whether inputs act late.
+                if learned is None or not learned.left_out_error > 0.02:
                     return None
             model = before_refinement(self.validation.model)
             with single_threaded(), np.errstate(all="ignore"):

@@ -10,8 +10,6 @@ import numpy as np
 from ctxval._util.arrays import Array, Rows
 from ctxval.gp.kernels import Matern
 
-_PRODUCTS = 0.3  # standard deviation of products of an input and a state, relative to that of the linear part
-
 
 @dataclass(frozen=True, eq=False)
 class Features:
@@ -78,7 +76,8 @@ class Features:
         parts = [np.ones((len(z), 1)), z]
         if self.products:
             x, u = z[:, : self.states], z[:, self.states : self.states + self.inputs]
-            parts.append(_PRODUCTS * (u[:, :, None] * x[:, None, :]).reshape(len(z), -1))
+            # Standard deviation of products of an input and a state, relative to that of the linear part.
+            parts.append(0.3 * (u[:, :, None] * x[:, None, :]).reshape(len(z), -1))
         return self.linear * np.concatenate(parts, axis=1)
 
 

@@ -24,7 +24,6 @@ from ctxval.learning.histories import History, Memory, Record, jacobian, of_one_
 from ctxval.learning.local_noise import LocalNoise, local_noise
 
 CENTRES = 64
-FILTER_CENTRES = 32
 _CANDIDATES = 600  # regressors from which centres are chosen
 _LENGTH = np.log(3.0)  # median of the length-scales in standard deviations of the data; their logarithms deviate by 1
 _AMPLITUDES = np.logspace(-4, 2, 19)  # of the residual, in root mean squares
@@ -313,7 +312,7 @@ def fit_filter(
     scaled = replace(scaled, visited=(recorded.visited * recorded.scale + recorded.shift - shift) / scale)
     theta = plain.theta.copy()
     theta[width] = np.log(6.0)
-    centres = scaled.centres[spread_rows(scaled.centres, FILTER_CENTRES)]
+    centres = scaled.centres[spread_rows(scaled.centres, 32)]
     features, sizes = scaled.features(theta, centres), np.maximum(plain.scaled.sizes, 1e-12)
     F, N = features(scaled.Z[:1]).shape[1], len(scaled.Z)
     weights: Array = np.zeros((F, n))

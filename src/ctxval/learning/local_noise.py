@@ -9,9 +9,7 @@ from scipy.spatial.distance import cdist
 
 from ctxval._util.arrays import Array
 
-_WIDTH = 0.5  # of the kernel average, in standard deviations of the data
 _PRIOR = 8.0  # innovations of the average size that each average holds
-_GAIN = 6.0  # least gain of the log likelihood of innovations that were left out
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +42,7 @@ def local_noise(pairs: Array, innovations: Array) -> LocalNoise | None:
     averages = (K @ squares + _PRIOR) / (K.sum(axis=1) + _PRIOR)
     # The log likelihood of normal innovations with these variances, above that with a variance of 1.
     gains = -0.5 * innovations.shape[1] * (np.log(averages) + squares[some] / averages - squares[some])
-    if gains.sum() <= _GAIN:
+    if gains.sum() <= 6.0:  # least gain of the log likelihood of innovations that were left out
         return None
     centres = pairs[rng.permutation(len(pairs))[:80]]
     K = _near(centres, pairs)
@@ -52,4 +50,5 @@ def local_noise(pairs: Array, innovations: Array) -> LocalNoise | None:
 
 
 def _near(pairs: Array, others: Array) -> Array:
-    return np.asarray(np.exp(-0.5 * cdist(pairs, others, "sqeuclidean") / _WIDTH**2))
+    # The width of the kernel average is half a standard deviation of the data.
+    return np.asarray(np.exp(-0.5 * cdist(pairs, others, "sqeuclidean") / 0.5**2))

@@ -33,7 +33,6 @@ STRUCTURES = (
 EXACT = 1e-3  # share of noise below which records with lags determine the next one
 NOISY = 0.01  # share of noise from which executions of one task differ
 _BETTER, _GOOD = 0.1, 0.02  # share of the error without a history, and of the residual, that a history leaves
-_UNEXPLAINED = 0.05  # share of the residual that nothing predicts if there is noise
 
 MATTERS = 0.01
 """Standard deviation of the distance of a task over its executions, as a share of the largest distance, from which
@@ -41,7 +40,6 @@ noise matters."""
 
 _TRIED = 32  # tasks of the pool among which those with the largest distances show what noise does
 _TASKS, _RUNS = 6, 10  # these tasks, and how often each of them is run
-_ROUNDING = 1e-5  # standard deviation of noise, as a share of a state's, below which it is rounding
 
 
 class NoiseStudy:
@@ -184,7 +182,8 @@ def _share(runs: Array, largest: float) -> float:
 
 def _matters(deviations: Array, posterior: DynamicsPosterior | NoisyPosterior) -> bool:
     """Return whether standard deviations ``(n,)`` of states are more than rounding."""
-    return bool((deviations > _ROUNDING * posterior.data.scale[: len(posterior.data.sizes)]).any())
+    # Standard deviation of noise, as a share of a state's, below which it is rounding.
+    return bool((deviations > 1e-5 * posterior.data.scale[: len(posterior.data.sizes)]).any())
 
 
 def _shaken(posterior: DynamicsPosterior) -> DisturbedDynamics:
@@ -271,7 +270,8 @@ def predicted_by_history(
         if with_history < min(_BETTER * without, _GOOD):
             return True
         shares += [with_history, fit.share]
-    return min(without, *shares) > _UNEXPLAINED  # noise
+    # Share of the residual that nothing predicts if there is noise.
+    return min(without, *shares) > 0.05  # noise
 
 
 def _preference(fit: InnovationsFit) -> float:

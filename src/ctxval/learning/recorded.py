@@ -17,7 +17,6 @@ from ctxval.learning.histories import Record
 from ctxval.models.scaling import standard_deviations
 
 _POOL = 3000  # largest number of transitions that these are chosen from
-_MANY = 30_000  # transitions from which on a tree finds the nearest ones, in less memory than all distances need
 
 
 def data_near(model: Model, loops: Trajectory) -> Transitions | None:
@@ -87,7 +86,8 @@ def _nearest(data: Transitions, loops: Trajectory, count: int, *, many: bool = F
         return np.arange(len(data))
     here = np.concatenate([data.x, data.u], axis=1)
     scale = standard_deviations(here)
-    if many or len(here) > _MANY:
+    # Transitions from which on a tree finds the nearest ones, in less memory than all distances need.
+    if many or len(here) > 30_000:
         gaps = cKDTree(there / scale).query(here / scale)[0]
     else:
         gaps = cdist(here / scale, there / scale).min(axis=1)

@@ -23,7 +23,6 @@ from ctxval.learning.tolerance import pushed
 NEGLIGIBLE = 0.01
 """Share of the threshold: what moves no distance by so much is no change."""
 
-_PUSH = 0.1  # sizes of the pushes that show what a residual does to distances, as shares of the residuals
 _LEAST, _MOST = 1e-6, 0.3  # limits of negligible residuals, as shares of a state's typical step
 
 
@@ -131,7 +130,8 @@ def influences(learned: LearnedDynamics) -> Array:
     """Return what a unit of a constant residual of each state moves the distance of executed tasks by, ``(n, q)``."""
     posterior, planner = learned.posterior, learned.study.planner
     data, n = posterior.data, len(posterior.data.sizes)
-    sizes = np.maximum(_PUSH * data.sizes, 1e-3 * data.steps)
+    # Sizes of the pushes that show what a residual does to distances, as shares of the residuals.
+    sizes = np.maximum(0.1 * data.sizes, 1e-3 * data.steps)
     pushes = np.concatenate([np.zeros((1, n)), np.diag(sizes), -np.diag(sizes)])
     with single_threaded():
         planned = planner.plan(learned.executed)

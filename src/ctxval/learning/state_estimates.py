@@ -24,8 +24,6 @@ from ctxval.models.scaling import standard_deviations
 _SHARES = np.array([1.0, 1e-1, 1e-2, 1e-3, 1e-4])
 """What M misses in recorded directions, beside what it misses in all others, as shares of their steps."""
 
-_EXACT = 1e-6  # error of the recorded outputs, as a share of their smallest step: they are reproduced
-
 
 class StateEstimates:
     """The states of M along executions, estimated from their inputs and outputs; they are kept like these.
@@ -102,7 +100,8 @@ def smoothed_states(
     shares = _SHARES[:, None, None] * recorded + np.eye(len(steps)) - recorded
     process = scale @ shares @ np.swapaxes(shares, -1, -2) @ scale
     spreads = np.sqrt(np.maximum(np.einsum("ij,ij->i", C, C), 1e-300))
-    measurement = np.diag((_EXACT * _SHARES[-1] * spreads) ** 2)
+    # Error of the recorded outputs, as a share of their smallest step: they are reproduced.
+    measurement = np.diag((1e-6 * _SHARES[-1] * spreads) ** 2)
     inputs = np.repeat(u[:, None], k, axis=1)
     known, _ = corrected(outputs, Estimate(np.repeat(start[None], k, axis=0), process), y[0], measurement)
     filtered, priors, jacobians, innovations = [known], list[Estimate](), list[Array](), list[Array]()

@@ -31,8 +31,6 @@ _EVALUATIONS = (512, 2048, 4096, 6000, 6000, 6000, 12000)  # tasks of a global s
 _SHOWN = 16  # largest number of these tasks
 _NEARBY = 1e-3  # largest change of each coordinate to a task that is nearly the same
 _NEARER = 64  # how many times nearer tasks are that tell kinks of a distance from jumps, a power of 2
-_BENT = 64  # rows of such tasks that are looked at more closely if the distance has kinks
-_FIRST = 8  # number of draws that show which tasks may be worst on the others
 _SCREENED = (8, 1500)  # number of draws of the hyperparameters in a screening, and of tasks in its search on the mean
 _APART = 0.15  # least distance of two tasks that are not next to each other, as a share of the cube's diagonal
 
@@ -155,7 +153,8 @@ class WorstCaseSearch:
 
         Of each row, the half with the larger change is kept, which a jump is in.
         """
-        rows = np.argsort(-np.nan_to_num(_bend(distances), nan=0.0, posinf=0.0), kind="stable")[:_BENT]
+        # Rows of such tasks that are looked at more closely if the distance has kinks.
+        rows = np.argsort(-np.nan_to_num(_bend(distances), nan=0.0, posinf=0.0), kind="stable")[:64]
         tasks, distances = tasks[rows], distances[rows]
         for _ in range(int(np.log2(_NEARER))):
             later = np.abs(distances[:, 2] - distances[:, 1]) > np.abs(distances[:, 1] - distances[:, 0])
@@ -350,7 +349,8 @@ class WorstCaseSearch:
         are not run on the others; their distances are minus infinity.
         """
         values = np.full((len(draws), len(tasks)), -np.inf)
-        first = np.unique(np.linspace(0, len(draws) - 1, _FIRST).astype(int))
+        # Number of draws that show which tasks may be worst on the others.
+        first = np.unique(np.linspace(0, len(draws) - 1, 8).astype(int))
         values[first] = self._distances(draws[first], tasks)
         others = np.setdiff1d(np.arange(len(draws)), first)
         if not len(others):

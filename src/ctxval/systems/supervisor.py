@@ -25,14 +25,13 @@ if TYPE_CHECKING:
     from typing import Any
 
 _LINUX = sys.platform.startswith("linux")
-_PR_SET_CHILD_SUBREAPER = 36
 
 
 def main() -> None:
     """Run the command, until it ends or must be ended."""
     parent, stdout, stderr, *command = sys.argv[1:]
     if _LINUX:
-        ctypes.CDLL(None).prctl(_PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
+        ctypes.CDLL(None).prctl(36, 1, 0, 0, 0)  # PR_SET_CHILD_SUBREAPER
     woken, wake = os.pipe()
     os.set_blocking(wake, False)
     signal.set_wakeup_fd(wake, warn_on_full_buffer=False)

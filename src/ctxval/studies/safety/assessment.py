@@ -37,10 +37,6 @@ from ctxval.studies.safety.draws import on_model, spec_distance
 TASKS = 4000
 """Number of tasks on M that the shares are of; of designs that are made one by one, a tenth of it."""
 
-_SEARCHED = 0.01
-"""Share of a bound on d_b by which a search may end below its largest value, which lies on a ridge: in the study of
-``docs/how-to/safety.md``, it ended by up to 0.2 % below."""
-
 
 @dataclass(frozen=True)
 class UnsafeTask(ShortRepr):
@@ -211,7 +207,9 @@ def assess(
             bound = margin if verdict.answer == "validated" else None
             doubt = verdict.reason.removesuffix(".")
         elif bound is not None and certified is not None:
-            searched = max(certified.details.get("disagreement") or 0.0, _SEARCHED)
+            # Share of a bound on d_b by which a search may end below its largest value, which lies on a ridge: in the
+            # study of ``docs/how-to/safety.md``, it ended by up to 0.2 % below.
+            searched = max(certified.details.get("disagreement") or 0.0, 0.01)
             bound = (1 + searched) * (bound + ERRORS * certified.error)
         elif certified is not None:
             doubt = certified.doubt or "the certificate leaves out a share of the tasks"

@@ -24,8 +24,6 @@ from ctxval.learning.closed_loops import LoopPlanner
 from ctxval.searches import by_name
 from ctxval.specs import Specification
 
-_ATTEMPTS, _TOGETHER = 64, 512  # batches of tasks that are tried for one with the margin, and tasks in each
-
 
 def spec_distance(validation: Validation) -> UnsafeMargin:
     """Return the distance of a validation, which must be the margin of unsafe tasks."""
@@ -81,8 +79,8 @@ class TasksWithMargin:
     def __call__(self, rng: np.random.Generator, n: int) -> Array:
         """Return n independent tasks, rows ``(n, d)`` in the units of the space."""
         kept = np.empty((0, self.space.dimension))
-        for _ in range(_ATTEMPTS):
-            unit = self.space.unit_draws(_TOGETHER if self.planner.batched else 16, rng)
+        for _ in range(64):  # batches of tasks that are tried for one with the margin, and tasks in each
+            unit = self.space.unit_draws(512 if self.planner.batched else 16, rng)
             kept = np.concatenate([kept, unit[on_model(self.planner, self.spec, unit) > self.margin]])
             if len(kept) >= n:
                 return np.asarray(self.space.from_unit(kept[:n]))
