@@ -105,7 +105,7 @@ def test_a_prior_mean_without_one_finite_value_a_point_is_refused(prior: regress
         fit_surrogate(*data(), prior_mean=prior)
 
 
-# SurrogateHyperparameters once, conditioned often
+# Learned once, conditioned often
 
 
 def many(d: int = 6, n: int = 40, seed: int = 0) -> np.ndarray:

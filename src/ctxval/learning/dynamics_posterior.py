@@ -113,7 +113,7 @@ class DynamicsPosterior(ShortRepr):
     def _components(self, rows: Iterable[int]) -> tuple[Component, ...]:
         """Return the most probable one and those of some draws of the hyperparameters.
 
-        ResidualHyperparameters whose covariance matrix is not positive definite are left out.
+        Hyperparameters whose covariance matrix is not positive definite are left out.
         """
         components, drawn = [self.most_probable], self.covariances.drawn
         last = drawn[0]

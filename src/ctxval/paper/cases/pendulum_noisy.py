@@ -7,6 +7,11 @@ from dataclasses import replace
 from ctxval import Experiment, systems
 from ctxval.paper.cases import pendulum
 
+ENCODER = 1e-3  # rad, about that of an encoder with 6,000 steps
+RATE_NOISE = 5e-3  # rad/s, of the measured rate
+PROCESS = 2e-3  # rad/s, of the rate in each step of 20 ms
+DELAY = 1.0  # steps
+
 
 def experiment(seed: int = 0) -> Experiment:
     """Return the example; the seed draws the data that the linear model is learned from, and the noise."""
@@ -15,10 +20,10 @@ def experiment(seed: int = 0) -> Experiment:
     assert isinstance(parts.system, systems.Simulated)
     system = systems.Imperfect(
         parts.system.model,
-        process=[0.0, 2e-3],  # rad/s, of the rate in each step of 20 ms
-        measurement=[0.0, 5e-3],  # rad/s, of the measured rate
-        resolution=[1e-3, 0.0],  # rad, about that of an encoder with 6,000 steps
-        delay=1.0,  # steps
+        process=[0.0, PROCESS],
+        measurement=[0.0, RATE_NOISE],
+        resolution=[ENCODER, 0.0],
+        delay=DELAY,
         seed=seed,
     )
     return replace(ideal, name="pendulum-noisy", validation=parts.with_system(system), truth=None)

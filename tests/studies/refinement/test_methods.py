@@ -8,7 +8,7 @@ import pytest
 from ctxval import Trajectory, Transitions, models
 from ctxval.core.model import Model
 from ctxval.studies.refinement import Records, ResidualCorrection
-from ctxval.studies.refinement.corrections import averaged_correction, exact_correction
+from ctxval.studies.refinement.methods import averaged_correction, exact_correction
 from rig_refine import FIRST, cart
 
 NOISE = 0.05
