@@ -751,7 +751,7 @@ def test_asking_ends_with_the_verdict(invoke: Any) -> None:
     report = json.loads(ended.stdout)
     assert (ended.exit_code, report["trial"], report["verdict"]) == (1, None, "falsified")
     shown = invoke("ask", "a.sqlite", "--threshold", "2")
-    assert "FALSIFIED against 2: trial 1 was executed and its distance 2.5" in " ".join(shown.stdout.split())
+    assert "FALSIFIED against 2: trial 1 has the distance 2.5" in " ".join(shown.stdout.split())
     assert len(Store("a.sqlite").trials()) == 2
 
 

@@ -173,7 +173,7 @@ def test_eight_drawn_tasks_are_executed_before_a_model_is_validated() -> None:
     assert tested.verdict(1.1 * largest).answer == "validated"
     by_model = plain.verdict(1.1 * largest, certificate=untested)
     assert by_model.answer == "validated"
-    assert "The verdict holds even if something unknown pushes" in str(by_model)
+    assert "The bound would survive a further error of M" in str(by_model)
     assert "must be predicted beforehand" in plain.verdict(1.1 * largest).reason
 
 

@@ -29,7 +29,7 @@ def test_two_predicted_excesses_falsify_and_one_does_not() -> None:
     verdict = counterexample(both, 1.0)
     assert verdict is not None
     assert verdict.answer == "falsified"
-    assert "2 of 2 executions exceed it, more than noise explains" in verdict.reason
+    assert "2 of 2 executions exceed it, too many for noise" in verdict.reason
 
 
 def test_a_repetition_is_a_bet_on_another_excess_whatever_was_predicted() -> None:
@@ -56,7 +56,7 @@ def test_without_noise_one_execution_falsifies() -> None:
 def test_an_undecided_verdict_says_that_noise_may_explain_an_excess() -> None:
     likely = np.linspace(0.5, 1.3, 200)
     reason = judge([trial(0, 0.9, likely), trial(1, 1.1, likely)], 1.0).reason
-    assert "1 of 2 executions exceeds 1, which noise may explain (evidence 1.81" in reason
+    assert "1 of 2 executions exceeds 1, which noise may explain (e-value 1.81" in reason
 
 
 @pytest.mark.parametrize("quantile", [0.8, 0.9])

@@ -122,7 +122,7 @@ def test_an_undecided_verdict_says_how_many_executions_are_needed_and_what_the_s
     certificate, expected = Dynamics(tests=0).certify_against(fewer, 1.2)
     assert certificate.doubt is not None
     assert expected == Forecast(2, 1.0, 0.0, fewest=True)
-    assert "at least 2 more executions are needed to decide: 100 % of the posterior samples" in str(expected)
+    assert "at least 2 more executions are needed to validate it, and 100 % of the posterior samples" in str(expected)
     assert Dynamics(tests=0).certify_against(sample(), 1.2)[1] is None
 
 
@@ -280,7 +280,7 @@ def test_a_validation_says_what_it_survives() -> None:
     evidence = replace(GOOD, pushed=PUSHED)
     verdict = judge(trials(), 1.35, CertificateOptions(Dynamics(tests=0)), Provenance(learned=Learned(evidence)))
     assert verdict.answer == "validated"
-    assert "The verdict holds even if something unknown pushes" in str(verdict)
+    assert "The bound would survive a further error of M" in str(verdict)
     assert "1.5 m/s^2 in speed" in str(verdict)
 
 

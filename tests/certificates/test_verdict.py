@@ -61,7 +61,7 @@ def test_an_executed_distance_above_the_threshold_falsifies() -> None:
     assert found.answer == "falsified"
     assert found.witness is not None
     assert found.witness.distance == largest
-    assert f"trial {found.witness.number} was executed" in str(found)
+    assert f"trial {found.witness.number} has the distance" in str(found)
     assert str(found).startswith("falsified: ")
 
 
@@ -268,7 +268,7 @@ def test_what_nothing_came_near_to_is_missing_where_the_bound_keeps_the_threshol
 def test_a_reason_does_not_round_its_comparison_away() -> None:
     falsified = counterexample([trial(0, 0, 0.50000001)], 0.5)
     assert falsified is not None
-    assert "its distance 0.50000001 exceeds 0.5, at" in falsified.reason
+    assert "has the distance 0.50000001, which exceeds 0.5, in" in falsified.reason
     near = judge_by(certificate(1.234561), trials(), 1.234569).reason
     assert "stays at or below 1.234569: the posterior bound is 1.234561," in near
     assert (
@@ -398,7 +398,7 @@ def test_sentences_have_units_and_tasks() -> None:
     assert "8 executions, the largest distance 0.9897 m" in str(validated)
     executed = trials()
     falsified = judge(executed, 0.5, posterior(), known)
-    assert falsified.reason.endswith(" m exceeds 0.5 m, at goal 1.143 rad.")
+    assert falsified.reason.endswith(" m, which exceeds 0.5 m, in the task goal 1.143 rad, executed once.")
     close = replace(executed[0], number=9, unit_point=executed[4].unit_point, distance=executed[4].distance)
     for more, said in (
         ([close], "rad, reproduced once."),

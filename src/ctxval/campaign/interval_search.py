@@ -49,6 +49,7 @@ from ctxval.core.trial import Trial
 from ctxval.errors import CertificateError, InputError
 from ctxval.learning.worst_case import is_kinked
 
+_FAR = 10.0  # multiple of what is known or allowed from which a predicted distance is said to be dangerous
 _FAILING = 6  # of so many last predictions, at least half must hold
 
 
@@ -334,7 +335,10 @@ def with_next_task(verdict: Verdict, recorder: TrialRecorder, options: Certifica
         return verdict
     space = recorder.validation.space
     point = space.from_unit(space.rounded(choice.unit_point))
-    task = with_units(space.labelled(point))
+    task, learned = with_units(space.labelled(point)), recorder.dynamics.learned(recorder.trials)
+    far = _FAR * max(search.best, search.limit)
+    if learned is not None and not learned.expected(choice.unit_point[None])[0] <= far:
+        task += " (its predicted run goes far beyond all others: be ready to stop it)"
     reason = f"{verdict.reason.removesuffix('.')}; next task: {task}."
     return replace(verdict, reason=reason, next_task=space.describe_point(point))
 

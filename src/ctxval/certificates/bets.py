@@ -31,11 +31,13 @@ class Bets:
     Attributes:
         wealth: the mean of the product of all bets and that of the bets on repetitions.
         above, executions: numbers of executions above the threshold, and of all.
+        quantile: the share q of the executions of each task that the threshold is said to bound.
     """
 
     wealth: float
     above: int
     executions: int
+    quantile: float = QUANTILE
 
     def falsify(self, confidence: float) -> bool:
         """Return whether the threshold is falsified with a confidence."""
@@ -57,7 +59,7 @@ def bets_against(trials: Sequence[Trial], threshold: float, quantile: float = QU
         factor = chance / (1 - quantile) if exceeds else (1 - chance) / quantile
         whole *= factor
         repetitions *= factor if repeated else 1.0
-    return Bets(0.5 * (whole + repetitions), above, len(known))
+    return Bets(0.5 * (whole + repetitions), above, len(known), quantile)
 
 
 def _prediction(trial: Trial) -> dict[str, object]:

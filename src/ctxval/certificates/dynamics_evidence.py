@@ -160,7 +160,8 @@ class PushedDistances(ShortRepr):
             share = (threshold - below) / rise if np.isfinite(rise) else 0.0
             return float(low + share * (self.levels[k] - low))
 
-        ratios = map(ratio, self.away if away else self.everywhere)
+        # What may act at every step may also act where no record is near alone, which can be worse.
+        ratios = map(ratio, self.away if away else np.maximum(self.everywhere, self.away))
         (state, residual), least = min(zip(self.residuals.items(), ratios, strict=True), key=lambda pair: pair[1])
         return Tolerance(state, least * residual, residual)
 

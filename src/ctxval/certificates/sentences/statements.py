@@ -286,7 +286,8 @@ def conditions_on_dynamics(details: Mapping[str, Any]) -> list[str]:
         complete,
         *([f"the inputs {acting} in every task, as in the executions"] if acting else []),
         alike,
-        f"its dynamics being, in gaps of the records of up to {with_units(details['resolution'])}, like what was seen",
+        "its dynamics having nothing new in the gaps of the records, which are in each coordinate alone at most "
+        f"{with_units(details['resolution'])}",
     ]
 
 

@@ -40,7 +40,7 @@ def falsified(
     """Return which executed task exceeds a threshold, and how often an execution of the same task reproduced it."""
     distance, limit = distinguishable(worst.distance or 0.0, tau)
     again = [(trial.distance or 0.0) > tau for trial in executions_of(worst, trials) if trial is not worst]
-    reproduced = ""
+    reproduced = ", executed once" if not again else ""
     if any(again):
         times = {1: "once", 2: "twice"}.get(sum(again), f"{sum(again)} times")
         reproduced = f", reproduced {times}"
@@ -49,12 +49,12 @@ def falsified(
     noise = ""
     if bets is not None:
         noise = (
-            f"; {bets.above} of {counted(bets.executions, 'execution')} exceed it, more than noise explains if a share "
-            f"of the executions as stated stays below in every task (evidence {bets.wealth:.3g})"
+            f"; {bets.above} of {counted(bets.executions, 'execution')} exceed it, too many for noise if "
+            f"{100 * bets.quantile:g} % of the executions of each task stay below it (e-value {bets.wealth:.3g})"
         )
     return (
-        f"trial {worst.number} was executed and its distance {quantities.of(distance)} exceeds {quantities.of(limit)}, "
-        f"at {quantities.task(worst)}{reproduced}{noise}."
+        f"trial {worst.number} has the distance {quantities.of(distance)}, which exceeds {quantities.of(limit)}, "
+        f"in the task {quantities.task(worst)}{reproduced}{noise}."
     )
 
 
@@ -63,7 +63,7 @@ def noise_may_explain(bets: Bets, tau: float, quantities: Quantities) -> str:
     exceed = "exceeds" if bets.above == 1 else "exceed"
     return (
         f"{bets.above} of {counted(bets.executions, 'execution')} {exceed} {quantities.of(f'{tau:.6g}')}, which noise "
-        f"may explain (evidence {bets.wealth:.3g} against the threshold)"
+        f"may explain (e-value {bets.wealth:.3g} against the threshold)"
     )
 
 
@@ -181,9 +181,8 @@ def evidence(certificate: Certificate, tau: float, quantities: Quantities) -> st
     if (known := tolerances(certificate, tau)) is not None:
         everywhere, away = known
         survives = (
-            f" The verdict holds even if something unknown pushes by {_push(everywhere)} at every step, or by "
-            f"{_push(away)} where no record is near; what M misses, and was learned, is up to "
-            f"{_rate(everywhere.state, everywhere.residual)}."
+            f" The bound would survive a further error of M of {_push(everywhere)} at every step, or of {_push(away)} "
+            f"where no record is near; its largest recorded error is {_rate(everywhere.state, everywhere.residual)}."
         )
     executions = counted(certificate.trials, "execution")
     return f"{executions}{largest}{tested}{missing}.{survives}{_not_entered(details.get('pocket'))} "
@@ -288,7 +287,7 @@ def _without_assumptions(certificate: Certificate, tau: float, quantities: Quant
     draws = [f"{counted(tests['spread'], 'test')} drawn as a Latin hypercube"] if tests["spread"] else []
     draws += [counted(tests["independent"], "independent draw")] if tests["independent"] else []
     return (
-        f" By these tests alone, without the assumptions: at most {at_most(100 * tests['share_missed'], 2)} % "
+        f" By these tests alone, whatever the dynamics are: at most {at_most(100 * tests['share_missed'], 2)} % "
         f"{of_tasks(certificate.distribution)} exceed {quantities.of(f'{tau:.6g}')} "
         f"({' and '.join(draws)}, {percent(certificate.confidence)})."
     )
@@ -370,9 +369,8 @@ def outlook(forecast: Forecast, horizon: int) -> str:
     many = f"about {forecast.executions}" if forecast.executions is not None else f"more than {horizon}"
     plural = "execution is" if forecast.executions == 1 else "executions are"
     if forecast.fewest:
-        validate = f"{100 * forecast.validated:.0f} % of the posterior samples of the dynamics stay below the threshold"
-        others = ", and the others exceed it" if forecast.falsified else ""
-        return f"at least {forecast.executions} more {plural} needed to decide: {validate}{others}"
+        share = f"{100 * forecast.validated:.0f} % of the posterior samples of the dynamics stay below the threshold"
+        return f"at least {forecast.executions} more {plural} needed to validate it, and {share}"
     shares = {"validated": forecast.validated, "falsified": forecast.falsified}
     answer = max(shares, key=lambda name: shares[name])
     outcome = f" ({answer} in {100 * shares[answer]:.0f} % of the simulated futures)" if shares[answer] else ""
