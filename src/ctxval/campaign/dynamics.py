@@ -24,6 +24,7 @@ from ctxval.certificates.dynamics_evidence import (
     StateInputCoverage,
     StateInputGap,
     StatePocket,
+    UntriedCorner,
     UntriedParameter,
 )
 from ctxval.certificates.prediction_tests import DRAWN
@@ -260,6 +261,7 @@ class CampaignDynamics:
             _coverage(learned.coverage, self._coordinates(learned)),
             unplanned=worst.unplanned,
             untried=None if untried is None else UntriedParameter(names[untried[0]], *untried[1:]),
+            corner=self._untried_corner(learned),
             sharpness=worst.sharpness,
             dense=worst.points.shape[1] <= DENSE and self._study.planner.batched,
             quantile=noisy.quantile if noisy is not None and noisy.is_noisy else None,
@@ -269,6 +271,13 @@ class CampaignDynamics:
             without_data=not learned.with_data,
             estimated=learned.study.given.outputs is not None,
         )
+
+    def _untried_corner(self, learned: LearnedDynamics) -> UntriedCorner | None:
+        if (untried := learned.untried_corner) is None:
+            return None
+        space = self._study.validation.space
+        values = space.from_unit(untried.task)
+        return UntriedCorner({space.labels[j]: float(values[j]) for j in untried.components}, untried.gap, untried.task)
 
     def _coordinates(self, learned: LearnedDynamics) -> tuple[str, ...]:
         """Return the labels of the states and inputs, with units; ``x[0], ..., u[0], ...`` for those without names."""

@@ -18,6 +18,7 @@ from ctxval.certificates.dynamics_evidence import (
     LearnedDistance,
     StateInputCoverage,
     StateInputGap,
+    UntriedCorner,
     UntriedParameter,
 )
 from ctxval.certificates.expiry import WatchState
@@ -72,6 +73,7 @@ __all__ = [
     "StateInputGap",
     "StoppingDecision",
     "StoppingRule",
+    "UntriedCorner",
     "UntriedParameter",
     "Verdict",
     "WatchState",

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import combinations
+from itertools import combinations, product
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -170,3 +170,38 @@ def largest_pocket(visited: Array, executed: Sequence[Trajectory], units: Sequen
         at = int(away.argmax())
         pockets.append(Pocket(float(away[at]), (i, j), some[at, [i, j]], away[at] * scale))
     return max(pockets, key=lambda pocket: pocket.size, default=None)
+
+
+# Corners
+
+
+@dataclass(frozen=True, eq=False)
+class Corner(ShortRepr):
+    """The corner of two components of a position in space that is farthest from all executed tasks."""
+
+    components: tuple[int, int]  # their indices among the task parameters
+    gap: float  # the distance of the nearest executed task, of the farther component, as a share of its range
+    task: Array  # a task there, a point of the unit cube (d,)
+
+
+def untried_corner(executed: Array, positions: Sequence[slice], task: Array) -> Corner | None:
+    """Return the corner that is farthest from executed tasks ``(n, d)``; None if no task parameter is a position.
+
+    Its task has the parameters of ``task`` ``(d,)``, except that each position moves to its own farthest corner.
+    """
+    farthest, task = None, task.copy()
+    for at in positions:
+        columns = np.arange(at.start, at.stop)
+        ends, pairs = np.array(list(product((0.0, 1.0), repeat=len(columns)))), list(combinations(columns.tolist(), 2))
+        gaps = np.stack(
+            [
+                np.abs(ends[:, None, [i - at.start, j - at.start]] - executed[:, [i, j]]).max(axis=2).min(axis=1)
+                for i, j in pairs
+            ]
+        )
+        # Of the corners with the largest gap, one task tries as many other pairs as it can.
+        corner = int(np.lexsort((gaps.sum(axis=0), gaps.max(axis=0)))[-1])
+        task[columns], pair = ends[corner], int(gaps[:, corner].argmax())
+        if farthest is None or gaps[pair, corner] > farthest[1]:
+            farthest = pairs[pair], float(gaps[pair, corner])
+    return None if farthest is None else Corner(*farthest, task)
