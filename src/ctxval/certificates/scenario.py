@@ -141,8 +141,8 @@ def certify_scenario(sample: Sample, confidence: Probability = 0.95, discarded: 
     if None in plans and len(plans) > 1:
         raise CertificateError(
             f"{list(sample.planned).count(None)} of the draws were imported, and nobody knows on what their number "
-            f"depended, which a {kind} bound does not allow beside counted ones; say --kind audit, which counts the last "
-            "ones alone."
+            f"depended, which a {kind} bound does not allow beside counted ones; say --kind audit, which counts the "
+            "last ones alone."
         )
     if len(plans) > 1:
         raise CertificateError(
