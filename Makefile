@@ -70,7 +70,7 @@ study-refine: .venv/.test  ## how much better refined models are; writes docs/re
 
 docs: .venv/.test  ## the manual, with its gallery; writes docs/_build/html, and looks for broken links
 	$(BIN)/python -m sphinx -W --keep-going -b html docs docs/_build/html
-	$(BIN)/python -m pytest -q --thorough --manual=docs/_build/html tests/test_manual_pages.py tests/test_how_to.py -k "manual_is_built or blocks"
+	$(BIN)/python -m pytest -q --thorough --manual=docs/_build/html tests/test_manual_pages.py tests/test_how_to.py -k "manual_is_built or accessible or blocks"
 
 pictures: .venv/.test  ## those of the README and of the manual; needs Chromium
 	$(BIN)/ctxval run pendulum --search gp-ucb --seed 1 --store docs/pictures/pendulum.sqlite --no-report

@@ -25,8 +25,11 @@ from dynamics_reporting import REPORTING
 from dynamics_rough import ROUGH
 from dynamics_truths import truth
 
-RULE = 5
-"""Version of the rule by which campaigns are run now: eight tests at drawn tasks come before a validation."""
+RULE = 6
+"""Version of the rule by which campaigns are run now: eight tests at drawn tasks come before a validation (5), and the
+corners of positions are executed (6). Campaigns of systems without positions are the same by both."""
+
+WITH_TESTS = 5  # the first rule with tests at drawn tasks
 
 BUDGETS = {"reporting": 20, "rough": 20, "paper": 24, "development": 20}
 """Largest numbers of executions."""

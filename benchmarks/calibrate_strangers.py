@@ -23,8 +23,9 @@ from strangers_diagnostics import JudgedRun
 from strangers_reporting import REPORTING
 from strangers_truths import TRUTHS
 
-RULE = 6
-"""Version of the rule by which campaigns are run: 5 tests again after a test that failed, if what is learned explains
+RULE = 7
+"""Version of the rule by which campaigns are run: 7 executes the corners of positions, so that those of systems without
+positions are as by rule 6; 5 tests again after a test that failed, if what is learned explains
 it by now; 4 finds task parameters that change the dynamics, and leaves out data of M that contradict the
 executions; 3 learns histories and noise, and tests are points of a hypercube."""
 

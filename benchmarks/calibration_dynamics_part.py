@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from calibrate_dynamics import BUDGETS, FALSE, FEW, GROUPS, RULE, STORED, TRUE, wanted
+from calibrate_dynamics import BUDGETS, FALSE, FEW, GROUPS, RULE, STORED, TRUE, WITH_TESTS, wanted
 from calibration_verdicts_part import false_of, table
 from ctxval._util.json_lines import JsonLines
 from ctxval.certificates import dynamics_diagnostics as rule
@@ -143,7 +143,7 @@ Result = dict[str, Any]
 def by_dynamics() -> str:
     """Return the part of the page."""
     present = STORED.select(group="reporting", rule=RULE)
-    reported, present_paper = _of("reporting", before=RULE), STORED.select(group="paper", rule=RULE)
+    reported, present_paper = _of("reporting", before=WITH_TESTS), STORED.select(group="paper", rule=RULE)
     rough = _of("rough")
     mild = [one for one in reported if not _entry(one).misleading]
     return TEXT.format(
@@ -180,10 +180,10 @@ def by_dynamics() -> str:
         timed=table(["push", "when", *TIMED_HEADER], time_varying_rows()),
         timed_seeds=TIMED_SEEDS,
         ranks=table_of_ranks(JsonLines(RANKS, RANK_KEY), range(FRESH, FRESH + 1000)),
-        paper=_table(_of("paper", before=RULE)),
+        paper=_table(_of("paper", before=WITH_TESTS)),
         paper_present=_table(present_paper),
         paper_seeds=len({one["seed"] for one in present_paper}),
-        paper_compared=_compared(present_paper, _of("paper", before=RULE)),
+        paper_compared=_compared(present_paper, _of("paper", before=WITH_TESTS)),
         development=_table(development) if (development := _of("development")) else "None was run by the present rule.",
     ).rstrip()
 

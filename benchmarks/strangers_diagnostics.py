@@ -32,6 +32,7 @@ NAMES = {
     "enter a gap in the records": "gap",
     "enter a gap in the joint records": "joint gap",
     "hardly changes the closed loops": "untried parameter",
+    "has a task near the corner": "untried corner",
     "is not tested where it matters": "largest distance untested",
     "small distances hardly test it": "no large prediction that held",
     "must be predicted beforehand": "tests missing",

@@ -123,6 +123,7 @@ def test_the_glossary_explains_what_certificates_and_trials_say() -> None:
     used |= keys({PREDICTION: ExecutionPrediction(1, (0.5,), 0.1, (1,), ((0.0,),), ((0.1,),), 0.0).to_json()})
     used |= {*get_args(Origin), *get_args(State), *KINDS, "validated", "falsified", "undecided"}
     explained = re.findall(r"`([^`]+)`", (ROOT / "docs" / "glossary.md").read_text())
+    explained += re.findall(r"^\| `([^`]+)` \|", (ROOT / "docs" / "parts.md").read_text(), re.MULTILINE)  # added kinds
     assert used <= set(explained)
 
 

@@ -10,12 +10,14 @@ import sys
 from collections.abc import Iterator
 from html.parser import HTMLParser
 from pathlib import Path
+from typing import Any
 from urllib.parse import unquote, urlsplit
 
 import pytest
 from matplotlib import pyplot
 
 import ctxval
+from browser import accessibility_findings
 
 ROOT = Path(__file__).parents[1]
 GALLERY = sorted((ROOT / "examples" / "gallery").glob("plot_*.py"))
@@ -60,6 +62,18 @@ def test_the_manual_is_built_without_a_warning_and_is_complete(tmp_path: Path, r
     assert not [one for page in pages.values() for one in page.loaded if urlsplit(one).scheme not in ("", "data")]
     assert not list(names_without_description(manual, pages))
     assert not list(pages_left_out(manual))
+
+
+@pytest.mark.slow
+@pytest.mark.thorough
+@pytest.mark.parametrize("page", ["index", "how-to/decide", "reference/api/ctxval.distances", "search"])
+def test_a_page_of_the_manual_is_accessible(page: str, browser: Any, request: pytest.FixtureRequest) -> None:
+    built = request.config.getoption("--manual")
+    if built is None:
+        pytest.skip("`make docs` runs it on the pages that it has built")
+    opened = browser.new_page()
+    opened.goto((Path(built).resolve() / f"{page}.html").as_uri())
+    assert accessibility_findings(opened) == []
 
 
 def build(folder: Path) -> Path:

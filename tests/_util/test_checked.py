@@ -26,6 +26,9 @@ from ctxval._util.checked import (
     require,
 )
 from ctxval.cli.config.parts import REGISTRIES
+from ctxval.core.distance import Distance
+from ctxval.core.system import Simulated, System
+from ctxval.distances import FinalState
 from ctxval.errors import CtxvalError, InputError, UnknownNameError
 
 INFINITY, NAN = float("inf"), float("nan")
@@ -206,3 +209,10 @@ def test_a_value_can_be_required_by_itself() -> None:
     for annotation, value in ((FiniteFloat, 10**400), (Probability, 1), (NonNegativeInt, -1), (float, float("nan"))):
         with pytest.raises(InputError, match="value must be"):
             require("value", annotation, value)
+
+
+def test_a_class_is_no_object_of_it() -> None:
+    with pytest.raises(InputError, match="an object and no class, got"):
+        require("system", System, Simulated)
+    with pytest.raises(InputError, match="an object and no class, got"):
+        require("distance", Distance, FinalState)

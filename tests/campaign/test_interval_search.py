@@ -24,6 +24,7 @@ from ctxval.certificates import (
     Posterior,
     StateInputCoverage,
     StateInputGap,
+    UntriedCorner,
     UntriedParameter,
 )
 from ctxval.certificates.automatic import Automatic
@@ -254,6 +255,8 @@ def test_what_is_executed_next_depends_on_what_stands_in_the_way() -> None:
     assert asked(tested, np.tile(known, (2, 1)), 2.0, best=0.9) == farthest.tolist()
     load = replace(covered, untried=UntriedParameter("load", 0.5, np.array([0.3, 0.4])))
     assert asked(load, known, 2.0, best=0.2) == [0.3, 0.4]
+    corner = replace(covered, corner=UntriedCorner({"x": 0.0, "y": 1.0}, 0.5, np.array([0.0, 1.0])))
+    assert asked(corner, known, 2.0, best=0.2) == [0.0, 1.0]
     # Every third execution explores, and no task is executed twice.
     assert asked(contested, np.tile(known, (2, 1)), 0.5) == farthest.tolist()
     assert asked(contested, np.array([[0.9, 0.9], [0.8, 0.8], [0.7, 0.7], farthest]), 2.0) == at_bound.tolist()

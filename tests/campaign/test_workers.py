@@ -301,7 +301,7 @@ def test_a_model_that_fails_stops_the_campaign_after_what_is_running(tmp_path: P
 def test_a_controller_that_cannot_be_sent_is_said_so(tmp_path: Path) -> None:
     validation = make_validation()
     validation.synthesizer = controllers.Policy(lambda t, x, task: -x[..., :1])
-    with pytest.raises(InputError, match="a policy must be a function of a module, not a lambda"):
+    with pytest.raises(InputError, match="must be a function or an object of a class of a module, not a lambda"):
         Campaign(validation).run(3, workers=2)
 
 

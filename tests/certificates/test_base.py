@@ -76,15 +76,22 @@ def sample(n: int = 9, origin: str = "acquisition") -> Sample:
 # The kinds of this package
 
 
+OWN = ("anytime", "audit", "auto", "dynamics", "posterior", "region", "sampling-discarding", "scenario", "suite")
 EVERYTHING = sample(30, origin="iid")
 SUITE = replace(EVERYTHING, suite=EVERYTHING.points)
 
 
 def certified(kind: str, confidence: float) -> Certificate:
+    """Return a certificate by the default options, which a kind that has been added may refuse."""
     chosen = KINDS.find(kind).of({"discard": 2})
-    if chosen.needs_threshold:
-        return chosen.certify_against(EVERYTHING, 1.5, confidence)[0]
-    return chosen.certify(SUITE if kind == "suite" else EVERYTHING, confidence)
+    try:
+        if chosen.needs_threshold:
+            return chosen.certify_against(EVERYTHING, 1.5, confidence)[0]
+        return chosen.certify(SUITE if kind == "suite" else EVERYTHING, confidence)
+    except CertificateError as refusal:
+        if kind in OWN:
+            raise
+        pytest.skip(str(refusal))
 
 
 @pytest.mark.parametrize("kind", [kind for kind in KINDS if kind != "posterior"])
@@ -120,9 +127,9 @@ def test_a_confidence_below_1_is_not_printed_as_1() -> None:
 
 
 def test_the_kinds_of_this_package_are_listed_by_name() -> None:
-    own = ["anytime", "audit", "auto", "dynamics", "posterior", "region"]
-    assert list(KINDS) == [*own, "sampling-discarding", "scenario", "suite"]
-    assert len(KINDS) == 9
+    assert set(OWN) <= set(KINDS)
+    assert list(KINDS) == sorted(KINDS)
+    assert len(KINDS) == len(list(KINDS))
     assert "posteriour" not in KINDS
     assert KINDS["posterior"] is Posterior
 
@@ -135,7 +142,8 @@ def test_which_kinds_have_a_use_for_an_option_follows_from_their_fields() -> Non
         "discard": ("region", "sampling-discarding"),
         "predictions": ("region",),
     }
-    assert {option: KINDS.with_option(option) for option in uses} == uses
+    found = {option: tuple(kind for kind in KINDS.with_option(option) if kind in OWN) for option in uses}
+    assert found == uses
     with pytest.raises(UnknownNameError, match="did you mean 'resolution'"):
         require_use("posterior", ["resolutoin"])
     with pytest.raises(CertificateError, match="of the kind region or sampling-discarding; the kind here is posterior"):

@@ -10,11 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ctxval.certificates import CheckedPrediction, DynamicsEvidence, UntriedParameter
+from ctxval.certificates import CheckedPrediction, DynamicsEvidence, UntriedCorner, UntriedParameter
 from ctxval.certificates.dynamics_diagnostics import (
     ACCURATE,
     AGREE,
     BEYOND,
+    CORNER,
     FEWEST,
     GAP,
     JUMP,
@@ -61,6 +62,7 @@ BAD: list[tuple[dict[str, Any], str]] = [
         "enter a gap in the joint records of x[0] and u[0] by 55 % (at x[0] 1, u[0] 3)",
     ),
     ({"untried": UntriedParameter("load", 1.1 * GAP, np.zeros(2))}, "the parameter load hardly changes"),
+    ({"corner": UntriedCorner({"x [m]": 1.0, "y [m]": -1.0}, 1.1 * CORNER, np.zeros(2))}, "the corner x 1 m, y -1 m"),
     ({"highest": 1.1 * BEST / TESTED}, "predicted to be 1.1, but the largest executed one is 0.8"),
     ({"predictions": (prediction(1, 0.9 * MATTERS, 0.9 * MATTERS),) * 3}, "small distances hardly test it"),
     (

@@ -28,7 +28,7 @@ from ctxval.certificates import (
 from ctxval.cli import app
 from ctxval.cli.config.settings import CertificateTable
 from ctxval.core.trial import Trial
-from ctxval.errors import ConformanceError
+from ctxval.errors import CertificateError, ConformanceError
 from ctxval.testing import check_certificate
 
 RECIPE = '''
@@ -96,11 +96,14 @@ class Counting(CertificateKind):
 
     def certify(self, sample: Sample, confidence: float = 0.95) -> Certificate:
         """Return the scenario bound of the draws."""
+        if sample.failed:
+            raise CertificateError("a failure exceeds any bound.")
         drawn = len(sample.only("iid") if self.all_of_them else sample.countable)
         volume = certificates.volume_bound(drawn, 0, 1 - confidence)
         return Certificate(self.name, "", sample.best, confidence, volume, drawn, ())
 
 
+@pytest.mark.slow
 def test_a_kind_that_counts_draws_whose_number_depended_on_results_is_noticed() -> None:
     trials = Sample(np.linspace(0, 1, 9)[:, None], np.linspace(0, 0.9, 9), ["initial"] * 9, ["completed"] * 9)
     for kind in (Counting(all_of_them=False), certificates.Audit(), certificates.Scenario()):
@@ -110,6 +113,57 @@ def test_a_kind_that_counts_draws_whose_number_depended_on_results_is_noticed() 
     check_certificate(Counting(all_of_them=False))
     with pytest.raises(ConformanceError, match="by draws that ended with the verdict"):
         check_certificate(Counting())
+
+
+@dataclass(frozen=True)
+class Unsound(CertificateKind):
+    """Bounds the share of the tasks above a limit, by rows of trials that it should not count alone."""
+
+    name: ClassVar[str] = "unsound"
+    rows: str = "all"
+    limit: float = 0.5
+
+    def certify(self, sample: Sample, confidence: float = 0.95) -> Certificate:
+        """Return the bound of Clopper and Pearson."""
+        counted = sample.rows(range(len(sample)) if self.rows == "all" else sample.countable)
+        if self.rows == "measured":
+            counted = counted.rows(np.flatnonzero(np.isfinite(counted.distances)).tolist())
+        above = int((~(counted.distances <= self.limit)).sum())
+        if above >= len(counted):
+            raise CertificateError("all tasks exceed the limit.")
+        volume = certificates.volume_bound(len(counted), above, 1 - confidence)
+        return Certificate(self.name, "", self.limit, confidence, volume, len(counted), ())
+
+
+@dataclass(frozen=True)
+class Narrower(CertificateKind):
+    """A bound on the same share of the tasks that more draws lower."""
+
+    name: ClassVar[str] = "narrower"
+
+    def certify(self, sample: Sample, confidence: float = 0.95) -> Certificate:
+        """Return the mean and three standard errors."""
+        drawn = sample.only("iid").distances
+        if not len(drawn):
+            raise CertificateError("there are no draws.")
+        bound = float(drawn.mean() + 3 * drawn.std() / np.sqrt(len(drawn)))
+        return Certificate(self.name, "", bound, confidence, 0.1, len(drawn), ())
+
+
+@pytest.mark.slow
+def test_kinds_whose_statements_are_false_too_often_are_noticed() -> None:
+    check_certificate(Unsound("countable"))
+    with pytest.raises(ConformanceError, match="20 trials of a search, 100 are false, and at most about 10"):
+        check_certificate(Unsound("all"))
+    with pytest.raises(ConformanceError, match="of which the worst tasks fail"):
+        check_certificate(Unsound("measured"))
+    with pytest.raises(ConformanceError, match="by draws that ended with the verdict, and by"):
+        check_certificate(Narrower())
+
+
+def test_a_check_in_which_a_kind_refuses_everything_is_no_check() -> None:
+    with pytest.raises(ConformanceError, match="nothing was checked; give the kind its options"):
+        check_certificate(certificates.SamplingDiscarding())
 
 
 @pytest.mark.parametrize(

@@ -220,6 +220,13 @@ def test_a_number_of_draws_that_was_raised_after_looking_is_refused(discarded: i
     assert certify_scenario(planned([40] * 40), 0.95, discarded).trials == 40
 
 
+@pytest.mark.parametrize("counts", [[None] * 10 + [20] * 20, [20] * 20 + [None] * 10])
+def test_imported_draws_do_not_stand_beside_counted_ones(counts: list[int | None]) -> None:
+    with pytest.raises(CertificateError, match="10 of the draws were imported"):
+        certify_scenario(planned(counts), 0.95)
+    assert certify_scenario(planned([None] * 30), 0.95).trials == 30  # imported alone, they are the user's word
+
+
 def test_an_audit_that_was_extended_counts_the_draws_that_were_decided_on_last() -> None:
     certificate = certify_audit(planned([20] * 20 + [60] * 40), 0.95)
     assert certificate.trials == 40

@@ -169,3 +169,9 @@ def test_the_own_jacobian_of_a_model_is_taken() -> None:
 def test_a_jacobian_that_is_not_finite_is_refused(bad: float) -> None:
     with pytest.raises(ModelError, match="Jacobian is not finite"), np.errstate(invalid="ignore"):
         linearize(Function(lambda x, u: x * bad), np.ones(2), np.zeros(1))
+
+
+def test_a_step_of_another_shape_is_named() -> None:
+    wrong = Function(lambda x, u: np.zeros((*x.shape[:-1], 3)), vectorized=True)
+    with pytest.raises(ModelError, match=r"step of the model must return states of shape \(12, 2\), got \(12, 3\)"):
+        linearize(wrong, np.zeros((4, 2)), np.zeros((4, 1)))

@@ -109,6 +109,14 @@ def test_units_are_known_by_name() -> None:
     assert TaskSpace(goal=(0, 1, "rad"), load=([0, 0], [1, 1])).units == {"goal": "rad", "load": ""}
 
 
+def test_vectors_of_lengths_are_positions() -> None:
+    space = TaskSpace(
+        load=(0, 1, "kg"), goal=([0, 0], [1, 1], "m"), angles=([0, 0], [1, 1], "rad"), at=([0] * 3, [9] * 3, "mm"),
+        row=([0] * 4, [1] * 4, "m"), height=(0, 1, "m"),
+    )  # fmt: skip
+    assert space.positions == (slice(1, 3), slice(5, 8))
+
+
 def test_points_outside_the_unit_cube_are_clipped_to_the_box(space: TaskSpace) -> None:
     np.testing.assert_array_equal(space.from_unit([-1.0, 2.0, 0.5, 3.0]), [-3, 1, 15, 2])
 

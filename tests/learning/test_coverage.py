@@ -11,7 +11,7 @@ from ctxval import Task, TaskSpace, Trajectory, Transitions, Validation, control
 from ctxval._util.arrays import Array
 from ctxval.core.coverage import StateInputCoverage
 from ctxval.learning.closed_loops import LoopPlanner
-from ctxval.learning.coverage import MOST_COORDINATES, largest_pocket
+from ctxval.learning.coverage import MOST_COORDINATES, largest_pocket, untried_corner
 from ctxval.learning.coverage import coverage as coverage_of
 from ctxval.learning.dynamics_posterior import DynamicsPosterior, PosteriorSettings, learn_posterior
 
@@ -197,3 +197,24 @@ def test_where_an_execution_moves_in_one_step_there_is_no_pocket() -> None:
 def test_one_state_has_no_pocket_and_neither_has_what_was_not_executed() -> None:
     assert largest_pocket(np.zeros((9, 1)), [trajectory([0.0], [1.0])], ["x [m]"]) is None
     assert largest_pocket(np.zeros((9, 2)), [], ["x [m]", "y [m]"]) is None
+
+
+@pytest.mark.parametrize("components", [2, 3])
+def test_four_tasks_try_the_corners_of_all_positions(components: int) -> None:
+    """Of positions with three components, they try all corners of each pair: an orthogonal array of strength two."""
+    low, high = [-1.0] * components, [2.0] * components
+    space = TaskSpace(load=(0, 1, "kg"), start=(low, high, "m"), goal=(low, high, "m"))
+    executed = 0.3 + 0.4 * np.random.default_rng(components).random((2, space.dimension))
+    while (corner := untried_corner(executed, space, np.full(space.dimension, 0.4))) is not None:
+        assert corner.gap >= 0.3
+        assert set(corner.place.values()) <= {-1.0, 2.0}
+        assert corner.task[0] == 0.4
+        assert set(corner.task[1:].tolist()) <= {0.0, 1.0}
+        executed = np.concatenate([executed, corner.task[None]])
+    assert len(executed) == 6
+    for i, j in (pair for at in space.positions for pair in combinations(range(at.start, at.stop), 2)):
+        assert {(row[i], row[j]) for row in executed[2:]} == {(0.0, 0.0), (0.0, 1.0), (1.0, 0.0), (1.0, 1.0)}
+
+
+def test_without_a_position_no_corner_is_asked_for() -> None:
+    assert untried_corner(TASKS, TaskSpace(angles=([0, 0], [1, 1], "rad")), TASKS[0]) is None

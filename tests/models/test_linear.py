@@ -134,3 +134,8 @@ def test_states_and_data_of_another_size_are_refused_in_one_sentence() -> None:
         ShapeError, match=r"2 states and 1 inputs, got states of shape \(3,\) and inputs of shape \(1,\)"
     ):
         Linear(np.eye(2), np.ones((2, 1))).step(np.ones(3), np.ones(1))
+
+
+def test_a_file_is_no_transitions() -> None:
+    with pytest.raises(InputError, match="data must be a Transitions, got"):
+        Linear.fit("run1.csv")  # type: ignore[arg-type]

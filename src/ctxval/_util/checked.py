@@ -144,16 +144,22 @@ def _missed_class(cls: type, arguments: tuple[Any, ...], value: Any) -> str:
             return f"a list of {len(kinds)} values"
         missed = next(filter(None, map(_missed, kinds, value)), "")
         return missed and f"a list of which each item is {missed}"
+    public = {name: method for name, method in vars(cls).items() if not name.startswith("_") or name == "__call__"}
+    required = {
+        name: method
+        for name, method in public.items()
+        if getattr(cls, "_is_protocol", False) and inspect.isfunction(method)
+    }
+    # The methods of a class want an object of it first.
+    unbound = isinstance(value, type) and any(
+        inspect.isfunction(inspect.getattr_static(value, name, None)) for name in required
+    )
     try:
-        if isinstance(value, cls):
+        if isinstance(value, cls) and not unbound:
             return ""
     except TypeError:  # a protocol that cannot be checked
         return ""
-    public = {name: method for name, method in vars(cls).items() if not name.startswith("_") or name == "__call__"}
-    methods = [
-        f"{name}({', '.join([*inspect.signature(method).parameters][1:])})"
-        for name, method in public.items()
-        if getattr(cls, "_is_protocol", False) and inspect.isfunction(method)
-    ]
+    methods = [f"{name}({', '.join([*inspect.signature(method).parameters][1:])})" for name, method in required.items()]
     article = "an" if cls.__name__[0] in "AEIO" else "a"
-    return f"{article} {cls.__name__}{' with ' if methods else ''}{' and '.join(methods)}"
+    instance = ", an object and no class" if unbound else ""
+    return f"{article} {cls.__name__}{' with ' if methods else ''}{' and '.join(methods)}{instance}"

@@ -255,6 +255,7 @@ class CampaignDynamics:
             learned.coverage,
             unplanned=worst.unplanned,
             untried=None if untried is None else UntriedParameter(names[untried[0]], *untried[1:]),
+            corner=learned.untried_corner,
             sharpness=worst.sharpness,
             dense=worst.points.shape[1] <= DENSE and self._study.planner.batched,
             quantile=noisy.quantile if noisy is not None and noisy.is_noisy else None,

@@ -28,6 +28,7 @@ from ctxval.certificates.bounds import Quantities, with_units
 from ctxval.certificates.covering import RESOLUTION, covering
 from ctxval.certificates.dynamics import Dynamics, bound_of, certify_dynamics
 from ctxval.certificates.dynamics_diagnostics import (
+    CORNER,
     FEWEST,
     GAP,
     doubt_of,
@@ -378,6 +379,8 @@ def next_task(
         candidates = [farthest, highest, largest]
         if evidence.untried is not None and evidence.untried.gap > GAP:
             candidates = [evidence.untried.task[None], *candidates]
+        elif evidence.corner is not None and evidence.corner.gap > CORNER:
+            candidates = [evidence.corner.task[None], *candidates]
     elif evidence.missed > 1 or untested(evidence, best, limit):
         candidates = [largest, highest, farthest]
     else:

@@ -172,8 +172,9 @@ class ProcessPool(WorkerPool):
             message = pickle.dumps((plan.controller, plan.task))
         except Exception as error:  # a user's object may raise any exception
             raise InputError(
-                f"the controller cannot be sent to a worker: {reason_of(error)}; a policy must be a function of a "
-                "module, not a lambda or a function in a function."
+                f"the controller cannot be sent to a worker: {reason_of(error)}; a policy, or what a "
+                "synthesizer designs, must be a function or an object of a class of a module, not a lambda or a "
+                "function in a function."
             ) from error
         worker.number, worker.started = number, time.monotonic()
         with contextlib.suppress(OSError):  # the worker has died; wait() detects this

@@ -39,7 +39,7 @@ from ctxval.certificates.scenario import (
 from ctxval.certificates.stopping import StoppingDecision, StoppingRule
 from ctxval.certificates.suite import WholeSuite
 from ctxval.certificates.verdict import Assessment, Verdict, assess, judge, judge_by
-from ctxval.core.coverage import StateInputCoverage, StateInputGap
+from ctxval.core.coverage import StateInputCoverage, StateInputGap, UntriedCorner
 
 __all__ = [
     "KINDS",
@@ -71,6 +71,7 @@ __all__ = [
     "StateInputGap",
     "StoppingDecision",
     "StoppingRule",
+    "UntriedCorner",
     "UntriedParameter",
     "Verdict",
     "WatchState",

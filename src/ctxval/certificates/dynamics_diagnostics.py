@@ -27,6 +27,7 @@ failed, of the margin that is left above the bound; see :func:`raised`."""
 NOISE = 0.01  # learned variance of noise, as a share of the mean square of the residual
 LEFT_OUT = 0.5  # share of the posterior variance that posterior samples leave out between their pivots
 GAP = 0.25  # gap of the records in a state or an input, as a share of the range that closed loops visit
+CORNER = 0.05  # distance of the nearest executed task from a corner of a position in space, as a share of its ranges
 PAIR_GAP = 0.5  # the same for two of them together
 BEYOND = 0.02
 """Largest excess of a state or an input over its largest record, or below its smallest one, as a share of that range.
@@ -231,8 +232,7 @@ def uncovered(evidence: DynamicsEvidence) -> list[str]:
         missing.append(sentences.GAP.format(gap=at(coverage.marginal)))
     if pair is not None and pair.size > PAIR_GAP:
         missing.append(sentences.PAIR_GAP.format(gap=at(pair)))
-    untried = untried_parameter(evidence)
-    return missing if untried is None else [*missing, untried]
+    return [*missing, *filter(None, [untried_parameter(evidence), untried_corner(evidence)])]
 
 
 def most_beyond(evidence: DynamicsEvidence) -> float:
@@ -246,6 +246,14 @@ def untried_parameter(evidence: DynamicsEvidence) -> str | None:
     if untried is None or untried.gap <= GAP:
         return None
     return sentences.UNTRIED.format(name=untried.name, percent=100 * untried.gap)
+
+
+def untried_corner(evidence: DynamicsEvidence) -> str | None:
+    """Return that a corner of a position in space was not tried; None if all were."""
+    corner = evidence.corner
+    if corner is None or corner.gap <= CORNER:
+        return None
+    return sentences.UNTRIED_CORNER.format(place=with_units(corner.place))
 
 
 def untested(evidence: DynamicsEvidence, best: float, bound: float, allowed: float | None = None) -> list[str]:

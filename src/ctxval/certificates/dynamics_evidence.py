@@ -12,7 +12,7 @@ from ctxval._util.arrays import Array
 from ctxval._util.representation import ShortRepr
 from ctxval.certificates.bounds import rank_of
 from ctxval.certificates.prediction_tests import TESTS
-from ctxval.core.coverage import StateInputCoverage, StateInputGap, StatePocket
+from ctxval.core.coverage import StateInputCoverage, StateInputGap, StatePocket, UntriedCorner
 from ctxval.core.quantiles import LEVELS, QUANTILE, chance_of_more
 from ctxval.core.trial import Origin
 
@@ -185,6 +185,7 @@ class DynamicsEvidence(ShortRepr):
         unplanned: share of the tasks for which no controller can be designed, or on which M diverges.
         untried: a parameter that M's loops do not depend on; None if there is none.
         without_model: whether the system was learned without M, because M is rougher than the system.
+        corner: the corner of a position that is farthest from executed tasks; None if no parameter is a position.
         sharpness: largest share by which a large distance on the mean exceeds those of tasks that are nearly the same.
         jump: largest jump of the distance on the mean between tasks that are nearly the same, at random tasks; 0 if it
             was not computed, because the bound is withdrawn anyway.
@@ -218,6 +219,7 @@ class DynamicsEvidence(ShortRepr):
     groups: int = 2
     unplanned: float = 0.0
     untried: UntriedParameter | None = None
+    corner: UntriedCorner | None = None
     without_model: bool = False
     sharpness: float = 0.0
     jump: float = 0.0
@@ -259,7 +261,8 @@ class DynamicsEvidence(ShortRepr):
     def from_json(cls, values: Any) -> Self | None:
         """Return the evidence that :meth:`to_json` returned; None if these are not its values."""
         try:
-            coverage, untried, tuples = values["coverage"], values["untried"], ("point", "quantiles", "p_values")
+            coverage, untried, corner = values["coverage"], values["untried"], values["corner"]
+            tuples = ("point", "quantiles", "p_values")
             gaps = {
                 name: gap and StateInputGap(**{**gap, "coordinates": tuple(gap["coordinates"])})
                 for name, gap in coverage.items()
@@ -274,6 +277,7 @@ class DynamicsEvidence(ShortRepr):
                 ),
                 "coverage": StateInputCoverage(**{**coverage, **gaps, "task": np.array(coverage["task"])}),
                 "untried": untried and UntriedParameter(**{**untried, "task": np.array(untried["task"])}),
+                "corner": corner and UntriedCorner(**{**corner, "task": np.array(corner["task"])}),
                 "pushed": values["pushed"] and PushedDistances.from_json(values["pushed"]),
                 "pocket": values["pocket"] and StatePocket(**values["pocket"]),
                 "physical": tuple(values["physical"]),

@@ -132,11 +132,17 @@ def certify_scenario(sample: Sample, confidence: Probability = 0.95, discarded: 
             f"otherwise ({', '.join(sorted(set(foreign)))}); run --search random, or say --kind audit."
         )
     require_more(len(sample), discarded)
-    plans = list(dict.fromkeys(planned for planned in sample.planned if planned is not None))
+    plans = list(dict.fromkeys(sample.planned))
     if 0 in plans:
         raise CertificateError(
             "the draws ended with the verdict, so their number depended on their distances, which a "
             f"{kind} bound does not allow; certify --audit N counts draws that are made from now on."
+        )
+    if None in plans and len(plans) > 1:
+        raise CertificateError(
+            f"{list(sample.planned).count(None)} of the draws were imported, and nobody knows on what their number "
+            f"depended, which a {kind} bound does not allow beside counted ones; say --kind audit, which counts the "
+            "last ones alone."
         )
     if len(plans) > 1:
         raise CertificateError(

@@ -57,3 +57,18 @@ class StatePocket:
     size: float
     place: dict[str, float]
     within: dict[str, float]
+
+
+@dataclass(frozen=True, eq=False)
+class UntriedCorner(ShortRepr):
+    """The corner of two components of a position in space that is farthest from all executed tasks.
+
+    Attributes:
+        place: the two components by their labels.
+        gap: the distance of the nearest executed task, of the farther component, as a share of its range.
+        task: a task there, a point of the unit cube ``(d,)``.
+    """
+
+    place: dict[str, float]
+    gap: float
+    task: Array

@@ -73,7 +73,14 @@ def linearize(model: Model, x: Array, u: Array) -> tuple[Array, Array]:
     Shapes ``(..., n), (..., m) -> (..., n, n), (..., n, m)``; a constant Jacobian may have no batch axes.
     """
     jacobian = getattr(model, "jacobian", None)
-    A, B = jacobian(x, u) if jacobian is not None else central_differences(model.step, x, u)
+
+    def step(x: Array, u: Array) -> Array:
+        reached = model.step(x, u)
+        if np.shape(reached) != np.shape(x):
+            raise ModelError(f"step of the model must return states of shape {np.shape(x)}, got {np.shape(reached)}.")
+        return reached
+
+    A, B = jacobian(x, u) if jacobian is not None else central_differences(step, x, u)
     if not (np.isfinite(A).all() and np.isfinite(B).all()):
         raise ModelError("the model's Jacobian is not finite along its own trajectory.")
     return A, B

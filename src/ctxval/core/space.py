@@ -51,6 +51,9 @@ class Parameters:
         return call(self, named(by_name, self._space.units), batch=self.points.shape[:-1])
 
 
+_LENGTHS = ("m", "mm", "cm", "km", "in", "ft")
+
+
 class TaskSpace:
     """A named box of task parameters.
 
@@ -126,6 +129,12 @@ class TaskSpace:
             return self._columns[name]
         except KeyError:
             raise UnknownNameError.among("task parameter", name, self._columns) from None
+
+    @property
+    def positions(self) -> tuple[slice, ...]:
+        """The columns of the parameters that are positions in space: two or three components in a unit of length."""
+        lengths = [at for name, at in self._columns.items() if self.units[name] in _LENGTHS]
+        return tuple(at for at in lengths if isinstance(at, slice) and at.stop - at.start in (2, 3))
 
     def values_of(self, name: str, points: Array) -> Any:
         """Return the values of a parameter in points ``(..., d)`` of the space, ``(...)`` or ``(..., k)``."""

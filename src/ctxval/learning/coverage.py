@@ -7,14 +7,15 @@ has entered: a post could stand there.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import combinations
+from itertools import combinations, product
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from ctxval._util.arrays import Array, Rows
 from ctxval._util.texts import parted
-from ctxval.core.coverage import StateInputCoverage, StateInputGap, StatePocket
+from ctxval.core.coverage import StateInputCoverage, StateInputGap, StatePocket, UntriedCorner
+from ctxval.core.space import TaskSpace
 from ctxval.core.trajectory import Trajectory
 from ctxval.learning.closed_loops import Loops, PlannedTasks
 from ctxval.learning.dynamics_posterior import DynamicsPosterior
@@ -148,3 +149,32 @@ def largest_pocket(visited: Array, executed: Sequence[Trajectory], labels: Seque
         names = labels[i], labels[j]
         pockets.append(StatePocket(float(away[at]), *(dict(zip(names, of, strict=True)) for of in (place, within))))
     return max(pockets, key=lambda pocket: pocket.size, default=None)
+
+
+# Corners
+
+
+def untried_corner(executed: Array, space: TaskSpace, task: Array) -> UntriedCorner | None:
+    """Return the corner that is farthest from executed tasks ``(n, d)``; None if no task parameter is a position.
+
+    Its task has the parameters of ``task`` ``(d,)``, except that each position moves to its own farthest corner.
+    """
+    components, farthest, task = (0, 0), 0.0, task.copy()
+    for at in space.positions:
+        columns = np.arange(at.start, at.stop)
+        ends, pairs = np.array(list(product((0.0, 1.0), repeat=len(columns)))), list(combinations(columns.tolist(), 2))
+        gaps = np.stack(
+            [
+                np.abs(ends[:, None, [i - at.start, j - at.start]] - executed[:, [i, j]]).max(axis=2).min(axis=1)
+                for i, j in pairs
+            ]
+        )
+        # Of the corners with the largest gap, one task tries as many other pairs as it can.
+        corner = int(np.lexsort((gaps.sum(axis=0), gaps.max(axis=0)))[-1])
+        task[columns], pair = ends[corner], int(gaps[:, corner].argmax())
+        if gaps[pair, corner] > farthest:
+            components, farthest = pairs[pair], float(gaps[pair, corner])
+    if not farthest:
+        return None
+    values = space.from_unit(task)
+    return UntriedCorner({space.labels[j]: float(values[j]) for j in components}, farthest, task)

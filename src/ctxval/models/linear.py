@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from ctxval._util.arrays import Array, ArrayLike, as_finite, single_threaded
-from ctxval._util.checked import Seconds
+from ctxval._util.checked import Seconds, require
 from ctxval._util.registry import part
 from ctxval._util.representation import ShortRepr
 from ctxval.core.trajectory import Transitions
@@ -41,6 +41,7 @@ class Linear(ShortRepr):
     @classmethod
     def fit(cls, data: Transitions, *, intercept: bool = True) -> Linear:
         """Fit A, B and c by least squares on recorded transitions; without an intercept, c is zero."""
+        require("data", Transitions, data)
         n, m = data.x.shape[1], data.u.shape[1]
         if not all(np.isfinite(array).all() for array in (data.x, data.u, data.x_next)):
             raise InputError("a linear model needs finite transitions, got NaN or infinity.")

@@ -40,6 +40,10 @@ UNTRIED = (
     "learned from states and inputs, and some of its values are {percent:.0f} % of its range away from every executed "
     "one; an execution there helps (`ctxval run` executes it)"
 )
+UNTRIED_CORNER = (
+    "no execution has a task near the corner {place}, and what stands in a corner, such as a post or a wall, concerns "
+    "few tasks; an execution there helps (`ctxval run` executes it)"
+)
 NOT_TESTED = (
     "the largest distance is predicted to be {highest:.4g}, but the largest executed one is {best:.4g}: the prediction "
     "is not tested where it matters; an execution of that task helps (`ctxval run` executes it)"
