@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from causes_systems import DEVELOPMENT, REPORTING
-from study_causes import EXECUTIONS, NOISES, SERVO, STORED
+from causes_robots import DEVELOPMENT, REPORTING
+from study_causes import EXECUTIONS, NOISES, RULE, SERVO, STORED
 
 PAGE = Path(__file__).parents[1] / "docs" / "how-to" / "causes.md"
 MARK = "<!-- written by benchmarks/causes_page.py -->\n"
@@ -63,7 +63,7 @@ def counts(records: Sequence[dict[str, Any]]) -> dict[str, int]:
 
 def table(of: str) -> str:
     """Return a table of the robots of a part."""
-    records, rows = STORED.select(of=of), []
+    records, rows = STORED.select(rule=RULE, of=of), []
     for robot, noise in dict.fromkeys((each["robot"], each["noise"]) for each in records):
         n = counts([each for each in records if (each["robot"], each["noise"]) == (robot, noise)])
         noisy = f"{100 * noise:g} %" if noise else "none"
@@ -93,7 +93,9 @@ def servo() -> str:
 def not_run() -> str:
     """Return which robots and noises are missing or incomplete."""
     robots = [*DEVELOPMENT, *REPORTING]
-    runs = {(name, noise): len(STORED.select(robot=name, noise=noise)) for name in robots for noise in NOISES}
+    runs = {
+        (name, noise): len(STORED.select(rule=RULE, robot=name, noise=noise)) for name in robots for noise in NOISES
+    }
     few = [
         f"{name} {'without noise' if not noise else 'with noise'} ({count} of 14 faults)"
         for (name, noise), count in runs.items()
@@ -104,7 +106,7 @@ def not_run() -> str:
 
 def section() -> str:
     """Return the measured part of the page."""
-    records = STORED.select(of="reporting")
+    records = STORED.select(rule=RULE, of="reporting")
     misses = [each for each in records if not each["foreign"] and not (each["named"] and each["in_group"])]
     missed = ", ".join(f"{each['robot']} {each['fault']} ({100 * each['noise']:g} %)" for each in misses) or "none"
     text = SECTION.strip().format(

@@ -13,15 +13,21 @@ from typing import Any
 import numpy as np
 
 from calibrate import RESULTS
-from causes_systems import DEVELOPMENT, REPORTING, Fault, Robot, faults_of, foreign_of
+from causes_robots import DEVELOPMENT, REPORTING
+from causes_systems import Fault, Robot, faults_of, foreign_of
 from ctxval import Campaign, searches
 from ctxval._util.json_lines import JsonLines
 from ctxval.errors import InputError
 from ctxval.studies import causes
 from ctxval.studies.causes import Cause, find_causes
 
+RULE = 2
+"""The number of the rule by which causes are found and named, and of the way in which faults are simulated.
+
+1: the first one. 2: noise is simulated in closed loops; robots of MuJoCo have the time step of their models.
+"""
 EXECUTIONS, NOISES = 5, (0.0, 1e-3)
-STORED = JsonLines(RESULTS / "causes.jsonl", ("robot", "fault", "noise"))
+STORED = JsonLines(RESULTS / "causes.jsonl", ("rule", "robot", "fault", "noise"))
 SERVO = JsonLines(RESULTS / "causes_servo.jsonl", ("seed",))
 SEEDS = 2
 _RATIOS = ("input gain", "sensor scale", "time step", "gravity", "mass")
@@ -129,11 +135,11 @@ def main() -> None:
             if arguments.only and name not in arguments.only:
                 continue
             for fault in (*faults_of(robot), *foreign_of(robot)):
-                if (name, fault.kind, noise) in STORED:
+                if (RULE, name, fault.kind, noise) in STORED:
                     continue
-                key = {"robot": name, "of": arguments.robots, "fault": fault.kind, "noise": noise}
+                key = {"rule": RULE, "robot": name, "of": arguments.robots, "fault": fault.kind, "noise": noise}
                 STORED.append({**key, **measured(robot, fault, noise)})
-                known = STORED[name, fault.kind, noise]
+                known = STORED[RULE, name, fault.kind, noise]
                 verdict = "right" if known["rank"] == 1 and known["named"] else ""
                 print(name, fault.kind, fault.sizes, noise, verdict, known["rank"], known["size_error"], flush=True)
                 print("    ", known["seconds"], known.get("structure"), known["sentence"], flush=True)

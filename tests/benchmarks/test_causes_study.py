@@ -12,7 +12,8 @@ pytest.importorskip("gymnasium")
 sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
 
 import causes_page
-from causes_systems import DEVELOPMENT, REPORTING, Fault, faults_of, foreign_of
+from causes_robots import DEVELOPMENT, REPORTING
+from causes_systems import Fault, faults_of, foreign_of
 from ctxval.studies import causes
 from study_causes import is_right, size_error
 
