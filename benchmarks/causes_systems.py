@@ -65,6 +65,15 @@ class Robot:
     weights: tuple[int, ...] = ()
     joint_efforts: tuple[float, ...] = ()
 
+    def constant_weight(self, joint: int) -> float | None:
+        """Return what gravity alone accelerates a joint by; None if it depends on the positions."""
+        if self.acceleration is None or joint not in self.weights:
+            return None
+        still = np.zeros(self.joints)
+        at = np.random.default_rng(0).uniform(-1, 1, (5, self.joints))
+        pulls = [self.acceleration(q, still, still, 1.0) - self.acceleration(q, still, still, 0.0) for q in at]
+        return float(pulls[0][joint]) if np.ptp(pulls, axis=0)[joint] < 1e-9 else None
+
     def experiment(self, fault: Fault, noise: float, seed: int) -> Experiment:
         """Return the experiment with a fault, and measurement noise in shares of the range of each state."""
         return self.make(self, Faulty(self, fault, noise, seed))

@@ -26,6 +26,8 @@ RULE = 2
 
 1: the first one. 2: noise is simulated in closed loops; robots of MuJoCo have the time step of their models.
 """
+COUNTS = {"development": 20, "reporting": 10}
+"""Seeded faults of a robot, beside 4 foreign ones; of development robots, all kinds that they can have."""
 EXECUTIONS, NOISES = 5, (0.0, 1e-3)
 STORED = JsonLines(RESULTS / "causes.jsonl", ("rule", "robot", "fault", "noise"))
 SERVO = JsonLines(RESULTS / "causes_servo.jsonl", ("seed",))
@@ -39,6 +41,9 @@ def is_right(robot: Robot, fault: Fault, cause: Cause) -> bool:
     attributes = {"viscous friction": "damping", "Coulomb friction": "frictionloss", "armature": "armature"}
     if isinstance(cause, causes.JointAttribute):
         return attributes.get(fault.kind) == cause.attribute and cause.joint.dof == place
+    weight = robot.constant_weight(place) if fault.kind == "gravity" else None
+    if weight is not None and isinstance(cause, causes.Bias):  # this is the same
+        return cause.joint.rate == joints + place and cause.joint.input is None
     if cause.name != fault.kind:
         return False
     if isinstance(cause, causes.BodyMass):
@@ -55,8 +60,11 @@ def is_right(robot: Robot, fault: Fault, cause: Cause) -> bool:
     return getattr(cause, "input", place) == place
 
 
-def size_error(fault: Fault, cause: Cause) -> float | None:
+def size_error(robot: Robot, fault: Fault, cause: Cause) -> float | None:
     """Return the largest relative error of a size; of ratios, that of their difference from 1."""
+    weight = robot.constant_weight(fault.place) if fault.kind == "gravity" else None
+    if weight is not None and isinstance(cause, causes.Bias):
+        return abs(cause.sizes[0] / (weight * (fault.sizes[0] - 1)) - 1)
     if not fault.sizes:
         return 0.0
     shift = 1.0 if fault.kind in _RATIOS else 0.0
@@ -88,7 +96,7 @@ def measured(robot: Robot, fault: Fault, noise: float) -> dict[str, Any]:
         "alike": len(report.explained),
         "rank": places[0] + 1 if places else None,
         "in_group": bool(right),
-        "size_error": size_error(fault, right[0]) if right else None,
+        "size_error": size_error(robot, fault, right[0]) if right else None,
         "share": report.explained[0].share if report.explained else None,
         "structure": report.explained[0].structure if report.explained else None,
         "uncertainty": report.explained[0].uncertainty if report.explained else None,
@@ -135,7 +143,7 @@ def main() -> None:
         for name, robot in robots.items():
             if arguments.only and name not in arguments.only:
                 continue
-            for fault in (*faults_of(robot), *foreign_of(robot)):
+            for fault in (*faults_of(robot, COUNTS[arguments.robots]), *foreign_of(robot)):
                 if (RULE, name, fault.kind, noise) in STORED:
                     continue
                 key = {"rule": RULE, "robot": name, "of": arguments.robots, "fault": fault.kind, "noise": noise}
