@@ -26,6 +26,7 @@ RULE = 2
 
 1: the first one. 2: noise is simulated in closed loops; robots of MuJoCo have the time step of their models.
 """
+ROBOTS = {"development": DEVELOPMENT, "reporting": REPORTING}
 COUNTS = {"development": 20, "reporting": 10}
 """Seeded faults of a robot, beside 4 foreign ones; of development robots, all kinds that they can have."""
 EXECUTIONS, NOISES = 5, (0.0, 1e-3)
@@ -33,6 +34,11 @@ STORED = JsonLines(RESULTS / "causes.jsonl", ("rule", "robot", "fault", "noise")
 SERVO = JsonLines(RESULTS / "causes_servo.jsonl", ("seed",))
 SEEDS = 2
 _RATIOS = ("input gain", "sensor scale", "time step", "gravity", "mass")
+
+
+def faults(robot: Robot, of: str) -> list[Fault]:
+    """Return the faults of a robot, with those that are foreign."""
+    return [*faults_of(robot, COUNTS[of]), *foreign_of(robot)]
 
 
 def is_right(robot: Robot, fault: Fault, cause: Cause) -> bool:
@@ -137,13 +143,13 @@ def main() -> None:
                 SERVO.append(on_servo(seed))
                 print(SERVO[(seed,)], flush=True)
         return
-    robots = DEVELOPMENT if arguments.robots == "development" else REPORTING
+    robots = ROBOTS[arguments.robots]
     warnings.simplefilter("ignore")  # that a fault keeps the robot from its goal
     for noise in arguments.noise:
         for name, robot in robots.items():
             if arguments.only and name not in arguments.only:
                 continue
-            for fault in (*faults_of(robot, COUNTS[arguments.robots]), *foreign_of(robot)):
+            for fault in faults(robot, arguments.robots):
                 if (RULE, name, fault.kind, noise) in STORED:
                     continue
                 key = {"rule": RULE, "robot": name, "of": arguments.robots, "fault": fault.kind, "noise": noise}

@@ -21,7 +21,7 @@ from ctxval.studies.causes.plant import Plant, plant_of
 from ctxval.studies.causes.report import CauseReport, Explained, Separating
 
 _ALIKE = 10.0  # differences of the criterion that do not tell causes apart
-_NAMED = 0.95  # share of the squared closed-loop deviations of M that causes must explain, to be the cause
+_NAMED = 0.98  # share of the squared deviations of M in closed loop that causes must explain, to be the cause
 _FITTED = 8  # explanations by one more cause that are fitted to all records
 _CHECKED = 4  # explanations that are tried in closed loop
 
