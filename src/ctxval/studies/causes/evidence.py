@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.optimize import least_squares
 
-from ctxval._util.arrays import Array, Rows
+from ctxval._util.arrays import Array, Mask, Rows
 from ctxval._util.representation import ShortRepr
 from ctxval.core.model import Model
 from ctxval.core.trajectory import Trajectory
@@ -18,6 +18,8 @@ from ctxval.studies.causes.cause import Repaired
 STEPS = (1, 6)  # of the predictions
 _LARGEST = 1e3  # of a residual, as a multiple of the typical one of M
 _DRAWS = 4  # of noise
+_LONGER = 4  # times as many steps, with which shares are measured if there is noise
+_UNKNOWN = 1e3  # a standard deviation
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,6 +59,7 @@ class Evidence:
         for padded, run in zip(self.inputs, runs, strict=True):
             padded[: len(run.inputs)] = run.inputs
         self.windows, self.sizes = list[Predictions](), list[Array]()
+        self._missed = dict[int, tuple[Array, Mask]]()  # by M after a number of steps, and which of it is evidence
         for number, length in enumerate(steps):
             window = self._window(min(length, min(self.horizons)), most[number])
             left = self.left_by(Repaired(model, ()), window)
@@ -113,26 +116,42 @@ class Evidence:
     def explained(self, repaired: Repaired, noise: Array) -> tuple[float, float]:
         """Return the share of the squared residuals of M after several steps that is explained, except for noise.
 
+        The effect of a cause grows with the number of steps, and so does that of an error of its size. More steps than
+        in fits are therefore taken only if noise then hides less of the effect.
+
         Args:
             noise: standard deviations ``(n,)`` of white noise of the measurements.
 
         Returns:
             the share and, because of noise, its standard deviation.
         """
-        window, sizes = self.windows[1], self.sizes[1]
-        most, rng = _LARGEST * sizes, np.random.default_rng(0)
+        steps, shortest = self.windows[1].steps, min(self.horizons)
+        lengths = [steps, *({min(_LONGER * steps, shortest)} - {steps} if noise.any() else ())]
+        return min((self._explained(repaired, noise, length) for length in lengths), key=lambda result: result[1])
+
+    def _explained(self, repaired: Repaired, noise: Array, steps: int) -> tuple[float, float]:
+        window, rng = self._window(steps, len(self.states)), np.random.default_rng(0)
+        if steps not in self._missed:
+            changes = _size(self.states[window.states + steps] - self.states[window.states])
+            missed = _size(self.left_by(Repaired(self.model, ()), window))
+            self._missed[steps] = missed, missed > 2e-3 * np.maximum(changes, 1e-12)
+        sizes, matter = self._missed[steps]
+        if not matter.any():
+            return 0.0, _UNKNOWN
+        most = _LARGEST * np.maximum(sizes, 1e-15)
         errors = np.nan_to_num(self.left_by(repaired, window), nan=np.inf).clip(-most, most)
         by_noise = noise**2
         for _ in range(_DRAWS if noise.any() else 0):
             moved = self.left_by(repaired, window, noise * rng.standard_normal(errors.shape)).clip(-most, most)
             by_noise = by_noise + np.nan_to_num((moved - errors) ** 2).mean(axis=0) / _DRAWS
-        matter = sizes > 2 * window.floors
         squares = np.stack([(errors**2).mean(axis=0), sizes**2, by_noise])[:, matter] / sizes[matter] ** 2
         left, before, spread = squares[0] - squares[2], squares[1] - squares[2], squares[2]
-        whole = max(float(np.maximum(before, 0.0).sum()), 1e-300)
+        whole = float(before.sum())
+        if whole <= 0:
+            return 0.0, _UNKNOWN
         # Every second prediction is independent of the others.
         uncertainty = float(np.sqrt((spread**2).sum() * 4 / len(errors))) / whole
-        return 1.0 - max(float(left.sum()), 0.0) / whole, min(uncertainty, 1e3)
+        return 1.0 - max(float(left.sum()), 0.0) / whole, min(uncertainty, _UNKNOWN)
 
     def measured(self, repaired: Repaired) -> tuple[float, float]:
         """Return minus twice the log-likelihood, and the share of the squared residuals of M that is left."""

@@ -154,15 +154,16 @@ class _Study:
             predicted.append(self.loops.predicted(fitted.repaired, execution, noise))
         by_noise = float(np.sum([each.by_noise.mean() for each in predicted]))
         spread = float(np.sqrt(np.sum([each.by_noise.var() for each in predicted])))
-        before = max(float(np.sum(self.loops.without)) - by_noise, 1e-300)
         left = float(np.sum([each.deviation for each in predicted])) - by_noise
+        # Without any effect beside noise, what is left says only whether it is more than noise.
+        before = max(float(np.sum(self.loops.without)) - by_noise, spread, 1e-300)
         structure, uncertain = self.evidence.explained(explanation.repaired, noise)
         return Explained(
             explanation,
             share=1 - max(left, 0.0) / before,
             distance=float(np.max([each.distance for each in predicted])),
             spreads=tuple(map(float, np.ptp(sizes, axis=0))),
-            uncertainty=min(spread / before, 1e3),
+            uncertainty=spread / before,
             structure=structure,
             uncertain_structure=uncertain,
         )

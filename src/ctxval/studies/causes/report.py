@@ -52,7 +52,7 @@ class Explained(ShortRepr):
         """The largest share that the causes may explain: of deviations or, if noise makes these, of residuals."""
         if self.resolved:
             return min(self.share + 2 * self.uncertainty, 1.0)
-        if self.uncertain_structure > 0.1 or self.share < -3 * self.uncertainty:
+        if self.uncertain_structure > 0.2 or self.share < 1 - 4 * self.uncertainty:
             return 0.0
         return min(self.structure + 2 * self.uncertain_structure, 1.0)
 
@@ -128,7 +128,8 @@ class CauseReport(ShortRepr):
             f"the largest distance of {self.executions} executions falls from {self.before:.3g} to "
             f"{first.distance:.3g}{units}"
         )
-        share = f"{np.floor(1e3 * first.share) / 10:.4g} % of the squared deviations"
+        part, of = (first.share, "deviations") if first.resolved else (first.structure, "residuals, except for noise")
+        share = f"{np.floor(1e3 * part) / 10:.4g} % of the squared {of}"
         if not self.named:
             less = "The largest part of the error that one explains" if first.share > 0.5 else "What comes nearest"
             return f"None of these {self.tried} causes. {less}: {self._text(first)}. It explains {share}, and {effect}."
