@@ -39,7 +39,9 @@ Results of the first rule had been seen before this one was made, those of arm, 
 It let noise hide causes in stiff loops and small plays, so noise is simulated now. Two things were changed in how
 faults are simulated and judged: robots of MuJoCo have the time step of their models, and a weight that is a constant
 force, as that of the quadrotor is, may be named so. The swimmer, the telescope and the rotary pendulum were written
-down before they were run, and no rule was changed after their first results.
+down before they were run. The second rule ran on {second} of their faults and missed {lost}: where noise made all
+deviations, a division by nearly nothing excluded every cause. This was corrected, with a small backlash of the pendulum
+as the example, and no rule was changed afterwards.
 
 {missed}
 
@@ -143,7 +145,10 @@ def section() -> str:
     earlier = STORED.select(rule=1, of="reporting")
     seen = {each["robot"] for each in earlier}
     new = said([each for each in records if each["robot"] not in seen])
+    second = [each for each in STORED.select(rule=2, of="reporting") if each["robot"] not in seen]
+    lost = [f"{each['robot']} {each['fault']}" for each in second if not (each["named"] and each["in_group"])]
     text = SECTION.strip().format(
+        second=len(second), lost=" and ".join(lost),
         executions=EXECUTIONS, reported=said(records), new=f"on robots that no rule has seen, {new}",
         earlier=said(earlier), missed=missed(records), servo=servo(), not_run=not_run(),
     )  # fmt: skip

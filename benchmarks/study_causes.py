@@ -137,6 +137,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("robots", choices=("development", "reporting", "servo"))
     parser.add_argument("--only", nargs="*", help="names of robots")
+    parser.add_argument("--faults", nargs="*", help="kinds of faults")
     parser.add_argument("--noise", nargs="*", type=float, default=NOISES, help="in shares of ranges")
     arguments = parser.parse_args()
     if arguments.robots == "servo":
@@ -152,7 +153,7 @@ def main() -> None:
             if arguments.only and name not in arguments.only:
                 continue
             for fault in faults(robot, arguments.robots):
-                if (RULE, name, fault.kind, noise) in STORED:
+                if (RULE, name, fault.kind, noise) in STORED or fault.kind not in (arguments.faults or [fault.kind]):
                     continue
                 key = {"rule": RULE, "robot": name, "of": arguments.robots, "fault": fault.kind, "noise": noise}
                 STORED.append({**key, **measured(robot, fault, noise)})
