@@ -80,15 +80,16 @@ def table(of: str) -> str:
 
 def servo() -> str:
     """Return what is found on the real servo."""
-    found = list(SERVO.values())
+    found = SERVO.select(rule=RULE) or SERVO.select(rule=1)
     if not found:
         return ""
+    by = "" if found[0]["rule"] == RULE else " by the first rule"
     loads = sum(each["first"] == "LoadFriction" for each in found)
     shares = ", ".join(f"{100 * each['share']:.0f} %" for each in found)
     return (
         f"On the [real servo](../servo.md) with the published model m1, which has viscous and Coulomb friction, "
-        f"friction that depends on the load comes first in {loads} of {len(found)} draws of {EXECUTIONS} recordings. "
-        f"It explains {shares} of the squared deviations in closed loop, and "
+        f"friction that depends on the load comes first{by} in {loads} of {len(found)} draws of {EXECUTIONS} recordings."
+        f" It explains {shares} of the squared deviations in closed loop, and "
         f"{'is' if all(each['named'] for each in found) else 'is not always'} named as the whole cause. The published "
         "models m3 and m4 have such a friction."
     )

@@ -33,7 +33,7 @@ COUNTS = {"development": 20, "reporting": 10}
 """Seeded faults of a robot, beside 4 foreign ones; of development robots, all kinds that they can have."""
 EXECUTIONS, NOISES = 5, (0.0, 1e-3)
 STORED = JsonLines(RESULTS / "causes.jsonl", ("rule", "robot", "fault", "noise"))
-SERVO = JsonLines(RESULTS / "causes_servo.jsonl", ("seed",))
+SERVO = JsonLines(RESULTS / "causes_servo.jsonl", ("rule", "seed"))
 SEEDS = 2
 _RATIOS = ("input gain", "sensor scale", "time step", "gravity", "mass")
 
@@ -124,6 +124,7 @@ def on_servo(seed: int) -> dict[str, Any]:
     report = find_causes(campaign)
     first = report.explained[0] if report.explained else None
     return {
+        "rule": RULE,
         "seed": seed,
         "first": type(report.ranked[0].repaired.causes[0]).__name__,
         "sizes": list(report.ranked[0].repaired.causes[0].sizes),
@@ -142,9 +143,9 @@ def main() -> None:
     arguments = parser.parse_args()
     if arguments.robots == "servo":
         for seed in range(SEEDS):
-            if (seed,) not in SERVO:
+            if (RULE, seed) not in SERVO:
                 SERVO.append(on_servo(seed))
-                print(SERVO[(seed,)], flush=True)
+                print(SERVO[RULE, seed], flush=True)
         return
     robots = ROBOTS[arguments.robots]
     warnings.simplefilter("ignore")  # that a fault keeps the robot from its goal
