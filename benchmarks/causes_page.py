@@ -88,8 +88,8 @@ def servo() -> str:
     shares = ", ".join(f"{100 * each['share']:.0f} %" for each in found)
     return (
         f"On the [real servo](../servo.md) with the published model m1, which has viscous and Coulomb friction, "
-        f"friction that depends on the load comes first{by} in {loads} of {len(found)} draws of {EXECUTIONS} recordings."
-        f" It explains {shares} of the squared deviations in closed loop, and "
+        f"friction that depends on the load comes first{by} in {loads} of {len(found)} draws of {EXECUTIONS} "
+        f"recordings. It explains {shares} of the squared deviations in closed loop, and "
         f"{'is' if all(each['named'] for each in found) else 'is not always'} named as the whole cause. The published "
         "models m3 and m4 have such a friction."
     )
