@@ -107,6 +107,8 @@ def test_the_load_of_a_gear_is_that_of_its_own_motor() -> None:
     model = models.Function(step, vectorized=True)
     loads = friction.load(model, np.zeros((2, 2)), np.array([[4.0, 0.0], [4.0, 9.0]]))
     np.testing.assert_allclose(loads, [7.0, 7.0], rtol=1e-9)
+    lost = friction.load(model, np.array([[np.nan, 0.0], [0.0, 0.0]]), np.array([[4.0, 0.0], [4.0, 9.0]]))
+    assert np.isfinite(lost).tolist() == [False, True]
 
 
 def test_noise_of_measurements_acts_through_the_controller() -> None:

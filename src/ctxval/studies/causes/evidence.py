@@ -109,7 +109,7 @@ class Evidence:
         here, slopes = self.left_by(repaired, window), np.ones(left.shape[1])
         for i, size in enumerate(0.1 * self.sizes[0]):
             there = self.left_by(repaired, window, size * np.eye(len(slopes))[i])
-            slopes[i] = np.nanmedian((there - here)[:, i]) / size
+            slopes[i] = np.median(np.nan_to_num((there - here)[:, i], nan=size)) / size
         variances = -products.mean(axis=0) / np.clip(slopes, 0.1, None)
         return np.asarray(np.sqrt(np.maximum(variances, 0.0)) * self.sizes[0])
 

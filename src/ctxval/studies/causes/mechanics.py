@@ -155,6 +155,7 @@ class LoadFriction(Force):
         rates, probes = list(self.rates), self.probe * np.eye(m)
         moved = np.stack([np.asarray(model.step(x, np.broadcast_to(each, u.shape))) for each in probes], axis=-1)
         effects = ((moved - unmoved[..., None]) / self.probe)[..., rates, :]
+        effects = np.nan_to_num(effects, nan=0.0, posinf=0.0, neginf=0.0)  # a step of M may have failed
         pulls = u - (np.linalg.pinv(effects) @ (unmoved - x)[..., rates, None])[..., 0]
         return np.asarray(np.abs(pulls[..., self.joint.input]))
 
