@@ -45,10 +45,11 @@ as the example, and no rule was changed afterwards.
 
 {missed}
 
-Swapped inputs let the arm (and the leg) diverge in every task, and a failed execution leaves no recording. The offset of
-the rotary pendulum's sensor changes only where executions begin, which any cause explains. The quadrotor's inputs count
-from hovering, so M does not know the load that its friction depends on. A gain and a saturation together come near a
-motor whose gain falls with its input. Why the pusher's faults are missed is not known.
+Swapped inputs let the arm and the leg diverge in every task, and a failed execution leaves no recording. The sensor
+offsets of the rotary pendulum and of the pusher change only where executions begin, which any cause explains. The
+quadrotor's inputs count from hovering, so M does not know the load that its friction depends on. A gain and a
+saturation together come near a motor whose gain falls with its input. Why other faults of the pusher are missed is not
+known.
 
 {not_run}
 
