@@ -1,7 +1,7 @@
 """Robots with one fault that their models lack, for ``study_causes.py``.
 
-Rules were chosen on the robots of ``DEVELOPMENT`` only; nothing is ever tuned on those of ``REPORTING``. The faults are
-simulated here in their own way, in 20 parts of a step, and not with the code that finds them.
+The faults are simulated here in their own way, in 20 parts of a step, and not with the code that finds them. The robots
+themselves are those of ``causes_robots.py``.
 """
 
 from __future__ import annotations
@@ -14,22 +14,9 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from ctxval import (
-    Array,
-    Experiment,
-    Parameters,
-    Task,
-    TaskSpace,
-    Trajectory,
-    controllers,
-    distances,
-    models,
-    rollout,
-    systems,
-)
+from ctxval import Array, Experiment, Task, Trajectory, rollout, systems
 from ctxval.core.controller import Controller
 from ctxval.core.model import Model
-from dynamics_systems import experiment, path
 
 PARTS = 20
 Acceleration = Callable[[Array, Array, Array, float], Array]
@@ -77,6 +64,15 @@ class Robot:
     mjcf: Path | None = None
     weights: tuple[int, ...] = ()
     joint_efforts: tuple[float, ...] = ()
+
+    def constant_weight(self, joint: int) -> float | None:
+        """Return what gravity alone accelerates a joint by; None if it depends on the positions."""
+        if self.acceleration is None or joint not in self.weights:
+            return None
+        still = np.zeros(self.joints)
+        at = np.random.default_rng(0).uniform(-1, 1, (5, self.joints))
+        pulls = [self.acceleration(q, still, still, 1.0) - self.acceleration(q, still, still, 0.0) for q in at]
+        return float(pulls[0][joint]) if np.ptp(pulls, axis=0)[joint] < 1e-9 else None
 
     def experiment(self, fault: Fault, noise: float, seed: int) -> Experiment:
         """Return the experiment with a fault, and measurement noise in shares of the range of each state."""
@@ -229,15 +225,15 @@ class _Analytic:
 
 
 class _OfMuJoCo:
-    """The mechanics of a robot of MuJoCo, with a smaller time step."""
+    """The mechanics of a robot of MuJoCo, with the time step of its model, and the mean of the inputs over each step.
+
+    A model of MuJoCo is exact for its time step only: with a smaller one, a robot would have a second fault.
+    """
 
     def __init__(self, robot: Robot, fault: Fault, task: Task) -> None:
-        self.robot, self.fault = robot, fault
-        spec = mujoco.MjSpec.from_file(str(robot.mjcf))
-        spec.option.timestep = robot.dt / PARTS
-        if fault.kind == "Coulomb friction":
-            spec.joints[fault.place].frictionloss = fault.sizes[0]
-        self.model = spec.compile()
+        self.robot, self.fault, self.inputs = robot, fault, list[Array]()
+        self.model = mujoco.MjModel.from_xml_path(str(robot.mjcf))
+        self.parts = round(PARTS * self.model.opt.timestep / robot.dt)
         if fault.kind == "viscous friction":
             self.model.dof_damping[fault.place] += fault.sizes[0]
         if fault.kind == "armature":
@@ -258,205 +254,26 @@ class _OfMuJoCo:
         return np.concatenate([self.data.qpos, self.data.qvel])
 
     def advance(self, u: Array, h: float) -> None:
-        data, robot, fault = self.data, self.robot, self.fault
-        self.model.opt.timestep = h
-        data.ctrl = u
-        if fault.kind not in ("Coulomb friction", "viscous friction"):
-            n = robot.joints
-            load = np.zeros(n)
-            load[list(robot.driven)] = np.array(self.model.actuator_gear[:, 0]) * u
-            load += np.array(data.qfrc_bias[:n])
-            data.qfrc_applied[:n] = _joint_forces(robot, fault, data.qpos[:n], data.qvel[:n], load, data.time)
+        self.inputs.append(u)
+        if len(self.inputs) < self.parts:
+            return
+        data, fault, j, sizes = self.data, self.fault, self.fault.place, self.fault.sizes
+        self.model.opt.timestep = h * self.parts
+        data.ctrl = np.mean(self.inputs, axis=0)
+        self.inputs.clear()
+        if fault.kind == "Coulomb friction":
+            self.model.dof_frictionloss[j] = sizes[0]
+        elif fault.kind == "Stribeck friction":
+            self.model.dof_frictionloss[j] = sizes[0] + sizes[1] * np.exp(-((data.qvel[j] / sizes[2]) ** 2))
+        elif fault.kind == "load-dependent friction":
+            mujoco.mj_forward(self.model, data)
+            self.model.dof_frictionloss[j] = sizes[0] * abs(data.qfrc_actuator[j] + data.qfrc_bias[j]) + sizes[1]
+        elif fault.foreign:
+            n = self.robot.joints
+            data.qfrc_applied[:n] = _joint_forces(
+                self.robot, fault, data.qpos[:n], data.qvel[:n], np.zeros(n), data.time
+            )
         mujoco.mj_step(self.model, data)
-
-
-def _analytic_model(joints: int, driven: tuple[int, ...], acceleration: Acceleration, dt: float) -> Model:
-    def derivative(x: Array, u: Array) -> Array:
-        # The axes of a batch stay in the opposite order until the end.
-        forces = np.zeros((*np.broadcast_shapes(x.shape[:-1], u.shape[:-1]), joints))
-        forces[..., list(driven)] = u
-        accelerations = acceleration(x[..., :joints].T, x[..., joints:].T, forces.T, 1.0)
-        return np.concatenate([x[..., joints:], accelerations.T], axis=-1)
-
-    return models.Function(systems.rk4(derivative, dt), vectorized=True)
-
-
-def _pendulum(q: Array, v: Array, forces: Array, gravity: float) -> Array:
-    return (forces - gravity * 4.0 * np.sin(q) - 0.1 * v) / 0.5
-
-
-def _crane(q: Array, v: Array, forces: Array, gravity: float) -> Array:
-    mass, load, length = 1.0, 0.4, 0.6
-    s, c = np.sin(q[1]), np.cos(q[1])
-    m11, m12, m22 = mass + load, load * length * c, load * length**2
-    b1 = forces[0] + load * length * v[1] ** 2 * s - 0.2 * v[0]
-    b2 = forces[1] - gravity * load * 9.81 * length * s - 0.01 * v[1]
-    det = m11 * m22 - m12**2
-    return np.stack([(m22 * b1 - m12 * b2) / det, (m11 * b2 - m12 * b1) / det])
-
-
-def _arm(q: Array, v: Array, forces: Array, gravity: float) -> Array:
-    a, b, d = 1.6, 0.5, 0.5
-    s, c = np.sin(q[1]), np.cos(q[1])
-    m11, m12, m22 = a + 2 * b * c, d + b * c, d + 0 * c
-    g2 = gravity * 3.0 * np.sin(q[0] + q[1])
-    b1 = forces[0] + b * s * (2 * v[0] * v[1] + v[1] ** 2) - gravity * 8.0 * np.sin(q[0]) - g2 - 0.2 * v[0]
-    b2 = forces[1] - b * s * v[0] ** 2 - g2 - 0.2 * v[1]
-    det = m11 * m22 - m12**2
-    return np.stack([(m22 * b1 - m12 * b2) / det, (m11 * b2 - m12 * b1) / det])
-
-
-def _quadrotor(q: Array, v: Array, forces: Array, gravity: float) -> Array:
-    """A planar quadrotor: x, z and tilt; thrust beyond hovering and torque."""
-    thrust = 9.81 + forces[1]
-    return np.stack(
-        [
-            forces[0] - thrust * np.sin(q[2]) - 0.1 * v[0],
-            thrust * np.cos(q[2]) - gravity * 9.81 - 0.1 * v[1],
-            forces[2] / 0.2 - 0.1 * v[2],
-        ]
-    )
-
-
-def _followed(p: Parameters, names: tuple[str, ...], horizon: int, dt: float, width: int) -> Task:
-    """Return the task of following a path of some joints, each to a goal and with a wave; the others are at 0."""
-    goals = np.stack([p[name] for name in names], axis=-1)
-    positions, rates = [], []
-    for i in range(width):
-        goal = goals[..., i] if i < len(names) else np.zeros(goals.shape[:-1])
-        q, v = path(
-            horizon,
-            dt,
-            0.0 * goal,
-            goal,
-            0.3 * np.abs(goals).max(axis=-1) * (i < len(names)),
-            p.frequency * (1 + 0.3 * i),
-        )
-        positions.append(q)
-        rates.append(v)
-    reference = np.stack([*positions, *rates], axis=-1)
-    return Task(reference[..., 0, :], reference=reference, horizon=horizon, dt=dt)
-
-
-def _tracking(
-    gains: tuple[Any, Any], names: tuple[str, ...], reach: float, frequency: tuple[float, float], units: str,
-    horizon: int, width: int, compared: tuple[int, ...], followed: tuple[int, ...],
-) -> Callable[[Robot, Any], Experiment]:  # fmt: skip
-    def make(robot: Robot, system: Any) -> Experiment:
-        return experiment(
-            robot.name,
-            units,
-            space=TaskSpace(**dict.fromkeys(names, (-reach, reach, units)), frequency=(*frequency, "Hz")),
-            task=lambda p: _followed(p, names, horizon, robot.dt, width),
-            system=system,
-            model=robot.model,
-            synthesizer=controllers.PID(gains[0], 0.0, gains[1], components=followed),
-            distance=distances.MaximumDeviation(components=compared),
-            start_tolerance=1e6,
-        )
-
-    return make
-
-
-def _regulated(
-    weights: tuple[Any, Any], space: Callable[[], TaskSpace], ends: Callable[[Parameters], tuple[list[Any], list[Any]]],
-    units: str, horizon: int, compared: tuple[int, ...],
-) -> Callable[[Robot, Any], Experiment]:  # fmt: skip
-    def make(robot: Robot, system: Any) -> Experiment:
-        def task(p: Parameters) -> Task:
-            start, goal = ends(p)
-            return Task(start, goal=goal, horizon=horizon, dt=robot.dt)
-
-        return experiment(
-            robot.name,
-            units,
-            space=space(),
-            task=task,
-            system=system,
-            model=robot.model,
-            synthesizer=controllers.LQR(*weights),
-            distance=distances.MaximumDeviation(components=compared),
-            start_tolerance=1e6,
-        )
-
-    return make
-
-
-def _of_gymnasium(name: str) -> Path:
-    import gymnasium
-
-    return Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets" / name
-
-
-def _analytic(
-    name: str, joints: int, driven: tuple[int, ...], acceleration: Acceleration, dt: float, **more: Any
-) -> Robot:
-    model = _analytic_model(joints, driven, acceleration, dt)
-    return Robot(name, joints, len(driven), driven, dt, model=model, acceleration=acceleration, **more)
-
-
-def _pusher(robot: Robot, system: Any) -> Experiment:
-    made = _tracking(
-        ([20.0, 20.0, 3.0, 10.0, 1.0, 2.0, 1.0], [4.0, 4.0, 0.3, 2.0, 0.1, 0.2, 0.1]),
-        ("pan", "lift", "roll", "elbow"), 0.5, (0.2, 0.6), "rad", 100, 11, (0, 1, 2, 3), (0, 1, 2, 3, 4, 5, 6),
-    )  # fmt: skip
-    return made(robot, system)
-
-
-DEVELOPMENT = {
-    each.name: each
-    for each in (
-        _analytic(
-            "pendulum", 1, (0,), _pendulum, 0.02,
-            rates=(1.0,), efforts=(4.0,), weights=(0,),
-            make=_tracking((30.0, 5.0), ("goal",), 1.2, (0.3, 0.8), "rad", 120, 1, (0,), (0,)),
-        ),
-        _analytic(
-            "crane", 2, (0,), _crane, 0.04,
-            rates=(1.0, 1.0), efforts=(3.0,), weights=(1,),
-            make=_tracking((6.0, 5.0), ("goal",), 1.2, (0.2, 0.5), "m", 100, 2, (0, 1), (0,)),
-        ),
-        Robot(
-            "double pendulum", 3, 1, (0,), 0.02, (1.0, 1.0, 1.0), (0.2,),
-            models.MuJoCo(_of_gymnasium("inverted_double_pendulum.xml"), dt=0.02),
-            _regulated(
-                ([10.0, 20.0, 20.0, 1.0, 1.0, 1.0], [400.0]),
-                lambda: TaskSpace(goal=(-0.5, 0.5, "m"), first=(-0.1, 0.1, "rad"), second=(-0.1, 0.1, "rad")),
-                lambda p: ([0.0, p.first, p.second, 0.0, 0.0, 0.0], [p.goal, 0.0, 0.0, 0.0, 0.0, 0.0]),
-                "m", 120, (0, 1, 2),
-            ),
-            mjcf=_of_gymnasium("inverted_double_pendulum.xml"), joint_efforts=(10.0, 3.0, 1.0),
-        ),
-    )
-}  # fmt: skip
-
-REPORTING = {
-    each.name: each
-    for each in (
-        _analytic(
-            "arm", 2, (0, 1), _arm, 0.02,
-            rates=(1.0, 1.0), efforts=(8.0, 3.0), weights=(0, 1),
-            make=_tracking(
-                ([80.0, 40.0], [20.0, 8.0]), ("first", "second"), 1.0, (0.2, 0.7), "rad", 120, 2, (0, 1), (0, 1)
-            ),
-        ),
-        _analytic(
-            "quadrotor", 3, (1, 2), _quadrotor, 0.04,
-            rates=(1.0, 1.0, 1.0), efforts=(2.0, 0.3), weights=(1,),
-            make=_regulated(
-                ([4.0, 6.0, 2.0, 2.0, 2.0, 0.5], [0.5, 5.0]),
-                lambda: TaskSpace(x=(-1.5, 1.5, "m"), z=(-1.0, 1.0, "m"), tilt=(-0.2, 0.2, "rad")),
-                lambda p: ([0.0, 0.0, p.tilt, 0.0, 0.0, 0.0], [p.x, p.z, 0.0, 0.0, 0.0, 0.0]),
-                "m", 100, (0, 1, 2),
-            ),
-        ),
-        Robot(
-            "pusher", 7, 7, (0, 1, 2, 3, 4, 5, 6), 0.02, (1.0,) * 7, (1.5, 1.5, 0.5, 0.8, 0.2, 0.2, 0.2),
-            models.MuJoCo(_of_gymnasium("pusher_v5.xml"), dt=0.02), _pusher,
-            mjcf=_of_gymnasium("pusher_v5.xml"), joint_efforts=(1.5, 1.5, 0.5, 0.8, 0.2, 0.2, 0.2),
-        ),
-    )
-}  # fmt: skip
 
 
 def _force_of(robot: Robot, joint: int) -> float:
@@ -469,7 +286,7 @@ def _force_of(robot: Robot, joint: int) -> float:
 def faults_of(robot: Robot, count: int = 10) -> list[Fault]:
     """Return seeded faults of a robot of different kinds; the place and the sizes are random."""
     rng = np.random.default_rng(sum(map(ord, robot.name)))
-    joints = [j for j in range(robot.joints) if robot.mjcf is None or j < 4]
+    joints = list(range(robot.joints)) if robot.mjcf is None else list(robot.driven[:4])
     kinds: list[str] = [
         "viscous friction", "Coulomb friction", "Stribeck friction", "load-dependent friction", "input gain",
         "input offset", "saturation", "dead zone", "backlash", "delay", "lag", "sensor offset", "sensor scale",
@@ -523,7 +340,7 @@ def _drawn(robot: Robot, kind: str, joints: list[int], rng: np.random.Generator)
 def foreign_of(robot: Robot) -> list[Fault]:
     """Return seeded faults that no dictionary has."""
     rng = np.random.default_rng(1 + sum(map(ord, robot.name)))
-    joints = [j for j in range(robot.joints) if j in robot.driven and (robot.mjcf is None or j < 4)]
+    joints = robot.driven[:4]
     j = int(rng.choice(joints))
     force = _force_of(robot, j)
     share = float(rng.uniform(0.6, 1.4))

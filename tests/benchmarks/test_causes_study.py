@@ -12,7 +12,8 @@ pytest.importorskip("gymnasium")
 sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
 
 import causes_page
-from causes_systems import DEVELOPMENT, REPORTING, Fault, faults_of, foreign_of
+from causes_robots import DEVELOPMENT, REPORTING
+from causes_systems import Fault, faults_of, foreign_of
 from ctxval.studies import causes
 from study_causes import is_right, size_error
 
@@ -43,8 +44,16 @@ def test_a_cause_is_right_only_at_its_place() -> None:
     assert is_right(arm, Fault("Coulomb friction", 0, (1.0,)), causes.Coulomb((1.05,), joint))
     assert not is_right(arm, Fault("Coulomb friction", 1, (1.0,)), causes.Coulomb((1.05,), joint))
     assert not is_right(arm, Fault("viscous friction", 0, (1.0,)), causes.Coulomb((1.05,), joint))
-    assert size_error(Fault("Coulomb friction", 0, (1.0,)), causes.Coulomb((1.05,), joint)) == pytest.approx(0.05)
-    assert size_error(Fault("input gain", 0, (0.8,)), causes.InputGain((0.78,), 0)) == pytest.approx(0.1)
+    assert size_error(arm, Fault("Coulomb friction", 0, (1.0,)), causes.Coulomb((1.05,), joint)) == pytest.approx(0.05)
+    assert size_error(arm, Fault("input gain", 0, (0.8,)), causes.InputGain((0.78,), 0)) == pytest.approx(0.1)
+
+
+def test_a_weight_that_is_a_constant_force_is_a_bias() -> None:
+    quadrotor, fault = REPORTING["quadrotor"], Fault("gravity", 1, (1.2,))
+    bias = causes.Bias((-1.9,), causes.Joint(rate=4, position=1))
+    assert is_right(quadrotor, fault, bias)
+    assert size_error(quadrotor, fault, bias) == pytest.approx(1 - 1.9 / (0.2 * 9.81))
+    assert not is_right(REPORTING["arm"], Fault("gravity", 0, (1.2,)), causes.Bias((-1.9,), causes.Joint(rate=2)))
 
 
 def test_the_page_is_that_of_the_stored_results() -> None:

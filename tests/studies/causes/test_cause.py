@@ -89,10 +89,40 @@ def test_coulomb_friction_holds_at_rest_and_brakes_in_motion() -> None:
 
 
 def test_load_dependent_friction_grows_with_what_the_gears_carry() -> None:
-    friction = Repaired(MODEL, (causes.LoadFriction((0.5, 0.0), **FORCE),))
+    friction = Repaired(MODEL, (causes.LoadFriction((0.5, 0.0), **FORCE, rates=(1,)),))
     moving = np.array([[0.0, 10.0], [0.0, 10.0]])
     lost = MODEL.step(moving, np.array([[1.0], [2.0]])) - friction.step(moving, np.array([[1.0], [2.0]]))
     np.testing.assert_allclose(lost[:, 1], [0.5 * DT, 1.0 * DT], rtol=1e-6)
+
+
+def test_the_load_of_a_gear_is_that_of_its_own_motor() -> None:
+    # The second motor moves the first joint, too, and a weight of 3 pulls at it.
+    inverse = np.array([[2.0, -1.0], [-1.0, 3.0]])
+
+    def step(x: Array, u: Array) -> Array:
+        return x + DT * (u - np.array([3.0, 0.0])) @ inverse
+
+    joint = Joint(rate=0, input=0)
+    friction = causes.LoadFriction((0.5, 0.0), joint, 0.1, DT, rates=(0, 1))
+    model = models.Function(step, vectorized=True)
+    loads = friction.load(model, np.zeros((2, 2)), np.array([[4.0, 0.0], [4.0, 9.0]]))
+    np.testing.assert_allclose(loads, [7.0, 7.0], rtol=1e-9)
+    lost = friction.load(model, np.array([[np.nan, 0.0], [0.0, 0.0]]), np.array([[4.0, 0.0], [4.0, 9.0]]))
+    assert np.isfinite(lost).tolist() == [False, True]
+
+
+def test_noise_of_measurements_acts_through_the_controller() -> None:
+    nothing, rng = Repaired(MODEL, ()), np.random.default_rng(0)
+    task = Task([0.4, 0.0], goal=[0.0, 0.0], horizon=40, dt=DT)
+    controller = controllers.LQR([10.0, 1.0], [0.5]).design(task, MODEL)
+    noise = 0.01 * rng.standard_normal((41, 3, 2))
+    together = nothing.execute(controller, task.starting_at(np.tile([0.4, 0.0], (3, 1))), noise)
+    for k in range(3):
+        alone = nothing.execute(controller, task, noise[:, k])
+        np.testing.assert_allclose(together[k].states, alone.states, atol=1e-12)
+        truth = alone.states - noise[:, k]
+        np.testing.assert_allclose(MODEL.step(truth[1:-1], alone.inputs[1:]), truth[2:], atol=1e-12)
+    np.testing.assert_array_equal(together.states[:, 0], np.tile([0.4, 0.0], (3, 1)))
 
 
 def test_an_acceleration_moves_the_position_as_far_as_the_model_integrates() -> None:

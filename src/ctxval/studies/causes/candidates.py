@@ -117,7 +117,8 @@ def _forces(plant: Plant, joint: Joint, x: Array, u: Array, missed: Array) -> It
         ((0.5 * force, 0.5 * force, 0.3 * speed), (0.7 * force, 0.3 * force, 0.1 * speed)),
     )
     starts = ((0.05, 0.0), (0.2, 0.3 * force))
-    yield Candidate(mechanics.LoadFriction((0.0, 0.0), *where), (0.0, 0.0), (2.0, most), (0.05, least), starts)
+    rates = tuple(dict.fromkeys(port.rate for port in plant.ports if port.input is not None))
+    yield Candidate(mechanics.LoadFriction((0.0, 0.0), *where, rates), (0.0, 0.0), (2.0, most), (0.05, least), starts)
 
 
 def _of_mujoco(plant: Plant, missed: Array) -> Iterator[Candidate]:

@@ -146,10 +146,15 @@ class Repaired(ShortRepr):
                 inputs, _ = cause.follow(inputs, None)
         return inputs
 
-    def execute(self, controller: Controller, task: Task) -> Trajectory:
-        """Return the closed loop with all causes; the controller acts on what is recorded."""
-        truth = self.true(np.asarray(task.initial_state, dtype=np.float64))
+    def execute(self, controller: Controller, task: Task, noise: Array | None = None) -> Trajectory:
+        """Return the closed loop with all causes; the controller acts on what is recorded.
+
+        Args:
+            noise: what is added to each recorded state, ``(H + 1, ..., n)``; that of the initial state has it already.
+        """
+        truth = self.true(np.asarray(task.initial_state, dtype=np.float64) - (0.0 if noise is None else noise[0]))
         memories: list[Any] = [None] * len(self.causes)
+        added = iter(() if noise is None else noise[1:])
 
         def step(_: Array, u: Array) -> Array:
             nonlocal truth
@@ -157,6 +162,6 @@ class Repaired(ShortRepr):
             for k, cause in enumerate(self.causes):
                 u, memories[k] = cause.follow(u, memories[k])
             truth = self.reached(truth, u)
-            return self.recorded(truth)
+            return self.recorded(truth) + next(added, 0.0)
 
         return rollout(step, controller, task)

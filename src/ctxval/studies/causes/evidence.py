@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.optimize import least_squares
 
-from ctxval._util.arrays import Array, Rows
+from ctxval._util.arrays import Array, Mask, Rows
 from ctxval._util.representation import ShortRepr
 from ctxval.core.model import Model
 from ctxval.core.trajectory import Trajectory
@@ -17,6 +17,9 @@ from ctxval.studies.causes.cause import Repaired
 
 STEPS = (1, 6)  # of the predictions
 _LARGEST = 1e3  # of a residual, as a multiple of the typical one of M
+_DRAWS = 4  # of noise
+_LONGER = 4  # times as many steps, with which shares are measured if there is noise
+_UNKNOWN = 1e3  # a standard deviation
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,6 +59,7 @@ class Evidence:
         for padded, run in zip(self.inputs, runs, strict=True):
             padded[: len(run.inputs)] = run.inputs
         self.windows, self.sizes = list[Predictions](), list[Array]()
+        self._missed = dict[int, tuple[Array, Mask]]()  # by M after a number of steps, and which of it is evidence
         for number, length in enumerate(steps):
             window = self._window(min(length, min(self.horizons)), most[number])
             left = self.left_by(Repaired(model, ()), window)
@@ -84,30 +88,70 @@ class Evidence:
         inputs = self.inputs.reshape(-1, self.inputs.shape[-1])
         return self.states[window.states], inputs[window.inputs], residuals
 
-    def left_by(self, repaired: Repaired, window: Predictions) -> Array:
-        """Return predicted minus recorded states ``(N, n)``."""
+    def left_by(self, repaired: Repaired, window: Predictions, moved: Array | float = 0.0) -> Array:
+        """Return predicted minus recorded states ``(N, n)``; predictions begin at recorded states that are moved."""
         acting = repaired.acting(self.inputs).reshape(-1, self.inputs.shape[-1])
-        x = repaired.true(self.states[window.states])
+        x = repaired.true(self.states[window.states] + moved)
         for k in range(window.steps):
             x = repaired.reached(x, acting[window.inputs + k])
         return np.asarray(repaired.recorded(x) - self.states[window.states + window.steps])
 
-    def structure(self, repaired: Repaired) -> tuple[float, float]:
-        """Return the part of the squared residuals of one step that is no noise, and all of them, in those of M.
+    def noise(self, repaired: Repaired) -> Array:
+        """Return the standard deviations ``(n,)`` of white noise of the measurements, as residuals of one step show it.
 
-        The part is at most so large, up to one standard error. It is their autocovariance over two steps to four. Noise
-        of a step or of a measurement has none of it: a measurement enters the residuals of two successive steps.
+        The noise of a measurement enters two successive residuals, with opposite signs.
         """
         left = self.left_by(repaired, self._window(1, len(self.states)))
         left = np.nan_to_num(left / self.sizes[0], nan=_LARGEST).clip(-_LARGEST, _LARGEST)
-        of_runs, squares = [], []
-        for run in np.split(left, np.cumsum(self.horizons)[:-1]):
-            lags = [k for k in (2, 3, 4) if k < len(run)]
-            of_runs.append(np.sum([(run[k:] * run[:-k]).sum(axis=0) / (len(lags) * len(run)) for k in lags], axis=0))
-            squares.append((run**2).mean(axis=0))
-        matter = self.sizes[0] > 2 * self.windows[0].floors
-        part, whole = (float(np.mean(each, axis=0)[matter].sum()) for each in (of_runs, squares))
-        return max(part, 0.0) + whole / float(np.sqrt(3 * sum(self.horizons))), whole
+        runs = np.split(left, np.cumsum(self.horizons)[:-1])
+        products = np.concatenate([run[1:] * run[:-1] for run in runs])
+        window = replace(self.windows[0], states=self.windows[0].states[::4], inputs=self.windows[0].inputs[::4])
+        here, slopes = self.left_by(repaired, window), np.ones(left.shape[1])
+        for i, size in enumerate(0.1 * self.sizes[0]):
+            there = self.left_by(repaired, window, size * np.eye(len(slopes))[i])
+            slopes[i] = np.median(np.nan_to_num((there - here)[:, i], nan=size)) / size
+        variances = -products.mean(axis=0) / np.clip(slopes, 0.1, None)
+        return np.asarray(np.sqrt(np.maximum(variances, 0.0)) * self.sizes[0])
+
+    def explained(self, repaired: Repaired, noise: Array) -> tuple[float, float]:
+        """Return the share of the squared residuals of M after several steps that is explained, except for noise.
+
+        The effect of a cause grows with the number of steps, and so does that of an error of its size. More steps than
+        in fits are therefore taken only if noise then hides less of the effect.
+
+        Args:
+            noise: standard deviations ``(n,)`` of white noise of the measurements.
+
+        Returns:
+            the share and, because of noise, its standard deviation.
+        """
+        steps, shortest = self.windows[1].steps, min(self.horizons)
+        lengths = [steps, *({min(_LONGER * steps, shortest)} - {steps} if noise.any() else ())]
+        return min((self._explained(repaired, noise, length) for length in lengths), key=lambda result: result[1])
+
+    def _explained(self, repaired: Repaired, noise: Array, steps: int) -> tuple[float, float]:
+        window, rng = self._window(steps, len(self.states)), np.random.default_rng(0)
+        if steps not in self._missed:
+            changes = _size(self.states[window.states + steps] - self.states[window.states])
+            missed = _size(self.left_by(Repaired(self.model, ()), window))
+            self._missed[steps] = missed, missed > 2e-3 * np.maximum(changes, 1e-12)
+        sizes, matter = self._missed[steps]
+        if not matter.any():
+            return 0.0, _UNKNOWN
+        most = _LARGEST * np.maximum(sizes, 1e-15)
+        errors = np.nan_to_num(self.left_by(repaired, window), nan=np.inf).clip(-most, most)
+        by_noise = noise**2
+        for _ in range(_DRAWS if noise.any() else 0):
+            moved = self.left_by(repaired, window, noise * rng.standard_normal(errors.shape)).clip(-most, most)
+            by_noise = by_noise + np.nan_to_num((moved - errors) ** 2).mean(axis=0) / _DRAWS
+        squares = np.stack([(errors**2).mean(axis=0), sizes**2, by_noise])[:, matter] / sizes[matter] ** 2
+        left, before, spread = squares[0] - squares[2], squares[1] - squares[2], squares[2]
+        whole = float(before.sum())
+        if whole <= 0:
+            return 0.0, _UNKNOWN
+        # Every second prediction is independent of the others.
+        uncertainty = float(np.sqrt((spread**2).sum() * 4 / len(errors))) / whole
+        return 1.0 - max(float(left.sum()), 0.0) / whole, min(uncertainty, _UNKNOWN)
 
     def measured(self, repaired: Repaired) -> tuple[float, float]:
         """Return minus twice the log-likelihood, and the share of the squared residuals of M that is left."""
@@ -143,25 +187,30 @@ class Explanation(ShortRepr):
         return [size for cause in self.repaired.causes for size in cause.sizes]
 
 
-def explained(evidence: Evidence, candidates: tuple[Candidate, ...], begun: Sequence[float] | Array) -> Explanation:
+def explained(
+    evidence: Evidence, candidates: tuple[Candidate, ...], begun: Sequence[float] | Array, *, near: bool = False
+) -> Explanation:
     """Return causes whose sizes are fitted to records by nonlinear least squares.
 
     The residuals of each state are first divided by those of M, and then twice by what is left of them.
 
     Args:
         begun: the sizes of all causes with which the fit begins.
+        near: whether these were fitted to nearly the same records.
     """
     fit = _Fit(evidence, candidates)
     theta = np.array(begun)
     if len(theta):
-        theta = fit.most_likely_of_states(fit.best(theta, evidence.sizes, 8))
-        for _ in range(2):
+        theta = theta if near else fit.most_likely_of_states(fit.best(theta, evidence.sizes, 8))
+        for _ in range(1 if near else 2):
             model = fit.repaired(theta)
             sizes = [
                 np.clip(np.hypot(_size(evidence.left_by(model, window)), window.floors), window.floors, size)
                 for window, size in zip(evidence.windows, evidence.sizes, strict=True)
             ]
-            theta = fit.best(theta, sizes, 6)
+            before, theta = theta, fit.best(theta, sizes, 6)
+            if (np.abs(theta - before) < 0.01 * fit.scales).all():
+                break
     model = fit.repaired(theta)
     misfit, left = evidence.measured(model)
     fitted = tuple(replace(each, cause=cause) for each, cause in zip(candidates, model.causes, strict=True))
@@ -185,13 +234,7 @@ def screened(evidence: Evidence, candidates: tuple[Candidate, ...]) -> tuple[flo
             J = fit.slope(theta, evidence.sizes, here)
             moved = np.clip(theta + np.linalg.lstsq(J, -here, rcond=1e-8)[0], fit.low, fit.high)
             linear = here + J @ (moved - theta)
-        misfit, first = 0.0, 0
-        for window, size in zip(evidence.windows, evidence.sizes, strict=True):
-            count, n = len(window.states), len(size)
-            squares = (linear[first : first + count * n].reshape(count, n) ** 2).sum(axis=0)
-            misfit += count * float(np.log(squares + (window.floors / size) ** 2).sum())
-            first += count * n
-        results.append((misfit + fit.penalty, moved))
+        results.append((fit.misfit(linear) + fit.penalty, moved))
     return min(results, key=lambda result: result[0])
 
 
@@ -244,7 +287,20 @@ class _Fit:
         for i in range(n):  # rows of errors are predictions after predictions, each with all states
             step = np.linalg.lstsq(J[i::n], -here[i::n], rcond=1e-8)[0]
             tried.append(np.clip(theta + step, self.low, self.high))
-        return min(tried, key=lambda each: self.evidence.measured(self.repaired(each))[0])
+        likely = min(tried, key=lambda each: self.misfit(here + J @ (each - theta)))
+        if likely is theta:
+            return theta
+        return min((theta, likely), key=lambda each: self.evidence.measured(self.repaired(each))[0])
+
+    def misfit(self, errors: Array) -> float:
+        """Return minus twice the log-likelihood of residuals in the sizes of those of M."""
+        misfit, first = 0.0, 0
+        for window, size in zip(self.evidence.windows, self.evidence.sizes, strict=True):
+            count, n = len(window.states), len(size)
+            squares = (errors[first : first + count * n].reshape(count, n) ** 2).sum(axis=0)
+            misfit += count * float(np.log(squares + (window.floors / size) ** 2).sum())
+            first += count * n
+        return misfit
 
     def best(self, start: Array, sizes: Sequence[Array], evaluations: int) -> Array:
         inside = np.clip(start, self.low + 1e-9 * self.scales, self.high - 1e-9 * self.scales)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -11,31 +10,20 @@ from ctxval._util.arrays import single_threaded
 from ctxval._util.progress import advance, stage
 from ctxval.campaign.campaign import Campaign
 from ctxval.campaign.history import executed_trials
-from ctxval.core.plan import Plan
-from ctxval.core.system import System, WithOutputs
-from ctxval.core.trajectory import Trajectory
 from ctxval.core.validation import Validation
 from ctxval.errors import CtxvalError, InputError
 from ctxval.learning.extended import estimates_by_loops_on_model
 from ctxval.studies.causes.candidates import Candidate, candidates
-from ctxval.studies.causes.cause import Repaired
 from ctxval.studies.causes.evidence import STEPS, Evidence, Explanation, explained, screened
+from ctxval.studies.causes.loops import ClosedLoops, Execution, Predicted
 from ctxval.studies.causes.mechanics import Force
 from ctxval.studies.causes.plant import Plant, plant_of
 from ctxval.studies.causes.report import CauseReport, Explained, Separating
 
 _ALIKE = 10.0  # differences of the criterion that do not tell causes apart
-_NAMED = 0.95  # share of the squared closed-loop deviations of M that causes must explain, to be the cause
+_NAMED = 0.98  # share of the squared deviations of M in closed loop that causes must explain, to be the cause
+_FITTED = 8  # explanations by one more cause that are fitted to all records
 _CHECKED = 4  # explanations that are tried in closed loop
-
-
-@dataclass(frozen=True, eq=False)
-class _Execution:
-    """An executed task: its plan, what the system did, and the same with states of M if only outputs are recorded."""
-
-    plan: Plan
-    executed: Trajectory
-    states: Trajectory
 
 
 def find_causes(campaign: Campaign, *, most: int = 2) -> CauseReport:
@@ -66,12 +54,12 @@ def find_causes(campaign: Campaign, *, most: int = 2) -> CauseReport:
                 raise InputError("the states of the model cannot be estimated from the recorded outputs.")
             states = estimated
         plans = [validation.plan(validation.space.from_unit(point)) for point, _ in executed]
-        executions = list(map(_Execution, plans, (run for _, run in executed), states))
+        executions = list(map(Execution, plans, (run for _, run in executed), states))
         return _Study(validation, executions).report(most)
 
 
 class _Study:
-    def __init__(self, validation: Validation, executions: Sequence[_Execution]) -> None:
+    def __init__(self, validation: Validation, executions: Sequence[Execution]) -> None:
         self.validation, self.executions, self.model = validation, executions, validation.model
         self.outputs = validation.outputs is not None
         runs = [each.states for each in executions]
@@ -82,7 +70,6 @@ class _Study:
         floors = [window.floors for window in self.evidence.windows]
         self.some = Evidence(self.model, runs, floors, (200, 40), steps)  # all causes are screened on these
         self.others = [Evidence(self.model, runs[:k] + runs[k + 1 :], floors, steps=steps) for k in range(len(runs))]
-        self.structure, _ = self.evidence.structure(Repaired(self.model, ()))
         x, u, residuals = self.evidence.pairs
         usable = np.isfinite(residuals).all(axis=1)
         if not usable.any():
@@ -91,26 +78,21 @@ class _Study:
         states, inputs = validation.names(n, m)
         self.plant: Plant = plant_of(self.model, executions[0].plan.task.dt, states, inputs, x[usable], u[usable])
         self.dictionary = candidates(self.plant, x[usable], u[usable], residuals[usable], outputs=self.outputs)
-        whole = np.concatenate([each.executed.states for each in executions])
-        self.ranges = np.maximum(np.ptp(whole, axis=0), 1e-12)
-        efforts = np.concatenate([each.executed.inputs for each in executions])
-        self.efforts = np.maximum(np.ptp(efforts, axis=0), 1e-12)
-        self.without = [self._deviation(each, each.plan.model_trajectory) for each in executions]
-        self.distances = [self._distance(each, each.plan.model_trajectory) for each in executions]
+        self.loops = ClosedLoops(validation, executions)
 
     def report(self, most: int) -> CauseReport:
         with stage("fitting causes", (2 * most - 1) * len(self.dictionary), "causes"):
             ranked = self._ranked(())
             chosen, alike = self._chosen(ranked)
             while chosen is not None and len(chosen.explanation.candidates) < most:
-                if chosen.explanation.left < 0.02 or chosen.share > 0.99:  # nothing is left for another cause
+                if chosen.explanation.left < 0.02 or chosen.complete > 0.99:  # nothing is left for another cause
                     break
                 better, others = self._chosen(self._ranked(chosen.explanation.candidates))
                 if better is not None:  # the first one was chosen without the other ones
                     better, others = self._chosen(self._ranked(better.explanation.candidates[1:]))
                 if better is None or better.explanation.criterion > chosen.explanation.criterion - _ALIKE:
                     break
-                if 1 - better.share > 0.5 * (1 - chosen.share):
+                if 1 - better.complete > 0.5 * (1 - chosen.complete):
                     break
                 chosen, alike = better, others
         named = chosen is not None and chosen.complete >= _NAMED
@@ -121,7 +103,7 @@ class _Study:
             named=named,
             tried=len(self.dictionary),
             executions=len(self.executions),
-            before=max(self.distances),
+            before=max(self.loops.distances),
             units=self.validation.labels.units,
             separating=self._separating(group) if named and len(group) > 1 else None,
             ranked=tuple(ranked[:5]),
@@ -140,7 +122,9 @@ class _Study:
                 results.append((*screened(self.some, together), together))
             advance(1)
         results.sort(key=lambda result: result[0])
-        refined = [explained(self.evidence, together, begun) for _, begun, together in results[:8]]
+        # What comes to less than a quarter of the evidence of the best one is not worth a fit.
+        worth = [result for result in results[:_FITTED] if result[0] <= 0.25 * results[0][0]]
+        refined = [explained(self.evidence, together, begun) for _, begun, together in worth or results[:1]]
         return sorted(refined, key=lambda explanation: explanation.criterion)
 
     def _chosen(self, ranked: list[Explanation]) -> tuple[Explained | None, list[Explained]]:
@@ -149,9 +133,9 @@ class _Study:
         Of those that explain alike, the one with the fewest sizes is the first, and what has it as a special case is
         no other explanation.
         """
-        before = max(self.distances)
+        before = max(self.loops.distances)
         tried = (self._in_closed_loop(each) for each in ranked[:_CHECKED])
-        best = next((each for each in tried if each.share > 0 and each.distance < before), None)
+        best = next((each for each in tried if each.counts(before)), None)
         if best is None:
             return None, []
         others = [each for each in ranked if each is not best.explanation and _alike(best.explanation, each)]
@@ -162,54 +146,27 @@ class _Study:
 
     def _in_closed_loop(self, explanation: Explanation) -> Explained:
         """Return how well causes predict each execution if they are fitted to the others."""
-        deviations, distances, sizes = [], [], []
+        noise = np.zeros(self.evidence.states.shape[1]) if self.outputs else self.evidence.noise(explanation.repaired)
+        predicted, sizes = list[Predicted](), []
         for execution, others in zip(self.executions, self.others, strict=True):
-            fitted = explained(others, explanation.candidates, explanation.sizes)
+            fitted = explained(others, explanation.candidates, explanation.sizes, near=True)
             sizes.append(fitted.sizes)
-            loop = self._loop(fitted.repaired, execution.plan, execution)
-            deviations.append(self._deviation(execution, loop))
-            distances.append(self._distance(execution, loop))
-        share = 1 - float(np.sum(deviations) / max(np.sum(self.without), 1e-300))
-        left, whole = self.evidence.structure(explanation.repaired)
-        structure, noise = 1 - left / max(self.structure, 1e-300), 1 - left / max(whole, 1e-300)
-        spreads = tuple(map(float, np.ptp(sizes, axis=0)))
-        return Explained(explanation, share, float(np.max(distances)), spreads, min(structure, 1.0), min(noise, 1.0))
-
-    def _loop(self, repaired: Repaired, plan: Plan, execution: _Execution | None = None) -> Trajectory | None:
-        """Return the closed loop of a plan on a model with causes; None if it fails."""
-        system: System = repaired
-        task = plan.task
-        if self.validation.outputs is not None:
-            system = WithOutputs(repaired, self.validation.outputs)
-        elif execution is not None:
-            task = task.starting_at(execution.executed.states[0])
-        try:
-            loop = system.execute(plan.controller, task)
-        except Exception:  # the user's own parts, at states that they never saw
-            return None
-        return loop if loop.finite.all() else None
-
-    def _deviation(self, execution: _Execution, loop: Trajectory | None) -> float:
-        """Return the mean squared deviation from an execution without noise, in shares of ranges.
-
-        Noise is what second differences over time show: the deviation that a cause makes is smooth beside it.
-        """
-        if loop is None:
-            return np.inf
-        executed, squares = execution.executed, 0.0
-        for each in ((loop.states - executed.states) / self.ranges, (loop.inputs - executed.inputs) / self.efforts):
-            noise = (np.diff(each, 2, axis=0) ** 2).mean(axis=0) / 6 if len(each) > 2 else 0.0
-            squares += float(np.maximum((each**2).mean(axis=0) - noise, 0.0).mean())
-        return squares
-
-    def _distance(self, execution: _Execution, loop: Trajectory | None) -> float:
-        if loop is None:
-            return np.inf
-        try:
-            with np.errstate(all="ignore"):
-                return float(self.validation.distance(loop.copy(), execution.executed.copy(), execution.plan.task))
-        except Exception:  # the user's distance
-            return np.inf
+            predicted.append(self.loops.predicted(fitted.repaired, execution, noise))
+        by_noise = float(np.sum([each.by_noise.mean() for each in predicted]))
+        spread = float(np.sqrt(np.sum([each.by_noise.var() for each in predicted])))
+        left = float(np.sum([each.deviation for each in predicted])) - by_noise
+        # Without any effect beside noise, what is left says only whether it is more than noise.
+        before = max(float(np.sum(self.loops.without)) - by_noise, spread, 1e-300)
+        structure, uncertain = self.evidence.explained(explanation.repaired, noise)
+        return Explained(
+            explanation,
+            share=1 - max(left, 0.0) / before,
+            distance=float(np.max([each.distance for each in predicted])),
+            spreads=tuple(map(float, np.ptp(sizes, axis=0))),
+            uncertainty=spread / before,
+            structure=structure,
+            uncertain_structure=uncertain,
+        )
 
     def _separating(self, group: Sequence[Explained]) -> Separating | None:
         """Return the task at which the predictions of causes that the executions do not tell apart differ most."""
@@ -220,14 +177,14 @@ class _Study:
                 plan = self.validation.plan(point)
             except CtxvalError:
                 continue
-            promised = self._loop(first.explanation.repaired, plan)
+            promised = self.loops.of_plan(first.explanation.repaired, plan)
             if promised is None:
                 continue
             for number, other in enumerate(group[1:], start=1):
-                loop = self._loop(other.explanation.repaired, plan)
+                loop = self.loops.of_plan(other.explanation.repaired, plan)
                 if loop is None:
                     continue
-                gap = float(np.max(np.abs(loop.states - promised.states) / self.ranges))
+                gap = float(np.max(np.abs(loop.states - promised.states) / self.loops.ranges))
                 if best is None or gap > best.gap:
                     apart = float(self.validation.distance(promised.copy(), loop.copy(), plan.task))
                     best = Separating(space.describe_point(point), apart, number, gap)

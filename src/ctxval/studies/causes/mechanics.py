@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -42,25 +42,24 @@ class Force(Cause):
             return (np.asarray(model.step(x, moved)) - free) / self.probe
         return _accelerated(np.zeros_like(x), [self.joint], np.full_like(x, self.dt), self.dt)
 
-    def force(self, rate: Array, load: Callable[[], Array], stopping: Array) -> Array:
+    def force(self, rate: Array, load: Array, stopping: Array) -> Array:
         """Return the force ``(...)`` at a mean rate; the force ``stopping`` would stop the joint within the step.
 
         Args:
-            load: returns the magnitude of the force that the gears carry.
+            load: the magnitude of the force that the gears carry.
         """
         raise NotImplementedError
+
+    def load(self, model: Model, x: Array, u: Array) -> Array:
+        """Return the magnitude of the force that the gears carry ``(...)``; 0 if the force does not depend on it."""
+        return np.zeros(x.shape[:-1])
 
     def pushed(self, model: Model, x: Array, u: Array, free: Array, reached: Array) -> Array:
         effect, number = self.effect(model, x, u, free), self.joint.rate
         moving = np.where(np.abs(effect[..., number]) > 1e-12, effect[..., number], 1e-12)
 
-        def load() -> Array:
-            # What the inputs do to the joint, against what everything else does to it, as the model has it.
-            unmoved = np.asarray(model.step(x, np.zeros_like(u)))[..., number]
-            return np.asarray(np.abs(free[..., number] - 2 * unmoved + x[..., number]) / np.abs(moving))
-
         rate = 0.5 * (x[..., number] + reached[..., number])
-        return reached + effect * self.force(rate, load, -reached[..., number] / moving)[..., None]
+        return reached + effect * self.force(rate, self.load(model, x, u), -reached[..., number] / moving)[..., None]
 
     def amount(self, plant: Plant, size: float, per: str = "") -> str:
         return f"{size:.3g} {plant.force_unit(self.joint)}{per}"
@@ -72,7 +71,7 @@ class Bias(Force):
 
     name: ClassVar[str] = "bias"
 
-    def force(self, rate: Array, load: Callable[[], Array], stopping: Array) -> Array:
+    def force(self, rate: Array, load: Array, stopping: Array) -> Array:
         return np.full_like(stopping, self.sizes[0])
 
     def text(self, plant: Plant) -> str:
@@ -85,7 +84,7 @@ class Viscous(Force):
 
     name: ClassVar[str] = "viscous friction"
 
-    def force(self, rate: Array, load: Callable[[], Array], stopping: Array) -> Array:
+    def force(self, rate: Array, load: Array, stopping: Array) -> Array:
         return -self.sizes[0] * rate
 
     def text(self, plant: Plant) -> str:
@@ -101,7 +100,7 @@ class Coulomb(Force):
 
     name: ClassVar[str] = "Coulomb friction"
 
-    def force(self, rate: Array, load: Callable[[], Array], stopping: Array) -> Array:
+    def force(self, rate: Array, load: Array, stopping: Array) -> Array:
         return np.clip(stopping, -self.sizes[0], self.sizes[0])
 
     def text(self, plant: Plant) -> str:
@@ -118,7 +117,7 @@ class Stribeck(Force):
 
     name: ClassVar[str] = "Stribeck friction"
 
-    def force(self, rate: Array, load: Callable[[], Array], stopping: Array) -> Array:
+    def force(self, rate: Array, load: Array, stopping: Array) -> Array:
         sliding, added, slow = self.sizes
         most = sliding + added * np.exp(-((rate / max(slow, 1e-12)) ** 2))
         return np.clip(stopping, -most, most)
@@ -134,19 +133,54 @@ class Stribeck(Force):
 class LoadFriction(Force):
     """Friction in proportion to the load that the gears carry. Sizes: the share of the load, and the part without it.
 
-    The load is the difference between what the inputs do to the joint and what everything else does, as M has it.
+    The load is the difference between the force of the motor and what everything else pulls with, as M has it.
+
+    Attributes:
+        rates: the rates of all joints that inputs drive.
     """
 
     name: ClassVar[str] = "load-dependent friction"
+    rates: tuple[int, ...] = ()
 
-    def force(self, rate: Array, load: Callable[[], Array], stopping: Array) -> Array:
-        most = self.sizes[0] * load() + self.sizes[1]
+    def load(self, model: Model, x: Array, u: Array) -> Array:
+        if self.joint.dof is not None:
+            assert isinstance(model, MuJoCo)
+            return np.abs(_pulls(model, x, u)[..., self.joint.dof])
+        unmoved, m = np.asarray(model.step(x, np.zeros_like(u))), u.shape[-1]
+        if self.joint.input is None:
+            number = self.joint.rate
+            driven = np.asarray(model.step(x, u))[..., number] - unmoved[..., number]
+            return np.asarray(np.abs(driven - (unmoved - x)[..., number]) / self.dt)
+        # What pulls is as large as the motors' forces that would do the same: each of them moves all joints.
+        rates, probes = list(self.rates), self.probe * np.eye(m)
+        moved = np.stack([np.asarray(model.step(x, np.broadcast_to(each, u.shape))) for each in probes], axis=-1)
+        effects = ((moved - unmoved[..., None]) / self.probe)[..., rates, :]
+        effects = np.nan_to_num(effects, nan=0.0, posinf=0.0, neginf=0.0)  # a step of M may have failed
+        pulls = u - (np.linalg.pinv(effects) @ (unmoved - x)[..., rates, None])[..., 0]
+        return np.asarray(np.abs(pulls[..., self.joint.input]))
+
+    def force(self, rate: Array, load: Array, stopping: Array) -> Array:
+        most = self.sizes[0] * load + self.sizes[1]
         return np.clip(stopping, -most, most)
 
     def text(self, plant: Plant) -> str:
         more = f", and {self.amount(plant, self.sizes[1])}" if self.sizes[1] > 0 else ""
         name = plant.joint_name(self.joint)
         return f"the friction of {name} depends on the load ({100 * self.sizes[0]:.3g} % of it{more})"
+
+
+def _pulls(model: MuJoCo, x: Array, u: Array) -> Array:
+    """Return the forces of actuators minus what pulls at the joints ``(..., nv)``, by the dynamics of MuJoCo."""
+    import mujoco
+
+    compiled = model.compiled
+    data, rows = mujoco.MjData(compiled), x.reshape(-1, x.shape[-1])
+    pulls = np.full((len(rows), compiled.nv), np.nan)
+    for k in np.flatnonzero(np.isfinite(rows).all(axis=1)):
+        data.qpos, data.qvel, data.ctrl = rows[k, : compiled.nq], rows[k, compiled.nq :], u.reshape(len(rows), -1)[k]
+        mujoco.mj_forward(compiled, data)
+        pulls[k] = data.qfrc_actuator + data.qfrc_bias
+    return pulls.reshape(*x.shape[:-1], -1)
 
 
 def _accelerated(reached: Array, joints: Sequence[Joint], gained: Array, dt: float) -> Array:

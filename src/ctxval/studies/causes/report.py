@@ -21,19 +21,21 @@ class Explained(ShortRepr):
     """Causes that were tried in closed loop, each execution predicted without itself.
 
     Attributes:
-        share: the share of the squared closed-loop deviations of M that the causes explain.
+        share: the share of the squared closed-loop deviations of M that the causes explain, except for what simulated
+            noise of the measurements makes of them.
+        uncertainty: the standard deviation of the share, because of noise.
+        structure, uncertain_structure: the same for the squared residuals of M after several steps.
         distance: the largest distance between an execution and its prediction.
         spreads: the range of each size if one execution is left out.
-        structure: the share of what is no noise in the residuals of one step that the causes explain.
-        noise: the share of noise in the residuals that the causes leave.
     """
 
     explanation: Explanation
     share: float
+    uncertainty: float
+    structure: float
+    uncertain_structure: float
     distance: float
     spreads: tuple[float, ...]
-    structure: float
-    noise: float
 
     @property
     def causes(self) -> tuple[Cause, ...]:
@@ -41,10 +43,22 @@ class Explained(ShortRepr):
         return self.explanation.repaired.causes
 
     @property
+    def resolved(self) -> bool:
+        """Whether closed loops follow causes rather than noise."""
+        return self.uncertainty < 0.1
+
+    @property
     def complete(self) -> float:
-        """The share that the causes explain: of deviations, or of residuals if most of what is left is noise."""
-        # Closed loops then follow noise rather than causes.
-        return max(self.share, self.structure) if self.noise > 0.5 else self.share
+        """The largest share that the causes may explain: of deviations or, if noise makes these, of residuals."""
+        if self.resolved:
+            return min(self.share + 2 * self.uncertainty, 1.0)
+        if self.uncertain_structure > 0.2 or self.share < 1 - 4 * self.uncertainty:
+            return 0.0
+        return min(self.structure + 2 * self.uncertain_structure, 1.0)
+
+    def counts(self, before: float) -> bool:
+        """Return whether executions are predicted better than by M, whose largest distance is given."""
+        return self.distance < before and self.share > 0 if self.resolved else self.complete > 0.5
 
 
 @dataclass(frozen=True)
@@ -114,7 +128,8 @@ class CauseReport(ShortRepr):
             f"the largest distance of {self.executions} executions falls from {self.before:.3g} to "
             f"{first.distance:.3g}{units}"
         )
-        share = f"{np.floor(1e3 * first.share) / 10:.4g} % of the squared deviations"
+        part, of = (first.share, "deviations") if first.resolved else (first.structure, "residuals, except for noise")
+        share = f"{np.floor(1e3 * part) / 10:.4g} % of the squared {of}"
         if not self.named:
             less = "The largest part of the error that one explains" if first.share > 0.5 else "What comes nearest"
             return f"None of these {self.tried} causes. {less}: {self._text(first)}. It explains {share}, and {effect}."
@@ -170,7 +185,8 @@ class CauseReport(ShortRepr):
                     "spreads": list(each.spreads),
                     "share": each.share,
                     "structure": each.structure,
-                    "noise": each.noise,
+                    "uncertainty": each.uncertainty,
+                    "uncertain_structure": each.uncertain_structure,
                     "distance": each.distance,
                     "criterion": each.explanation.criterion,
                     "residual_left": each.explanation.left,
