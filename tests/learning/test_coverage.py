@@ -216,5 +216,11 @@ def test_four_tasks_try_the_corners_of_all_positions(components: int) -> None:
         assert {(row[i], row[j]) for row in executed[2:]} == {(0.0, 0.0), (0.0, 1.0), (1.0, 0.0), (1.0, 1.0)}
 
 
+def test_before_the_first_execution_every_corner_is_untried() -> None:
+    corner = untried_corner(np.empty((0, 2)), TaskSpace(goal=([0, 0], [1, 1], "m")), np.array([0.4, 0.6]))
+    assert corner is not None
+    assert corner.gap == 1
+
+
 def test_without_a_position_no_corner_is_asked_for() -> None:
     assert untried_corner(TASKS, TaskSpace(angles=([0, 0], [1, 1], "rad")), TASKS[0]) is None

@@ -165,7 +165,7 @@ def untried_corner(executed: Array, space: TaskSpace, task: Array) -> UntriedCor
         ends, pairs = np.array(list(product((0.0, 1.0), repeat=len(columns)))), list(combinations(columns.tolist(), 2))
         gaps = np.stack(
             [
-                np.abs(ends[:, None, [i - at.start, j - at.start]] - executed[:, [i, j]]).max(axis=2).min(axis=1)
+                np.abs(ends[:, None, [i - at.start, j - at.start]] - executed[:, [i, j]]).max(axis=2).min(axis=1, initial=1.0)
                 for i, j in pairs
             ]
         )
