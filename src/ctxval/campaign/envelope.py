@@ -154,6 +154,20 @@ class EnvelopeSearch:
             tests.append(changed)
         return replace(evidence, predictions=tuple(tests))
 
+    def reserved(self) -> Choice | None:
+        """Return a test if a distance exceeds the threshold, and the budget is just enough for the missing tests.
+
+        It is None if executions may differ by noise: then others may be needed to falsify the model.
+        """
+        interval, trials, recorder = self._interval, self._ended(), self._recorder
+        stored = [trial for trial in trials if trial.origin in DRAWN and recorder.dynamics.stored_prediction(trial)]
+        missing = interval.tests - len(stored)
+        left = interval.budget - recorder.executions - sum(trial.state == "open" for trial in recorder.trials)
+        if not 0 < left <= missing or interval.best <= self._threshold or not interval.predicts:
+            return None
+        known = self._known(trials) if recorder.has_tasks else None
+        return None if known is None or self._regular(trials, known[1]) is None else interval.test()
+
     def choose(self) -> Choice | None:
         """Return the next task that enlarges the envelope, or a test of it; None if it would hardly grow.
 
