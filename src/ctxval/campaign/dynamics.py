@@ -226,10 +226,8 @@ class CampaignDynamics:
             return evidence
         # Many closed loops, which only matter to a bound that nothing else withdraws.
         evidence = _with_jumps(evidence, learned, bound)
-        labels = self._coordinates(learned)
-        names = [parted(label)[1] for label in labels]
-        states = len(learned.posterior.data.sizes)
-        if (pocket := learned.pocket(names[:states])) is not None:
+        labels, states = self._coordinates(learned), len(learned.posterior.data.sizes)
+        if (pocket := learned.pocket([parted(label)[1] for label in labels[:states]])) is not None:
             of = [labels[i] for i in pocket.states]
             place, within = (dict(zip(of, each.tolist(), strict=True)) for each in (pocket.place, pocket.within))
             evidence = replace(evidence, pocket=StatePocket(pocket.size, place, within))

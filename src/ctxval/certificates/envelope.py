@@ -12,6 +12,10 @@ they were learned from. A task is no part of the envelope if its closed loop lea
 with a larger distance. Without tests the envelope is withdrawn, as the bound on d* is, and if a test exceeds the
 threshold although the learned dynamics have it below.
 
+If a few recorded transitions are no smooth function of what is recorded, as those of contacts, and the others are, then
+the draws are learned from the others alone (:mod:`ctxval.learning.regular`), and a task is no part of the envelope if
+its run comes to states like those of the few. The tests are predicted from the executions of all other tasks.
+
 Between these tasks, ``mean + k spread`` is interpolated (:mod:`ctxval.certificates.envelope_surface`). The largest
 error of the nearest tasks, if each of them is interpolated from all others, is added. Further tasks of the set check
 this: errors are multiplied until hardly any of these tasks has ``mean + k spread`` above the threshold.
@@ -46,7 +50,7 @@ from ctxval.certificates.dynamics_evidence import CheckedPrediction, DynamicsEvi
 from ctxval.certificates.envelope_surface import Surfaces, exported, write_onnx
 from ctxval.certificates.envelope_words import Region, regions_inside
 from ctxval.certificates.prediction_tests import DRAWN
-from ctxval.certificates.sentences import dynamics_assumptions, envelope_statement
+from ctxval.certificates.sentences import IRREGULAR, dynamics_assumptions, envelope_statement
 from ctxval.core.space import TaskSpace
 from ctxval.core.task_suite import TaskSuite
 from ctxval.errors import InputError
@@ -325,7 +329,7 @@ def envelope_of(
         executions=evidence.executions,
         tests=sum(each.stored and each.origin in DRAWN for each in evidence.predictions),
         quantile=evidence.quantile,
-        assumptions=dynamics_assumptions(evidence),
+        assumptions=(*dynamics_assumptions(evidence), *([IRREGULAR] if irregular else [])),
         irregular=irregular,
         units=units,
     )

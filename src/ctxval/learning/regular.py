@@ -87,8 +87,10 @@ def split_transitions(
         before.append(regular.tobytes())
         rows = np.flatnonzero(regular)
         covariances = learn_covariances(model, transitions[rows], sources[rows], seed, settings)
-        posterior = covariances and condition(covariances, transitions[rows], sources[rows])
-        if covariances is None or posterior is None:
+        if covariances is None:
+            return None
+        posterior = condition(covariances, transitions[rows], sources[rows])
+        if posterior is None:
             return None
         regular = _is_regular(posterior, transitions, regular)
         if regular.tobytes() in before:
