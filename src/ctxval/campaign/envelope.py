@@ -83,15 +83,13 @@ class EnvelopeSearch:
                 )
                 return withdrawn(space, threshold, confidence, unknown)
             regular = self._regular(trials, known[1])
-            if regular is not None and known[1].quantile is not None:
-                return self._of(*regular, trials)
-            envelope = self._of(*known, trials)
-            if envelope.doubt is None and envelope.raised_by is not None:
-                regular = self._regular(trials, known[1], always=True)
             if regular is None:
+                return self._of(*known, trials)
+            envelope = self._of(*regular, trials)
+            if known[1].quantile is not None:  # noise that the regular part does not have
                 return envelope
-            other = self._of(*regular, trials)
-            return other if other.share > envelope.share else envelope
+            smooth = self._of(*known, trials)  # soft contacts can be learned
+            return envelope if envelope.share > smooth.share else smooth
 
     def _of(self, learned: LearnedDynamics, evidence: DynamicsEvidence, trials: Sequence[Trial]) -> Envelope:
         """Return the envelope of what was learned, or why there is none."""
@@ -112,15 +110,9 @@ class EnvelopeSearch:
             return withdrawn(space, threshold, confidence, reason_of(error))
 
     def _regular(
-        self, trials: Sequence[Trial], evidence: DynamicsEvidence, *, always: bool = False
+        self, trials: Sequence[Trial], evidence: DynamicsEvidence
     ) -> tuple[LearnedDynamics, DynamicsEvidence] | None:
-        """Return what regular transitions teach if all transitions are no function of what is recorded, and they are.
-
-        With ``always``, they are asked whatever all transitions are. The tests are those of the campaign.
-        """
-        explained = all(is_explained(each, self._threshold) for each in evidence.predictions)
-        if evidence.quantile is None and explained and not always:
-            return None
+        """Return what the regular transitions teach; None if all are regular, or if there is noise in them."""
         numbers = tuple(trial.number for trial in trials)
         if self._split is None or self._split[0] != numbers:
             try:
@@ -181,7 +173,8 @@ class EnvelopeSearch:
         known = self._known(trials)
         if known is None:
             return None
-        regular = self._regular(trials, known[1])
+        explained = all(is_explained(each, self._threshold) for each in known[1].predictions)
+        regular = None if known[1].quantile is None and explained else self._regular(trials, known[1])
         learned, evidence = regular or known
         missing = missing_tests(evidence.predictions, interval.tests)
         waiting = sum(trial.state == "open" for trial in recorder.trials)
