@@ -30,11 +30,12 @@ from study_auto import RESULTS
 
 STORED = JsonLines(RESULTS / "envelope.jsonl", ("system", "seed", "rule"))
 PAGE = Path(__file__).parents[1] / "docs" / "envelope.md"
-RULE = 7
+RULE = 8
 """The version of the method: 1 had one margin for all tasks, 2 did not check its interpolation, 3 stated no envelope if
 learned dynamics missed the distance of a test, on whichever side of the threshold, 4 executed the tests before the
 model was falsified, which cost the verdict of oblique-wall, 5 learned contacts as noise, and 6
-asked for a regular part only if there seemed to be noise, or a test was not explained."""
+asked for a regular part only if there seemed to be noise, or a test was not explained; 7 interpolated the boundary of
+the regular part between tasks from steep values."""
 COMPARABLE = 3  # later versions differ in what they do if learned dynamics miss a distance, and 4 in when it tests
 BUDGET, KEPT, CONFIDENCE = 15, 0.7, 0.95
 TASKS, NOISY_TASKS, REPEATS = 4000, 1000, 60

@@ -22,7 +22,7 @@ class DrawnDistances(ShortRepr):
         points: tasks, points of the unit cube ``(K, d)``.
         draws: distances on S draws ``(S, K)``; infinity if the loop diverges, NaN if no controller can be designed.
         beyond: how far the loop on the mean leaves the records, as a share of the visited range ``(K,)``.
-        crossed: how far it crosses the boundary of the regular part, in the same way; None if there is no boundary.
+        crossed: how far it crosses the boundary of the regular part, from -1 to 1; None if there is no boundary.
     """
 
     points: Array
@@ -68,8 +68,9 @@ class DrawnDistances(ShortRepr):
         Args:
             most: by how much loops may leave the records, as a share of the visited range.
         """
-        beyond = self.beyond / most if self.crossed is None else np.maximum(self.beyond, most + self.crossed) / most
-        return np.asarray(np.minimum(beyond, LARGEST))
+        leaving = np.minimum(self.beyond / most, LARGEST)
+        # A slope of 1, because what is steep can hardly be interpolated between tasks.
+        return leaving if self.crossed is None else np.maximum(leaving, 1 + self.crossed)
 
     def upper(self, factor: float, threshold: float) -> Array:
         """Return mean + k spread as shares of the threshold ``(K,)``, at most ``LARGEST``."""
