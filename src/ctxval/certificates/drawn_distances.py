@@ -68,9 +68,9 @@ class DrawnDistances(ShortRepr):
         Args:
             most: by how much loops may leave the records, as a share of the visited range.
         """
-        leaving = np.minimum(self.beyond / most, LARGEST)
-        # A slope of 1, because what is steep can hardly be interpolated between tasks.
-        return leaving if self.crossed is None else np.maximum(leaving, 1 + self.crossed)
+        # Both have the same slope: smaller slopes cost more of the set, because their errors reach farther.
+        beyond = self.beyond if self.crossed is None else np.maximum(self.beyond, most + self.crossed)
+        return np.asarray(np.minimum(beyond / most, LARGEST))
 
     def upper(self, factor: float, threshold: float) -> Array:
         """Return mean + k spread as shares of the threshold ``(K,)``, at most ``LARGEST``."""
