@@ -3,8 +3,8 @@
 The threshold is the 0.7 quantile of the true distance over the tasks, so it is below d* and 70 % of the tasks keep it.
 The true set is known at 4,000 random tasks, by executions of the true system that count as none; a noisy system is
 executed 60 times at each of 1,000 tasks, and its distance is the 0.9 quantile. The method was tuned on systems of the
-development lists alone (hanging-pendulum, two-tanks, docking-magnet, corner-stop, hidden-load, and the
-carts and pendulums with noise).
+development lists alone (hanging-pendulum, two-tanks, docking-magnet, corner-stop, hidden-load, the
+carts and pendulums with noise, and the systems with contacts of ``envelope_development.py``).
 
 ``python benchmarks/study_envelope.py --seeds 4`` runs the campaigns that are not stored yet, and writes
 ``docs/envelope.md``. With ``--seeds 0``, it only writes the page.
@@ -30,10 +30,11 @@ from study_auto import RESULTS
 
 STORED = JsonLines(RESULTS / "envelope.jsonl", ("system", "seed", "rule"))
 PAGE = Path(__file__).parents[1] / "docs" / "envelope.md"
-RULE = 5
+RULE = 7
 """The version of the method: 1 had one margin for all tasks, 2 did not check its interpolation, 3 stated no envelope if
-learned dynamics missed the distance of a test, on whichever side of the threshold, and 4 executed the tests before the
-model was falsified, which cost the verdict of oblique-wall."""
+learned dynamics missed the distance of a test, on whichever side of the threshold, 4 executed the tests before the
+model was falsified, which cost the verdict of oblique-wall, 5 learned contacts as noise, and 6
+asked for a regular part only if there seemed to be noise, or a test was not explained."""
 COMPARABLE = 3  # later versions differ in what they do if learned dynamics miss a distance, and 4 in when it tests
 BUDGET, KEPT, CONFIDENCE = 15, 0.7, 0.95
 TASKS, NOISY_TASKS, REPEATS = 4000, 1000, 60
@@ -97,12 +98,18 @@ systems that are reported and were not tuned on. (Four campaigns of an earlier v
 boat-in-current and ball-on-beam, showed that its interpolation lost much in five parameters. It was replaced by one
 that was chosen on development systems, and which further tasks check since a system with short waves was made to
 mislead it. Version 3 stated no envelope for the three systems with contacts, because the learned dynamics missed the
-distance of a test. Since version 4, such a distance raises the factor; it withdraws the envelope only if it exceeds the
-threshold and the learned dynamics have it below. Version 4 also executed the tests before the model was falsified,
-which left oblique-wall undecided. The rest is the same.) Of each system, 70 % of the tasks keep the threshold. "Found"
-is the share of these tasks that the envelope trusts; "false" is the share of all tasks that it trusts although their
-true distance is larger. True sets are known at {tasks} random tasks, of noisy systems at {noisy_tasks} tasks by
-{repeats} executions each. [How to use an envelope](how-to/envelope.md) says what it is.
+distance of a test. Since version 4, such a distance raises the factor; it withdraws the envelope only if it exceeds
+the threshold and the learned dynamics have it below. Version 4 also executed the tests before the model was falsified,
+which left oblique-wall undecided. Versions 3 to 5 found nothing of systems with contacts: steps that touch something
+were learned as noise, and predicted runs diverged. Since version 6, the draws are learned without such steps, and
+tasks whose runs come to them are not trusted; version 6 did so only if there seemed to be noise, or a test was not
+explained. Version 7 is the present one. It was developed on cart-at-wall, gripper-on-floor, moored-boat and rail-cars;
+heavy-bin, hidden-heat, hidden-load, corner-stop, hidden-post, gate-at-post and docking-magnet were to show false
+volume. The rest is the same, so results of smooth systems by version 3 stay.) Of each system, 70 % of the tasks keep
+the threshold. "Found" is the share of these tasks that the envelope trusts; "false" is the share of all tasks that it
+trusts although their true distance is larger. True sets are known at {tasks} random tasks, of noisy systems at
+{noisy_tasks} tasks by {repeats} executions each.
+[How to use an envelope](how-to/envelope.md) says what it is.
 
 **The median share found is {found:.0f} %. It is at least 80 % on {enough} of {systems} systems, of which {contacts}
 have contacts and {noisy} noise (the goal is 8, of which 2 have contacts and 2 noise). In {above} of {count} campaigns,
@@ -111,6 +118,7 @@ the falsely included volume is above 1 % (the goal is at most 5 % of 200 campaig
 
 {table}
 
+"Version" is that of each campaign: of the systems with contacts, those of a version below 7 were not run again.
 "Words" is the share of the tasks in the largest box that the envelope names. "False, at most" is the largest true
 distance of a falsely trusted task, divided by the threshold. Figures of systems are medians, except for the false ones,
 which are the largest.

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from conftest import make_validation, make_validation_without_inputs
-from ctxval import Campaign, Store, certificates
+from ctxval import Campaign, Store, Task, TaskSpace, Validation, certificates, controllers, distances, models, systems
 from ctxval.errors import InputError
 
 TAU, BUDGET = 0.3, 14
@@ -82,3 +82,47 @@ def test_bad_input_is_refused() -> None:
     with pytest.raises(InputError, match="needs one of the certificates auto and dynamics, got 'posterior'"):
         campaign.envelope(TAU, certificate=by)
     assert campaign.executions == 0
+
+
+def make_validation_with_wall() -> Validation:
+    """Return a validation of a cart with drag that meets a stiff wall in a part of the tasks."""
+
+    def derivative(x: np.ndarray, u: np.ndarray) -> np.ndarray:
+        position, speed = x[..., 0], x[..., 1]
+        pushed = u[..., 0] - 0.5 * speed * np.abs(speed) - 300 * np.maximum(position - 0.9, 0)
+        return np.stack([speed, pushed], axis=-1)
+
+    def step(x: np.ndarray, u: np.ndarray) -> np.ndarray:
+        fine = systems.rk4(derivative, 0.0125)
+        return fine(fine(fine(fine(x, u), u), u), u)
+
+    return Validation(
+        space=TaskSpace(start=(-1.0, 0.5, "m"), goal=(-1.0, 1.2, "m")),
+        task=lambda p: Task(
+            np.stack([p.start, 0 * p.start], axis=-1),
+            goal=np.stack([p.goal, 0 * p.goal], axis=-1),
+            horizon=30,
+            dt=0.05,
+        ),
+        system=systems.Simulated(step, vectorized=True),
+        model=models.Linear([[1.0, 0.05], [0.0, 1.0]], [[0.00125], [0.05]]),
+        synthesizer=controllers.LQR([20.0, 1.0], [0.1]),
+        distance=distances.MaximumDeviation(components=(0,)),
+    )
+
+
+@pytest.mark.slow
+def test_tasks_that_touch_nothing_are_trusted_in_spite_of_a_wall() -> None:
+    validation = make_validation_with_wall()
+    tasks = validation.space.iid(2000, np.random.default_rng(9))
+    true = validation.distances(tasks)
+    tau = float(np.quantile(true, 0.7))
+    campaign = Campaign(validation, seed=1).run(15, tau, envelope=True)
+    assert campaign.verdict(tau).answer == "falsified"
+    envelope = campaign.envelope(tau)
+    assert envelope.doubt is None
+    assert envelope.irregular > 0
+    assert "no smooth function of what is recorded, as contacts are" in envelope.statement
+    trusted = envelope.trusted(tasks)
+    assert trusted[true <= tau].mean() > 0.8
+    assert trusted[true > tau].mean() < 0.01

@@ -65,7 +65,7 @@ def test_one_execution_above_the_threshold_is_not_enough() -> None:
     verdict = campaign.verdict(0.7 * largest, certificate=FEW_TESTS)
     assert verdict.answer == "falsified"
     assert sum((trial.distance or 0) > 0.7 * largest for trial in campaign.trials) >= 2
-    assert "more than noise explains" in verdict.reason
+    assert "too many for noise" in verdict.reason
 
 
 @pytest.mark.slow

@@ -20,6 +20,7 @@ from ctxval.certificates.envelope import (
     must_outlive_a_test,
     withdrawn,
 )
+from ctxval.certificates.sentences import IRREGULAR
 from ctxval.errors import CertificateError, InputError
 from rig_evidence import GOOD
 
@@ -247,3 +248,18 @@ def test_further_tasks_check_what_is_interpolated() -> None:
         false.append((np.isfinite(known.bound_at(others)) & (waves(others).mean > 0.6)).mean())
     assert false[0] > 0.01
     assert false[1] < 0.5 * false[0]
+
+
+def test_tasks_whose_runs_come_to_contacts_are_not_trusted() -> None:
+    drawn = replace(drawn_from(POINTS), crossed=0.2 * (POINTS[:, 0] - 0.5))
+    found = envelope_of(SPACE, drawn, evidence_of(), EXECUTED, 0.6, 0.95, irregular=7)
+    low = np.column_stack([np.linspace(0.02, 0.98, 25), np.full(25, 0.1)])
+    trusted = np.isfinite(found.bound_at(low))
+    assert (trusted == (low[:, 0] < 0.5)).mean() > 0.9
+    assert not trusted[low[:, 0] > 0.52].any()
+    assert found.uncovered > 0.2
+    assert found.to_json()["irregular"] == 7
+    assert IRREGULAR in found.assumptions
+    assert "leave what was recorded or come to contacts" in found.statement
+    assert "7 recorded steps are no smooth function of what is recorded, as contacts are" in found.statement
+    assert "come to contacts" not in envelope().statement

@@ -222,6 +222,8 @@ class Campaign:
                 return None
             if decides is None:
                 return by_search
+            if enlarges is not None and (test := enlarges.reserved()) is not None:
+                return test
             choice = decides.choose()
             return enlarges.choose() if choice is None and enlarges is not None and decides.is_falsified else choice
 

@@ -110,6 +110,10 @@ class CampaignDynamics:
         _, learned, self.failure = self._learned[key]
         return learned
 
+    def regular(self, trials: Sequence[Trial]) -> LearnedDynamics | None:
+        """Return what the regular transitions of the completed trials teach; None if there are no irregular ones."""
+        return self._study.regular([(trial.unit_point, known) for trial, known in executed_trials(self._store, trials)])
+
     def prediction(self, trials: Sequence[Trial], *, pending: bool = False) -> Prediction | None:
         """Return the distance predicted from the executed trajectories, for a search; None if there is none.
 

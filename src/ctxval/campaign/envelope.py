@@ -18,7 +18,14 @@ from ctxval.campaign.trials import TrialRecorder
 from ctxval.certificates.automatic import Automatic
 from ctxval.certificates.drawn_distances import DrawnDistances
 from ctxval.certificates.dynamics import Dynamics, draws_for
-from ctxval.certificates.dynamics_diagnostics import fewest_executions, missing_tests, most_beyond, untried_parameter
+from ctxval.certificates.dynamics_diagnostics import (
+    NOISE,
+    fewest_executions,
+    is_explained,
+    missing_tests,
+    most_beyond,
+    untried_parameter,
+)
 from ctxval.certificates.dynamics_evidence import DynamicsEvidence
 from ctxval.certificates.envelope import (
     Envelope,
@@ -36,6 +43,7 @@ from ctxval.learning import LearnedDynamics
 
 _CANDIDATES = 8192  # tasks among which these are chosen
 _SCREENED = 256  # tasks of the pool among which the next one is chosen
+_SAME_TASK = 1e-6
 
 
 class EnvelopeSearch:
@@ -51,11 +59,12 @@ class EnvelopeSearch:
             raise InputError(f"an envelope needs one of the certificates auto and dynamics, got {kind.name!r}.")
         self._interval, self._recorder = interval, interval.recorder
         self._threshold, self._confidence = interval.limit, interval.options.confidence
+        self._split: tuple[tuple[int, ...], LearnedDynamics | None] | None = None
 
     def envelope(self) -> Envelope:
         """Return the envelope that the executions give, or why there is none. The system is never executed."""
-        space, units = self._recorder.validation.space, self._recorder.validation.labels.units
-        threshold, confidence, trials = self._threshold, self._confidence, self._ended()
+        space, trials = self._recorder.validation.space, self._ended()
+        threshold, confidence = self._threshold, self._confidence
         failed = [trial.number for trial in trials if trial.distance is None]
         if failed:
             why = f"trial {failed[0]} has no distance, so nothing is known of its task; execute it again"
@@ -68,19 +77,83 @@ class EnvelopeSearch:
                     "controller can be designed"
                 )
                 return withdrawn(space, threshold, confidence, unknown)
-            learned, evidence = known
+            regular = self._regular(trials, known[1])
+            if regular is None:
+                return self._of(*known, trials)
+            envelope = self._of(*regular, trials)
+            if known[1].quantile is not None:  # noise that the regular part does not have
+                return envelope
+            smooth = self._of(*known, trials)  # soft contacts can be learned
+            return envelope if envelope.share > smooth.share else smooth
+
+    def _of(self, learned: LearnedDynamics, evidence: DynamicsEvidence, trials: Sequence[Trial]) -> Envelope:
+        """Return the envelope of what was learned, or why there is none."""
+        space, units = self._recorder.validation.space, self._recorder.validation.labels.units
+        threshold, confidence = self._threshold, self._confidence
+        executed = [(trial.unit_point, float(trial.distance or 0.0)) for trial in trials]
+        # Further tasks check the interpolation between these; without batches, each costs a design of its own.
+        checks = (256 if evidence.quantile is None else 64) if learned.study.planner.batched else 0
+        at = partial(self._at, learned) if checks else None
+        try:
+            if learned.split is not None:
+                evidence = self._left_out(learned, evidence)
             if (doubt := doubt_of_envelope(evidence, threshold)) is not None:
                 return withdrawn(space, threshold, confidence, doubt)
-            executed = [(trial.unit_point, float(trial.distance or 0.0)) for trial in trials]
-            # Each further task of a planner without batches costs a design of its own.
-            # Further tasks that check the interpolation between these.
-            checks = (256 if evidence.quantile is None else 64) if learned.study.planner.batched else 0
-            at = partial(self._at, learned) if checks else None
+            drawn, irregular = self._drawn(learned, evidence), learned.split.irregular if learned.split else 0
+            return envelope_of(space, drawn, evidence, executed, threshold, confidence, at, checks, units, irregular)
+        except Exception as error:  # users' parts, at states that no execution has reached
+            return withdrawn(space, threshold, confidence, reason_of(error))
+
+    def _regular(
+        self, trials: Sequence[Trial], evidence: DynamicsEvidence
+    ) -> tuple[LearnedDynamics, DynamicsEvidence] | None:
+        """Return what the regular transitions teach; None if all are regular, or if there is noise in them."""
+        numbers = tuple(trial.number for trial in trials)
+        if self._split is None or self._split[0] != numbers:
             try:
-                drawn = self._drawn(learned, evidence)
-                return envelope_of(space, drawn, evidence, executed, threshold, confidence, at, checks, units)
-            except Exception as error:  # users' parts, at states that no execution has reached
-                return withdrawn(space, threshold, confidence, reason_of(error))
+                self._split = numbers, self._recorder.dynamics.regular(trials)
+            except Exception:  # users' parts
+                self._split = numbers, None
+        learned = self._split[1]
+        if learned is None or learned.posterior.noise > NOISE:
+            return None
+        without = learned.posterior.covariances.without_model
+        return learned, replace(evidence, quantile=None, lags=0, noise=learned.posterior.noise, without_model=without)
+
+    def _left_out(self, learned: LearnedDynamics, evidence: DynamicsEvidence) -> DynamicsEvidence:
+        """Return evidence with the tests alone, each predicted from all executions of other tasks.
+
+        Nothing was predicted of a test whose run leaves what these have recorded.
+        """
+        tests, most = [], most_beyond(evidence)
+        for test in evidence.predictions:
+            if not test.stored or test.origin not in DRAWN:
+                continue
+            point = np.array(test.point)
+            same = np.flatnonzero((np.abs(learned.executed - point) <= _SAME_TASK).all(axis=1))
+            others = learned.without(same.tolist())
+            drawn = None if others is None else self._at(others, point[None])
+            median = upper = np.inf
+            if drawn is not None and drawn.known[0] and drawn.leaving(most)[0] <= 1:
+                median, upper = np.quantile(drawn.draws[:, 0], [0.5, 0.95]).tolist()
+            at = test.point if np.isfinite(median) else ()
+            changed = replace(test, median=median, upper=upper, quantiles=(), explained=None, point=at)
+            tests.append(changed)
+        return replace(evidence, predictions=tuple(tests))
+
+    def reserved(self) -> Choice | None:
+        """Return a test if a distance exceeds the threshold, and the budget is just enough for the missing tests.
+
+        It is None if executions may differ by noise: then others may be needed to falsify the model.
+        """
+        interval, trials, recorder = self._interval, self._ended(), self._recorder
+        stored = [trial for trial in trials if trial.origin in DRAWN and recorder.dynamics.stored_prediction(trial)]
+        missing = interval.tests - len(stored)
+        left = interval.budget - recorder.executions - sum(trial.state == "open" for trial in recorder.trials)
+        if not 0 < left <= missing or interval.best <= self._threshold or not interval.predicts:
+            return None
+        known = self._known(trials) if recorder.has_tasks else None
+        return None if known is None or self._regular(trials, known[1]) is None else interval.test()
 
     def choose(self) -> Choice | None:
         """Return the next task that enlarges the envelope, or a test of it; None if it would hardly grow.
@@ -95,7 +168,9 @@ class EnvelopeSearch:
         known = self._known(trials)
         if known is None:
             return None
-        learned, evidence = known
+        explained = all(is_explained(each, self._threshold) for each in known[1].predictions)
+        regular = None if known[1].quantile is None and explained else self._regular(trials, known[1])
+        learned, evidence = regular or known
         missing = missing_tests(evidence.predictions, interval.tests)
         waiting = sum(trial.state == "open" for trial in recorder.trials)
         if missing and interval.budget - recorder.executions - waiting <= missing:
@@ -108,6 +183,9 @@ class EnvelopeSearch:
         # Within three spreads above the mean, a task is uncertain.
         straddle = 3.0 * drawn.spread(self._threshold) - np.abs(drawn.mean - self._threshold)  # Bryan et al. 2006
         uncertain, uncovered = below & (straddle > 0), below & (drawn.beyond > most_beyond(evidence))
+        if drawn.crossed is not None:  # executions of these tasks would not teach the regular part
+            uncertain, uncovered = uncertain & (drawn.crossed <= 0), uncovered & (drawn.crossed <= 0)
+            straddle = np.where(drawn.crossed <= 0, straddle, -np.inf)
         few = evidence.executions < fewest_executions(evidence)
         # Share of the tasks predicted below the threshold that may be uncertain or uncovered at the end.
         if few or (uncertain | uncovered).sum() > 0.03 * below.sum():
@@ -118,7 +196,8 @@ class EnvelopeSearch:
             new = (away > (0.0 if is_suite else NEAR)).all(axis=1)
             if (np.isfinite(score) & new).any():
                 return Choice.tested(drawn.points[int(np.where(new, score, -np.inf).argmax())])
-        return interval.test() if missing or must_outlive_a_test(drawn, evidence, self._threshold) else None
+        outlive = regular is None and must_outlive_a_test(drawn, evidence, self._threshold)
+        return interval.test() if missing or outlive else None
 
     def _ended(self) -> list[Trial]:
         return [trial for trial in self._recorder.trials if trial.state != "open"]

@@ -184,13 +184,16 @@ class IntervalSearch:
         if self._suite is not None or not self.predicts or (bets is not None and bets.falsify(self.options.confidence)):
             return None
         learned = self.recorder.dynamics.learned(trials)
-        if learned is None or learned.noisy is None or not learned.noisy.is_noisy:
-            return None
+        is_noisy = learned is not None and learned.noisy is not None and learned.noisy.is_noisy
+        if learned is None or (bets is None and not is_noisy):
+            return None  # but a threshold that noise was predicted to exceed is falsified by repetitions alone
         worst = max((trial for trial in trials if trial.distance is not None), key=lambda trial: trial.distance or 0.0)
         alike = (trial for trial in trials if trial.distance is not None or trial.state == "open")
         # Times that a noisy task is repeated in any case if its distance exceeds the limit.
         if sum(np.abs(trial.unit_point - worst.unit_point).max() <= 1e-9 for trial in alike) <= 2:
             return Choice.tested(worst.unit_point)
+        if not is_noisy:
+            return None
         tasks = [worst.unit_point, learned.worst_of_mean.elites[0]]
         noises = [None if (predicted := learned.predict(task)) is None else predicted.noise for task in tasks]
         chances = [0.0 if noise is None else noise.chance_of_more(self.limit) for noise in noises]

@@ -22,11 +22,13 @@ class DrawnDistances(ShortRepr):
         points: tasks, points of the unit cube ``(K, d)``.
         draws: distances on S draws ``(S, K)``; infinity if the loop diverges, NaN if no controller can be designed.
         beyond: how far the loop on the mean leaves the records, as a share of the visited range ``(K,)``.
+        crossed: how far it crosses the boundary of the regular part, from -1 to 1; None if there is no boundary.
     """
 
     points: Array
     draws: Array
     beyond: Array
+    crossed: Array | None = None
 
     @property
     def known(self) -> Mask:
@@ -57,7 +59,18 @@ class DrawnDistances(ShortRepr):
             np.concatenate([self.points, others.points]),
             np.concatenate([self.draws, others.draws], axis=1),
             np.concatenate([self.beyond, others.beyond]),
+            None if self.crossed is None or others.crossed is None else np.concatenate([self.crossed, others.crossed]),
         )
+
+    def leaving(self, most: float) -> Array:
+        """Return how far loops leave the records or cross the boundary ``(K,)``: nothing is known of those above 1.
+
+        Args:
+            most: by how much loops may leave the records, as a share of the visited range.
+        """
+        # Both have the same slope: smaller slopes cost more of the set, because their errors reach farther.
+        beyond = self.beyond if self.crossed is None else np.maximum(self.beyond, most + self.crossed)
+        return np.asarray(np.minimum(beyond / most, LARGEST))
 
     def upper(self, factor: float, threshold: float) -> Array:
         """Return mean + k spread as shares of the threshold ``(K,)``, at most ``LARGEST``."""

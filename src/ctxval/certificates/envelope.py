@@ -12,6 +12,10 @@ they were learned from. A task is no part of the envelope if its closed loop lea
 with a larger distance. Without tests the envelope is withdrawn, as the bound on d* is, and if a test exceeds the
 threshold although the learned dynamics have it below.
 
+If a few recorded transitions are no smooth function of what is recorded, as those of contacts, and the others are, then
+the draws are learned from the others alone (:mod:`ctxval.learning.regular`), and a task is no part of the envelope if
+its run comes to states like those of the few. The tests are predicted from the executions of all other tasks.
+
 Between these tasks, ``mean + k spread`` is interpolated (:mod:`ctxval.certificates.envelope_surface`). The largest
 error of the nearest tasks, if each of them is interpolated from all others, is added. Further tasks of the set check
 this: errors are multiplied until hardly any of these tasks has ``mean + k spread`` above the threshold.
@@ -46,7 +50,7 @@ from ctxval.certificates.dynamics_evidence import CheckedPrediction, DynamicsEvi
 from ctxval.certificates.envelope_surface import Surfaces, exported, write_onnx
 from ctxval.certificates.envelope_words import Region, regions_inside
 from ctxval.certificates.prediction_tests import DRAWN
-from ctxval.certificates.sentences import dynamics_assumptions, envelope_statement
+from ctxval.certificates.sentences.statements import IRREGULAR, dynamics_assumptions, envelope_statement
 from ctxval.core.space import TaskSpace
 from ctxval.core.task_suite import TaskSuite
 from ctxval.errors import InputError
@@ -79,6 +83,8 @@ class Envelope(ShortRepr):
         executions, tests: numbers of executions, and of those that were predicted beforehand at drawn tasks.
         quantile: the share of the executions of a task whose distances are below tau; None if the system is not noisy.
         assumptions: what it assumes.
+        irregular: the number of recorded steps, such as contacts, that are no part of what is learned; a task is not
+            trusted if its run comes to states like theirs.
         doubt: why it is withdrawn; then no task is trusted.
         units: the units of the distance.
     """
@@ -100,6 +106,7 @@ class Envelope(ShortRepr):
     tests: int = 0
     quantile: float | None = None
     assumptions: tuple[str, ...] = ()
+    irregular: int = 0
     doubt: str | None = None
     units: str = ""
     _surfaces: Surfaces | None = None
@@ -148,7 +155,7 @@ class Envelope(ShortRepr):
     def to_json(self) -> dict[str, Any]:
         """Return the statement and its numbers, ready for JSON."""
         first = "threshold confidence units statement words share regions tasks factor raised_by margin evaluated"
-        names = f"{first} checks uncovered executions tests quantile assumptions doubt".split()
+        names = f"{first} checks uncovered executions tests quantile assumptions irregular doubt".split()
         plain = {name: getattr(self, name) for name in names}
         lists = {name: list(value) for name, value in plain.items() if isinstance(value, tuple)}
         lists["regions"] = [region.to_json() for region in self.regions]
@@ -274,8 +281,8 @@ def _interpolated(
     executed: Sequence[tuple[Array, float]],
 ) -> Surfaces:
     """Return the surfaces of the bounds and, if loops of trusted tasks leave the records, of by how much."""
-    beyond = np.minimum(drawn.beyond / most_beyond(evidence), LARGEST)
-    points, values = drawn.points, np.stack([drawn.upper(factor, threshold), beyond], axis=1)
+    leaving = drawn.leaving(most_beyond(evidence))
+    points, values = drawn.points, np.stack([drawn.upper(factor, threshold), leaving], axis=1)
     for point, distance in executed:
         if distance > threshold and evidence.quantile is None:
             far = np.abs(points - point).max(axis=1) > _SAME_TASK
@@ -299,6 +306,7 @@ def envelope_of(
     evaluate: Callable[[Array], DrawnDistances] | None = None,
     checks: int = 0,
     units: str = "",
+    irregular: int = 0,
 ) -> Envelope:
     """Return the envelope from drawn distances and evidence of the same executions, which nothing withdraws.
 
@@ -307,6 +315,7 @@ def envelope_of(
         evaluate: returns the distances of further tasks on the same draws; None if the interpolation is not checked.
         checks: the number of these tasks.
         units: the units of the distance.
+        irregular: the number of recorded steps that the draws are not learned from.
     """
     factor, raised_by = _raised(drawn, evidence, threshold, confidence)
     envelope = Envelope(
@@ -320,7 +329,8 @@ def envelope_of(
         executions=evidence.executions,
         tests=sum(each.stored and each.origin in DRAWN for each in evidence.predictions),
         quantile=evidence.quantile,
-        assumptions=dynamics_assumptions(evidence),
+        assumptions=(*dynamics_assumptions(evidence), *([IRREGULAR] if irregular else [])),
+        irregular=irregular,
         units=units,
     )
     if isinstance(space, TaskSuite):
@@ -331,7 +341,7 @@ def envelope_of(
         tasks = tasks[(surfaces(tasks) <= 1).all(axis=1)][:checks]
         if evaluate is not None and len(tasks):
             checked = evaluate(tasks)
-            outside = (checked.upper(factor, threshold) > 1) | (checked.beyond > most_beyond(evidence))
+            outside = (checked.upper(factor, threshold) > 1) | (checked.leaving(most_beyond(evidence)) > 1)
             surfaces = surfaces.without(tasks[outside], len(tasks))
             envelope = replace(envelope, checks=len(tasks))
         envelope = replace(envelope, margin=float(np.median(surfaces.errors[:, 0])), _surfaces=surfaces)
@@ -354,8 +364,9 @@ def _of_suite(
     uncovered = np.zeros(len(suite), dtype=np.bool_)
     upper = threshold * drawn.upper(envelope.factor or 0.0, threshold)
     rows = suite.rows_at(drawn.points)
-    bounds[rows] = np.where((upper <= threshold) & (drawn.beyond <= most), upper, np.inf)
-    uncovered[rows] = (upper <= threshold) & (drawn.beyond > most)
+    leaving = drawn.leaving(most) > 1
+    bounds[rows] = np.where((upper <= threshold) & ~leaving, upper, np.inf)
+    uncovered[rows] = (upper <= threshold) & leaving
     for point, distance in executed if envelope.quantile is None else ():
         row = int(suite.rows_at(point))
         bounds[row], uncovered[row] = distance if distance <= threshold else np.inf, False

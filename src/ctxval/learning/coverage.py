@@ -71,13 +71,17 @@ def coverage(
     )
 
 
-def beyond_records(posterior: DynamicsPosterior, of_pool: Sequence[Loops], loops: Sequence[Loops]) -> list[Array]:
+def beyond_records(
+    posterior: DynamicsPosterior, of_pool: Sequence[Loops], loops: Sequence[Loops], *, executed_only: bool = False
+) -> list[Array]:
     """Return how far closed loops leave the records in any coordinate, as a share of the range of the pool's loops.
 
-    Each array has a number for each task, in the order of the loops.
+    Each array has a number for each task, in the order of the loops. With ``executed_only``, the data that M was made
+    from are no records.
     """
     width = _widths(_visited(posterior, of_pool))
-    recorded = posterior.data.pairs / width
+    pairs = posterior.data.pairs[posterior.data.sources >= 0] if executed_only else posterior.data.pairs
+    recorded = pairs / width
     return [_beyond(recorded, _visited(posterior, [each]) / width).max(axis=(1, 2)) for each in loops]
 
 
@@ -165,7 +169,9 @@ def untried_corner(executed: Array, space: TaskSpace, task: Array) -> UntriedCor
         ends, pairs = np.array(list(product((0.0, 1.0), repeat=len(columns)))), list(combinations(columns.tolist(), 2))
         gaps = np.stack(
             [
-                np.abs(ends[:, None, [i - at.start, j - at.start]] - executed[:, [i, j]]).max(axis=2).min(axis=1, initial=1.0)
+                np.abs(ends[:, None, [i - at.start, j - at.start]] - executed[:, [i, j]])
+                .max(axis=2)
+                .min(axis=1, initial=1.0)
                 for i, j in pairs
             ]
         )

@@ -29,6 +29,7 @@ from ctxval.learning.noise_study import NoiseStudy
 from ctxval.learning.noisy_draws import NoisyPosterior
 from ctxval.learning.prediction import ErrorVectors, Executed, predict_composed, predict_distance
 from ctxval.learning.recorded import data_near, digest, recorded_transitions, scheduled
+from ctxval.learning.regular import split_transitions
 from ctxval.learning.worst_case import WorstCaseSearch, WorstCaseSettings
 from ctxval.models.corrected import before_refinement
 from ctxval.searches import Prediction
@@ -152,6 +153,20 @@ class DynamicsStudy(ShortRepr):
                 parameter = self._found[key]
                 learned = learned if parameter is None else self._with_parameter(parameter).learn(executed)
         return learned
+
+    def regular(self, executed: Executed) -> LearnedDynamics | None:
+        """Return what the regular transitions of executions teach; None if there are no irregular ones."""
+        extended, model = self._executions(executed), before_refinement(self.validation.model)
+        for with_data in (True, False):
+            recorded = self._recorded(extended, (), with_data) if extended else None
+            if recorded is None or self._loops is None or not extended:
+                return None
+            settings, seed = PosteriorSettings.for_horizon(self._loops.horizon), (self.seed, len(executed), 0)
+            split = split_transitions(model, *recorded, seed, settings)
+            if split is not None and (parts := split.posterior()) is not None:
+                points, loops = np.array([point for point, _ in extended]), [loop for _, loop in extended]
+                return LearnedDynamics(self, parts[0], points, loops, with_data, split, parts[1]).with_noisy(None)
+        return None
 
     def _learn(self, executed: Executed, logged: Sequence[Trajectory], *, with_data: bool) -> LearnedDynamics | None:
         recorded = self._recorded(executed, logged, with_data)

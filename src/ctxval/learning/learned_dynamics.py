@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
@@ -19,6 +19,7 @@ from ctxval.learning.coverage import beyond_records, coverage, largest_pocket, u
 from ctxval.learning.dynamics_posterior import DynamicsPosterior
 from ctxval.learning.execution_prediction import ExecutionPrediction, predict_execution
 from ctxval.learning.noisy_draws import SETTLED, NoisyDraws, NoisyPosterior
+from ctxval.learning.regular import Boundary, RegularTransitions
 from ctxval.learning.tolerance import PushResponse, push_response
 from ctxval.learning.worst_case import WorstCase
 
@@ -37,6 +38,9 @@ class LearnedDynamics(ShortRepr):
     # whether the data that M was made from are learned from too; if they contradict the executions, M was learned on
     # another system, such as one without its load
     with_data: bool = True
+    # if only regular transitions are learned from: all of them, and where the regular part ends
+    split: RegularTransitions | None = None
+    boundary: Boundary | None = None
 
     _worst_cases: dict[int, WorstCase] = field(default_factory=dict, init=False)
     _draws: dict[tuple[int, bool], AnyDraws] = field(default_factory=dict, init=False)
@@ -108,12 +112,18 @@ class LearnedDynamics(ShortRepr):
         """The largest distance over some tasks on the posterior mean alone, as if it were the only draw."""
         return self.study.search.on_mean(self.drawn_from, self._on_pool[0], self.executed, self._rng(4), globally=False)
 
-    def drawn_distances(self, points: Array, draws: int, *, settled: bool = True) -> tuple[Array, Array]:
+    def without(self, rows: Collection[int]) -> LearnedDynamics | None:
+        """Return what the regular transitions of the other executions teach; None if it is nothing."""
+        parts = None if self.split is None else self.split.posterior(rows)
+        return None if parts is None else replace(self, posterior=parts[0], boundary=parts[1]).with_noisy(None)
+
+    def drawn_distances(self, points: Array, draws: int, *, settled: bool = True) -> tuple[Array, Array, Array | None]:
         """Return the distances ``(S, m)`` of tasks ``(m, d)`` on draws, and how far their loops leave the records.
 
         The latter is the largest excess ``(m,)`` of the loop on the mean over the records in a coordinate, as a share
         of the range of the loops of the pool; it is infinity if a task cannot be planned. The draws, at least so many,
         are the same for all points; if the system is noisy and not ``settled``, they have fewer sequences of noise.
+        If only regular transitions are learned from, the third array says how far loops cross their boundary ``(m,)``.
         """
         search, planner = self.study.search, self.study.planner
         with single_threaded():
@@ -131,9 +141,16 @@ class LearnedDynamics(ShortRepr):
             values = planner.distances(self._draws[key], planned, len(points))
             of_pool, loops = (planner.run(self.drawn_from.silent, plans) for plans in (search.plans, planned))
             beyond = np.full(len(points), np.inf)
-            for plan, each in zip(planned, beyond_records(self.posterior, of_pool, loops), strict=True):
+            executed_only = self.boundary is not None
+            all_beyond = beyond_records(self.posterior, of_pool, loops, executed_only=executed_only)
+            for plan, each in zip(planned, all_beyond, strict=True):
                 beyond[plan.rows] = each
-        return values, beyond
+            if self.boundary is None:
+                return values, beyond, None
+            crossed = np.ones(len(points))
+            for plan, loop in zip(planned, loops, strict=True):
+                crossed[plan.rows] = self.boundary.crossed(self.posterior, loop)
+        return values, beyond, crossed
 
     def _functions(self, draws: int) -> int:
         """Return the number of functions for each draw of the hyperparameters that gives at least so many draws."""

@@ -175,6 +175,12 @@ def two_distances(sample: Sample, rows: tuple[int, int]) -> str:
 
 # Learned dynamics
 
+IRREGULAR = (
+    "the dynamics are smooth except at states like those of the recorded contacts: a quadratic function of one or two "
+    "states, or of all states and inputs, tells them apart, and there is no other contact that no execution has met"
+)
+"""What an envelope assumes if it is learned without some recorded steps."""
+
 
 def dynamics_statement(upper: float, error: float, confidence: float, quantile: float | None = None) -> str:
     """Return the bound on d*, or on the quantile of the distance at the worst task, from learned dynamics."""
@@ -301,10 +307,17 @@ def envelope_statement(envelope: Envelope) -> str:
     if not envelope.share:
         tasks = "no task that can be named"
     sentences = [f"With {percent(envelope.confidence)} confidence, {what} stays below {limit} on {tasks}."]
+    or_irregular = " or come to contacts" if envelope.irregular else ""
     if envelope.uncovered >= 0.005:
         sentences.append(
             f"Another {100 * envelope.uncovered:.2g} % of the tasks are predicted to stay below it, but their runs "
-            "leave what was recorded, so they are not trusted, however accurate the model is there."
+            f"leave what was recorded{or_irregular}, so they are not trusted, however accurate the model is there."
+        )
+    if envelope.irregular:
+        steps = "1 recorded step is" if envelope.irregular == 1 else f"{envelope.irregular} recorded steps are"
+        sentences.append(
+            f"{steps} no smooth function of what is recorded, as contacts are; tasks whose runs come to states like "
+            "theirs are not trusted."
         )
     if envelope.share and envelope.tasks is None and not envelope.checks:
         sentences.append(
