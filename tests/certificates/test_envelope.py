@@ -20,7 +20,7 @@ from ctxval.certificates.envelope import (
     must_outlive_a_test,
     withdrawn,
 )
-from ctxval.certificates.sentences import IRREGULAR
+from ctxval.certificates.sentences.statements import IRREGULAR
 from ctxval.errors import CertificateError, InputError
 from rig_evidence import GOOD
 
