@@ -159,7 +159,8 @@ class IntervalSearch:
         if isinstance(kind, Automatic) and evidence.quantile is None and self._suite is None:
             known = self._points(self.recorder.trials)
             # Executions, besides tests, after which `auto` uses the posterior bound if the dynamics decide nothing.
-            patient = sum(trial.origin not in DRAWN for trial in self.recorder.trials) < 16
+            chosen = sum(trial.origin not in DRAWN for trial in self.recorder.trials)
+            patient = chosen < 16 or self._lacks_tests_alone(evidence)
             # In few dimensions, executions soon cover the tasks, and the posterior bound of the distance may decide.
             if not patient or covering(known, kind.posterior.resolution, 0) is not None:
                 choice = self._by_distance()
@@ -251,9 +252,7 @@ class IntervalSearch:
     def _by_evidence(self, evidence: DynamicsEvidence) -> Choice:
         """Return the task that the learned dynamics choose, or a test if nothing else is missing."""
         best, limit, confidence, trials = self.best, self.limit, self.options.confidence, self.recorder.trials
-        bound = self._bound(evidence)
-        missing = only_tests_missing(evidence, best, bound) or only_a_failed_test(evidence, best, bound, limit)
-        if max(bound, evidence.highest) <= limit and missing:
+        if self._lacks_tests_alone(evidence):
             return self.test()
         learned = self.recorder.dynamics.learned(trials)
         steady = Steadiness(self.recorder.dynamics.planner, None if learned is None else learned.expected)
@@ -278,6 +277,13 @@ class IntervalSearch:
             return None
         evidence = dynamics.kept_evidence(trials, self.options.confidence) or dynamics.screening(trials)
         return None if evidence is None else replace(evidence, tests=self.tests)
+
+    def _lacks_tests_alone(self, evidence: DynamicsEvidence) -> bool:
+        """Return whether nothing but tests is missing for a validation, as far as a few posterior samples say."""
+        bound = self._bound(evidence)
+        missing = only_tests_missing(evidence, self.best, bound)
+        missing = missing or only_a_failed_test(evidence, self.best, bound, self.limit)
+        return max(bound, evidence.highest) <= self.limit and missing
 
     def _fails(self, evidence: DynamicsEvidence) -> bool:
         """Return whether predictions fail so often that the dynamics cannot be learned."""
