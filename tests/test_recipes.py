@@ -73,7 +73,7 @@ TESTS = (
     "tests/benchmarks/test_parts_page.py",
     "tests/test_documents.py::test_the_glossary_explains_what_certificates_and_trials_say",
     "tests/test_testing.py::test_every_search_conforms[halving]",
-    "tests/core/test_preflight.py::test_every_distance_takes_states_by_name",
+    "tests/core/test_plan.py::test_every_distance_takes_states_by_name",
     *(
         f"tests/certificates/test_kind_registry.py::{name}"
         for name in (
