@@ -185,7 +185,7 @@ ACCESSIBLE = (
     (re.compile('role="heading">'), 'role="heading" aria-level="2">'),
     (re.compile('<aside class="(sidebar|toc)-drawer">'), r'<aside class="\1-drawer" aria-label="\1">'),
     (re.compile("<pre>"), '<pre tabindex="0">'),  # the keyboard scrolls it
-    (re.compile('<(h2)( id="search-documentation".*)</h2>'), r"<h1\2</h1>"),
+    (re.compile(r'(<article role="main" id="furo-main-content">\s*)<noscript>'), r"\1<h1>Search</h1><noscript>"),
     (re.compile(r'<dl>((?:\n<dd><em class="sig-param">.*</dd>)+)\n</dl>'), r'<ul class="signature">\1\n</ul>'),
     (re.compile(r'<dd>(<em class="sig-param">.*)</dd>'), r"<li>\1</li>"),
 )
