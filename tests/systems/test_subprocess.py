@@ -303,7 +303,8 @@ def test_a_supervisor_that_is_killed_or_stopped_takes_its_command_with_it(
     signal_: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(supervised, "_GRACE_PERIOD", 0.2)
-    code = SPAWN + f"import os, signal; os.kill(os.getppid(), signal.{signal_}); time.sleep(60)"
+    # Whoever watches has time to say which process it started, also on a busy computer.
+    code = SPAWN + f"import os, signal; time.sleep(0.5); os.kill(os.getppid(), signal.{signal_}); time.sleep(60)"
     with pytest.raises(ExecutionError, match=r"the process that watches the command was killed|did not end within 2 s"):
         python(tmp_path, code, str(tmp_path), timeout=2).execute(designed(), TASK)
     assert gone(int((tmp_path / "pid").read_text()))
