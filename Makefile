@@ -51,8 +51,8 @@ attack: .venv/.test  ## hostile input, thousands of command lines; better with s
 # The lowest typer imports what the newest click warns of.
 lowest: .venv/lowest/.installed  ## the page's security, with the lowest versions that pyproject.toml permits
 	.venv/lowest/bin/python -m pytest -q -p no:cacheprovider -W "ignore:'click.utils:DeprecationWarning" \
-	  tests/web/test_access.py tests/web/test_security.py tests/web/test_connections.py tests/web/test_app.py \
-	  -k "test_access or test_security or three_hundred or send_much or nonsense or (refused and not wrong_file)"
+	  tests/web/test_security.py tests/web/test_connections.py tests/web/test_app.py \
+	  -k "test_security or three_hundred or send_much or nonsense or (refused and not wrong_file)"
 
 bench: .venv/.test  ## speed, as ratios measured in one run
 	for script in benchmarks/bench_*.py; do $(BIN)/python $$script || exit 1; done
