@@ -147,10 +147,8 @@ class EnvelopeSearch:
         It is None if executions may differ by noise: then others may be needed to falsify the model.
         """
         interval, trials, recorder = self._interval, self._ended(), self._recorder
-        stored = [trial for trial in trials if trial.origin in DRAWN and recorder.dynamics.stored_prediction(trial)]
-        missing = interval.tests - len(stored)
-        left = interval.budget - recorder.executions - sum(trial.state == "open" for trial in recorder.trials)
-        if not 0 < left <= missing or interval.best <= self._threshold or not interval.predicts:
+        missing = interval.tests - _stored_tests(recorder, trials)
+        if not 0 < self._left <= missing or interval.best <= self._threshold or not interval.predicts:
             return None
         known = self._known(trials) if recorder.has_tasks else None
         return None if known is None or self._regular(trials, known[1]) is None else interval.test()
@@ -172,8 +170,7 @@ class EnvelopeSearch:
         regular = None if known[1].quantile is None and explained else self._regular(trials, known[1])
         learned, evidence = regular or known
         missing = missing_tests(evidence.predictions, interval.tests)
-        waiting = sum(trial.state == "open" for trial in recorder.trials)
-        if missing and interval.budget - recorder.executions - waiting <= missing:
+        if missing and self._left <= missing:
             return interval.test()
         if evidence.untried is not None and untried_parameter(evidence) is not None:
             return Choice.tested(evidence.untried.task)
@@ -199,6 +196,12 @@ class EnvelopeSearch:
         outlive = regular is None and must_outlive_a_test(drawn, evidence, self._threshold)
         return interval.test() if missing or outlive else None
 
+    @property
+    def _left(self) -> int:
+        """The number of executions that the budget leaves."""
+        recorder = self._recorder
+        return self._interval.budget - recorder.executions - sum(trial.state == "open" for trial in recorder.trials)
+
     def _ended(self) -> list[Trial]:
         return [trial for trial in self._recorder.trials if trial.state != "open"]
 
@@ -217,7 +220,7 @@ class EnvelopeSearch:
         if space.members is not None:
             return self._at(learned, pool)
         noisy = evidence.quantile is not None
-        # The same numbers for the pool and the boundary if each draw has sequences of noise.
+        # If each draw has sequences of noise, closed loops run on fewer tasks.
         drawn = self._at(learned, np.concatenate([pool[:192] if noisy else pool, learned.executed]))
         if not learned.study.planner.batched:
             return drawn  # each further task costs a design of its own
@@ -235,6 +238,12 @@ def has_tests(recorder: TrialRecorder, options: CertificateOptions) -> bool:
     """Return whether the tests of an envelope were executed, so that it is worth computing; nothing is learned."""
     if not isinstance(options.kind, Automatic | Dynamics) or not recorder.search.uses_prediction:
         return False
-    drawn = [trial for trial in recorder.trials if trial.state == "completed" and trial.origin in DRAWN]
-    stored = sum(recorder.dynamics.stored_prediction(trial) is not None for trial in drawn)
-    return bool(drawn) and stored >= options.kind.tests
+    completed = [trial for trial in recorder.trials if trial.state == "completed"]
+    drawn = any(trial.origin in DRAWN for trial in completed)
+    return drawn and _stored_tests(recorder, completed) >= options.kind.tests
+
+
+def _stored_tests(recorder: TrialRecorder, trials: Sequence[Trial]) -> int:
+    """Return the number of drawn trials with a prediction that was stored before their execution."""
+    drawn = (trial for trial in trials if trial.origin in DRAWN)
+    return sum(recorder.dynamics.stored_prediction(trial) is not None for trial in drawn)

@@ -28,9 +28,7 @@ from ctxval.certificates.bounds import Quantities, with_units
 from ctxval.certificates.covering import RESOLUTION, covering
 from ctxval.certificates.dynamics import Dynamics, bound_of, certify_dynamics
 from ctxval.certificates.dynamics_diagnostics import (
-    CORNER,
     FEWEST,
-    GAP,
     doubt_of,
     held,
     missing_tests,
@@ -39,6 +37,8 @@ from ctxval.certificates.dynamics_diagnostics import (
     raised,
     uncovered,
     untested,
+    untried_corner,
+    untried_parameter,
 )
 from ctxval.certificates.options import WITHIN
 from ctxval.certificates.posterior import Posterior
@@ -386,9 +386,9 @@ def next_task(
         candidates = [highest, farthest]
     elif uncovered(evidence):
         candidates = [farthest, highest, largest]
-        if evidence.untried is not None and evidence.untried.gap > GAP:
+        if evidence.untried is not None and untried_parameter(evidence) is not None:
             candidates = [evidence.untried.task[None], *candidates]
-        elif evidence.corner is not None and evidence.corner.gap > CORNER:
+        elif evidence.corner is not None and untried_corner(evidence) is not None:
             candidates = [evidence.corner.task[None], *candidates]
     elif evidence.missed > 1 or untested(evidence, best, limit):
         candidates = [largest, highest, farthest]

@@ -163,23 +163,17 @@ def untried_corner(executed: Array, space: TaskSpace, task: Array) -> UntriedCor
 
     Its task has the parameters of ``task`` ``(d,)``, except that each position moves to its own farthest corner.
     """
-    components, farthest, task = (0, 0), 0.0, task.copy()
+    components, farthest, task = [0, 0], 0.0, task.copy()
     for at in space.positions:
-        columns = np.arange(at.start, at.stop)
-        ends, pairs = np.array(list(product((0.0, 1.0), repeat=len(columns)))), list(combinations(columns.tolist(), 2))
-        gaps = np.stack(
-            [
-                np.abs(ends[:, None, [i - at.start, j - at.start]] - executed[:, [i, j]])
-                .max(axis=2)
-                .min(axis=1, initial=1.0)
-                for i, j in pairs
-            ]
-        )
+        k = at.stop - at.start
+        ends, pairs = np.array(list(product((0.0, 1.0), repeat=k))), list(map(list, combinations(range(k), 2)))
+        away = np.abs(ends[:, None] - executed[:, at])
+        gaps = np.stack([away[..., pair].max(axis=2).min(axis=1, initial=1.0) for pair in pairs])
         # Of the corners with the largest gap, one task tries as many other pairs as it can.
         corner = int(np.lexsort((gaps.sum(axis=0), gaps.max(axis=0)))[-1])
-        task[columns], pair = ends[corner], int(gaps[:, corner].argmax())
-        if gaps[pair, corner] > farthest:
-            components, farthest = pairs[pair], float(gaps[pair, corner])
+        task[at], worst = ends[corner], int(gaps[:, corner].argmax())
+        if gaps[worst, corner] > farthest:
+            components, farthest = [at.start + i for i in pairs[worst]], float(gaps[worst, corner])
     if not farthest:
         return None
     values = space.from_unit(task)

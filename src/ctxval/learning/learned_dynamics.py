@@ -187,13 +187,12 @@ class LearnedDynamics(ShortRepr):
         """The labels of the states and inputs, with units; ``x[0], ..., u[0], ...`` for those without names."""
         inputs = self.posterior.data.inputs
         states = self.posterior.data.pairs.shape[1] - inputs
-        coordinates = [*(f"x[{i}]" for i in range(states)), *(f"u[{i}]" for i in range(inputs))]
+        coordinates = [*(("x", i) for i in range(states)), *(("u", i) for i in range(inputs))]
         labels = [label for names in self.study.validation.names(states, inputs) for label in labels_of(names)]
-        if len(set(labels)) < len(labels):  # a state and an input of the same name
-            return tuple(coordinates)
+        twice = len(set(labels)) < len(labels)  # a state and an input of the same name
         return tuple(
-            index if label == f"{index[0]}{index[2:-1]}" else label
-            for index, label in zip(coordinates, labels, strict=True)
+            f"{letter}[{i}]" if twice or label == f"{letter}{i}" else label
+            for (letter, i), label in zip(coordinates, labels, strict=True)
         )
 
     def pocket(self) -> StatePocket | None:

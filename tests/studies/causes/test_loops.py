@@ -12,7 +12,7 @@ from ctxval.core.controller import Controller
 from ctxval.core.model import Model
 from ctxval.studies import causes
 from ctxval.studies.causes import Repaired
-from ctxval.studies.causes.loops import ClosedLoops, Execution
+from ctxval.studies.causes.loops import ClosedLoops, ExecutedTask
 
 DT, NOISE = 0.05, np.array([2e-3, 1e-2])
 MODEL = models.Linear([[1.0, DT], [0.0, 1.0]], [[0.5 * DT**2], [DT]])
@@ -31,7 +31,7 @@ class OneByOne:
         return pi
 
 
-def loops(synthesizer: Any) -> tuple[ClosedLoops, Execution]:
+def loops(synthesizer: Any) -> tuple[ClosedLoops, ExecutedTask]:
     """Return an execution with play in its actuator and noise of its measurements."""
     validation = Validation(
         space=TaskSpace(goal=(-1.5, 1.5, "m")),
@@ -45,7 +45,7 @@ def loops(synthesizer: Any) -> tuple[ClosedLoops, Execution]:
     plan = validation.plan(np.array([1.0]))
     noise = NOISE * np.random.default_rng(5).standard_normal((61, 2))
     executed = Repaired(MODEL, (causes.Backlash((0.3,)),)).execute(plan.controller, plan.task, noise)
-    execution = Execution(plan, executed, executed)
+    execution = ExecutedTask(plan, executed, executed)
     return ClosedLoops(validation, [execution]), execution
 
 

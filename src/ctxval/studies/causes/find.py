@@ -15,7 +15,7 @@ from ctxval.errors import CtxvalError, InputError
 from ctxval.learning.extended import estimates_by_loops_on_model
 from ctxval.studies.causes.candidates import Candidate, candidates
 from ctxval.studies.causes.evidence import STEPS, Evidence, Explanation, explained, screened
-from ctxval.studies.causes.loops import ClosedLoops, Execution, Predicted
+from ctxval.studies.causes.loops import ClosedLoops, ExecutedTask, Predicted
 from ctxval.studies.causes.mechanics import Force
 from ctxval.studies.causes.plant import Plant, plant_of
 from ctxval.studies.causes.report import CauseReport, Explained, Separating
@@ -54,12 +54,12 @@ def find_causes(campaign: Campaign, *, most: int = 2) -> CauseReport:
                 raise InputError("the states of the model cannot be estimated from the recorded outputs.")
             states = estimated
         plans = [validation.plan(validation.space.from_unit(point)) for point, _ in executed]
-        executions = list(map(Execution, plans, (run for _, run in executed), states))
+        executions = list(map(ExecutedTask, plans, (run for _, run in executed), states))
         return _Study(validation, executions).report(most)
 
 
 class _Study:
-    def __init__(self, validation: Validation, executions: Sequence[Execution]) -> None:
+    def __init__(self, validation: Validation, executions: Sequence[ExecutedTask]) -> None:
         self.validation, self.executions, self.model = validation, executions, validation.model
         self.outputs = validation.outputs is not None
         runs = [each.states for each in executions]

@@ -20,7 +20,7 @@ _DRAWS = 12  # of noise
 
 
 @dataclass(frozen=True, eq=False)
-class Execution(ShortRepr):
+class ExecutedTask(ShortRepr):
     """An executed task: its plan, what the system did, and the same with states of M if only outputs are recorded."""
 
     plan: Plan
@@ -50,7 +50,7 @@ class ClosedLoops:
         without, distances: squared deviations and distances of the executions from the loops on M.
     """
 
-    def __init__(self, validation: Validation, executions: Sequence[Execution]) -> None:
+    def __init__(self, validation: Validation, executions: Sequence[ExecutedTask]) -> None:
         self.validation = validation
         whole = np.concatenate([each.executed.states for each in executions])
         self.ranges = np.maximum(np.ptp(whole, axis=0), 1e-12)
@@ -59,7 +59,7 @@ class ClosedLoops:
         self.without = [self._deviation(each.executed, each.plan.model_trajectory) for each in executions]
         self.distances = [self._distance(each, each.plan.model_trajectory) for each in executions]
 
-    def predicted(self, repaired: Repaired, execution: Execution, noise: Array) -> Predicted:
+    def predicted(self, repaired: Repaired, execution: ExecutedTask, noise: Array) -> Predicted:
         """Return the prediction of an execution from where it began.
 
         Noise of measurements acts on the system through the controller, and may move it out of dead zones and plays.
@@ -92,7 +92,7 @@ class ClosedLoops:
             return None
         return loop if loop.finite.all() else None
 
-    def _noisy(self, repaired: Repaired, execution: Execution, noise: Array) -> list[Trajectory]:
+    def _noisy(self, repaired: Repaired, execution: ExecutedTask, noise: Array) -> list[Trajectory]:
         """Return loops with noise; none if there is no noise, or if one fails."""
         if not noise.any():
             return []
@@ -124,7 +124,7 @@ class ClosedLoops:
             squares += float(np.maximum((each**2).mean(axis=0) - noise, 0.0).mean())
         return squares
 
-    def _distance(self, execution: Execution, loop: Trajectory) -> float:
+    def _distance(self, execution: ExecutedTask, loop: Trajectory) -> float:
         try:
             with np.errstate(all="ignore"):
                 return float(self.validation.distance(loop.copy(), execution.executed.copy(), execution.plan.task))
