@@ -73,7 +73,7 @@ def test_distances_of_published_models_are_those_of_the_page(servo: ModuleType) 
         assert validation.space.task_names[int(known.argmax())] == task
 
 
-@pytest.mark.slow
+@pytest.mark.thorough  # `make servo` runs it for all published models
 def test_a_campaign_falsifies_m1_and_sees_only_what_it_executes(servo: ModuleType) -> None:
     validation = servo.experiment(friction="m1").validation
     revealed: list[str] = []

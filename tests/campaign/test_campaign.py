@@ -11,7 +11,7 @@ import pytest
 from scipy.stats import kstest
 
 from conftest import interrupt_at_once, make_validation
-from ctxval import Campaign, Task, TaskSpace, Trajectory, Validation, controllers, models, searches
+from ctxval import Campaign, Task, TaskSpace, Trajectory, Validation, controllers, distances, models, searches
 from ctxval._util.arrays import Array
 from ctxval.certificates import RESOLUTION, CertificateOptions, Posterior, farthest_task
 from ctxval.core.trial import Trial
@@ -133,9 +133,28 @@ def test_failures_are_data(validation: Validation) -> None:
     for reason, expected in zip(reasons, ["motor cut out", "not finite", "operator", "must have states"], strict=True):
         assert reason is not None
         assert expected in reason
+    recorded = campaign.store.trajectories([t.number for t in campaign.failed], "system")
+    # Of a step that is missing at the end, the others remain.
+    assert {number: trajectory.horizon for number, trajectory in recorded.items()} == {6: 24}
     failed = np.array([t.unit_point for t in campaign.failed])
     others = np.array([t.unit_point for t in campaign.completed])
     assert np.abs(failed[:, None] - others[None]).min() > 0
+
+
+def test_a_failure_is_told_with_what_was_recorded_before(validation: Validation) -> None:
+    campaign = Campaign(validation)
+    opened = campaign.ask()
+    whole = validation.execute(opened.plan)
+    states = whole.states.copy()
+    states[8:] = np.nan
+    ended = campaign.tell(opened, Trajectory(whole.times, states, whole.inputs), failed="it was stopped")
+    assert (ended.state, ended.failure, ended.distance) == ("failed", "it was stopped", None)
+    recorded = campaign.store.trajectory(0, "system")
+    assert np.array_equal(recorded.states, states[:8])
+    assert campaign.remeasure(distances.MaximumDeviation()) == []
+    opened = campaign.ask()
+    with pytest.raises(InputError, match="recording of the failed execution has no step of this task"):
+        campaign.tell(opened, Trajectory(whole.times, whole.states + 9.0, whole.inputs), failed="it was stopped")
 
 
 def test_failures_do_not_change_what_a_resumed_campaign_chooses(validation: Validation, tmp_path: Path) -> None:
@@ -218,7 +237,7 @@ def test_a_short_trajectory_told_by_hand_leaves_the_trial_open(validation: Valid
 
 @pytest.mark.parametrize(
     ("told", "sentence"),
-    [((99,), "there is no trial 99"), ((0,), "one of a trajectory, a distance and the reason")],
+    [((99,), "there is no trial 99"), ((0,), "a trajectory, a distance or the reason")],
 )
 def test_telling_nonsense_is_refused(validation: Validation, told: tuple[int, ...], sentence: str) -> None:
     campaign = Campaign(validation)

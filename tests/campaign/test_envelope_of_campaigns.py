@@ -111,7 +111,7 @@ def make_validation_with_wall() -> Validation:
     )
 
 
-@pytest.mark.slow
+@pytest.mark.thorough  # `make envelope` measures it on more systems
 def test_tasks_that_touch_nothing_are_trusted_in_spite_of_a_wall() -> None:
     validation = make_validation_with_wall()
     tasks = validation.space.iid(2000, np.random.default_rng(9))

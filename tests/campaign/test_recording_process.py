@@ -123,7 +123,7 @@ class Greedy(Probe):
     """Needs more than it may have."""
 
     def read_file(self, *_: Any) -> None:  # type: ignore[override]
-        hoard = [b"x" * 2**28 for _ in range(64)]
+        hoard = [bytes(2**28) for _ in range(64)]  # counted when it is asked for, not when it is filled
         raise InputError(f"{len(hoard)} times 256 MiB")
 
 

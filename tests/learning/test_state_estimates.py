@@ -70,6 +70,7 @@ def test_a_replay_has_the_outputs() -> None:
     assert replay.corrected.states == pytest.approx(executed[1][1].states, abs=0.02)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("share", "answer"), [(1.3, "validated"), (0.9, "falsified")])
 def test_a_campaign_decides_with_the_angle_alone(share: float, answer: str) -> None:
     validation = swing_validation()

@@ -374,7 +374,7 @@ class Campaign:
             opened: the open trial, or its number.
             trajectory: the recorded trajectory.
             distance: the distance, if there is no recording.
-            failed: the reason why there is no result.
+            failed: the reason why there is no result; a trajectory has then the steps before the failure.
             start_tolerance: replaces the start tolerance of the validation.
             replace: why this result replaces one that was told before, such as "wrong file". The history of the store
                 keeps the earlier result with its trajectory.

@@ -11,7 +11,7 @@ import numpy as np
 from ctxval._util.arrays import Array
 from ctxval._util.representation import call, fields_of, lines, shown
 from ctxval._util.texts import text_of
-from ctxval.core.plan import Plan
+from ctxval.core.plan import Plan, recorded_before_failure
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import Origin, State, Trial
 from ctxval.core.validation import Validation
@@ -74,7 +74,8 @@ class Execution:
     """What an execution of S gave.
 
     Attributes:
-        trajectory: the object that the system returned or a person recorded; None if there is none.
+        trajectory: the object that the system returned or a person recorded, of a failed execution the steps before
+            the failure; None if there is none.
         distance: d(p); None if it is not known.
         failed: the reason why there is no result: the system failed, or the execution took too long.
         unusable: the reason why the distance function gave no usable number.
@@ -91,15 +92,24 @@ class Execution:
 
     @classmethod
     def reported(cls, trajectory: Trajectory | None, distance: float | None, failed: str | None) -> Execution:
-        """Return an execution as a user reports it: by exactly one of the three."""
-        if sum(given is not None for given in (trajectory, distance, failed)) != 1:
-            raise InputError("exactly one of a trajectory, a distance and the reason of a failure must be given.")
+        """Return an execution as a user reports it: by one of the three; a failure may have a recording, too."""
+        if (distance is None) == (trajectory is None and failed is None):
+            raise InputError("a trajectory, a distance or the reason of a failure must be given.")
         if distance is not None and not 0 <= distance < np.inf:
             raise InputError(f"the distance must be a finite number >= 0, got {distance!r}.")
         return cls(trajectory, None if distance is None else float(distance), failed)
 
     def measured(self, validation: Validation, plan: Plan, start_tolerance: float | None = None) -> Execution:
-        """Return the execution with its distance, after the checks of :meth:`Validation.accept`."""
+        """Return the execution with its distance, after the checks of :meth:`Validation.accept`.
+
+        Of one that failed, the steps before the failure remain.
+        """
+        if self.failed is not None and self.trajectory is not None:
+            tolerance = validation.start_tolerance if start_tolerance is None else start_tolerance
+            recorded = recorded_before_failure(plan, self.trajectory, tolerance)
+            if recorded is None:
+                raise InputError("the recording of the failed execution has no step of this task.")
+            return replace(self, trajectory=recorded)
         if self.failed is not None or self.distance is not None:
             return self
         measurement = validation.accept(plan, self.trajectory, start_tolerance)

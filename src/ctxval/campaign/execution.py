@@ -13,7 +13,7 @@ from ctxval._util.representation import named
 from ctxval.campaign.choices import Choice, Execution, OpenTrial
 from ctxval.campaign.trials import TrialRecorder
 from ctxval.campaign.workers import AHEAD, SerialPool, WorkerPool
-from ctxval.core.plan import start_offset
+from ctxval.core.plan import recorded_before_failure, start_offset
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import CONVERGED, Trial
 from ctxval.errors import CtxvalError, ExecutionError, InputError, StoreError
@@ -173,7 +173,9 @@ class ExecutionLoop:
         try:
             execution = execution.measured(self.recorder.validation, opened.plan)
         except (ExecutionError, InputError) as error:
-            execution = Execution(failed=str(error), seconds=execution.seconds)
+            validation = self.recorder.validation
+            recorded = recorded_before_failure(opened.plan, execution.trajectory, validation.start_tolerance)
+            execution = Execution(recorded, failed=str(error), seconds=execution.seconds)
         if execution.failed is not None:
             self.failures[opened.number] += 1
             if self.failures[opened.number] <= self.retry_failures:

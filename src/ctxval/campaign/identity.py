@@ -226,7 +226,7 @@ def _measured(trial: Trial) -> dict[str, Any]:
 
 def _measured_again(store: Store, validation: Validation, trial: Trial) -> Trial:
     advance()
-    if trial.state == "open" or not trial.executed:
+    if trial.state in ("open", "failed"):
         return trial
     model, system = store.trajectory(trial.number, "model"), store.trajectory(trial.number, "system")
     if model is None or system is None:

@@ -35,12 +35,12 @@ Names = Mapping[str, str]
 
 @dataclass(frozen=True)
 class SuppliedResult:
-    """The result of a trial, before it is checked. Exactly one of recording, distance and failed is given.
+    """The result of a trial, before it is checked: a recording, a distance, or why it failed.
 
     Attributes:
         recording: the file of the recorded trajectory: CSV, NPZ or a log of another kind.
         distance: the distance, if there is no recording.
-        failed: the reason why there is no result.
+        failed: the reason why there is no result; a recording has then the steps before the failure.
         npz: whether the recording is an NPZ file; None if the suffix decides.
         resample: interpolate the recording to the times of the task.
         start_tolerance: replaces the start tolerance of the validation.
@@ -82,7 +82,7 @@ class SuppliedResult:
                 why = f"; it was split: {recordings.breaks[0]}" if recordings.breaks else ""
                 raise InputError(f"{path} must be one recording without gaps, and has {len(recordings.runs)}{why}.")
             logged = recordings.runs[0].trajectory
-            return logged.resampled(times) if self.resample else logged
+            return self._resampled(logged, times)
         require_file(path)
         if path.suffix == ".npz" if self.npz is None else self.npz:
             recording = Trajectory.from_npz(path)
@@ -92,8 +92,15 @@ class SuppliedResult:
                 raise InputError(f"{path} must have the columns of the inputs, {', '.join(inputs)}.")
         if recording.states.ndim != 2:
             raise InputError(f"{path} must be one recording, got a batch of shape {recording.states.shape}.")
-        _require_finite(path, recording, states, inputs)
-        return recording.resampled(times) if self.resample else recording
+        if self.failed is None:
+            _require_finite(path, recording, states, inputs)
+        return self._resampled(recording, times)
+
+    def _resampled(self, recording: Trajectory, times: Array) -> Trajectory:
+        if not self.resample:
+            return recording
+        recorded = recording.times[-1] - recording.times[0]
+        return recording.resampled(times if self.failed is None else times[times <= max(recorded, times[1])])
 
     def read_confined(self, path: Path, states: Names, inputs: Names, times: Array) -> Trajectory:
         """Return the recording as a process without rights reads it; see :mod:`ctxval._util.cores`."""

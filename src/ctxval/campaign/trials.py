@@ -279,7 +279,7 @@ class TrialRecorder:
         The trial is open, unless there is a reason for ``replacing`` its result.
         """
         ended = execution.ended(trial, executed=executed)
-        trajectory = None if ended.state == "failed" else execution.trajectory
+        trajectory = execution.trajectory
         if replacing is not None:
             self.store.replace_result(self._trials[ended.number], ended, trajectory, replacing, changes=self._changes)
             self._redefine(self.validation, self.description)
@@ -299,7 +299,7 @@ class TrialRecorder:
     def close_together(self, executions: Sequence[tuple[Trial, Execution]]) -> list[Trial]:
         """Store measured executions of open trials in one transaction; if an error is raised, none is stored."""
         ended = [execution.ended(trial) for trial, execution in executions]
-        trajectories = (None if execution.failed is not None else execution.trajectory for _, execution in executions)
+        trajectories = (execution.trajectory for _, execution in executions)
         self.store.close_trials(zip(ended, trajectories, strict=True), changes=self._changes)
         self._closed(ended)
         return ended

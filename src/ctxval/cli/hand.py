@@ -141,8 +141,9 @@ def tell(
     replace: str | None = None,
 ) -> Any:
     stated = {"--trajectory": trajectory, "--npz": npz, "--distance": distance, "--failed": failed}
-    if sum(value is not None for value in stated.values()) != 1:
-        raise InputError(f"exactly one of {', '.join(stated)} must be given.")
+    count = sum(value is not None for value in stated.values())
+    if count != 1 and not (count == 2 and failed is not None and distance is None):
+        raise InputError(f"one of {', '.join(stated)} must be given; a recording may have --failed beside it.")
     if failed is not None and not failed.strip():
         raise InputError('--failed needs a reason, such as "the motor cut out".')
     if trajectory is None and npz is None and (resample or start_tolerance is not None):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -55,7 +55,7 @@ class Measurement:
 def require_execution(plan: Plan, trajectory: Trajectory, start_tolerance: float) -> None:
     """Check that a complete trajectory belongs to the task of a plan; see :class:`Validation` for the tolerance."""
     expected = plan.model_trajectory
-    require_times(trajectory, plan.task.times)
+    require_times(trajectory, plan.task.times[: expected.horizon + 1])
     if trajectory.states.shape != expected.states.shape or trajectory.inputs.shape != expected.inputs.shape:
         wanted = f"states {expected.states.shape} and inputs {expected.inputs.shape}"
         raise ShapeError(
@@ -71,6 +71,26 @@ def require_execution(plan: Plan, trajectory: Trajectory, start_tolerance: float
         raise InputError(
             f"the trajectory starts elsewhere: state {i} must start at {wanted}. Check that it belongs to this trial."
         )
+
+
+def recorded_before_failure(plan: Plan, trajectory: object, start_tolerance: float) -> Trajectory | None:
+    """Return the steps of a plan that were recorded before its execution failed; None if there are none."""
+    expected = plan.model_trajectory
+    widths = expected.states.shape[-1], expected.inputs.shape[-1]
+    if not isinstance(trajectory, Trajectory) or trajectory.batch_shape:
+        return None
+    if (trajectory.states.shape[-1], trajectory.inputs.shape[-1]) != widths:
+        return None
+    unknown = ~np.isfinite(np.concatenate([trajectory.states[1:], trajectory.inputs], axis=1)).all(axis=1)
+    steps = min([trajectory.horizon, expected.horizon, *np.flatnonzero(unknown)[:1].tolist()])
+    if not steps:
+        return None
+    recorded = trajectory.first(steps)
+    try:
+        require_execution(replace(plan, model_trajectory=expected.first(steps)), recorded, start_tolerance)
+    except InputError:
+        return None  # it is a recording of another task
+    return recorded
 
 
 def gives_inputs(plan: Plan, trajectory: Trajectory, tolerance: float) -> bool:

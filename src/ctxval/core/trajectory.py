@@ -119,6 +119,12 @@ class Trajectory:
         single = Trajectory(self.times, self.states[index], self.inputs[index])
         return single if self.ended == COMPLETE or single.finite.all() else replace(single, ended=self.ended)
 
+    def first(self, steps: int) -> Trajectory:
+        """Return the first steps."""
+        return Trajectory(
+            self.times[: steps + 1], self.states[..., : steps + 1, :], self.inputs[..., :steps, :], self.ended
+        )
+
     def transitions(self) -> Transitions:
         """Return all steps of all tasks of the batch as one set of transitions."""
         return Transitions(rows_of(self.states[..., :-1, :]), rows_of(self.inputs), rows_of(self.states[..., 1:, :]))

@@ -128,3 +128,59 @@ def test_one_execution_is_too_few() -> None:
     alone = Campaign(few.validation, search=searches.by_name("random"), seed=0).run(1)
     with pytest.raises(InputError, match="at least 2 executions with trajectories in the store, got 1"):
         find_causes(alone)
+
+
+@pytest.mark.slow
+def test_executions_that_failed_tell_which_inputs_are_exchanged() -> None:
+    A, B = np.eye(4), np.zeros((4, 2))
+    A[:2, 2:], B[2:] = DT * np.eye(2), DT * np.diag([1.0, 2.0])
+
+    def step(x: Array, u: Array) -> Array:
+        turned = x @ A.T + u[..., ::-1] @ B.T
+        return np.where(np.abs(turned).max(axis=-1, keepdims=True) > 3, np.nan, turned)  # the robot stops
+
+    validation = Validation(
+        space=TaskSpace(goal=([-1, -1], [1, 1], "m")),
+        task=lambda p: Task(np.zeros((*p.goal.shape[:-1], 4)), goal=[p.goal[0], p.goal[1], 0, 0], horizon=80, dt=DT),
+        system=systems.Simulated(step),
+        model=models.Linear(A, B),
+        synthesizer=controllers.LQR([5.0, 5.0, 1.0, 1.0], [1.0, 1.0]),
+        distance=distances.MaximumDeviation(components=(0, 1)),
+    )
+    failed = Campaign(validation, search=searches.by_name("random"), seed=0).run(4)
+    assert {trial.state for trial in failed.trials} == {"failed"}
+    report = find_causes(failed)
+    assert [cause.name for cause in report.causes] == ["swapped inputs"]
+    assert report.failed == report.executions == 4
+    assert "of 4 executions until they failed falls from" in report.sentence
+
+
+@pytest.mark.slow
+def test_executions_that_begin_elsewhere_are_not_explained_by_the_dynamics() -> None:
+    """M contains no position, so that an offset of its sensor changes nothing but where the executions begin."""
+
+    class Shifted:
+        batched = True
+
+        def execute(self, controller: Any, task: Any) -> Any:
+            start = task.initial_state + self.shift * np.array([1.0, 0.0])
+            return systems.Simulated(slide(no_force), vectorized=True).execute(controller, task.starting_at(start))
+
+        def __init__(self, *shifts: float) -> None:
+            self.shifts = [*shifts]
+
+        @property
+        def shift(self) -> float:
+            return self.shifts.pop(0)
+
+    def report_of(*shifts: float) -> CauseReport:
+        validation = campaign(slide(no_force)).validation.with_system(Shifted(*shifts))
+        return find_causes(Campaign(validation, search=searches.by_name("random"), seed=0).run(3))
+
+    report = report_of(0.1, 0.1, 0.1)
+    assert [(cause.name, cause.sizes) for cause in report.causes] == [("sensor offset", pytest.approx((0.1,)))]
+    assert "The sensor of position reads 0.1 m too much, or all executions began there." in report.sentence
+    assert json.loads(report.to_json())["began_elsewhere"]
+    report = report_of(0.1, -0.2, 0.15)
+    assert report.causes == ()
+    assert "M predicts the executions from where they began, and that is not where their tasks begin" in report.sentence

@@ -3,27 +3,35 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from ctxval._util.arrays import single_threaded
 from ctxval._util.progress import advance, stage
 from ctxval.campaign.campaign import Campaign
-from ctxval.campaign.history import executed_trials
+from ctxval.campaign.history import executed_trials, failed_trials
+from ctxval.core.trajectory import Trajectory
+from ctxval.core.trial import Trial
 from ctxval.core.validation import Validation
 from ctxval.errors import CtxvalError, InputError
 from ctxval.learning.extended import estimates_by_loops_on_model
 from ctxval.studies.causes.candidates import Candidate, candidates
+from ctxval.studies.causes.cause import Repaired
 from ctxval.studies.causes.evidence import STEPS, Evidence, Explanation, explained, screened
 from ctxval.studies.causes.loops import ClosedLoops, ExecutedTask, Predicted
 from ctxval.studies.causes.mechanics import Force
 from ctxval.studies.causes.plant import Plant, plant_of
 from ctxval.studies.causes.report import CauseReport, Explained, Separating
+from ctxval.studies.causes.signals import SensorOffset
 
 _ALIKE = 10.0  # differences of the criterion that do not tell causes apart
 _NAMED = 0.98  # share of the squared deviations of M in closed loop that causes must explain, to be the cause
 _FITTED = 8  # explanations by one more cause that are fitted to all records
 _CHECKED = 4  # explanations that are tried in closed loop
+_FAILED = 4  # executions that failed
+_AWAY = 30.0  # ranges of the states that M promised, from where on a failed execution says nothing of M
+_STEPS = 5  # of a failed execution
 
 
 def find_causes(campaign: Campaign, *, most: int = 2) -> CauseReport:
@@ -31,7 +39,8 @@ def find_causes(campaign: Campaign, *, most: int = 2) -> CauseReport:
 
     Every cause of the dictionary is fitted alone, and then each beside the best one. The Bayesian information criterion
     chooses. A cause counts if M with it, fitted without an execution, predicts this execution in closed loop better
-    than M does, and if the largest distance so predicted is smaller.
+    than M does, and if the largest distance so predicted is smaller. Of executions that failed, the steps before the
+    failure are used.
 
     Args:
         most: the largest number of causes together.
@@ -42,9 +51,11 @@ def find_causes(campaign: Campaign, *, most: int = 2) -> CauseReport:
     validation = campaign.validation
     trials = executed_trials(campaign.store, campaign.trials)
     trials.sort(key=lambda pair: -(pair[0].distance or 0.0))
+    failed = [] if validation.outputs is not None else _usable(campaign)[:_FAILED]
+    trials = failed + trials[: 8 - len(failed)]  # those with the largest distances
     if len(trials) < 2:
         raise InputError(f"causes need at least 2 executions with trajectories in the store, got {len(trials)}.")
-    executed = [(trial.unit_point, run) for trial, run in trials[:8]]  # those with the largest distances
+    executed = [(trial.unit_point, run) for trial, run in trials]
     with single_threaded():
         states = [run for _, run in executed]
         if validation.outputs is not None:
@@ -55,12 +66,26 @@ def find_causes(campaign: Campaign, *, most: int = 2) -> CauseReport:
             states = estimated
         plans = [validation.plan(validation.space.from_unit(point)) for point, _ in executed]
         executions = list(map(ExecutedTask, plans, (run for _, run in executed), states))
-        return _Study(validation, executions).report(most)
+        return _Study(validation, executions, len(failed)).report(most)
+
+
+def _usable(campaign: Campaign) -> list[tuple[Trial, Trajectory]]:
+    """Return the failed trials with what was recorded until they left the surroundings of what M promised."""
+    usable = []
+    for trial, run in failed_trials(campaign.store, campaign.trials):
+        promised = campaign.recorder.plan(trial).model_trajectory.states
+        far = np.abs(run.states - promised[0]) > _AWAY * np.ptp(promised, axis=0).clip(1e-12)
+        near = np.flatnonzero(far.any(axis=1))
+        steps = min([run.horizon, *(near[:1] - 1)])
+        if steps >= _STEPS:
+            usable.append((trial, run.first(steps)))
+    return usable
 
 
 class _Study:
-    def __init__(self, validation: Validation, executions: Sequence[ExecutedTask]) -> None:
+    def __init__(self, validation: Validation, executions: Sequence[ExecutedTask], failed: int) -> None:
         self.validation, self.executions, self.model = validation, executions, validation.model
+        self.failed = failed
         self.outputs = validation.outputs is not None
         runs = [each.states for each in executions]
         horizon = min(len(run.inputs) for run in runs)
@@ -81,6 +106,11 @@ class _Study:
         self.loops = ClosedLoops(validation, executions)
 
     def report(self, most: int) -> CauseReport:
+        from_start = None if self.outputs else self._in_closed_loop(Explanation((), Repaired(self.model, ()), 0.0, 1.0))
+        if from_start is not None and from_start.complete >= _NAMED:
+            offset = self._offset_of_starts()
+            group = [] if offset is None else [replace(from_start, explanation=offset)]
+            return self._reported(group, began_elsewhere=True)
         with stage("fitting causes", (2 * most - 1) * len(self.dictionary), "causes"):
             ranked = self._ranked(())
             chosen, alike = self._chosen(ranked)
@@ -95,19 +125,40 @@ class _Study:
                 if 1 - better.complete > 0.5 * (1 - chosen.complete):
                     break
                 chosen, alike = better, others
-        named = chosen is not None and chosen.complete >= _NAMED
-        group = [] if chosen is None else [chosen, *alike]
+        return self._reported([] if chosen is None else [chosen, *alike], ranked)
+
+    def _reported(
+        self, group: list[Explained], ranked: Sequence[Explanation] = (), *, began_elsewhere: bool = False
+    ) -> CauseReport:
+        named = bool(group) and group[0].complete >= _NAMED
         return CauseReport(
             plant=self.plant,
             explained=tuple(group),
             named=named,
+            began_elsewhere=began_elsewhere,
             tried=len(self.dictionary),
             executions=len(self.executions),
             before=max(self.loops.distances),
+            failed=self.failed,
             units=self.validation.labels.units,
             separating=self._separating(group) if named and len(group) > 1 else None,
             ranked=tuple(ranked[:5]),
         )
+
+    def _offset_of_starts(self) -> Explanation | None:
+        """Return the offset of the sensor that gives all executions the same start; None if they differ."""
+        gaps = np.array([each.executed.states[0] - each.plan.model_trajectory.states[0] for each in self.executions])
+        state = int((np.abs(gaps.mean(axis=0)) / self.loops.ranges).argmax())
+        gap = float(gaps[:, state].mean())
+        for each in self.dictionary:
+            if (
+                isinstance(each.cause, SensorOffset)
+                and each.cause.state == state
+                and np.ptp(gaps[:, state]) < 0.5 * abs(gap)
+            ):
+                repaired = Repaired(self.model, (each.cause.with_sizes([gap]),))
+                return Explanation((replace(each, cause=repaired.causes[0]),), repaired, 0.0, 1.0)
+        return None
 
     def _ranked(self, beside: tuple[Candidate, ...]) -> list[Explanation]:
         """Return the explanations by each cause beside given ones, the most probable first.

@@ -21,7 +21,10 @@ _DRAWS = 12  # of noise
 
 @dataclass(frozen=True, eq=False)
 class ExecutedTask(ShortRepr):
-    """An executed task: its plan, what the system did, and the same with states of M if only outputs are recorded."""
+    """An executed task: its plan, what the system did, and the same with states of M if only outputs are recorded.
+
+    Of an execution that failed, these are the steps before its failure.
+    """
 
     plan: Plan
     executed: Trajectory
@@ -56,8 +59,10 @@ class ClosedLoops:
         self.ranges = np.maximum(np.ptp(whole, axis=0), 1e-12)
         efforts = np.concatenate([each.executed.inputs for each in executions])
         self.efforts = np.maximum(np.ptp(efforts, axis=0), 1e-12)
-        self.without = [self._deviation(each.executed, each.plan.model_trajectory) for each in executions]
-        self.distances = [self._distance(each, each.plan.model_trajectory) for each in executions]
+        on_model = [each.plan.model_trajectory.first(each.executed.horizon) for each in executions]
+        pairs = list(zip(executions, on_model, strict=True))
+        self.without = [self._deviation(each.executed, loop) for each, loop in pairs]
+        self.distances = [self._distance(each, loop) for each, loop in pairs]
 
     def predicted(self, repaired: Repaired, execution: ExecutedTask, noise: Array) -> Predicted:
         """Return the prediction of an execution from where it began.
@@ -71,7 +76,8 @@ class ClosedLoops:
         outputs = self.validation.outputs is not None
         loops = [] if outputs else self._noisy(repaired, execution, noise)
         if not loops:
-            loop = self.of_plan(repaired, execution.plan, None if outputs else execution.executed.states[0])
+            start = None if outputs else execution.executed.states[0]
+            loop = self.of_plan(repaired, execution.plan, start, execution.executed.horizon)
             if loop is None:
                 return Predicted(np.inf, np.zeros(1), np.inf)
             loops = [loop]
@@ -81,8 +87,10 @@ class ClosedLoops:
         by_noise = np.array([self._deviation(loop, mean) for loop in loops]) * (count + 1) / max(count - 1, 1)
         return Predicted(self._deviation(execution.executed, mean), by_noise, self._distance(execution, mean))
 
-    def of_plan(self, repaired: Repaired, plan: Plan, start: Array | None = None) -> Trajectory | None:
-        """Return the closed loop of a plan on a model with causes, without noise; None if it fails."""
+    def of_plan(
+        self, repaired: Repaired, plan: Plan, start: Array | None = None, steps: int | None = None
+    ) -> Trajectory | None:
+        """Return the first steps of a plan's closed loop on a model with causes, without noise; None if it fails."""
         system: System = repaired
         if self.validation.outputs is not None:
             system = WithOutputs(repaired, self.validation.outputs)
@@ -90,6 +98,7 @@ class ClosedLoops:
             loop = system.execute(plan.controller, plan.task if start is None else plan.task.starting_at(start))
         except Exception:  # the user's own parts, at states that they never saw
             return None
+        loop = loop.first(plan.task.horizon if steps is None else steps)
         return loop if loop.finite.all() else None
 
     def _noisy(self, repaired: Repaired, execution: ExecutedTask, noise: Array) -> list[Trajectory]:
@@ -101,7 +110,8 @@ class ClosedLoops:
 
         def of(draws: int | slice) -> Trajectory:
             initial = np.broadcast_to(start, drawn[0, draws].shape)
-            return repaired.execute(plan.controller, plan.task.starting_at(initial), drawn[:, draws])
+            loop = repaired.execute(plan.controller, plan.task.starting_at(initial), drawn[:, draws])
+            return loop.first(execution.executed.horizon)
 
         loops: list[Trajectory] = []
         with contextlib.suppress(Exception):  # the user's own parts, at states that they never saw

@@ -88,6 +88,8 @@ class CauseReport(ShortRepr):
             comes nearest.
         tried: the number of causes in the dictionary.
         executions, before: the number of executions that were learned from, and their largest distance from M.
+        failed: how many of them failed, of which only the steps before are known.
+        began_elsewhere: whether M predicts the executions from where they began, and not from where their tasks begin.
         separating: the task that tells causes apart which these executions do not.
         ranked: the most probable causes alone, the best one first.
     """
@@ -98,7 +100,9 @@ class CauseReport(ShortRepr):
     tried: int
     executions: int
     before: float
+    failed: int = 0
     units: str = ""
+    began_elsewhere: bool = False
     separating: Separating | None = None
     ranked: tuple[Explanation, ...] = ()
 
@@ -121,11 +125,19 @@ class CauseReport(ShortRepr):
     def sentence(self) -> str:
         """What M lacks, in one or two sentences."""
         units = f" {self.units}" if self.units else ""
+        if self.began_elsewhere and not self.named:
+            return (
+                f"None of these {self.tried} causes: M predicts the executions from where they began, and that is not "
+                "where their tasks begin."
+            )
         if not self.explained:
             return f"None of these {self.tried} causes: none predicts executions better that it was not fitted to."
         first = self.explained[0]
+        failed = "" if not self.failed else " until they failed"
+        if 0 < self.failed < self.executions:
+            failed = f", {self.failed} of them until {'they' if self.failed > 1 else 'it'} failed,"
         effect = (
-            f"the largest distance of {self.executions} executions falls from {self.before:.3g} to "
+            f"the largest distance of {self.executions} executions{failed} falls from {self.before:.3g} to "
             f"{first.distance:.3g}{units}"
         )
         part, of = (first.share, "deviations") if first.resolved else (first.structure, "residuals, except for noise")
@@ -136,6 +148,8 @@ class CauseReport(ShortRepr):
         what = "; or ".join(map(self._text, self.explained))
         if len(self.explained) > 1:
             what = f"One of these, which the executions do not tell apart: {what}"
+        if self.began_elsewhere:
+            what = f"{what}, or all executions began there"
         together = "both" if len(first.causes) == 2 else "this"
         return f"{what[0].upper()}{what[1:]}. With {together} in M, {effect}. This explains {share}."
 
@@ -195,6 +209,8 @@ class CauseReport(ShortRepr):
             ],
             "tried": self.tried,
             "executions": self.executions,
+            "failed": self.failed,
+            "began_elsewhere": self.began_elsewhere,
             "distance_before": self.before,
             "distance_after": self.after,
             "units": self.units,
