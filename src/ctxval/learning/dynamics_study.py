@@ -313,12 +313,21 @@ class DynamicsStudy(ShortRepr):
             among = executed[max(0, some - 5) : some] if estimated else executed[:some]
             inputs = among[0][1].inputs.shape[-1]
 
+            plain: list[Record] = []  # if states are recorded, they are the same with every actuator
+
             def records_of(actuator: Actuator) -> list[Record]:
+                if plain:
+                    commanded = [trajectory.inputs for _, trajectory in among]
+                    alike = len({u.shape for u in commanded}) == 1
+                    acting = actuator.acting(np.stack(commanded)) if alike else map(actuator.acting, commanded)
+                    return [replace(record, inputs=u) for record, u in zip(plain, acting, strict=True)]
                 extended = ExtendedValidation(self.given, actuator, inputs)
                 known = extended.executions(among, len(among))
                 if known is None:
                     raise np.linalg.LinAlgError
-                return extended.records(known)
+                records = extended.records(known)
+                plain.extend(() if estimated else records)
+                return records
 
             before, self._actuators[key] = self._found_actuator(executed[: some - 1]), None
             if before is None:
