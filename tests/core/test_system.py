@@ -212,3 +212,19 @@ def test_what_needs_states_says_so() -> None:
     with pytest.raises(InputError, match="a replay needs recorded states of M, and this validation records outputs"):
         swing_validation().require_states("a replay")
     swing_validation(outputs=None).require_states("a replay")
+
+
+def test_a_step_that_raises_leaves_what_was_recorded_before() -> None:
+    def step(x: np.ndarray, u: np.ndarray) -> np.ndarray:
+        if x[0] > 0.25:
+            raise RuntimeError("emergency stop")
+        x += 0.1  # a step may change what it is given
+        return x
+
+    task = Task([0.0], goal=[1.0], horizon=8, dt=0.1)
+    trajectory = systems.Simulated(step).execute(lambda t, x: np.array([float(t)]), task)
+    assert trajectory.ended == "RuntimeError: emergency stop"
+    np.testing.assert_allclose(trajectory.states[:, 0], [0.0, 0.1, 0.2, 0.3])
+    np.testing.assert_array_equal(trajectory.inputs[:, 0], [0.0, 1.0, 2.0])
+    with pytest.raises(RuntimeError):
+        systems.Simulated(step).execute(lambda t, x: np.zeros(1), Task([1.0], goal=[1.0], horizon=8, dt=0.1))

@@ -177,7 +177,11 @@ def run(
     if verdict is not None:
         print_other_stores(report["other_stores"])
     if campaign.failed and not campaign.completed:
-        err.say(ERROR, f"all {len(campaign.failed)} executions failed, so there is no distance.")
+        err.say(
+            ERROR,
+            f"all {len(campaign.failed)} executions failed, so there is no distance. `ctxval why` looks for a "
+            "cause in what was recorded before the failures.",
+        )
         return report, CANNOT_GO_ON
     return report, status_of(verdict)
 
