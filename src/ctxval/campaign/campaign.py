@@ -135,7 +135,10 @@ class Campaign:
         return max(self.completed, key=lambda trial: trial.distance or 0.0, default=None)
 
     def trajectories(self, trial: Trial) -> tuple[Trajectory | None, Trajectory | None]:
-        """Return the trajectories of the model and of the system in a trial; None if a trajectory is not stored."""
+        """Return the trajectories of the model and of the system in a trial; None if a trajectory is not stored.
+
+        That of a failed execution has the steps before the failure.
+        """
         return self.store.trajectory(trial.number, "model"), self.store.trajectory(trial.number, "system")
 
     def start_offset(self, trial: Trial) -> StartOffset | None:
