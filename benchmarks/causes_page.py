@@ -27,7 +27,7 @@ are MuJoCo models of gymnasium. Foreign faults are in no dictionary: a torque th
 spring that hardens, a force that swings with time, and a motor whose gain falls with its input. A fault is found if it
 is named and first, with its joint or input, or together with others that are alike to the executions.
 
-**Reporting robots**: {reported} Of these, {new}
+**Reporting robots**: {reported}
 
 {{reporting}}
 
@@ -35,21 +35,21 @@ is named and first, with its joint or input, or together with others that are al
 
 {{development}}
 
-Results of the first rule had been seen before this one was made, those of arm, quadrotor and in part pusher: {earlier}
-It let noise hide causes in stiff loops and small plays, so noise is simulated now. Two things were changed in how
-faults are simulated and judged: robots of MuJoCo have the time step of their models, and a weight that is a constant
-force, as that of the quadrotor is, may be named so. The swimmer, the telescope and the rotary pendulum were written
-down before they were run. The second rule ran on {second} of their faults and missed {lost}: where noise made all
-deviations, a division by nearly nothing excluded every cause. This was corrected, with a small backlash of the pendulum
-as the example, and no rule was changed afterwards.
+The rules were changed three times after results on reporting robots had been seen. The first rule saw arm, quadrotor and a
+part of pusher, and let noise hide causes in stiff loops and small plays: {first} Since the second, noise is simulated,
+robots of MuJoCo have the time step of their models, and a weight that is a constant force, as that of the quadrotor is, may
+be named so. The swimmer, the telescope and the rotary pendulum were written down before they were run. The second rule ran
+on {second} of their faults and missed {lost}: where noise made all deviations, a division by nearly nothing excluded
+every cause. By the third rule, {third} Exchanged inputs let the arm fail in every task, so that nothing was recorded, and
+an offset of a sensor that changes nothing but where executions begin was explained by any cause, once by an inertia of
+0.997 times that of M. Now the steps before a failure are kept, and executions that M predicts from where they began need no
+cause in its dynamics.
 
 {missed}
 
-Swapped inputs let the arm and the leg diverge in every task, and a failed execution leaves no recording. The sensor
-offsets of the rotary pendulum and of the pusher change only where executions begin, which any cause explains. The
-quadrotor's inputs count from hovering, so M does not know the load that its friction depends on. A gain and a
-saturation together come near a motor whose gain falls with its input. Why other faults of the pusher are missed is not
-known.
+The quadrotor's inputs count from hovering, so M does not know the load that its friction depends on. A gain and a
+saturation together come near a motor whose gain falls with its input. The faults of the pusher that are missed change its
+distances by no more than noise does, about 0.005 rad. Such a cause is not named, although it is often the most probable one.
 
 {not_run}
 
@@ -149,15 +149,13 @@ def missed(records: Sequence[dict[str, Any]]) -> str:
 def section() -> str:
     """Return the measured part of the page."""
     records = STORED.select(rule=RULE, of="reporting")
-    earlier = STORED.select(rule=1, of="reporting")
-    seen = {each["robot"] for each in earlier}
-    new = said([each for each in records if each["robot"] not in seen])
+    first, third = (STORED.select(rule=rule, of="reporting") for rule in (1, 3))
+    seen = {each["robot"] for each in first}
     second = [each for each in STORED.select(rule=2, of="reporting") if each["robot"] not in seen]
     lost = [f"{each['robot']} {each['fault']}" for each in second if not (each["named"] and each["in_group"])]
     text = SECTION.strip().format(
         second=len(second), lost=" and ".join(lost),
-        executions=EXECUTIONS, reported=said(records), new=f"on robots that no rule has seen, {new}",
-        earlier=said(earlier), missed=missed(records), servo=servo(), not_run=not_run(),
+        executions=EXECUTIONS, reported=said(records), first=said(first), third=said(third), missed=missed(records), servo=servo(), not_run=not_run(),
     )  # fmt: skip
     paragraphs = [
         textwrap.fill(part, 120, break_long_words=False, break_on_hyphens=False) for part in text.split("\n\n")

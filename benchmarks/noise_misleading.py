@@ -112,6 +112,19 @@ def _wall(x: Array, u: Array, goal: Array, memory: Any, rng: np.random.Generator
     return _moved(x, u[..., 0] - _drag(x) + stop) + _noise(x, rng), memory
 
 
+def _dropouts(x: Array, u: Array, goal: Array, memory: Any, rng: np.random.Generator, t: int) -> tuple[Array, Any]:
+    """One record of thirty is that of the step before."""
+    true = x if memory is None else memory
+    true = _moved(true, u[..., 0] - _drag(true)) + _noise(true, rng, 2e-4)
+    return np.where(rng.random((*x.shape[:-1], 1)) < 1 / 30, x, true), true
+
+
+def _battery(x: Array, u: Array, goal: Array, memory: Any, rng: np.random.Generator, t: int) -> tuple[Array, Any]:
+    """The motor has another strength in each execution, between 85 and 100 %."""
+    strength = rng.uniform(0.85, 1.0, x.shape[:-1]) if memory is None else memory
+    return _moved(x, strength * u[..., 0] - _drag(x)) + _noise(x, rng), strength
+
+
 @dataclass(frozen=True)
 class MisleadingPlant(Plant):
     """A cart that misleads.
@@ -141,5 +154,7 @@ PLANTS = {
         "sticking": _sticking,
         "warming": _warming,
         "wall": _wall,
+        "dropouts": _dropouts,
+        "battery": _battery,
     }.items()
 }
