@@ -35,21 +35,22 @@ is named and first, with its joint or input, or together with others that are al
 
 {{development}}
 
-The rules were changed three times after results on reporting robots had been seen. The first rule saw arm, quadrotor and a
-part of pusher, and let noise hide causes in stiff loops and small plays: {first} Since the second, noise is simulated,
-robots of MuJoCo have the time step of their models, and a weight that is a constant force, as that of the quadrotor is, may
-be named so. The swimmer, the telescope and the rotary pendulum were written down before they were run. The second rule ran
-on {second} of their faults and missed {lost}: where noise made all deviations, a division by nearly nothing excluded
-every cause. By the third rule, {third} Exchanged inputs let the arm fail in every task, so that nothing was recorded, and
-an offset of a sensor that changes nothing but where executions begin was explained by any cause, once by an inertia of
-0.997 times that of M. Now the steps before a failure are kept, and executions that M predicts from where they began need no
-cause in its dynamics.
+The rules were changed three times after results on reporting robots had been seen. The first rule saw arm, quadrotor
+and a part of pusher, and let noise hide causes in stiff loops and small plays: {first} Since the second, noise is
+simulated, robots of MuJoCo have the time step of their models, and a weight that is a constant force, as that of the
+quadrotor is, may be named so. The swimmer, the telescope and the rotary pendulum were written down before they were
+run. The second rule ran on {second} of their faults and missed {lost}: where noise made all deviations, a division by
+nearly nothing excluded every cause. By the third rule, {third} Exchanged inputs let the arm fail in every task, so that
+nothing was recorded, and an offset of a sensor that changes nothing but where executions begin was explained by any
+cause, once by an inertia of 0.997 times that of M. Now the steps before a failure are kept, and executions that M
+predicts from where they began need no cause in its dynamics.
 
 {missed}
 
 The quadrotor's inputs count from hovering, so M does not know the load that its friction depends on. A gain and a
-saturation together come near a motor whose gain falls with its input. The faults of the pusher that are missed change its
-distances by no more than noise does, about 0.005 rad. Such a cause is not named, although it is often the most probable one.
+saturation together come near a motor whose gain falls with its input. The faults of the pusher that are missed change
+its distances by no more than noise does, about 0.005 rad. Such a cause is not named, although it is often the most
+probable one.
 
 {not_run}
 
@@ -155,7 +156,8 @@ def section() -> str:
     lost = [f"{each['robot']} {each['fault']}" for each in second if not (each["named"] and each["in_group"])]
     text = SECTION.strip().format(
         second=len(second), lost=" and ".join(lost),
-        executions=EXECUTIONS, reported=said(records), first=said(first), third=said(third), missed=missed(records), servo=servo(), not_run=not_run(),
+        executions=EXECUTIONS, reported=said(records), first=said(first), third=said(third),
+        missed=missed(records), servo=servo(), not_run=not_run(),
     )  # fmt: skip
     paragraphs = [
         textwrap.fill(part, 120, break_long_words=False, break_on_hyphens=False) for part in text.split("\n\n")
