@@ -8,9 +8,9 @@ from typing import Any
 from ctxval.errors import InputError
 
 
-def require_extra(module: str, extra: str, purpose: str) -> Any:
+def require_extra(module: str, extra: str, needs: str) -> Any:
     try:
         return importlib.import_module(module)
     except ImportError as error:
-        name = module.partition(".")[0]
-        raise InputError(f"{purpose} need {name}: pip install 'ctxval[{extra}]'.") from error
+        name = (error.name or module).partition(".")[0]
+        raise InputError(f"{needs} {name}: pip install 'ctxval[{extra}]'.") from error

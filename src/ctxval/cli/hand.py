@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import functools
-import importlib
 import shlex
 from pathlib import Path
 from typing import Any
 
 from ctxval._util.checked import NonNegativeFloat, require
+from ctxval._util.extras import require_extra
 from ctxval._util.progress import advance, stage
 from ctxval._util.texts import enumerated
 from ctxval.campaign.by_hand import (
@@ -245,7 +245,4 @@ def _served(opened: Opened, threshold: float | None, budget: int | None) -> Serv
 
 def web_server() -> Any:
     """Return the module of the server, which needs the extra ``web``."""
-    try:
-        return importlib.import_module("ctxval.web.server")
-    except ImportError as error:
-        raise InputError(f"the page needs {error.name}: pip install 'ctxval[web]'.") from error
+    return require_extra("ctxval.web.server", "web", "the page needs")

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from ctxval._util.files import make_folder_of, require_made_by_us
+from ctxval._util.texts import reworded
 from ctxval.errors import InputError
 
 
@@ -60,11 +61,9 @@ def require_outputs(outputs: Mapping[str, Path | None], inputs: Iterable[object]
         if suffix and path.suffix.lower() != suffix:
             raise InputError(f"{name} must be a file that ends in {suffix}, got {str(path)!r}.")
         make_folder_of(path)
-        try:
+        with reworded(f"{path} cannot be written", OSError, RuntimeError, ValueError):
             place, there = path.resolve(), path.exists()
             is_input = there and any(each.exists() and each.samefile(path) for each in read)
-        except (OSError, RuntimeError, ValueError) as error:
-            raise InputError(f"{path} cannot be written: {error}.") from error
         if place in named:
             raise InputError(f"{named[place]} and {name} must be different files, and both are {path}.")
         named[place] = name

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, get_args
 
 from ctxval._util.representation import task_text
-from ctxval._util.texts import shortened
+from ctxval._util.texts import reworded, shortened
 from ctxval.cli.base import CANNOT_GO_ON, FALSIFIED, command, err, notes, out, print_columns
 from ctxval.cli.config.parts import part
 from ctxval.cli.config.references import reference, require_function
@@ -327,10 +327,8 @@ def collect(
         raise InputError(f"--amplitude must be a number or a list such as [1.0, 0.5], got {amplitude!r}.")
     allowed = None if limits is None else parsed(limits)
     excitation = Excitation(experiment.validation, kind, size, allowed, seed)  # type: ignore[arg-type]
-    try:
+    with reworded(f"{out_} cannot be made", OSError):
         out_.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{out_} cannot be made: {error.strerror}.") from error
     paths = [out_ / f"run{number:04d}.csv" for number in range(runs)]
     missing = [number for number, path in enumerate(paths) if not path.exists()]
     recorded, failed, known = list[str](), list[dict[str, Any]](), runs - len(missing)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import os
 import sys
 import webbrowser
@@ -12,8 +11,9 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ctxval._util.extras import require_extra
 from ctxval._util.progress import also_listening
-from ctxval._util.texts import reason_of
+from ctxval._util.texts import reason_of, reworded
 from ctxval.campaign.interval_search import IntervalSearch
 from ctxval.campaign.storage.other_stores import other_stores
 from ctxval.certificates.verdict import usable_bound
@@ -188,14 +188,9 @@ def _workers(workers: int | None, dask: str | None) -> Iterator[dict[str, Any]]:
     if dask is None:
         yield {"workers": workers}
         return
-    try:
-        distributed: Any = importlib.import_module("distributed")
-    except ImportError as error:
-        raise InputError("--dask needs dask.distributed: pip install 'ctxval[dask]'.") from error
-    try:
+    distributed = require_extra("distributed", "dask", "--dask needs")
+    with reworded(f"there is no Dask scheduler at {dask}"):
         client = distributed.Client(dask, timeout=10)
-    except (OSError, ValueError, TypeError) as error:
-        raise InputError(f"there is no Dask scheduler at {dask}: {type(error).__name__}: {error}.") from error
     with client:
         threads = sum(client.nthreads().values())
         if not threads:

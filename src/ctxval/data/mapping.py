@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
@@ -12,10 +11,10 @@ from typing import Any, Literal
 from ctxval._util.arrays import Array
 from ctxval._util.checked import FiniteFloat, NonNegativeInt, Seconds, checked, require
 from ctxval._util.columns import column_of, conversion, named_unit
-from ctxval._util.files import read_bytes
+from ctxval._util.files import read_toml
 from ctxval._util.representation import ShortRepr
-from ctxval._util.texts import enumerated
-from ctxval.data.log import LISTED, Clock, Log, reading
+from ctxval._util.texts import enumerated, reworded
+from ctxval.data.log import LISTED, Clock, Log
 from ctxval.errors import InputError, UnknownNameError
 
 Stamp = Literal["auto", "log", "publish", "header"]
@@ -69,13 +68,11 @@ class Field:
         """Return the factor of the recorded value; ``stated`` is the unit that the log itself states, if any."""
         if self.factor is not None:
             return float(self.factor)
-        try:
+        with reworded(f"the field {self.path}", InputError):
             if stated and self.recorded and conversion(stated, self.recorded) != 1:
                 raise InputError(f"it is recorded in {stated}, and the mapping states {self.recorded}.")
             recorded = stated or self.recorded
             return conversion(recorded, self.unit) if recorded and (self.unit or not stated) else 1.0
-        except InputError as error:
-            raise InputError(f"the field {self.path}: {error}") from error
 
 
 @dataclass(frozen=True)
@@ -189,36 +186,35 @@ class LogMapping(ShortRepr):
         _require_known("entry of the mapping of recordings", table, [field.name for field in fields(LogMapping)])
         parts = dict[str, Any]()
         for kind in ("states", "inputs"):
-            named = table.get(kind, {})
-            named = [named] if isinstance(named, str) else named
-            if isinstance(named, list):
-                named = {str(item.get("path") if isinstance(item, Mapping) else item): item for item in named}
-            if not isinstance(named, Mapping):
-                raise InputError(f"{kind} must be a table of fields or a list of paths, got {named!r}.")
-            parts[kind] = named
+            match table.get(kind, {}):
+                case {} as named:
+                    parts[kind] = named
+                case str(path):
+                    parts[kind] = {path: path}
+                case [*listed]:
+                    parts[kind] = {
+                        str(item.get("path") if isinstance(item, Mapping) else item): item for item in listed
+                    }
+                case named:
+                    raise InputError(f"{kind} must be a table of fields or a list of paths, got {named!r}.")
         if "states" not in table:
             raise InputError("the mapping of recordings needs states.")
-        if "observer" in table:  # module:attr, or a table
-            given = table["observer"]
-            observer: Any = {"function": given} if isinstance(given, str) else given
-            if not isinstance(observer, Mapping) or not isinstance(observer.get("function"), str):
+        match table:
+            case {"observer": str(function)}:
+                parts["observer"] = Observer(None, {}, function)
+            case {"observer": {"function": str(function)} as observer}:
+                _require_known("entry of the observer", observer, ["function", "states"])
+                parts["observer"] = Observer(None, observer.get("states", {}), function)
+            case {"observer": given}:
                 raise InputError(f"an observer must name a function module:attr, got {given!r}.")
-            _require_known("entry of the observer", observer, ["function", "states"])
-            parts["observer"] = Observer(None, observer.get("states", {}), observer["function"])
         return LogMapping(**{**table, **parts})
 
     @staticmethod
     def from_toml(path: str | Path) -> LogMapping:
         """Return the mapping in a TOML file, or in the table ``[recordings]`` of an experiment file."""
-        with reading(path):
-            content = read_bytes(path)
-        try:
-            table = tomllib.loads(content.decode("utf-8"))
+        table = read_toml(path)
+        with reworded(str(path), InputError):
             return LogMapping.from_table(table.get("recordings", table))
-        except InputError as error:
-            raise InputError(f"{path}: {error}") from error
-        except (ValueError, RecursionError) as error:
-            raise InputError(f"{path} is not valid TOML: {error}.") from error
 
     @staticmethod
     def usual(log: Log, states: Mapping[str, str] | None = None, inputs: Mapping[str, str] | None = None) -> LogMapping:
@@ -261,15 +257,14 @@ def _require_known(what: str, table: Mapping[str, Any], names: Sequence[str]) ->
 
 
 def _field(name: str, described: Any) -> Field:
-    if isinstance(described, Field):
-        return described
-    if isinstance(described, str):
-        return Field(described)
+    match described:
+        case Field():
+            return described
+        case str():
+            return Field(described)
     if not isinstance(described, Mapping):
         raise InputError(f"the field {name} must be a path or a table, got {described!r}.")
     table = {("path" if key == "field" else key): value for key, value in described.items()}
     _require_known(f"entry of the field {name}", table, [field.name for field in fields(Field)])
-    try:
+    with reworded(f"the field {name}", InputError):
         return Field(**({} if "derivative_of" in table else {"path": name}) | table)
-    except InputError as error:
-        raise InputError(f"the field {name}: {error}") from error

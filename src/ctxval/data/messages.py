@@ -13,7 +13,7 @@ import io
 import itertools
 import json
 import zlib
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, redirect_stderr, suppress
 from functools import partial
 from pathlib import Path
@@ -24,7 +24,7 @@ import numpy as np
 from ctxval._util.arrays import Array
 from ctxval._util.extras import require_extra
 from ctxval._util.files import open_regular
-from ctxval._util.texts import quoted, reason_of
+from ctxval._util.texts import quoted, reason_of, reworded
 from ctxval.data.log import reading
 from ctxval.data.topics import Message, TopicLog
 from ctxval.errors import InputError
@@ -37,7 +37,7 @@ Definition = tuple[Callable[[str, bytes], Decoder], str, bytes]
 
 _MOST_CHUNK = 128 * 2**20  # largest size of a record, and of a chunk of records after it is decompressed, in bytes
 
-_library = partial(require_extra, extra="logs", purpose="logs of messages")
+_library = partial(require_extra, extra="logs", needs="logs of messages need")
 
 
 class _FileOfMessages(TopicLog):
@@ -58,14 +58,8 @@ class _FileOfMessages(TopicLog):
         """Return the content of a message, decoded by the definition of its channel."""
         if channel not in self._decoders:
             make, name, text = definition()
-            try:
+            with reworded(f"{self.source}: the definition of the messages of {topic}, {name}, cannot be read"):
                 self._decoders[channel] = make(name, text)
-            except InputError:
-                raise
-            except Exception as error:  # the definition in a file may be anything
-                raise InputError(
-                    f"{self.source}: the definition of the messages of {topic}, {name}, cannot be read."
-                ) from error
         try:
             return self._decoders[channel](data)
         except Exception as error:  # decoders raise many kinds
@@ -184,14 +178,10 @@ class BagLog(_FileOfMessages):
         if self._version == 2 and definition.format.name != "MSG":
             # Bags before ROS 2 Iron do not hold the definitions of their messages.
             typesys = _library("rosbags.typesys")
-            try:
+            what = f"the definition of the messages of {connection.topic}, {connection.msgtype}"
+            with reworded(f"{self.source}: {what}, is not in the bag, and is not one of ROS 2 itself"):
                 known = typesys.get_typestore(typesys.Stores.LATEST)
                 text, _ = known.generate_msgdef(connection.msgtype, ros_version=2)
-            except Exception as error:
-                raise InputError(
-                    f"{self.source}: the definition of the messages of {connection.topic}, {connection.msgtype}, is "
-                    "not in the bag, and is not one of ROS 2 itself."
-                ) from error
         make = ros1_decoder if self._version == 1 else ros2_decoder
         return make, connection.msgtype, text.encode()
 
@@ -253,10 +243,11 @@ def _plain(value: Any) -> Any:
         fields = value.DESCRIPTOR.fields
         known = [field.name for field in fields if not field.has_presence or value.HasField(field.name)]
         return {name: _plain(getattr(value, name)) for name in known}
-    if isinstance(value, Mapping):
-        return {str(key): _plain(item) for key, item in value.items()}
-    if isinstance(value, bool | int | float | str | bytes):
-        return value
+    match value:
+        case {}:
+            return {str(key): _plain(item) for key, item in value.items()}
+        case int() | float() | str() | bytes():
+            return value
     return [_plain(item) for item in value]
 
 

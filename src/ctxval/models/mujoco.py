@@ -69,7 +69,7 @@ class MuJoCo(ShortRepr):
         """
         another = copy.copy(self)
         if change is not None:
-            mujoco = require_extra("mujoco", "mujoco", "models of MuJoCo")
+            mujoco = require_extra("mujoco", "mujoco", "models of MuJoCo need")
             another._model = copy.copy(self._model)
             change(another._model)
             mujoco.mj_setConst(another._model, mujoco.MjData(another._model))
@@ -85,7 +85,7 @@ class MuJoCo(ShortRepr):
         batch = np.broadcast_shapes(x.shape[:-1], u.shape[:-1])
         states, inputs = map(rows_of, paired(x, u))
         reached = np.full(states.shape, np.nan)
-        mujoco = require_extra("mujoco", "mujoco", "models of MuJoCo")
+        mujoco = require_extra("mujoco", "mujoco", "models of MuJoCo need")
         data = mujoco.MjData(model)
         for k in np.flatnonzero(np.isfinite(states).all(axis=1) & np.isfinite(inputs).all(axis=1)).tolist():
             mujoco.mj_resetData(model, data)

@@ -65,8 +65,8 @@ class FeedforwardReLU(IncrementModel):
         """
         scaling = IncrementScaling.of(data)
         seeds = np.random.SeedSequence(seed).generate_state(restarts)
-        perceptron = require_extra("sklearn.neural_network", "cases", "learned networks").MLPRegressor
-        ignored = require_extra("sklearn.exceptions", "cases", "learned networks").ConvergenceWarning
+        perceptron = require_extra("sklearn.neural_network", "cases", "learned networks need").MLPRegressor
+        ignored = require_extra("sklearn.exceptions", "cases", "learned networks need").ConvergenceWarning
         trained, targets = [], scaling.targets(data)
         targets = targets.ravel() if targets.shape[1] == 1 else targets  # else it warns
         with single_threaded(), warnings.catch_warnings():

@@ -14,6 +14,7 @@ from ctxval._util.arrays import Array, rows_of
 from ctxval._util.extras import require_extra
 from ctxval._util.registry import part
 from ctxval._util.representation import ShortRepr
+from ctxval._util.texts import reworded
 from ctxval.core.model import paired
 from ctxval.core.trajectory import Transitions
 from ctxval.errors import InputError, ModelError, ShapeError
@@ -92,9 +93,8 @@ class Torch(ShortRepr):
         if training:
             self.module.eval()
         try:
-            yield
-        except RuntimeError as error:
-            raise ModelError(f"the module cannot be evaluated: {error}") from error
+            with reworded("the module cannot be evaluated", RuntimeError, to=ModelError):
+                yield
         finally:
             torch.set_num_threads(threads)
             if training:
@@ -102,7 +102,7 @@ class Torch(ShortRepr):
 
 
 def _torch() -> Any:
-    return require_extra("torch", "torch", "torch modules")
+    return require_extra("torch", "torch", "torch modules need")
 
 
 def _floats(tensor: Any) -> Array:

@@ -17,7 +17,7 @@ from ctxval.searches.base import SequentialSearch
 if TYPE_CHECKING:
     from cmaes import CMA
 
-_library = partial(require_extra, "cmaes", "searches", "CMA-ES searches")
+_library = partial(require_extra, "cmaes", "searches", "CMA-ES searches need")
 
 
 @part("cma-es")

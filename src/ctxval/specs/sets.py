@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Self
@@ -81,10 +81,9 @@ class _Placed(Set):
             place = task.environment[given][..., None, :]
         else:
             place = np.asarray(given, dtype=np.float64)
-            if place.ndim > 1:
-                if len(place) < times:
-                    raise ShapeError(f"a {what} that moves needs a row for each of {times} times, got {len(place)}.")
-                place = place[:times]
+            if place.ndim > 1 and len(place) < times:
+                raise ShapeError(f"a {what} that moves needs a row for each of {times} times, got {len(place)}.")
+            place = place[:times] if place.ndim > 1 else place
         if place.ndim and place.shape[-1] != k:
             raise _other_dimension(what, place.shape[-1], k)
         return place
@@ -265,14 +264,13 @@ SETS: Registry[Set] = Registry(
 
 def as_set(what: str, given: Any) -> Set:
     """Return a set from itself, or from a table of its arguments with its ``type``."""
-    if isinstance(given, Set):
-        return given
-    if isinstance(given, Mapping) and isinstance(given.get("type"), str):
-        arguments = dict(given)
-        name = arguments.pop("type")
-        if name not in SETS.built_in:  # a table runs no code of other packages
-            raise UnknownNameError.among("set", name, SETS.built_in)
-        return SETS.make(name, **arguments)
+    match given:
+        case Set():
+            return given
+        case {"type": str(name), **arguments}:
+            if name not in SETS.built_in:  # a table runs no code of other packages
+                raise UnknownNameError.among("set", name, SETS.built_in)
+            return SETS.make(name, **{str(key): value for key, value in arguments.items()})
     raise InputError(f"{what} must be a set, such as Box(low=[0, 0], high=[1, 1]), or its table, got {given!r}.")
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from ctxval._util.arrays import Array
 from ctxval._util.extras import require_extra
 from ctxval._util.registry import part
-from ctxval._util.texts import reason_of
+from ctxval._util.texts import reworded
 from ctxval.core.distance import NamedStates, selected
 from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory
@@ -38,7 +38,7 @@ class STL(NamedStates):
     components: Sequence[int | str] | None = None
 
     def __post_init__(self) -> None:
-        require_extra("rtamt", "stl", "specifications in signal temporal logic")
+        require_extra("rtamt", "stl", "specifications in signal temporal logic need")
         if not len(self.variables):
             raise InputError("a formula needs the name of at least one state in variables, got none.")
         if self.components is None:
@@ -63,19 +63,17 @@ class STL(NamedStates):
         return np.array([self._of_one(names, row, task) for row in rows]).reshape(batch)
 
     def _of_one(self, names: Sequence[str], signals: Array, task: Task) -> float:
-        rtamt = require_extra("rtamt", "stl", "specifications in signal temporal logic")
+        rtamt = require_extra("rtamt", "stl", "specifications in signal temporal logic need")
         monitor = rtamt.StlDiscreteTimeSpecification()
         monitor.unit = "s"
         monitor.set_sampling_period(task.dt, "s", 0.1)
         for name in names:
             monitor.declare_var(name, "float")
         monitor.spec = self.formula
-        try:
+        with reworded(f"the formula {self.formula!r} cannot be evaluated"):  # whatever rtamt raises
             monitor.parse()
             data = dict(zip(names, signals.tolist(), strict=True))
             rho = float(monitor.evaluate({"time": task.times[: signals.shape[1]].tolist(), **data})[0][1])
-        except Exception as error:  # whatever rtamt raises
-            raise InputError(f"the formula {self.formula!r} cannot be evaluated: {reason_of(error)}.") from error
         if not np.isfinite(rho):
             raise InputError(f"the formula {self.formula!r} needs times after the end of the task.")
         return rho

@@ -9,6 +9,7 @@ from ctxval._util.arrays import as_floats
 from ctxval._util.checked import Seconds
 from ctxval._util.registry import part
 from ctxval._util.representation import ShortRepr
+from ctxval._util.texts import reworded
 from ctxval.core.controller import Controller, Feedback, started
 from ctxval.core.labels import require_names
 from ctxval.core.task import Task
@@ -34,12 +35,10 @@ class Function(ShortRepr):
         returned = self.function(started(controller, task), task)
         if isinstance(returned, Trajectory):
             return returned
-        try:
+        wanted = f"a Trajectory, or states (H + 1, n) and inputs (H, m) with H = {task.horizon}"
+        with reworded(f"the system's function must return {wanted}", TypeError, ValueError, to=ExecutionError):
             states, inputs = (as_floats(name, part) for name, part in zip(("states", "inputs"), returned, strict=True))
             return Trajectory(task.times, states, inputs)
-        except (InputError, TypeError, ValueError) as error:
-            wanted = f"a Trajectory, or states (H + 1, n) and inputs (H, m) with H = {task.horizon}"
-            raise ExecutionError(f"the system's function must return {wanted}: {error}") from error
 
 
 @part()

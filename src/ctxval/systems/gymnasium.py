@@ -16,6 +16,7 @@ from ctxval._util.extras import require_extra
 from ctxval._util.mjcf import warning_of
 from ctxval._util.registry import part
 from ctxval._util.representation import ShortRepr
+from ctxval._util.texts import reworded
 from ctxval.core.controller import Controller
 from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory
@@ -135,16 +136,20 @@ class Gymnasium(ShortRepr):
             self._idle.pop().close()
 
     def _made(self) -> Any:
-        gymnasium = require_extra("gymnasium", "mujoco", "environments")
+        gymnasium = require_extra("gymnasium", "mujoco", "environments need")
         if self._given:
             return self.environment if not hasattr(self, "_idle") else copy.deepcopy(self.environment)
         if not isinstance(self.environment, str):
             return self.environment(**{**self.options, **self._files})
-        try:
+        with reworded(
+            f"the environment {self.environment!r} cannot be made",
+            gymnasium.error.Error,
+            ImportError,
+            TypeError,
+            AttributeError,
+        ):
             # The passive checker would warn of actions outside the action space, but the environment clips them.
             return gymnasium.make(self.environment, **{"disable_env_checker": True, **self.options, **self._files})
-        except (gymnasium.error.Error, ImportError, TypeError, AttributeError) as error:
-            raise InputError(f"the environment {self.environment!r} cannot be made: {error}") from error
 
     def _start(self, environment: Any, task: Task) -> None:
         environment.reset(seed=self.seed)

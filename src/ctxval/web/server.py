@@ -16,6 +16,7 @@ from typing import Any
 import uvicorn
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
+from ctxval._util.texts import reworded
 from ctxval.errors import InputError
 from ctxval.web.app import application
 from ctxval.web.jobs import OpenCampaign
@@ -105,12 +106,9 @@ def listening(host: str, port: int) -> socket.socket:
     """Return a socket that listens at an address."""
     if not 0 <= port <= 65535:
         raise InputError(f"the port must be from 0 to 65535, got {port}.")
-    try:
+    with reworded(f"the page cannot be served at {host}, port {port}", OSError, UnicodeError):
         family, *_, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
         return socket.create_server(address[:2], family=family, backlog=128)
-    except (OSError, UnicodeError) as error:
-        reason = getattr(error, "strerror", None) or str(error)
-        raise InputError(f"the page cannot be served at {host}, port {port}: {reason}.") from error
 
 
 def page_address(host: str, port: int) -> str:

@@ -16,8 +16,10 @@ from pydantic.errors import PydanticUserError
 from pydantic_core import SchemaError
 
 from ctxval import controllers, distances, models, systems
+from ctxval._util.checked import require
 from ctxval._util.files import Archive, read_bytes
 from ctxval._util.registry import Declaration, Registry, construct, declaration_of
+from ctxval._util.texts import reworded
 from ctxval.cli.config.references import accepts, is_function, reference, require_function, require_part
 from ctxval.core.experiment import Experiment
 from ctxval.core.model import Model
@@ -27,7 +29,7 @@ from ctxval.core.task_distribution import Normal
 from ctxval.core.trajectory import Transitions
 from ctxval.core.validation import Validation
 from ctxval.data import LogMapping, read_recordings
-from ctxval.errors import CtxvalError, InputError, ShapeError, UnknownNameError
+from ctxval.errors import InputError, UnknownNameError
 from ctxval.models.saved import stored_transitions
 from ctxval.paper import cases
 
@@ -87,15 +89,14 @@ def _built(kind: str, what: str, build: Any, arguments: dict[str, Any], folder: 
 
 def argument(value: Any, folder: Path | None = None) -> Any:
     """Return an argument unchanged, or the object that ``{ref = "module:attr"}`` names."""
-    if isinstance(value, Mapping):
-        if set(value) == {"ref"}:
-            named = reference(str(value["ref"]), folder)
+    match value:
+        case {"ref": text, **others} if not others:
+            named = reference(str(text), folder)
             if inspect.ismodule(named) or (inspect.isroutine(named) and not inspect.isfunction(named)):
-                raise InputError(
-                    f"{value['ref']} must be an object, a class or a function written in Python, got {named!r}."
-                )
+                raise InputError(f"{text} must be an object, a class or a function written in Python, got {named!r}.")
             return named
-        return {key: argument(item, folder) for key, item in value.items()}
+        case {}:
+            return {key: argument(item, folder) for key, item in value.items()}
     return value
 
 
@@ -106,18 +107,14 @@ def recorded(files: Any, folder: Path | None = None) -> Transitions:
         mapping = LogMapping.from_table({key: value for key, value in files.items() if key != "logs"})
         files = files.get("logs")
     paths = [files] if isinstance(files, str) else files
-    if not isinstance(paths, list) or not paths or not all(isinstance(path, str) for path in paths):
+    if not paths or type(paths) is not list or {*map(type, paths)} != {str}:
         raise InputError(f"data must be a file of recorded trajectories or a list of files, got {files!r}.")
     parts, logs = list[Transitions](), dict[str, list[Path]]()
     for path in (Path(folder or "", path) for path in paths):
         stored = None
         if mapping is None and path.suffix == ".npz":
-            try:
+            with reworded(f"{path} cannot be read as recorded data", InputError):
                 stored = stored_transitions(Archive(read_bytes(path)))
-            except ShapeError:
-                raise
-            except InputError as error:
-                raise InputError(f"{path} cannot be read as recorded data: {error}.") from error
         if stored is not None:
             parts.append(stored)
         else:  # arrays in NPZ files have other names than columns
@@ -169,21 +166,15 @@ def task_function(given: str | Mapping[str, Any], space: TaskSpace, system: Any,
     missing = [key for key in ("initial_state", "horizon", "dt") if table.get(key) is None]
     if missing:
         raise InputError(f"[task] needs {', '.join(missing)}.")
-    around = table.get("environment", {})
-    if not isinstance(around, dict):
-        raise InputError(f"environment of [task] must be a table of names and lists, got {around!r}.")
+    around = require("environment of [task]", Mapping, table.get("environment", {}))
     of_environment = {f"environment {name!r}": entries for name, entries in around.items()}
     for name, entries in {"initial_state": table["initial_state"], "goal": table["goal"], **of_environment}.items():
-        plain = isinstance(entries, list) and entries and all(type(entry) in (int, float, str) for entry in entries)
+        plain = type(entries) is list and entries and {*map(type, entries)} <= {int, float, str}
         if not plain and (name, entries) != ("goal", None):
             raise InputError(f"{name} of [task] must be a list of numbers and of names of parameters, got {entries!r}.")
     task = TaskTable(**table)
-    try:
+    with reworded("[task] cannot be used"):
         task(space.parameters(space.low))
-    except (ValueError, IndexError, TypeError) as error:
-        if isinstance(error, CtxvalError):
-            raise
-        raise InputError(f"[task] cannot be used: {error}.") from error
     return task
 
 

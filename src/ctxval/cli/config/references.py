@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Any
 
 from ctxval._util.registry import Registry, has_method
-from ctxval._util.texts import reason_of
-from ctxval.errors import CtxvalError, InputError
+from ctxval._util.texts import reworded
+from ctxval.errors import InputError
 
 _added: set[str] = set()
 """Folders of experiments that this module has put on ``sys.path``."""
@@ -28,14 +28,11 @@ def reference(text: str, folder: Path | None = None) -> Any:
         raise InputError(f"a reference must be module:attr, such as 'my_rig:experiment', got {text!r}.")
     with _searched_first(os.path.realpath(folder or _here())) as home:
         _require_place(text, module.partition(".")[0], home)
-        try:
+        with (
+            reworded(f"{module} failed while it was loaded"),
+            reworded(f"{text} cannot be loaded", ImportError, AttributeError, ValueError, TypeError),
+        ):
             return getattr(importlib.import_module(module), attribute)
-        except (ImportError, AttributeError, ValueError, TypeError) as error:
-            raise InputError(f"{text} cannot be loaded: {error}.") from error
-        except CtxvalError:
-            raise
-        except Exception as error:
-            raise InputError(f"{module} failed while it was loaded: {reason_of(error)}.") from error
 
 
 @contextmanager

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shlex
-import tomllib
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -13,6 +13,7 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 from pydantic_core import PydanticCustomError
 
+from ctxval._util.files import read_toml
 from ctxval.campaign.campaign import Campaign
 from ctxval.campaign.interval_search import is_decisive
 from ctxval.campaign.storage.store import Store
@@ -333,16 +334,10 @@ def read_settings(target: str, overrides: dict[str, Any]) -> Settings:
         raise InputError(not_an_experiment(target))
     content: dict[str, Any] = {"experiment": target}
     if is_file:
-        path = Path(target)
-        try:
-            content = tomllib.loads(path.read_bytes().decode("utf-8"))
-        except FileNotFoundError:
-            example = f"`ctxval init {shlex.quote(str(path))}` writes an example"
-            raise InputError(f"there is no experiment file {path}; {example}.") from None
-        except OSError as error:
-            raise InputError(f"the experiment file {path} cannot be read: {error.strerror}.") from error
-        except (ValueError, RecursionError) as error:
-            raise InputError(f"{path} is not valid TOML: {error}.") from error
+        if not os.path.lexists(target):
+            example = f"`ctxval init {shlex.quote(target)}` writes an example"
+            raise InputError(f"there is no experiment file {target}; {example}.")
+        content = read_toml(target)
     if "folder" in content:
         where = "modules and files are read from the folder of this file"
         raise InputError(f"{target}: no setting is called 'folder'; {where}.")

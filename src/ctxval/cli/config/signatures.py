@@ -77,8 +77,10 @@ def why_no_key() -> str | None:
 
 
 def _signatures(settings: Mapping[str, Any]) -> list[str]:
-    kept = settings.get(SIGNATURES)
-    return [each for each in kept if isinstance(each, str) and each.isascii()] if isinstance(kept, list) else []
+    match settings.get(SIGNATURES):
+        case [*kept]:
+            return [each for each in kept if isinstance(each, str) and each.isascii()]
+    return []
 
 
 def _signature(key: bytes, settings: Mapping[str, Any]) -> str:
@@ -147,9 +149,9 @@ def code_named(settings: Mapping[str, Any]) -> list[str]:
     ]
     try:
         code = [_shown(key, settings[key]) for key in ("task", "outputs") if isinstance(settings.get(key), str)]
-        recordings = settings.get("recordings")
-        if isinstance(recordings, Mapping) and "observer" in recordings:
-            code.append(_shown("recordings.observer", recordings["observer"]))
+        match settings:
+            case {"recordings": {"observer": observer}}:
+                code.append(_shown("recordings.observer", observer))
         for key, name_key, registry in named:
             code += _parts(key, settings.get(key), name_key, registry)
         return [*code, *_references("", settings)]
@@ -171,14 +173,15 @@ def _parts(where: str, given: Any, name_key: str, registry: Any) -> Iterator[str
 
 
 def _references(where: str, value: Any) -> Iterator[str]:
-    if isinstance(value, Mapping):
-        if "ref" in value:
-            yield _shown(where, value["ref"])
-        for key, item in value.items():
-            yield from _references(f"{where}.{key}" if where else str(key), item)
-    elif isinstance(value, list):
-        for item in value:
-            yield from _references(where, item)
+    match value:
+        case {}:
+            if "ref" in value:
+                yield _shown(where, value["ref"])
+            for key, item in value.items():
+                yield from _references(f"{where}.{key}" if where else str(key), item)
+        case [*items]:
+            for item in items:
+                yield from _references(where, item)
 
 
 def _shown(where: str, value: Any) -> str:

@@ -117,14 +117,15 @@ def _files_outside(kept: dict[str, Any], folder: Path, home: Path) -> list[str]:
 
 def _texts(value: Any, path: bool) -> Iterator[str]:
     """Yield the texts in settings that are paths, or a MuJoCo model as its text."""
-    if isinstance(value, dict):
-        for key, item in value.items():
-            yield from _texts(item, path or key in _FILE_KEYS)
-    elif isinstance(value, list):
-        for item in value:
-            yield from _texts(item, path)
-    elif path and isinstance(value, str):
-        yield value
+    match value:
+        case {}:
+            for key, item in value.items():
+                yield from _texts(item, path or key in _FILE_KEYS)
+        case [*items]:
+            for item in items:
+                yield from _texts(item, path)
+        case str() if path:
+            yield value
 
 
 # Campaigns
