@@ -16,7 +16,8 @@ import numpy as np
 
 from ctxval._util.arrays import Array
 from ctxval._util.files import MOST_BYTES, open_regular
-from ctxval._util.texts import enumerated, reworded, unguarded
+from ctxval._util.refusals import reworded
+from ctxval._util.texts import enumerated, unguarded
 from ctxval.errors import InputError
 
 # Units. Angles have a dimension of their own here: ``pint`` converts 1 Hz to 1 rad/s, and degrees to numbers.

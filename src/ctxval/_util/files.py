@@ -30,7 +30,7 @@ from typing import IO, Any, BinaryIO
 import numpy as np
 import numpy.typing as npt
 
-from ctxval._util.texts import reworded
+from ctxval._util.refusals import reworded
 from ctxval.errors import InputError
 
 MOST_BYTES = 256 * 2**20  # largest size of a file in bytes, enough for 33 million numbers of a trajectory

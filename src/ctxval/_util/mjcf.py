@@ -10,9 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from ctxval._util.extras import require_extra
 from ctxval._util.files import read_bytes
-from ctxval._util.texts import reworded
+from ctxval._util.refusals import require_extra, reworded
 from ctxval.errors import InputError
 
 

@@ -10,10 +10,9 @@ from typing import Any, Self
 import numpy as np
 
 from ctxval._util.arrays import Array, rows_of
-from ctxval._util.extras import require_extra
 from ctxval._util.files import MADE_BY, make_folder_of, read_bytes, written_whole
+from ctxval._util.refusals import require_extra, reworded
 from ctxval._util.representation import ShortRepr
-from ctxval._util.texts import reworded
 from ctxval.errors import InputError, ModelError, ShapeError
 
 _TYPES: dict[str, type[np.float32] | type[np.float64]] = {"tensor(float)": np.float32, "tensor(double)": np.float64}

@@ -11,7 +11,7 @@ from dataclasses import KW_ONLY, dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from ctxval._util.checked import checked
-from ctxval._util.texts import reworded
+from ctxval._util.refusals import reworded
 from ctxval.errors import InputError, UnknownNameError
 
 if TYPE_CHECKING:  # importlib.metadata is slow to import, and is needed only for names that are not built in

@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
-
-from ctxval.errors import CtxvalError, InputError
+from collections.abc import Iterable, Sequence
 
 LONGEST = 2_000
 """Largest number of characters of a failure's text that are kept: half from its beginning, half from its end."""
@@ -76,24 +73,6 @@ def reason_of(error: BaseException) -> str:
     name, message = type(error).__name__, plain(error)
     # Room for a sentence around it, so that a text is not shortened twice.
     return shortened(f"{name}: {message}" if message and message != name else name, LONGEST - 200)
-
-
-@contextmanager
-def reworded(what: str, *kinds: type[BaseException], to: type[CtxvalError] = InputError) -> Iterator[None]:
-    """Raise an error of ctxval in the place of others: what cannot be done, and after a colon why.
-
-    The kinds are those of expected errors, whose messages are reasons. Without kinds, it is code of others that may
-    raise anything; the name of an exception is then a part of the reason, and errors of ctxval are raised as they are.
-    """
-    caught = kinds or (Exception,)
-    try:
-        yield
-    except caught as error:
-        if not kinds and isinstance(error, CtxvalError):
-            raise
-        reason = " ".join(plain(getattr(error, "strerror", None) or error).split()) if kinds else reason_of(error)
-        ended = "" if reason.endswith("?") or not issubclass(to, InputError) else "."
-        raise to(f"{what}: {reason.removesuffix('.')}{ended}") from error
 
 
 def guarded(text: str) -> str:

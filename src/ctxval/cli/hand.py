@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from ctxval._util.checked import NonNegativeFloat, require
-from ctxval._util.extras import require_extra
 from ctxval._util.progress import advance, stage
+from ctxval._util.refusals import require_extra
 from ctxval._util.texts import enumerated
 from ctxval.campaign.by_hand import (
     TRIAL_FILES,

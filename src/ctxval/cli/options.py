@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from ctxval._util.files import make_folder_of, require_made_by_us
-from ctxval._util.texts import reworded
+from ctxval._util.refusals import reworded
 from ctxval.errors import InputError
 
 

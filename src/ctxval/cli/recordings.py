@@ -7,8 +7,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, get_args
 
+from ctxval._util.refusals import reworded
 from ctxval._util.representation import task_text
-from ctxval._util.texts import reworded, shortened
+from ctxval._util.texts import shortened
 from ctxval.cli.base import CANNOT_GO_ON, FALSIFIED, command, err, notes, out, print_columns
 from ctxval.cli.config.parts import part
 from ctxval.cli.config.references import reference, require_function

@@ -11,9 +11,9 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ctxval._util.extras import require_extra
 from ctxval._util.progress import also_listening
-from ctxval._util.texts import reason_of, reworded
+from ctxval._util.refusals import require_extra, reworded
+from ctxval._util.texts import reason_of
 from ctxval.campaign.interval_search import IntervalSearch
 from ctxval.campaign.storage.other_stores import other_stores
 from ctxval.certificates.verdict import usable_bound

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from ctxval._util.arrays import Array, ArrayLike, as_weight
+from ctxval._util.refusals import reworded
 from ctxval._util.registry import part
 from ctxval._util.representation import ShortRepr
-from ctxval._util.texts import reworded
 from ctxval.core.controller import AffineFeedback, Limits, LimitsLike
 from ctxval.core.model import Model, linearize
 from ctxval.core.task import Task

@@ -9,7 +9,7 @@ import numpy as np
 
 from ctxval._util.arrays import Array, ArrayLike, Mask, as_floats
 from ctxval._util.checked import PositiveFloat, PositiveInt
-from ctxval._util.extras import require_extra
+from ctxval._util.refusals import require_extra
 from ctxval._util.registry import part
 from ctxval._util.representation import ShortRepr
 from ctxval.controllers.lqr import QuadraticCost

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ctxval._util.arrays import Mask
-from ctxval._util.texts import enumerated, reworded
+from ctxval._util.refusals import reworded
+from ctxval._util.texts import enumerated
 from ctxval.core.trajectory import Trajectory
 from ctxval.data.mapping import LogMapping, Observer
 from ctxval.data.sampling import Break

@@ -12,8 +12,9 @@ from ctxval._util.arrays import Array
 from ctxval._util.checked import FiniteFloat, NonNegativeInt, Seconds, checked, require
 from ctxval._util.columns import column_of, conversion, named_unit
 from ctxval._util.files import read_toml
+from ctxval._util.refusals import reworded
 from ctxval._util.representation import ShortRepr
-from ctxval._util.texts import enumerated, reworded
+from ctxval._util.texts import enumerated
 from ctxval.data.log import LISTED, Clock, Log
 from ctxval.errors import InputError, UnknownNameError
 
@@ -25,33 +26,26 @@ _VALID = re.compile(r"\s*(\S.*?)\s*(==|!=)\s*([+-]?\d+(?:\.\d*)?)\s*")
 @checked
 @dataclass(frozen=True)
 class Field:
-    """Where one state or input is in a log; the value is ``factor * recorded + offset``.
+    """Where one state or input is in a log; the value is ``factor * recorded + offset``."""
 
-    Attributes:
-        path: the name of a column, such as ``angle`` or ``observation.state[2]``, or a field of a message, such as
-            ``/joint_states.position[0]``. A vector stands for all its components.
-        unit: the unit in which the model takes the value.
-        recorded: the unit in the log, if it is another one and the name of the column does not state it. Known units
-            are converted.
-        factor: the factor, if the units are not known; None for that of the units.
-        offset: added to the value, in the unit of the model.
-        angle: whether it is an angle in radians that the log may keep between -pi and pi: it is continued over turns.
-        held: whether a value holds until the next one is logged, however long that takes, such as that of a command
-            that is sent only if it changes.
-        derivative_of: the name of a recorded state of which this one is the derivative; it has no path then. It is that
-            of a parabola through ``window`` records, half of which come later.
-        window: the number of these records, an odd number of at least 3.
-    """
-
+    #: the name of a column, such as ``angle`` or ``observation.state[2]``, or a field of a message, such as
+    #: ``/joint_states.position[0]``. A vector stands for all its components.
     path: str = ""
-    unit: str = ""
+    unit: str = ""  #: the unit in which the model takes the value
+    #: the unit in the log, if it is another one and the name of the column does not state it. Known units are
+    #: converted.
     recorded: str = ""
-    factor: FiniteFloat | None = None
-    offset: FiniteFloat = 0.0
+    factor: FiniteFloat | None = None  #: the factor, if the units are not known; None for that of the units
+    offset: FiniteFloat = 0.0  #: added to the value, in the unit of the model
+    #: whether it is an angle in radians that the log may keep between -pi and pi: it is continued over turns
     angle: bool = False
+    #: whether a value holds until the next one is logged, however long that takes, such as that of a command that is
+    #: sent only if it changes
     held: bool = False
+    #: the name of a recorded state of which this one is the derivative; it has no path then. It is that of a parabola
+    #: through ``window`` records, half of which come later.
     derivative_of: str = ""
-    window: int = 7
+    window: int = 7  #: the number of these records, an odd number of at least 3
 
     def __post_init__(self) -> None:
         if self.derivative_of:
@@ -77,18 +71,15 @@ class Field:
 
 @dataclass(frozen=True)
 class Observer(ShortRepr):
-    """A function of the user's own that estimates states from the records of one recording.
+    """A function of the user's own that estimates states from the records of one recording."""
 
-    Attributes:
-        function: ``(y, u, dt) -> x``, from the recorded states ``(H + 1, p)``, the inputs ``(H, m)`` and the time step
-            in seconds to states ``(H + 1, n)``. The first states may be NaN, while it settles; they are left out. None
-            until it is loaded.
-        states: the names of the n states with their units; empty for those of the records, or else x0, x1, ...
-        reference: ``module:attr`` of the function, which the command line loads from the folder of the mapping's file.
-    """
-
+    #: ``(y, u, dt) -> x``, from the recorded states ``(H + 1, p)``, the inputs ``(H, m)`` and the time step in seconds
+    #: to states ``(H + 1, n)``. The first states may be NaN, while it settles; they are left out. None until it is
+    #: loaded.
     function: Callable[[Array, Array, float], Array] | None
+    #: the names of the n states with their units; empty for those of the records, or else x0, x1, ..
     states: Mapping[str, str] = field(default_factory=dict)
+    #: ``module:attr`` of the function, which the command line loads from the folder of the mapping's file
     reference: str = ""
 
     def __post_init__(self) -> None:
@@ -99,33 +90,27 @@ class Observer(ShortRepr):
 
 @dataclass(frozen=True)
 class LogMapping(ShortRepr):
-    """How recordings become states and inputs at equal steps.
+    """How recordings become states and inputs at equal steps."""
 
-    Attributes:
-        states, inputs: the fields of the states and inputs by name, in the order of the model.
-        time, time_unit, stamp: where the times come from, as in :class:`Clock`.
-        dt: length of a step in seconds; None for the median period of the first state. A table without times has one
-            row for each step.
-        delay: seconds between the time at which an input is logged and the time from which it acts on the states.
-        longest_gap: longest time in seconds between two samples of one field over which it is interpolated or held;
-            None for 1.5 median periods of the field. A recording is split at longer gaps and at missing values.
-        lags: the number of earlier steps whose states and inputs are further states, if the records at one step do not
-            determine the next ones.
-        valid: which rows count, such as ``status == 0``: a field, ``==`` or ``!=``, and a number; None for all rows.
-        observer: a function that estimates the states from the recorded ones, or an :class:`Observer`; None if they are
-            the states.
-    """
-
-    states: Mapping[str, Field]
+    states: Mapping[str, Field]  #: the fields of the states and inputs by name, in the order of the model
     inputs: Mapping[str, Field] = field(default_factory=dict)
-    time: str | None = None
+    time: str | None = None  #: where the times come from, as in :class:`Clock`
     time_unit: str = ""
     stamp: Stamp = "auto"
+    #: length of a step in seconds; None for the median period of the first state. A table without times has one row for
+    #: each step.
     dt: float | None = None
+    #: seconds between the time at which an input is logged and the time from which it acts on the states
     delay: float = 0.0
+    #: longest time in seconds between two samples of one field over which it is interpolated or held; None for 1.5
+    #: median periods of the field. A recording is split at longer gaps and at missing values.
     longest_gap: float | None = None
+    #: the number of earlier steps whose states and inputs are further states, if the records at one step do not
+    #: determine the next ones
     lags: int = 0
+    #: which rows count, such as ``status == 0``: a field, ``==`` or ``!=``, and a number; None for all rows
     valid: str | None = None
+    #: a function that estimates the states from the recorded ones, or an :class:`Observer`; None if they are the states
     observer: Observer | Callable[[Array, Array, float], Array] | None = None
 
     def __post_init__(self) -> None:

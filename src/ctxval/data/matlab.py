@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 
 from ctxval._util.arrays import Array
-from ctxval._util.extras import require_extra
 from ctxval._util.files import MOST_BYTES, open_regular
+from ctxval._util.refusals import require_extra
 from ctxval._util.texts import quoted
 from ctxval.data.control_desk import X_FIELDS, Y_FIELDS, ControlDeskLog, is_control_desk
 from ctxval.data.log import Log, MemoryTable, reading

@@ -22,9 +22,9 @@ from typing import IO, Any
 import numpy as np
 
 from ctxval._util.arrays import Array
-from ctxval._util.extras import require_extra
 from ctxval._util.files import open_regular
-from ctxval._util.texts import quoted, reason_of, reworded
+from ctxval._util.refusals import require_extra, reworded
+from ctxval._util.texts import quoted, reason_of
 from ctxval.data.log import reading
 from ctxval.data.topics import Message, TopicLog
 from ctxval.errors import InputError

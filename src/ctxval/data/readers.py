@@ -18,9 +18,8 @@ import numpy as np
 from ctxval._util.arrays import Array
 from ctxval._util.checked import PositiveFloat, require
 from ctxval._util.columns import CsvTable
-from ctxval._util.extras import require_extra
 from ctxval._util.files import MOST_BYTES, Archive, read_bytes, read_json, require_regular_file
-from ctxval._util.texts import reworded
+from ctxval._util.refusals import require_extra, reworded
 from ctxval.data.log import Log, MemoryTable, Table, reading
 from ctxval.data.matlab import read_mat
 from ctxval.data.messages import BagLog, McapLog

@@ -11,8 +11,8 @@ import numpy as np
 
 from ctxval._util.arrays import Array, rows_of
 from ctxval._util.checked import Seconds
-from ctxval._util.extras import require_extra
 from ctxval._util.mjcf import compile_mjcf, is_mjcf_text
+from ctxval._util.refusals import require_extra
 from ctxval._util.registry import part
 from ctxval._util.representation import ShortRepr
 from ctxval.core.model import paired

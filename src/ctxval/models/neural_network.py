@@ -11,7 +11,7 @@ import numpy as np
 
 from ctxval._util.arrays import ArrayLike, as_finite, single_threaded
 from ctxval._util.checked import NonNegativeInt, PositiveInt, checked
-from ctxval._util.extras import require_extra
+from ctxval._util.refusals import require_extra
 from ctxval.core.trajectory import Transitions
 from ctxval.errors import ShapeError
 from ctxval.models.scaling import IncrementModel, IncrementScaling

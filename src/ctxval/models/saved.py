@@ -12,8 +12,8 @@ import numpy as np
 
 from ctxval._util.arrays import Array
 from ctxval._util.files import MADE_BY, Archive, read_bytes, written_whole
+from ctxval._util.refusals import reworded
 from ctxval._util.registry import part
-from ctxval._util.texts import reworded
 from ctxval.core.model import Model
 from ctxval.core.trajectory import Transitions
 from ctxval.errors import InputError

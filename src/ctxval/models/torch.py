@@ -11,10 +11,9 @@ from typing import Any
 import numpy as np
 
 from ctxval._util.arrays import Array, rows_of
-from ctxval._util.extras import require_extra
+from ctxval._util.refusals import require_extra, reworded
 from ctxval._util.registry import part
 from ctxval._util.representation import ShortRepr
-from ctxval._util.texts import reworded
 from ctxval.core.model import paired
 from ctxval.core.trajectory import Transitions
 from ctxval.errors import InputError, ModelError, ShapeError

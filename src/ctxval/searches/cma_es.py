@@ -9,7 +9,7 @@ import numpy as np
 
 from ctxval._util.arrays import Array, single_threaded
 from ctxval._util.checked import PositiveFloat, PositiveInt
-from ctxval._util.extras import require_extra
+from ctxval._util.refusals import require_extra
 from ctxval._util.registry import part
 from ctxval.errors import InputError
 from ctxval.searches.base import SequentialSearch

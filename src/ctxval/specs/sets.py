@@ -44,15 +44,12 @@ class Set(ShortRepr, ABC):
 
 @dataclass(frozen=True, eq=False)
 class _Placed(Set):
-    """A set with a place of its own, which may move.
+    """A set with a place of its own, which may move."""
 
-    Attributes:
-        center: the place of the set, numbers ``(k,)``, a row for each time ``(H + 1, k)``, or the name of an entry of
-            the task's environment.
-        velocity: how the place changes with time, per second, given like the center; None if it does not.
-    """
-
+    #: the place of the set, numbers ``(k,)``, a row for each time ``(H + 1, k)``, or the name of an entry of the task's
+    #: environment
     center: Place = 0.0
+    #: how the place changes with time, per second, given like the center; None if it does not
     velocity: Place | None = None
 
     def __post_init__(self) -> None:
@@ -114,14 +111,10 @@ class Ball(_Placed):
 @checked
 @dataclass(frozen=True, eq=False)
 class Box(_Placed):
-    """All positions between two corners, which are relative to the center.
-
-    Attributes:
-        low, high: the corners, ``(k,)``; infinite or None where there is no end. One of them may be left out.
-    """
+    """All positions between two corners, which are relative to the center."""
 
     _: dataclasses.KW_ONLY
-    low: Any = None
+    low: Any = None  #: the corners, ``(k,)``; infinite or None where there is no end. One of them may be left out.
     high: Any = None
 
     def __post_init__(self) -> None:
@@ -164,15 +157,11 @@ class Polytope(_Placed):
     """All positions with ``A x <= b``, where x is relative to the center.
 
     The signed distance is the largest one to the planes of the faces. Outside it is at most the Euclidean distance.
-
-    Attributes:
-        A: one row for each face, ``(q, k)``.
-        b: ``(q,)``.
     """
 
     _: dataclasses.KW_ONLY
-    A: Any
-    b: Any
+    A: Any  #: one row for each face, ``(q, k)``
+    b: Any  #: ``(q,)``
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -206,13 +195,9 @@ class Polytope(_Placed):
 @checked
 @dataclass(frozen=True, eq=False)
 class Union(Set):
-    """All positions that are in one of several sets.
+    """All positions that are in one of several sets."""
 
-    Attributes:
-        sets: the sets, or tables of their arguments with their ``type``.
-    """
-
-    sets: Sequence[Any]
+    sets: Sequence[Any]  #: the sets, or tables of their arguments with their ``type``
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "sets", as_sets("sets of a Union", self.sets))
@@ -235,13 +220,9 @@ class Union(Set):
 @checked
 @dataclass(frozen=True, eq=False)
 class Outside(Set):
-    """All positions that are not in a set; to avoid them is to stay in the set.
+    """All positions that are not in a set; to avoid them is to stay in the set."""
 
-    Attributes:
-        of: the set, or a table of its arguments with its ``type``.
-    """
-
-    of: Any
+    of: Any  #: the set, or a table of its arguments with its ``type``
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "of", as_set("the set of Outside", self.of))

@@ -8,9 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ctxval._util.arrays import Array
-from ctxval._util.extras import require_extra
+from ctxval._util.refusals import require_extra, reworded
 from ctxval._util.registry import part
-from ctxval._util.texts import reworded
 from ctxval.core.distance import NamedStates, selected
 from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory
@@ -26,15 +25,11 @@ class STL(NamedStates):
     the time step. An entry ``obstacle`` of the task's environment is known to the formula as ``obstacle_0``,
     ``obstacle_1`` and so on. The robustness changes by at most as much as the states if each predicate compares one
     state with a constant; with other predicates, scale them.
-
-    Attributes:
-        formula: the formula.
-        variables: a name in the formula for each state that it looks at.
-        components: these states, by index or by the name in the experiment; the first ones by default.
     """
 
-    formula: str
-    variables: Sequence[str]
+    formula: str  #: the formula
+    variables: Sequence[str]  #: a name in the formula for each state that it looks at
+    #: these states, by index or by the name in the experiment; the first ones by default
     components: Sequence[int | str] | None = None
 
     def __post_init__(self) -> None:

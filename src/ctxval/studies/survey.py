@@ -51,47 +51,30 @@ _STATES = (
 
 @dataclass(frozen=True)
 class FieldSummary(ShortRepr):
-    """One field of a log.
+    """One field of a log."""
 
-    Attributes:
-        path, unit: its name and its unit; the unit is empty if the log states none.
-        records, period: number of records, and median seconds between two of them.
-        low, high: its smallest and its largest value.
-        role: whether it is taken as a state, as an input, or not at all.
-        remark: what is unusual, such as that it never changes.
-    """
-
-    path: str
+    path: str  #: its name and its unit; the unit is empty if the log states none
     unit: str
-    records: int
+    records: int  #: number of records, and median seconds between two of them
     period: float
-    low: float
+    low: float  #: its smallest and its largest value
     high: float
-    role: Role
-    remark: str
+    role: Role  #: whether it is taken as a state, as an input, or not at all
+    remark: str  #: what is unusual, such as that it never changes
 
 
 @dataclass(frozen=True, eq=False)
 class Survey(ShortRepr):
-    """What logs hold, and how well models that are learned from them predict others of them.
+    """What logs hold, and how well models that are learned from them predict others of them."""
 
-    Attributes:
-        sources: the files and episodes.
-        fields: the fields of the first log.
-        mapping, guesses: which fields are taken as states and inputs, and what was guessed, one sentence each.
-        fit: a linear model and one with what this leaves, each with its errors.
-        replay: what the recordings show of the better one.
-        reach: number of steps for which its errors are close, and those that were compared.
-    """
-
-    sources: tuple[str, ...]
-    fields: tuple[FieldSummary, ...]
-    mapping: LogMapping
+    sources: tuple[str, ...]  #: the files and episodes
+    fields: tuple[FieldSummary, ...]  #: the fields of the first log
+    mapping: LogMapping  #: which fields are taken as states and inputs, and what was guessed, one sentence each
     guesses: tuple[str, ...]
     recordings: Recordings
-    fit: FitReport
-    replay: ReplayReport
-    reach: tuple[int, int]
+    fit: FitReport  #: a linear model and one with what this leaves, each with its errors
+    replay: ReplayReport  #: what the recordings show of the better one
+    reach: tuple[int, int]  #: number of steps for which its errors are close, and those that were compared
 
     @property
     def best(self) -> FittedModel:

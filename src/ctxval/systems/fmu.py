@@ -20,11 +20,10 @@ import numpy as np
 
 from ctxval._util.arrays import Array
 from ctxval._util.checked import Seconds
-from ctxval._util.extras import require_extra
 from ctxval._util.files import require_regular_file
+from ctxval._util.refusals import require_extra, reworded
 from ctxval._util.registry import part
 from ctxval._util.representation import ShortRepr
-from ctxval._util.texts import reworded
 from ctxval.core.controller import Controller
 from ctxval.core.task import Task
 from ctxval.core.trajectory import COMPLETE, Trajectory

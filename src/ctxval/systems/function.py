@@ -7,9 +7,9 @@ from typing import Any, NoReturn
 
 from ctxval._util.arrays import as_floats
 from ctxval._util.checked import Seconds
+from ctxval._util.refusals import reworded
 from ctxval._util.registry import part
 from ctxval._util.representation import ShortRepr
-from ctxval._util.texts import reworded
 from ctxval.core.controller import Controller, Feedback, started
 from ctxval.core.labels import require_names
 from ctxval.core.task import Task

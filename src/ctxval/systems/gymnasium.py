@@ -12,11 +12,10 @@ import numpy as np
 
 from ctxval._util.arrays import Array, as_floats
 from ctxval._util.checked import NonNegativeInt, Seconds
-from ctxval._util.extras import require_extra
 from ctxval._util.mjcf import warning_of
+from ctxval._util.refusals import require_extra, reworded
 from ctxval._util.registry import part
 from ctxval._util.representation import ShortRepr
-from ctxval._util.texts import reworded
 from ctxval.core.controller import Controller
 from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory

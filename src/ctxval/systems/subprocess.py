@@ -23,9 +23,9 @@ from typing import IO
 
 from ctxval._util.checked import TimeLimit
 from ctxval._util.files import temporary_folder
+from ctxval._util.refusals import reworded
 from ctxval._util.registry import part
 from ctxval._util.representation import ShortRepr
-from ctxval._util.texts import reworded
 from ctxval.core.controller import Controller
 from ctxval.core.exchange import write_controller, write_task
 from ctxval.core.labels import require_names

@@ -112,21 +112,15 @@ OpenCampaign = Callable[[], ServedCampaign]
 
 @dataclass(frozen=True)
 class TaskRequest:
-    """What the operator asks for: by default, the task that the search chooses.
-
-    Attributes:
-        again: the number of an earlier trial whose task is executed again, ``because`` something was changed.
-        draw: whether the task is an independent draw, for an audit.
-        trials: the number of trials that the operator has seen; None to skip the check.
-        decides: whether the task is the one that is expected to decide the verdict soonest.
-    """
+    """What the operator asks for: by default, the task that the search chooses."""
 
     parameters: Mapping[str, Any] | None = None
+    #: the number of an earlier trial whose task is executed again, ``because`` something was changed
     again: int | None = None
     because: str | None = None
-    draw: bool = False
-    trials: int | None = None
-    decides: bool = False
+    draw: bool = False  #: whether the task is an independent draw, for an audit
+    trials: int | None = None  #: the number of trials that the operator has seen; None to skip the check
+    decides: bool = False  #: whether the task is the one that is expected to decide the verdict soonest
 
     def require_current(self, trials: int) -> None:
         """Refuse a request if another task was opened since the operator looked."""

@@ -16,7 +16,7 @@ from typing import Any
 import uvicorn
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-from ctxval._util.texts import reworded
+from ctxval._util.refusals import reworded
 from ctxval.errors import InputError
 from ctxval.web.app import application
 from ctxval.web.jobs import OpenCampaign

@@ -18,8 +18,8 @@ from pydantic_core import SchemaError
 from ctxval import controllers, distances, models, systems
 from ctxval._util.checked import require
 from ctxval._util.files import Archive, read_bytes
+from ctxval._util.refusals import reworded
 from ctxval._util.registry import Declaration, Registry, construct, declaration_of
-from ctxval._util.texts import reworded
 from ctxval.cli.config.references import accepts, is_function, reference, require_function, require_part
 from ctxval.core.experiment import Experiment
 from ctxval.core.model import Model

@@ -13,8 +13,8 @@ from importlib.machinery import PathFinder
 from pathlib import Path
 from typing import Any
 
+from ctxval._util.refusals import reworded
 from ctxval._util.registry import Registry, has_method
-from ctxval._util.texts import reworded
 from ctxval.errors import InputError
 
 _added: set[str] = set()

@@ -48,22 +48,20 @@ class CertificateTable(BaseModel):
     """The table ``[certificate]``: the certificate for the verdict, chosen before the campaign is run.
 
     A kind of certificate from another package has its own options in the table.
-
-    Attributes:
-        volume: the share of the task space that may exceed the threshold.
-        tests: the number of executions that must have been predicted beforehand at tasks drawn over the task space.
-        quantile: the share of the executions of each task that the verdict is about, if they differ by noise.
-        resolution: the largest distance between a task and its nearest trial, in diagonals of the task space.
-        discard: the number of largest distances to discard, for ``sampling-discarding``.
     """
 
     model_config = ConfigDict(extra="allow")
 
     kind: str = "auto"
+    #: the share of the task space that may exceed the threshold
     volume: float = Field(default=0.0, ge=0, le=MOST_VOLUME, strict=True)
+    #: the number of executions that must have been predicted beforehand at tasks drawn over the task space
     tests: int = Field(default=TESTS, ge=0, strict=True)
+    #: the share of the executions of each task that the verdict is about, if they differ by noise
     quantile: float = Field(default=QUANTILE, ge=0.5, lt=1, strict=True)
+    #: the largest distance between a task and its nearest trial, in diagonals of the task space
     resolution: float = Field(default=RESOLUTION, gt=0, allow_inf_nan=False, strict=True)
+    #: the number of largest distances to discard, for ``sampling-discarding``
     discard: int | None = Field(default=None, ge=0)
 
     @model_validator(mode="after")
@@ -149,16 +147,6 @@ class Settings(BaseModel):
     """The content of an experiment file, overridden by the options of the command line.
 
     Either ``experiment`` names the experiment, or ``name`` to ``units`` describe it completely.
-
-    Attributes:
-        suite: the parameters of each task by its name, in the place of the space, if tasks are a list.
-        distribution: see :func:`~ctxval.cli.config.parts.with_distribution`; a named experiment may have one too.
-        judge: whether the distance is judged or, as by ``ctxval safe``, the specification.
-        physical: the task parameters that change the dynamics of the system; a named experiment may have some too.
-        outputs: the indices of M's states that are recorded, or the function ``module:attr`` of them.
-        explore, within: as the options of ``ctxval run``, so that a store knows the command that made it.
-        refined: the file of a model that `ctxval refine` has learned from executions; it replaces the given model.
-        folder: the folder of modules and files, which is that of the experiment file; None for the current folder.
     """
 
     model_config = ConfigDict(extra="forbid")
@@ -167,7 +155,9 @@ class Settings(BaseModel):
     options: dict[str, Any] = Field(default_factory=dict)
     name: str | None = None
     space: dict[str, list[Any]] | None = None
+    #: the parameters of each task by its name, in the place of the space, if tasks are a list
     suite: dict[str, dict[str, float | str]] | None = None
+    #: see :func:`~ctxval.cli.config.parts.with_distribution`; a named experiment may have one too
     distribution: dict[str, dict[str, Any]] | None = None
     task: Part | None = None
     system: Part | None = None
@@ -180,9 +170,11 @@ class Settings(BaseModel):
     budget: int | None = Field(default=None, ge=1)
     threshold: float | None = Field(default=None, gt=0, allow_inf_nan=False, strict=True)
     longest: int | None = Field(default=None, ge=1, strict=True)
+    #: the task parameters that change the dynamics of the system; a named experiment may have some too
     physical: list[str] | None = None
+    #: the indices of M's states that are recorded, or the function ``module:attr`` of them
     outputs: str | list[int] | None = None
-    explore: bool | None = None
+    explore: bool | None = None  #: as the options of ``ctxval run``, so that a store knows the command that made it
     within: float = Field(default=WITHIN, gt=0, allow_inf_nan=False, strict=True)
     confidence: float = Field(default=CONFIDENCE, ge=LEAST_CONFIDENCE, lt=1, strict=True)
     certificate: CertificateTable = Field(default_factory=CertificateTable)
@@ -191,9 +183,12 @@ class Settings(BaseModel):
     search: SearchTable = Field(default_factory=SearchTable)
     aspect1: Aspect1Table = Field(default_factory=Aspect1Table)
     spec: SpecTable | None = None
+    #: whether the distance is judged or, as by ``ctxval safe``, the specification
     judge: Literal["distance", "spec"] = "distance"
+    #: the file of a model that `ctxval refine` has learned from executions; it replaces the given model
     refined: Path | None = None
     recordings: dict[str, Any] | None = None
+    #: the folder of modules and files, which is that of the experiment file; None for the current folder
     folder: Path | None = None
 
     def load(self) -> Experiment:

@@ -7,7 +7,6 @@ from typing import Any
 
 from ctxval import Experiment
 from ctxval._util.registry import Registry, construct
-from ctxval._util.texts import reworded
 from ctxval.errors import InputError, UnknownNameError
 
 NAMES: dict[str, str] = {
@@ -45,8 +44,10 @@ def options_of(name: str) -> dict[str, Any]:
     The first parameter of a case is its seed, which is not an option.
     """
     case = REGISTRY.find(name)
-    with reworded(f"the case {name!r} must be a function of a seed and its options", TypeError, ValueError):
+    try:
         parameters = list(inspect.signature(case).parameters.values())[1:]
+    except (TypeError, ValueError) as error:
+        raise InputError(f"the case {name!r} must be a function of a seed and its options: {error}.") from error
     variadic = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
     return {parameter.name: parameter.default for parameter in parameters if parameter.kind not in variadic}
 

@@ -127,16 +127,11 @@ class Place(NamedTuple):
 
 
 class ExecutionsWithin(Study):
-    """Executions until the estimate is within some per cent of d*, for each technique and place.
+    """Executions until the estimate is within some per cent of d*, for each technique and place."""
 
-    Attributes:
-        column: the name of the places in the data.
-        dodge: the horizontal distance between the triangles of two techniques.
-    """
-
-    column: str
+    column: str  #: the name of the places in the data
     places: tuple[Place, ...]
-    dodge: float
+    dodge: float  #: the horizontal distance between the triangles of two techniques
 
     @abstractmethod
     def budget(self, search: str, scale: Scale) -> int:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from importlib.metadata import entry_points
 from typing import Protocol, runtime_checkable
 
-from ctxval._util.texts import reworded
+from ctxval._util.refusals import reworded
 from ctxval.errors import InputError
 from ctxval.report.context import ReportContext
 from ctxval.report.sections.appendix import for_the_file
@@ -22,13 +22,9 @@ GROUP = "ctxval.report_sections"
 
 @runtime_checkable
 class Section(Protocol):
-    """A section of a report.
+    """A section of a report."""
 
-    Attributes:
-        title: its heading.
-    """
-
-    title: str
+    title: str  #: its heading
 
     def render(self, context: ReportContext) -> str:
         """Return the content: ``Markup`` stays as it is, any other text becomes one escaped paragraph.

@@ -30,17 +30,11 @@ class ExecutedTask(ShortRepr):
 
 @dataclass(frozen=True, eq=False)
 class Predicted(ShortRepr):
-    """What a model with causes predicts of an execution.
+    """What a model with causes predicts of an execution."""
 
-    Attributes:
-        deviation: the mean squared deviation of the execution from the mean of the loops, in shares of ranges.
-        by_noise: those of loops with noise from their mean, shape ``(K,)``; 0 without noise.
-        distance: between the execution and the mean of the loops.
-    """
-
-    deviation: float
-    by_noise: Array
-    distance: float
+    deviation: float  #: the mean squared deviation of the execution from the mean of the loops, in shares of ranges
+    by_noise: Array  #: those of loops with noise from their mean, shape ``(K,)``; 0 without noise
+    distance: float  #: between the execution and the mean of the loops
 
 
 class ClosedLoops:

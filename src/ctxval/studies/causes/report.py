@@ -18,24 +18,17 @@ from ctxval.studies.causes.plant import Plant
 
 @dataclass(frozen=True, eq=False)
 class Explained(ShortRepr):
-    """Causes that were tried in closed loop, each execution predicted without itself.
-
-    Attributes:
-        share: the share of the squared closed-loop deviations of M that the causes explain, except for what simulated
-            noise of the measurements makes of them.
-        uncertainty: the standard deviation of the share, because of noise.
-        structure, uncertain_structure: the same for the squared residuals of M after several steps.
-        distance: the largest distance between an execution and its prediction.
-        spreads: the range of each size if one execution is left out.
-    """
+    """Causes that were tried in closed loop, each execution predicted without itself."""
 
     explanation: Explanation
+    #: the share of the squared closed-loop deviations of M that the causes explain, except for what simulated noise of
+    #: the measurements makes of them
     share: float
-    uncertainty: float
-    structure: float
+    uncertainty: float  #: the standard deviation of the share, because of noise
+    structure: float  #: the same for the squared residuals of M after several steps
     uncertain_structure: float
-    distance: float
-    spreads: tuple[float, ...]
+    distance: float  #: the largest distance between an execution and its prediction
+    spreads: tuple[float, ...]  #: the range of each size if one execution is left out
 
     @property
     def causes(self) -> tuple[Cause, ...]:
@@ -63,44 +56,33 @@ class Explained(ShortRepr):
 
 @dataclass(frozen=True)
 class Separating(ShortRepr):
-    """The task that tells two causes apart.
-
-    Attributes:
-        distance, gap: between what the two causes predict of it: the distance, and the largest difference of a state in
-            shares of its range.
-        other: the number of the second cause among those that were explained; the first one is 0.
-    """
+    """The task that tells two causes apart."""
 
     task: Mapping[str, Any]
+    #: distance, gap: between what the two causes predict of it: the distance, and the largest difference of a state in
+    #: shares of its range
     distance: float
-    other: int
+    other: int  #: the number of the second cause among those that were explained; the first one is 0
     gap: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
 class CauseReport(ShortRepr):
-    """Why a model fails.
-
-    Attributes:
-        explained: the most probable causes, and others that the executions do not tell from them; empty if no cause
-            predicts held-out executions better than M.
-        named: whether the first of these is the cause. Otherwise the answer is none of these, and ``explained`` is what
-            comes nearest.
-        tried: the number of causes in the dictionary.
-        executions, before: the number of executions that were learned from, and their largest distance from M.
-        separating: the task that tells causes apart which these executions do not.
-        ranked: the most probable causes alone, the best one first.
-    """
+    """Why a model fails."""
 
     plant: Plant
+    #: the most probable causes, and others that the executions do not tell from them; empty if no cause predicts held-
+    #: out executions better than M
     explained: tuple[Explained, ...]
+    #: whether the first of these is the cause. Otherwise the answer is none of these, and ``explained`` is what comes
+    #: nearest.
     named: bool
-    tried: int
-    executions: int
+    tried: int  #: the number of causes in the dictionary
+    executions: int  #: the number of executions that were learned from, and their largest distance from M
     before: float
     units: str = ""
-    separating: Separating | None = None
-    ranked: tuple[Explanation, ...] = ()
+    separating: Separating | None = None  #: the task that tells causes apart which these executions do not
+    ranked: tuple[Explanation, ...] = ()  #: the most probable causes alone, the best one first
 
     @property
     def causes(self) -> tuple[Cause, ...]:

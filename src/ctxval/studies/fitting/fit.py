@@ -31,36 +31,24 @@ HOLD_OUT = 0.25
 
 @dataclass(frozen=True)
 class FittedParameter(ShortRepr):
-    """One parameter of a model.
-
-    Attributes:
-        value, low, high: the estimate and the confidence interval, which is infinite if the recordings determine none.
-        note: what is unusual: the value is at a bound, or depends on others; empty otherwise.
-    """
+    """One parameter of a model."""
 
     name: str
-    value: float
+    value: float  #: the estimate and the confidence interval, which is infinite if the recordings determine none
     low: float
     high: float
-    note: str = ""
+    note: str = ""  #: what is unusual: the value is at a bound, or depends on others; empty otherwise
 
 
 @dataclass(frozen=True, eq=False)
 class FittedModel(ShortRepr):
-    """A model that was learned from recordings.
+    """A model that was learned from recordings."""
 
-    Attributes:
-        kind: ``given`` for a model that existed before.
-        errors: those on the held-out recordings.
-        parameters: those of the user's function; none for other kinds.
-        notes: sentences on the fit, such as how well the recordings determine a linear model.
-    """
-
-    kind: Kind
+    kind: Kind  #: ``given`` for a model that existed before
     model: Model
-    errors: tuple[StepError, ...]
-    parameters: tuple[FittedParameter, ...] = ()
-    notes: tuple[str, ...] = ()
+    errors: tuple[StepError, ...]  #: those on the held-out recordings
+    parameters: tuple[FittedParameter, ...] = ()  #: those of the user's function; none for other kinds
+    notes: tuple[str, ...] = ()  #: sentences on the fit, such as how well the recordings determine a linear model
 
     @property
     def relative(self) -> float:

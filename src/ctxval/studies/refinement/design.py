@@ -26,15 +26,11 @@ class SameControllers:
 
     The distance of the refined model on such a task is known without another execution, if the system is
     deterministic. The model has learned from them, so they can falsify it, and they never count for it.
-
-    Attributes:
-        tasks, same: number of executed tasks that were compared, and of those with numerically the same controller.
-        worst: the largest distance of the refined model on the latter; None if there are none.
     """
 
-    tasks: int = 0
+    tasks: int = 0  #: number of executed tasks that were compared, and of those with numerically the same controller
     same: int = 0
-    worst: float | None = None
+    worst: float | None = None  #: the largest distance of the refined model on the latter; None if there are none
 
 
 def with_best_jacobian(validation: Validation, refined: Refined) -> tuple[Refined, str | None]:

@@ -188,19 +188,13 @@ class Refit(ShortRepr, _Replacement):
 
 @dataclass(frozen=True, eq=False)
 class ParameterFit(ShortRepr, _Replacement):
-    """New values of the parameters of a user's function ``(x, u, theta) -> x_next``, by least squares.
+    """New values of the parameters of a user's function ``(x, u, theta) -> x_next``, by least squares."""
 
-    Attributes:
-        bounds: the bounds of each parameter by name, in the order of theta.
-        step: the function; None for that of the first model, which must then be a ``Parametric``.
-        vectorized: whether ``step`` takes whole batches.
-        seed: seed of the starting points.
-    """
-
-    bounds: Mapping[str, tuple[float, float]]
+    bounds: Mapping[str, tuple[float, float]]  #: the bounds of each parameter by name, in the order of theta
+    #: the function; None for that of the first model, which must then be a ``Parametric``
     step: ParametricStep | None = None
-    vectorized: bool = False
-    seed: int = 0
+    vectorized: bool = False  #: whether ``step`` takes whole batches
+    seed: int = 0  #: seed of the starting points
     name: str = field(default="parameters", init=False)
     makes = Parametric
 

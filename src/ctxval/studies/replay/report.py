@@ -29,50 +29,35 @@ STEPS = (1, 5, 20, 100)
 
 @dataclass(frozen=True)
 class RecordedData(ShortRepr):
-    """The recordings that were compared with the model.
+    """The recordings that were compared with the model."""
 
-    Attributes:
-        sources: the files and episodes.
-        recordings, steps: the numbers of recordings and of steps.
-        states, inputs: the names of the states and inputs with their units.
-        breaks, notes: where logs were split and why, and sentences on how they were read.
-        seen: number of recordings that are in the data from which the model was learned. They are left out of the
-            errors, unless all recordings are.
-    """
-
-    sources: tuple[str, ...]
-    recordings: int
+    sources: tuple[str, ...]  #: the files and episodes
+    recordings: int  #: the numbers of recordings and of steps
     steps: int
     dt: float
-    states: dict[str, str]
+    states: dict[str, str]  #: the names of the states and inputs with their units
     inputs: dict[str, str]
-    breaks: tuple[Break, ...]
+    breaks: tuple[Break, ...]  #: where logs were split and why, and sentences on how they were read
     notes: tuple[str, ...]
+    #: number of recordings that are in the data from which the model was learned. They are left out of the errors,
+    #: unless all recordings are.
     seen: int
 
 
 @dataclass(frozen=True, eq=False)
 class ReplayReport(ShortRepr):
-    """What recordings show of a model.
-
-    Attributes:
-        errors: the error of each state after each number of steps.
-        regions: the one-step error in ranges of each state and input.
-        residuals: how much of the one-step residual of each state can be explained.
-        suggestions, faults: changes of timing, and faults of the recordings, that explain errors.
-        tasks: what the recordings predict of the tasks of an experiment; None without an experiment, or if the
-            recordings teach nothing.
-        insights: what follows, in sentences, the most important one first.
-    """
+    """What recordings show of a model."""
 
     data: RecordedData
-    errors: tuple[StepError, ...]
-    regions: tuple[Region, ...]
-    residuals: tuple[ResidualShare, ...]
-    suggestions: tuple[Suggestion, ...]
+    errors: tuple[StepError, ...]  #: the error of each state after each number of steps
+    regions: tuple[Region, ...]  #: the one-step error in ranges of each state and input
+    residuals: tuple[ResidualShare, ...]  #: how much of the one-step residual of each state can be explained
+    suggestions: tuple[Suggestion, ...]  #: changes of timing, and faults of the recordings, that explain errors
     faults: tuple[Fault, ...]
+    #: what the recordings predict of the tasks of an experiment; None without an experiment, or if the recordings teach
+    #: nothing
     tasks: PredictedTasks | None
-    insights: tuple[str, ...]
+    insights: tuple[str, ...]  #: what follows, in sentences, the most important one first
 
     def to_json(self) -> dict[str, Any]:
         """Return all results as plain values; numbers that are not finite are None."""
