@@ -22,8 +22,7 @@ from ctxval.errors import InputError
 
 # Units. Angles have a dimension of their own here: ``pint`` converts 1 Hz to 1 rad/s, and degrees to numbers.
 
-Powers = tuple[int, int, int, int, int]
-"""Powers of m, kg, s, A and rad."""
+Powers = tuple[int, int, int, int, int]  #: powers of m, kg, s, A and rad
 
 _UNITS: dict[str, tuple[float, Powers]] = {
     **{"1": (1.0, (0, 0, 0, 0, 0)), "m": (1.0, (1, 0, 0, 0, 0)), "kg": (1.0, (0, 1, 0, 0, 0))},

@@ -35,8 +35,7 @@ from ctxval.searches import REGISTRY as SEARCHES
 
 FALSIFIED, BAD_INPUT, CANNOT_GO_ON, INTERRUPTED, CUT_OFF = 1, 2, 3, 130, 141
 
-RUN = "run"
-"""Key under which a store keeps the verdict of its last run and the report that was written."""
+RUN = "run"  #: key under which a store keeps the verdict of its last run and the report that was written
 
 ERROR = ("error: ", "bold red")
 

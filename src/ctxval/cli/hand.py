@@ -34,8 +34,7 @@ from ctxval.core.trial import CONVERGED, Trial
 from ctxval.errors import InputError
 from ctxval.web.jobs import ServedCampaign
 
-_WAIT = 60.0
-"""Seconds to wait for other terminals: each of them locks the store while it chooses a task."""
+_WAIT = 60.0  #: seconds to wait for other terminals: each of them locks the store while it chooses a task
 
 
 @command()

@@ -22,8 +22,7 @@ from ctxval._util.representation import ShortRepr
 from ctxval._util.texts import enumerated, quoted, reason_of
 from ctxval.errors import InputError
 
-LISTED = 24
-"""Largest number of fields that a message names."""
+LISTED = 24  #: largest number of fields that a message names
 
 Located = TypeVar("Located")
 

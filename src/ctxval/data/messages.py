@@ -29,8 +29,7 @@ from ctxval.data.log import reading
 from ctxval.data.topics import Message, TopicLog
 from ctxval.errors import InputError
 
-Decoder = Callable[[bytes], Any]
-"""A function that decodes the bytes of one message."""
+Decoder = Callable[[bytes], Any]  #: A function that decodes the bytes of one message
 
 Definition = tuple[Callable[[str, bytes], Decoder], str, bytes]
 """A function that makes a decoder, and its arguments: the name of a type of messages, and the text that defines it."""

@@ -35,8 +35,7 @@ class UnsafeMargin(ShortRepr):
       with the threshold c, a campaign asks whether every task with ``rho_M > c`` is safe.
     """
 
-    to_task: ClassVar[bool] = True
-    """Whether it measures trajectories against the task."""
+    to_task: ClassVar[bool] = True  #: whether it measures trajectories against the task
 
     kinked: ClassVar[bool] = True
     """Whether it is a continuous function of the trajectories with kinks, which are no jumps."""

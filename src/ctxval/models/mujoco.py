@@ -19,8 +19,7 @@ from ctxval.core.model import paired
 from ctxval.core.trajectory import Transitions
 from ctxval.errors import InputError, ShapeError
 
-_SYSID = "params_x_hat.yaml"
-"""A file that ``mujoco.sysid.save_results`` writes beside the identified models."""
+_SYSID = "params_x_hat.yaml"  #: A file that ``mujoco.sysid.save_results`` writes beside the identified models
 
 
 @part(files=("mjcf",))

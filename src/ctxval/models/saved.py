@@ -29,8 +29,7 @@ _DATA = ("x", "u", "x_next")
 _CORRECTED = "corrected_"  # before the names of the arrays of the model that a correction belongs to
 
 _PLAIN = (Linear, FeedforwardReLU, GaussianProcessModel)
-SavedModel = Linear | FeedforwardReLU | GaussianProcessModel | Corrected
-"""The models that can be written to a file."""
+SavedModel = Linear | FeedforwardReLU | GaussianProcessModel | Corrected  #: the models that can be written to a file
 
 
 def write_model(path: str | Path, model: Model, note: dict[str, Any] | None = None) -> None:

@@ -20,8 +20,7 @@ from ctxval._util.representation import ShortRepr
 from ctxval.certificates.bounds import at_most
 from ctxval.report.markup import element, joined, number
 
-SMALL = {"width": 340, "height": 220}
-"""Size of a chart of which several stand side by side."""
+SMALL = {"width": 340, "height": 220}  #: size of a chart of which several stand side by side
 
 _LEFT, _RIGHT, _TOP, _BOTTOM = 62, 14, 12, 46
 

@@ -15,8 +15,7 @@ from ctxval._util.representation import ShortRepr, call, options
 from ctxval.errors import InputError, ShapeError
 from ctxval.gp.surrogate import Surrogate
 
-Note = dict[str, Any]
-"""What a search records about the choice of a point, in types that JSON has."""
+Note = dict[str, Any]  #: what a search records about the choice of a point, in types that JSON has
 
 
 @dataclass(frozen=True)

@@ -23,8 +23,7 @@ from ctxval._util.representation import ShortRepr
 from ctxval.core.task import Task
 from ctxval.errors import InputError, ShapeError, UnknownNameError
 
-Place = ArrayLike | str
-"""Numbers ``(k,)``, or the name of an entry of the task's environment."""
+Place = ArrayLike | str  #: numbers ``(k,)``, or the name of an entry of the task's environment
 
 
 class Set(ShortRepr, ABC):

@@ -48,8 +48,7 @@ class Manual(ShortRepr):
     States and inputs are names of the components with their units, for files.
     """
 
-    manual = True
-    """Mark of a system that a program cannot execute."""
+    manual = True  #: mark of a system that a program cannot execute
 
     def __init__(self, *, states: Mapping[str, str], inputs: Mapping[str, str], dt: Seconds) -> None:
         self.states, self.inputs = dict(states), dict(inputs)

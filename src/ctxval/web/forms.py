@@ -18,8 +18,7 @@ from ctxval.web.jobs import TaskRequest
 
 Number = TypeVar("Number", int, float)
 
-Fields = Mapping[str, str]
-"""The fields of a form that are texts."""
+Fields = Mapping[str, str]  #: the fields of a form that are texts
 
 
 def task_request(fields: Fields, space: TaskSpace) -> TaskRequest:

@@ -25,11 +25,9 @@ from ctxval.core.labels import labels_of
 from ctxval.core.trial import Trial
 from ctxval.errors import InputError
 
-Files = dict[str, bytes]
-"""The files of a trial by name."""
+Files = dict[str, bytes]  #: the files of a trial by name
 
-Pictures = dict[str, bytes | str]
-"""Pictures by name as SVG; a text says why a picture is missing."""
+Pictures = dict[str, bytes | str]  #: pictures by name as SVG; a text says why a picture is missing
 
 
 @dataclass(frozen=True, eq=False)

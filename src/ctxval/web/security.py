@@ -22,8 +22,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from ctxval._util.representation import call
 from ctxval.errors import InputError
 
-MOST_UPLOAD = 64 * 2**20
-"""Largest size of a recording in bytes."""
+MOST_UPLOAD = 64 * 2**20  #: largest size of a recording in bytes
 
 HEADERS = {
     # Nothing from elsewhere, and no script or style inside the page.

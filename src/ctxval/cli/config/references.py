@@ -17,8 +17,7 @@ from ctxval._util.refusals import reworded
 from ctxval._util.registry import Registry, has_method
 from ctxval.errors import InputError
 
-_added: set[str] = set()
-"""Folders of experiments that this module has put on ``sys.path``."""
+_added: set[str] = set()  #: folders of experiments that this module has put on ``sys.path``
 
 
 def reference(text: str, folder: Path | None = None) -> Any:

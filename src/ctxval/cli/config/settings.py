@@ -40,8 +40,7 @@ from ctxval.searches import Search, by_name
 from ctxval.studies.aspect1 import TASKS
 from ctxval.studies.safety import judged_by
 
-Part = str | dict[str, Any]
-"""``module:attr``, or a table with a type and its arguments."""
+Part = str | dict[str, Any]  #: ``module:attr``, or a table with a type and its arguments
 
 
 class CertificateTable(BaseModel):

@@ -25,8 +25,7 @@ from ctxval.cli.config.parts import REGISTRIES
 from ctxval.errors import InputError
 from ctxval.paper import cases
 
-SIGNATURES = "signatures"
-"""The key of the signatures in the settings of a store."""
+SIGNATURES = "signatures"  #: the key of the signatures in the settings of a store
 
 _BYTES = 32
 

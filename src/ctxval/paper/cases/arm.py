@@ -53,8 +53,7 @@ MJCF = """
 </mujoco>
 """
 
-END_EFFECTOR = (4, 5)
-"""Indices of y and z in the state; these are the paper's names of the coordinates on the table."""
+END_EFFECTOR = (4, 5)  #: indices of y and z in the state; these are the paper's names of the coordinates on the table
 
 
 @dataclass(frozen=True)

@@ -24,8 +24,7 @@ from ctxval import (
 )
 from ctxval.errors import UnknownNameError
 
-WAVES = 10
-"""Sine components of the reference, as in the paper."""
+WAVES = 10  #: sine components of the reference, as in the paper
 
 
 def root_mean_square(model_trajectory: Trajectory, system_trajectory: Trajectory, task: Task) -> Array:

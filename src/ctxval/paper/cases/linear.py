@@ -22,8 +22,7 @@ from ctxval import (
 )
 from ctxval.errors import InputError
 
-DIMENSIONS = range(1, 11)
-"""The numbers of states in the paper."""
+DIMENSIONS = range(1, 11)  #: the numbers of states in the paper
 
 
 @dataclass(frozen=True)

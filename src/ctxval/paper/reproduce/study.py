@@ -69,8 +69,7 @@ class Claim:
     remark: str = ""
 
 
-Columns = dict[str, Sequence[float | str]]
-"""The data behind a figure, as columns of equal length."""
+Columns = dict[str, Sequence[float | str]]  #: the data behind a figure, as columns of equal length
 
 
 class Study(ABC):

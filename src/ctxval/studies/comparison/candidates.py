@@ -31,8 +31,7 @@ Question = Literal["worst", "mean"]
 Executed = Sequence[tuple[Array, Trajectory]]
 """Executed tasks, points of the unit cube ``(d,)``, with the system's trajectories."""
 
-OnTrial = Callable[[str, Trial], None]
-"""Called with the name of a candidate and each of its trials that has ended."""
+OnTrial = Callable[[str, Trial], None]  #: called with the name of a candidate and each of its trials that has ended
 
 
 @dataclass(frozen=True)

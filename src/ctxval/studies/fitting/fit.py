@@ -23,10 +23,8 @@ from ctxval.studies.replay.report import plain_numbers
 
 Kind = Literal["linear", "network", "gaussian-process", "parameters", "given"]
 KINDS: tuple[Kind, ...] = get_args(Kind)[:4]
-STEPS = (1, 20)
-"""Numbers of steps after which the held-out errors are computed, unless others are given."""
-HOLD_OUT = 0.25
-"""Share of the recordings that is held out, unless another one is given."""
+STEPS = (1, 20)  #: numbers of steps after which the held-out errors are computed, unless others are given
+HOLD_OUT = 0.25  #: share of the recordings that is held out, unless another one is given
 
 
 @dataclass(frozen=True)

@@ -36,8 +36,7 @@ RefitKind = Literal["linear", "network", "gaussian-process"]
 _KINDS: dict[str, type[Model]] = {
     "linear": Linear, "network": FeedforwardReLU, "gaussian-process": GaussianProcessModel
 }  # fmt: skip
-NAMES = ("residual", "causes", *_KINDS, "parameters", "fit")
-"""The names of the methods on the command line."""
+NAMES = ("residual", "causes", *_KINDS, "parameters", "fit")  #: the names of the methods on the command line
 
 
 @dataclass(frozen=True, eq=False)

@@ -23,8 +23,7 @@ from ctxval.studies.replay.causes import ResidualShare, Suggestion, residual_sha
 from ctxval.studies.replay.faults import EXPLAINS, Fault, faults
 from ctxval.studies.replay.untested import PredictedTasks, predicted_tasks
 
-STEPS = (1, 5, 20, 100)
-"""Numbers of steps after which errors are computed, unless others are given."""
+STEPS = (1, 5, 20, 100)  #: numbers of steps after which errors are computed, unless others are given
 
 
 @dataclass(frozen=True)

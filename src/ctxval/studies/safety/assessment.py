@@ -34,8 +34,7 @@ from ctxval.learning.closed_loops import LoopPlanner
 from ctxval.specs import ReachAvoid
 from ctxval.studies.safety.draws import on_model, spec_distance
 
-TASKS = 4000
-"""Number of tasks on M that the shares are of; of designs that are made one by one, a tenth of it."""
+TASKS = 4000  #: number of tasks on M that the shares are of; of designs that are made one by one, a tenth of it
 
 
 @dataclass(frozen=True)
