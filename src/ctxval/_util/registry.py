@@ -7,6 +7,7 @@ import importlib
 import inspect
 import sys
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import KW_ONLY, dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
@@ -48,10 +49,9 @@ _declarations: dict[Any, Declaration] = {}
 
 def declaration_of(made: Any) -> Declaration | None:
     """Return how a class or a function was declared; None if it was not. A subclass does not inherit it."""
-    try:
+    with suppress(TypeError):  # it cannot be hashed
         return _declarations.get(made)
-    except TypeError:  # it cannot be hashed
-        return None
+    return None
 
 
 class Registry(Mapping[str, Any], Generic[Made]):
@@ -85,10 +85,9 @@ class Registry(Mapping[str, Any], Generic[Made]):
     @property
     def installed(self) -> tuple[str, ...]:
         """The names of the parts that other installed packages add, sorted; none if their metadata is damaged."""
-        try:
+        with suppress(InputError):
             return tuple(sorted({point.name for point in self._entry_points()} - {*self.built_in}))
-        except InputError:
-            return ()
+        return ()
 
     def is_data(self, name: Any) -> bool:
         """Return whether a part with plain arguments runs no code; what is not built in always counts as code.

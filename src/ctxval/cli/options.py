@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,7 +24,6 @@ class Allowed:
 
 
 def named_values(given: Sequence[str] | None, flag: str = "--option", /, **named: Any) -> dict[str, Any]:
-    """Return the options that a command line states, by name."""
     values = {name: value for name, value in named.items() if value is not None}
     for text in given or ():
         name, equals, value = text.partition("=")
@@ -38,12 +38,11 @@ def named_values(given: Sequence[str] | None, flag: str = "--option", /, **named
 
 def parsed(text: str) -> Any:
     """Return the number, Boolean, list or quoted text that a TOML file would contain, or else the text itself."""
-    try:
-        content = tomllib.loads(f"value = {text}")
-    except (tomllib.TOMLDecodeError, RecursionError):
-        return text
-    value = content.get("value")
-    return value if len(content) == 1 and isinstance(value, str | int | float | bool | list) else text
+    with suppress(tomllib.TOMLDecodeError, RecursionError):
+        match tomllib.loads(f"value = {text}"):
+            case {"value": str() | int() | float() | list() as value, **others} if not others:
+                return value
+    return text
 
 
 # Files that options name: never onto an input, and never onto the work of others

@@ -117,11 +117,9 @@ class StepFunction:
 
     @property
     def bounds(self) -> dict[str, Any]:
-        """The bounds of the parameters by name."""
         return named_values(self.parameter, "--parameter")
 
     def load(self) -> Any:
-        """Return the function; None if none is named."""
         if self.step is None:
             return None
         return require_function(f"--step {self.step}", reference(self.step), "(x, u, theta) -> x_next")
@@ -281,7 +279,6 @@ def require_model_file(path: Path | None, inputs: Iterable[object], *, force: bo
 
 
 def print_parameters(parameters: Sequence[FittedParameter]) -> None:
-    """Print parameters with their intervals."""
     for each in parameters:
         note = f"; {each.note}" if each.note else ""
         between = f"between {each.low:.6g} and {each.high:.6g} with confidence 0.95{note}"

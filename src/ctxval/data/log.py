@@ -134,11 +134,9 @@ class Table(Log):
         self._marks = marks or (lambda name: columns([name])[name])
 
     def fields(self) -> tuple[str, ...]:
-        """Return the names of the columns."""
         return self._names
 
     def signals(self, fields: Sequence[str], clock: Clock) -> dict[str, Signal]:
-        """Return fields over time; see :meth:`Log.signals`."""
         require_distinct(self.source, self._names)
         find = partial(column_of, self.source, self._names)
         located = {field: self._located(field, find) for field in fields}

@@ -48,7 +48,6 @@ class _FileOfMessages(TopicLog):
         self._decoders: dict[Any, Decoder] = {}
 
     def topics(self) -> tuple[str, ...]:
-        """Return the names of the topics."""
         return tuple(self._topics)
 
     def _decoded(
@@ -100,7 +99,6 @@ class McapLog(_FileOfMessages):
                 yield from library.StreamReader(chunk, **{**inside, "skip_magic": True}).records
 
     def messages(self, topics: Iterable[str]) -> Iterator[Message]:
-        """Yield decoded messages; see :meth:`TopicLog.messages`."""
         wanted = set(topics)
         schemas, channels = dict[int, Any](), dict[int, Any]()
         with self._opened() as file:
@@ -158,7 +156,6 @@ class BagLog(_FileOfMessages):
             reader.close()
 
     def messages(self, topics: Iterable[str]) -> Iterator[Message]:
-        """Yield decoded messages; see :meth:`TopicLog.messages`."""
         wanted = set(topics)
         with self._reader() as reader:
             records = reader.messages([connection for connection in reader.connections if connection.topic in wanted])

@@ -185,10 +185,9 @@ def _column(values: list[Any]) -> Array | None:
     """Return a field of all records, ``(N,)`` or ``(N, k)``; None if it does not hold numbers."""
     width = next((len(value) for value in values if isinstance(value, list)), None)
     missing = np.nan if width is None else [np.nan] * width
-    try:
+    with suppress(TypeError, ValueError, OverflowError):
         return np.array([missing if value is None else value for value in values], dtype=np.float64)
-    except (TypeError, ValueError, OverflowError):
-        return None
+    return None
 
 
 # Files and folders

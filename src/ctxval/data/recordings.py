@@ -244,7 +244,6 @@ class Recorded(ShortRepr):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The names of the tasks."""
         return tuple(self.runs)
 
     def execute(self, controller: Controller, task: Task) -> Trajectory:

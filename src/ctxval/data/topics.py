@@ -54,7 +54,6 @@ class TopicLog(Log):
         return tuple(names)
 
     def signals(self, fields: Sequence[str], clock: Clock) -> dict[str, Signal]:
-        """Return fields over time; see :meth:`Log.signals`."""
         split = {field: self._split(field) for field in fields}
         records: dict[str, list[tuple[dict[str, Any], dict[str, Array]]]] = {topic: [] for topic, _ in split.values()}
         size = 0

@@ -52,8 +52,7 @@ class Manual(ShortRepr):
 
     def __init__(self, *, states: Mapping[str, str], inputs: Mapping[str, str], dt: Seconds) -> None:
         self.states, self.inputs = dict(states), dict(inputs)
-        texts = [*self.states.items(), *self.inputs.items()]
-        if not self.states or not all(isinstance(text, str) for pair in texts for text in pair):
+        if not self.states:
             raise InputError(f"states and inputs must be names with units, got {self.states} and {self.inputs}.")
         require_names(self.states, self.inputs)
         self.dt = float(dt)

@@ -6,12 +6,12 @@ import contextlib
 import copy
 import os
 from collections.abc import Callable
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
 from ctxval._util.arrays import Array, as_floats
-from ctxval._util.checked import NonNegativeInt, Seconds
+from ctxval._util.checked import Must, NonNegativeInt, Seconds, require
 from ctxval._util.mjcf import warning_of
 from ctxval._util.refusals import require_extra, reworded
 from ctxval._util.registry import part
@@ -87,9 +87,9 @@ class Gymnasium(ShortRepr):
         self.inputs = int(np.prod(space.shape))
         bare = first.unwrapped
         stated = getattr(bare, "dt", None)
-        step = stated if dt is None else dt
-        if not isinstance(step, int | float | np.number) or not (np.isfinite(step) and step > 0):
-            raise InputError(f"dt must be the positive number of seconds in one step of the environment, got {step!r}.")
+        step: Any = stated if dt is None else dt
+        positive = Must("the positive number of seconds in one step of the environment", lambda dt: 0 < dt < np.inf)
+        require("dt", Annotated[float, positive], step)
         if stated is not None and not np.isclose(stated, step, rtol=1e-9, atol=0):
             raise InputError(f"dt must be that of the environment, {stated:g} s, got {step:g} s.")
         self.dt = float(step)

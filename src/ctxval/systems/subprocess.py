@@ -203,10 +203,9 @@ class Subprocess(ShortRepr):
 
 def signal_name(number: int) -> str:
     """Return the name of a signal, also of one that Python does not know."""
-    try:
+    with contextlib.suppress(ValueError):
         return signal.Signals(number).name
-    except ValueError:
-        return f"signal {number}"
+    return f"signal {number}"
 
 
 def _trajectory(folder: Path, task: Task) -> Trajectory:

@@ -55,12 +55,10 @@ class Snapshot:
 
     @property
     def executions(self) -> int:
-        """The number of executions of S that have ended."""
         return sum(trial.executed for trial in self.trials)
 
     @property
     def worst(self) -> Trial | None:
-        """The trial with the largest distance."""
         known = (trial for trial in self.trials if trial.state == "completed")
         return max(known, key=lambda trial: trial.distance or 0.0, default=None)
 
@@ -77,7 +75,6 @@ class ServedCampaign:
 
     @property
     def store_name(self) -> str:
-        """The name of the file of the store."""
         path = self.campaign.store.path
         return "a store in memory" if path is None else path.name
 
@@ -153,7 +150,6 @@ def choose(served: ServedCampaign, request: TaskRequest) -> tuple[int, Files] | 
 
 
 def files_of(served: ServedCampaign, number: int) -> Files:
-    """Return the files of an open trial."""
     with stage(f"preparing the files of trial {number}"):
         return _files(served, served.campaign.reopen(number))
 
@@ -179,14 +175,12 @@ def judge(served: ServedCampaign) -> Verdict | None:
 
 
 def draw(served: ServedCampaign) -> Pictures:
-    """Return the pictures of the present trials."""
     with stage("drawing the pictures"):
         served.campaign.refresh()
         return pictures_of(served)
 
 
 def pictures_of(served: ServedCampaign) -> Pictures:
-    """Return the pictures of the trials that the campaign knows."""
     import matplotlib
     from matplotlib.figure import Figure
 

@@ -92,7 +92,6 @@ class Server(uvicorn.Server):
         self._state = state
 
     def handle_exit(self, sig: int, frame: FrameType | None) -> None:
-        """End the server at a signal."""
         super().handle_exit(sig, frame)  # which asks whether the end has begun already
         self.end()
 
@@ -103,7 +102,6 @@ class Server(uvicorn.Server):
 
 
 def listening(host: str, port: int) -> socket.socket:
-    """Return a socket that listens at an address."""
     if not 0 <= port <= 65535:
         raise InputError(f"the port must be from 0 to 65535, got {port}.")
     with reworded(f"the page cannot be served at {host}, port {port}", OSError, UnicodeError):
@@ -155,17 +153,14 @@ class Connection(H11Protocol):
         self.app_state = {**self.app_state, "connection": self}
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """Begin to wait for a request."""
         super().connection_made(transport)
         self.waiting.add(self)
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Wait no longer."""
         self.waiting.remove(self)
         super().connection_lost(exc)
 
     def on_response_complete(self) -> None:
-        """Wait for the next request."""
         if not self.transport.is_closing():
             self.waiting.add(self)
         super().on_response_complete()

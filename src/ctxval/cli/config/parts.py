@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin, get_type_hints
@@ -133,14 +134,12 @@ class TaskTable:
     environment: dict[str, list[float | str]] = field(default_factory=dict)
 
     def __call__(self, p: Parameters) -> Task:
-        """Return the task, or the batch of tasks."""
         start = [_component(entry, p) for entry in self.initial_state]
         goal = None if self.goal is None else [_component(entry, p) for entry in self.goal]
         around = {name: [_component(entry, p) for entry in entries] for name, entries in self.environment.items()}
         return Task(start, goal=goal, horizon=self.horizon, dt=self.dt, environment=around)
 
     def describe(self) -> dict[str, Any]:
-        """Return what identifies this task function in a store."""
         known = {name: getattr(self, name) for name in ("initial_state", "goal", "horizon", "dt")}
         return known | ({"environment": self.environment} if self.environment else {})
 
@@ -274,12 +273,9 @@ def plain_options(case: str) -> dict[str, Any]:
 
     The default of an option that must be given is None.
     """
-    try:
-        hints = get_type_hints(cases.REGISTRY.find(case))
-    except InputError:
-        raise
-    except Exception:  # annotations that are texts are evaluated, and anything may stand in them
-        hints = {}
+    hints, made = dict[str, Any](), cases.REGISTRY.find(case)
+    with suppress(Exception):  # annotations that are texts are evaluated, and anything may stand in them
+        hints = get_type_hints(made)
 
     def is_plain(hint: Any) -> bool:
         return get_origin(hint) is Literal or bool({hint, *get_args(hint)} & {str, int, float, bool})

@@ -8,7 +8,7 @@ import inspect
 import os
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from importlib.machinery import PathFinder
 from pathlib import Path
 from typing import Any
@@ -53,10 +53,9 @@ def _searched_first(home: str) -> Iterator[str]:
 
 
 def _here() -> str:
-    try:
+    with suppress(OSError):  # it was deleted
         return os.getcwd()
-    except OSError:  # it was deleted
-        return os.devnull
+    return os.devnull
 
 
 def _require_place(text: str, module: str, home: str) -> None:
@@ -148,20 +147,18 @@ def is_function(value: Any) -> bool:
 
 def _unwrapped(value: Any) -> Any:
     """Return the function inside decorators, such as those of compilers."""
-    try:
+    with suppress(ValueError, AttributeError):
         return inspect.unwrap(value)
-    except (ValueError, AttributeError):
-        return value
+    return value
 
 
 def accepts(function: Any, count: int, /, **named: Any) -> bool:
     """Return whether a function can be called with this number of positional arguments and these named ones."""
-    try:
-        inspect.signature(function).bind(*range(count), **named)
-    except TypeError:
-        return False
-    except ValueError:  # the function has no signature
-        return True
+    with suppress(ValueError):  # the function has no signature
+        try:
+            inspect.signature(function).bind(*range(count), **named)
+        except TypeError:
+            return False
     return True
 
 

@@ -82,7 +82,6 @@ class CertificateTable(BaseModel):
     def options(
         self, confidence: float, *, kind: str | None = None, stated: Mapping[str, Any] | None = None
     ) -> CertificateOptions:
-        """Return the kind, the options and the confidence of the certificate for the verdict."""
         given, chosen = dict(stated or {}), KINDS.find(kind or self.kind)
         require_use(chosen.name, given)
         if kind in (None, self.kind):
@@ -102,7 +101,6 @@ class SearchTable(BaseModel):
     repeats: int = Field(default=1, ge=1)
 
     def build(self, folder: Path | None = None) -> Search:
-        """Return the search."""
         options = {key: argument(value, folder) for key, value in (self.model_extra or {}).items()}
         options = require_types(f"search {self.name!r}", SEARCHES.find(self.name), options)
         return by_name(self.name, repeats=self.repeats, **options)
@@ -191,7 +189,6 @@ class Settings(BaseModel):
     folder: Path | None = None
 
     def load(self) -> Experiment:
-        """Return the experiment."""
         if self.experiment is None:
             experiment = self._described()
         else:
@@ -293,7 +290,6 @@ class Settings(BaseModel):
 
     @property
     def certificate_options(self) -> CertificateOptions:
-        """The certificate for the verdict."""
         return self.certificate.options(self.confidence)
 
     @property
@@ -308,7 +304,6 @@ class Settings(BaseModel):
 
     @property
     def log_mapping(self) -> LogMapping | None:
-        """The mapping of logs; None if there is none."""
         return None if self.recordings is None else LogMapping.from_table(self.recordings)
 
     def store_path(self, name: str) -> Path:

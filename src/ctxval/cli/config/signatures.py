@@ -53,16 +53,14 @@ def signed(settings: Mapping[str, Any], before: Mapping[str, Any]) -> dict[str, 
 
 def verifies(settings: Mapping[str, Any]) -> bool:
     """Return whether settings carry a valid signature of this user."""
-    signatures = _signatures(settings)
-    try:
-        key = _read_key(key_path()) if signatures else None
-    except OSError:
-        return False
-    return key is not None and any(hmac.compare_digest(_signature(key, settings), each) for each in signatures)
+    if signatures := _signatures(settings):
+        with suppress(OSError):
+            signature = _signature(_read_key(key_path()), settings)
+            return any(hmac.compare_digest(signature, each) for each in signatures)
+    return False
 
 
 def unsigned(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Return settings without their signatures."""
     return {key: value for key, value in settings.items() if key != SIGNATURES}
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from scipy.linalg import expm
@@ -20,7 +21,7 @@ from ctxval import (
     models,
     systems,
 )
-from ctxval.errors import InputError
+from ctxval._util.checked import Must, require
 
 DIMENSIONS = range(1, 11)  #: the numbers of states in the paper
 
@@ -113,8 +114,8 @@ def experiment(seed: int = 0, dim: int = 4, settings: Settings | None = None) ->
 
     The seed draws K, then independently A and B of the system and A and B of the model.
     """
-    if not isinstance(dim, int | np.integer) or isinstance(dim, bool) or dim not in DIMENSIONS:
-        raise InputError(f"dim, the number of states, must be an integer from 1 to 10, got {dim!r}.")
+    known = Must("an integer from 1 to 10", lambda dim: dim in DIMENSIONS)
+    require("dim, the number of states,", Annotated[int, known], dim)
     settings = Settings() if settings is None else settings
     of_gain, of_system, of_model = np.random.default_rng(seed).spawn(3)
     gain = of_gain.normal(scale=1 / np.sqrt(dim), size=(dim, dim))

@@ -55,7 +55,6 @@ class Job:
         return re.sub(r"[^a-zA-Z0-9._-]+", "-", "_".join(filter(None, parts)))
 
     def experiment(self) -> Experiment:
-        """Return the case that the job runs on."""
         return cases.by_name(self.case, self.seed, **dict(self.options))
 
 

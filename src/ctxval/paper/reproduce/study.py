@@ -37,7 +37,6 @@ class Scale:
 
     @property
     def seeds(self) -> range:
-        """The seeds of the trials."""
         return range(self.trials)
 
     def of(self, full: int) -> int:
@@ -104,7 +103,6 @@ class Study(ABC):
         """Return the paper's claims about the figure, with the measured numbers."""
 
     def draw(self, results: Results, scale: Scale) -> Figure:
-        """Return the figure."""
         from matplotlib.figure import Figure  # imported here, because only figures need it
 
         figure = Figure(figsize=(6.4, 4.2), layout="constrained")

@@ -80,11 +80,10 @@ class ClosedLoops:
         system: System = repaired
         if self.validation.outputs is not None:
             system = WithOutputs(repaired, self.validation.outputs)
-        try:
+        with contextlib.suppress(Exception):  # the user's own parts, at states that they never saw
             loop = system.execute(plan.controller, plan.task if start is None else plan.task.starting_at(start))
-        except Exception:  # the user's own parts, at states that they never saw
-            return None
-        return loop if loop.finite.all() else None
+            return loop if loop.finite.all() else None
+        return None
 
     def _noisy(self, repaired: Repaired, execution: ExecutedTask, noise: Array) -> list[Trajectory]:
         """Return loops with noise; none if there is no noise, or if one fails."""
@@ -119,8 +118,6 @@ class ClosedLoops:
         return squares
 
     def _distance(self, execution: ExecutedTask, loop: Trajectory) -> float:
-        try:
-            with np.errstate(all="ignore"):
-                return float(self.validation.distance(loop.copy(), execution.executed.copy(), execution.plan.task))
-        except Exception:  # the user's distance
-            return np.inf
+        with contextlib.suppress(Exception), np.errstate(all="ignore"):  # the user's distance
+            return float(self.validation.distance(loop.copy(), execution.executed.copy(), execution.plan.task))
+        return np.inf

@@ -24,13 +24,12 @@ class Force(Cause):
     probe: float = 1.0  #: a force that is typical of the joint, with which its effect in M is measured
     dt: float = 1.0  #: seconds
 
-    def effect(self, model: Model, x: Array, u: Array, free: Array) -> Array:
+    def effect(self, model: Any, x: Array, u: Array, free: Array) -> Array:
         """Return the change of the next state ``free`` of the model by one unit of the force, shape ``(..., n)``."""
-        if self.joint.dof is not None:
-            assert isinstance(model, MuJoCo)
+        if self.joint.dof is not None:  # of a model of MuJoCo
             forces = np.zeros(model.compiled.nv)
             forces[self.joint.dof] = self.probe
-            return (model.changed(forces=forces).step(x, u) - free) / self.probe
+            return np.asarray((model.changed(forces=forces).step(x, u) - free) / self.probe)
         if self.joint.input is not None:
             moved = np.array(u)
             moved[..., self.joint.input] += self.probe
@@ -45,7 +44,7 @@ class Force(Cause):
         """
         raise NotImplementedError
 
-    def load(self, model: Model, x: Array, u: Array) -> Array:
+    def load(self, model: Any, x: Array, u: Array) -> Array:
         """Return the magnitude of the force that the gears carry ``(...)``; 0 if the force does not depend on it."""
         return np.zeros(x.shape[:-1])
 
@@ -134,9 +133,8 @@ class LoadFriction(Force):
     name: ClassVar[str] = "load-dependent friction"
     rates: tuple[int, ...] = ()  #: the rates of all joints that inputs drive
 
-    def load(self, model: Model, x: Array, u: Array) -> Array:
+    def load(self, model: Any, x: Array, u: Array) -> Array:
         if self.joint.dof is not None:
-            assert isinstance(model, MuJoCo)
             return np.abs(_pulls(model, x, u)[..., self.joint.dof])
         unmoved, m = np.asarray(model.step(x, np.zeros_like(u))), u.shape[-1]
         if self.joint.input is None:
@@ -243,9 +241,9 @@ class OfMuJoCo(Cause):
         """Change a copy of the compiled model, a ``mujoco.MjModel``."""
         raise NotImplementedError
 
-    def model(self, model: Model) -> Model:
-        assert isinstance(model, MuJoCo)
-        return model.changed(self.change)
+    def model(self, model: Any) -> Model:
+        changed: Model = model.changed(self.change)
+        return changed
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from typing import Any, Literal
@@ -162,11 +162,9 @@ class Candidate:
     def _prediction(self, executed: Executed) -> Prediction | None:
         key = tuple(id(trajectory) for _, trajectory in executed)
         if self._last is None or self._last[0] != key:
-            try:
-                prediction = self._study.predict(list(executed))
-            except Exception:  # the user's parts, at states that no execution has reached, must not end a comparison
-                prediction = None
-            self._last = key, prediction
+            self._last = key, None
+            with suppress(Exception):  # the user's parts, at states that no execution has reached
+                self._last = key, self._study.predict(list(executed))
         return self._last[1]
 
 

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import Any, Literal, get_args
+from typing import Annotated, Any, Literal, get_args
 
 import numpy as np
 from scipy.optimize import least_squares
 from scipy.special import stdtrit
 
 from ctxval._util.arrays import Array, single_threaded
+from ctxval._util.checked import Must, require
 from ctxval._util.representation import ShortRepr, counted
 from ctxval.core.model import Model, require_time_step
 from ctxval.core.trajectory import Trajectory, Transitions
@@ -193,8 +194,8 @@ def split(recordings: Recordings, share: float, seed: int) -> tuple[Recordings, 
 
     Whole recordings are held out, drawn at random. Of a single recording, the last part is held out.
     """
-    if not isinstance(share, int | float) or not 0 < share < 1:
-        raise InputError(f"the share that is held out must be between 0 and 1, got {share!r}.")
+    inside = Must("between 0 and 1", lambda share: 0 < share < 1)
+    require("the share that is held out", Annotated[float, inside], share)
     runs = recordings.runs
     if len(runs) == 1:
         run, horizon = runs[0], runs[0].trajectory.horizon
@@ -291,10 +292,9 @@ def as_bounds(bounds: Mapping[str, tuple[float, float]]) -> tuple[Array, Array]:
     """Return the lower and the upper bounds of parameters, shapes ``(p,)``."""
     if not bounds:
         raise InputError("at least one parameter with its bounds is needed, such as mass = [0.5, 2.0].")
+    ordered = Must("two numbers, the lower one first", lambda pair: -np.inf < pair[0] < pair[1] < np.inf)
     for name, pair in bounds.items():
-        valid = isinstance(pair, Sequence) and not isinstance(pair, str) and len(pair) == 2
-        if not valid or not all(isinstance(b, int | float) and np.isfinite(b) for b in pair) or pair[0] >= pair[1]:
-            raise InputError(f"the bounds of {name} must be two numbers, the lower one first, got {pair!r}.")
+        require(f"the bounds of {name}", Annotated[tuple[float, float], ordered], pair)
     ends = np.array([[float(b) for b in pair] for pair in bounds.values()])
     return ends[:, 0], ends[:, 1]
 

@@ -6,6 +6,7 @@ These errors by regions of states and inputs are what a robust controller must a
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -150,10 +151,9 @@ def held_out(learn: Callable[[Records], Model], before: Model, records: Records)
     """
     parts = []
     for known, held in records.folds():
-        try:
+        model = before
+        with suppress(CtxvalError):
             model = learn(known)
-        except CtxvalError:
-            model = before
         parts.append(_compared(held.transitions, held.executed, model, before))
     return _joined(parts)
 
@@ -175,13 +175,12 @@ def _errors_later(model: Model, runs: Sequence[Trajectory], n: int) -> Array:
     if not long:
         return np.zeros((0, n))
     x, after = (np.concatenate([run.states[part] for run in long]) for part in (slice(-_LATER), slice(_LATER, None)))
-    try:
+    with suppress(Exception):  # users' models, at states that were not recorded
         for k in range(_LATER):
             u = np.concatenate([run.inputs[k : run.horizon - _LATER + 1 + k] for run in long])
             x = np.asarray(model.step(x, u))
-    except Exception:  # users' models, at states that were not recorded
-        return np.full_like(after, np.nan)
-    return np.asarray(after - x)
+        return np.asarray(after - x)
+    return np.full_like(after, np.nan)
 
 
 def _joined(parts: list[HeldOut]) -> HeldOut:

@@ -5,11 +5,12 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
 from ctxval._util.arrays import single_threaded
+from ctxval._util.checked import Must, require
 from ctxval._util.columns import unit_advice
 from ctxval._util.representation import ShortRepr, counted, task_text
 from ctxval.core.model import Model, require_time_step
@@ -81,8 +82,8 @@ def replay(
         validation: an experiment with this model, whose tasks are then judged too; its system is never executed.
         executions: number of executions of the experiment that are proposed.
     """
-    if not steps or not all(isinstance(k, int) and not isinstance(k, bool) and k >= 1 for k in steps):
-        raise InputError(f"steps must be positive integers, got {list(steps)}.")
+    positive = Must("positive integers", lambda steps: len(steps) > 0 and min(steps) >= 1)
+    require("steps", Annotated[Sequence[int], positive], steps)
     if validation is not None:
         validation.require_states("a replay")
         space = validation.space

@@ -248,12 +248,10 @@ def _deviation_bound(campaign: Campaign, spec: Any, confidence: float) -> float 
     """Return the bound that learned dynamics give on the largest deviation; None if they give none."""
     validation = campaign.validation.with_distance(MaximumDeviation(2, getattr(spec, "components", None)))
     pairs = [(trial.unit_point, system) for trial, system in executed_trials(campaign.store, campaign.trials)]
-    try:
+    with suppress(Exception):  # users' parts, at states that no execution has reached
         learned = DynamicsStudy(validation, campaign.seed).learn(pairs)
-        if learned is None:
-            return None
-        maxima = learned.worst_case_of(draws_for(confidence)).maxima
-    except Exception:  # users' parts, at states that no execution has reached
-        return None
-    bound = float(np.sort(maxima)[min(rank_of(confidence, len(maxima)), len(maxima)) - 1])
-    return bound if np.isfinite(bound) else None
+        if learned is not None:
+            maxima = learned.worst_case_of(draws_for(confidence)).maxima
+            bound = float(np.sort(maxima)[min(rank_of(confidence, len(maxima)), len(maxima)) - 1])
+            return bound if np.isfinite(bound) else None
+    return None
