@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated
 
 import numpy as np
 from scipy.linalg import expm
@@ -21,9 +20,10 @@ from ctxval import (
     models,
     systems,
 )
-from ctxval._util.checked import Must, require
+from ctxval.errors import InputError
 
-DIMENSIONS = range(1, 11)  #: the numbers of states in the paper
+DIMENSIONS = range(1, 11)
+"""The numbers of states in the paper."""
 
 
 @dataclass(frozen=True)
@@ -31,19 +31,23 @@ class Settings:
     """Every free parameter of the case, with the reason for its value.
 
     The paper gives none of them; it only says that A, B and K are random.
+
+    Attributes:
+        dt: s; the discretisation is exact, so dt only sets how long an input is held. 50 ms are short against the
+            closed loops' time constants, of which the shortest is typically 0.4 s.
+        horizon: steps; 1 s is half of the longest time constant, so that the final state depends both on the initial
+            state and on the goal.
+        decay: 1/s; both closed loops decay at least this fast. Draws that decay more slowly are shifted, ``A - s I``.
+            Rejecting them would take too long, because few random closed loops of 10 states are stable.
+        spread: 1/s; about the modulus of the largest eigenvalue of A and of B K, for any n.
+        tolerance: the threshold is this times the number of states; it is a quarter of the way from the centre of P to
+            its edge.
     """
 
-    #: s; the discretisation is exact, so dt only sets how long an input is held. 50 ms are short against the closed
-    #: loops' time constants, of which the shortest is typically 0.4 s.
     dt: float = 0.05
-    #: steps; 1 s is half of the longest time constant, so that the final state depends both on the initial state and on
-    #: the goal
     horizon: int = 20
-    #: 1/s; both closed loops decay at least this fast. Draws that decay more slowly are shifted, ``A - s I``. Rejecting
-    #: them would take too long, because few random closed loops of 10 states are stable.
     decay: float = 0.5
-    spread: float = 1.0  #: 1/s; about the modulus of the largest eigenvalue of A and of B K, for any n
-    #: the threshold is this times the number of states; it is a quarter of the way from the centre of P to its edge
+    spread: float = 1.0
     tolerance: float = 0.25
 
 
@@ -114,8 +118,8 @@ def experiment(seed: int = 0, dim: int = 4, settings: Settings | None = None) ->
 
     The seed draws K, then independently A and B of the system and A and B of the model.
     """
-    known = Must("an integer from 1 to 10", lambda dim: dim in DIMENSIONS)
-    require("dim, the number of states,", Annotated[int, known], dim)
+    if not isinstance(dim, int | np.integer) or isinstance(dim, bool) or dim not in DIMENSIONS:
+        raise InputError(f"dim, the number of states, must be an integer from 1 to 10, got {dim!r}.")
     settings = Settings() if settings is None else settings
     of_gain, of_system, of_model = np.random.default_rng(seed).spawn(3)
     gain = of_gain.normal(scale=1 / np.sqrt(dim), size=(dim, dim))
