@@ -80,10 +80,11 @@ class ClosedLoops:
         system: System = repaired
         if self.validation.outputs is not None:
             system = WithOutputs(repaired, self.validation.outputs)
-        with contextlib.suppress(Exception):  # the user's own parts, at states that they never saw
+        try:
             loop = system.execute(plan.controller, plan.task if start is None else plan.task.starting_at(start))
-            return loop if loop.finite.all() else None
-        return None
+        except Exception:  # the user's own parts, at states that they never saw
+            return None
+        return loop if loop.finite.all() else None
 
     def _noisy(self, repaired: Repaired, execution: ExecutedTask, noise: Array) -> list[Trajectory]:
         """Return loops with noise; none if there is no noise, or if one fails."""

@@ -59,30 +59,35 @@ class Separating(ShortRepr):
     """The task that tells two causes apart."""
 
     task: Mapping[str, Any]
-    #: distance, gap: between what the two causes predict of it: the distance, and the largest difference of a state in
-    #: shares of its range
-    distance: float
+    distance: float  #: between what the two causes predict of it
     other: int  #: the number of the second cause among those that were explained; the first one is 0
-    gap: float = 0.0
+    gap: float = 0.0  #: the largest difference of a state in both predictions, in shares of its range
 
 
 @dataclass(frozen=True, eq=False)
 class CauseReport(ShortRepr):
-    """Why a model fails."""
+    """Why a model fails.
+
+    Attributes:
+        explained: the most probable causes, and others that the executions do not tell from them; empty if no cause
+            predicts held-out executions better than M.
+        named: whether the first of these is the cause. Otherwise the answer is none of these, and ``explained`` is what
+            comes nearest.
+        tried: the number of causes in the dictionary.
+        executions, before: the number of executions that were learned from, and their largest distance from M.
+        separating: the task that tells causes apart which these executions do not.
+        ranked: the most probable causes alone, the best one first.
+    """
 
     plant: Plant
-    #: the most probable causes, and others that the executions do not tell from them; empty if no cause predicts held-
-    #: out executions better than M
     explained: tuple[Explained, ...]
-    #: whether the first of these is the cause. Otherwise the answer is none of these, and ``explained`` is what comes
-    #: nearest.
     named: bool
-    tried: int  #: the number of causes in the dictionary
-    executions: int  #: the number of executions that were learned from, and their largest distance from M
+    tried: int
+    executions: int
     before: float
     units: str = ""
-    separating: Separating | None = None  #: the task that tells causes apart which these executions do not
-    ranked: tuple[Explanation, ...] = ()  #: the most probable causes alone, the best one first
+    separating: Separating | None = None
+    ranked: tuple[Explanation, ...] = ()
 
     @property
     def causes(self) -> tuple[Cause, ...]:

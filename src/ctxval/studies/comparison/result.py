@@ -33,9 +33,9 @@ class CandidateResult(ShortRepr):
     """What is known of one candidate; a value that is not known is None."""
 
     name: str
-    executions: int  #: executions, failed: the number of executions that were made for it, and of those that failed
+    executions: int  #: the number of executions that were made for it
     shared: int  #: the number of executions of other candidates that count for it too, because its controllers agree
-    failed: int
+    failed: int  #: how many of its executions failed
     largest: float | None  #: the largest executed distance, and the parameters of this task
     task: dict[str, Point] | None
     bound: float | None  #: what d* is at most, if a decision needed it

@@ -91,7 +91,7 @@ class Refinement:
     """A sequence of models of one system, each validated by executions under its own controllers."""
 
     rounds: tuple[Round, ...]  #: the first model and the refined ones
-    threshold: float  #: threshold, units: tau, and the units of the distance
+    threshold: float  #: tau
     confidence: float  #: the confidence of the whole sequence
     budget: int  #: the largest total number of executions
     ended: str  #: why the sequence ended, in one sentence

@@ -26,14 +26,14 @@ class ResidualShare(ShortRepr):
 
     state: str
     unit: str
-    rms: float  #: rms, rest: root mean square of the residual, and of what state and input do not explain
+    rms: float  #: root mean square of the residual
     linear: float  #: share of its mean square that an affine function of state and input explains; at least 0
     #: share that a Gaussian process of state and input explains, or the affine function if that is more; at least 0
     explained: float
     #: share of the rest that the previous state, input and residual explain; at least 0. If it is large, the system has
     #: a state that is not recorded, or a delay.
     history: float
-    rest: float
+    rest: float  #: root mean square of what state and input do not explain
 
 
 def residual_shares(model: Model, recorded: RecordedSteps, seed: int) -> tuple[ResidualShare, ...]:
