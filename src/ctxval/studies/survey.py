@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -210,12 +211,10 @@ def _is(path: str, words: str) -> bool:
 
 def _guessed(log: Log, fields: Sequence[FieldSummary], clock: Clock, guesses: list[str]) -> LogMapping:
     """Return the mapping by usual names, or by words in the names of fields; say how it was found."""
-    try:
+    with suppress(InputError):
         usual = LogMapping.usual(log)
         guesses.append(f"states and inputs have their usual names: {enumerated(usual.fields, 12)}")
         return usual
-    except InputError:
-        pass
     moving = [each for each in fields if each.records and not each.remark.startswith((_NEVER, _HARDLY))]
     still = [each.path for each in fields if each not in moving]
     inputs = [each.path for each in moving if _is(each.path, _INPUTS)]

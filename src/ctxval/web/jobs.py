@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import tempfile
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -81,11 +82,10 @@ class ServedCampaign:
     @property
     def decides(self) -> bool:
         """Whether executions can be chosen that decide the verdict."""
-        try:
+        with suppress(InputError):
             require_decisive(self.certificate)
-        except InputError:
-            return False
-        return self.threshold is not None
+            return self.threshold is not None
+        return False
 
     def read(self) -> Snapshot:
         """Read the trials in the store, with what people must know of the open tasks before they execute them."""
