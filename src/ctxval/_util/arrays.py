@@ -17,8 +17,7 @@ from threadpoolctl import ThreadpoolController
 
 from ctxval.errors import InputError, ShapeError
 
-Array = npt.NDArray[np.float64]
-"""An array of numbers in double precision."""
+Array = npt.NDArray[np.float64]  #: an array of numbers in double precision
 Mask = npt.NDArray[np.bool_]
 Rows = npt.NDArray[np.intp]
 ArrayLike = npt.ArrayLike

@@ -9,10 +9,8 @@ import scipy
 
 from ctxval._util.arrays import Array
 
-Box = tuple[Array, Array]
-"""The lower and upper bounds ``(d,)`` of a box."""
-Sloped = Callable[[Array], tuple[Array, Array]]
-"""Points ``(..., d)`` -> values ``(...)`` and gradients ``(..., d)``."""
+Box = tuple[Array, Array]  #: the lower and upper bounds ``(d,)`` of a box
+Sloped = Callable[[Array], tuple[Array, Array]]  #: points ``(..., d)`` -> values ``(...)`` and gradients ``(..., d)``
 
 
 def latin_hypercube(count: int, dimension: int, rng: np.random.Generator) -> Array:

@@ -87,42 +87,43 @@ def enclosed(function: types.FunctionType) -> list[Any]:
 
 def _source_and_uses(item: Any) -> tuple[list[str], list[Any]]:
     """Return the digests of what an object is made of, if that is source of users, and the objects that it uses."""
-    if isinstance(item, _Global):
-        known = _read(None if is_library(item.module) else getattr(item.module, "__file__", None))
-        body = known.assigned.get(item.name, [])
-        used = [vars(item.module)[item.name], *known.imported(item), *_globals(item.module, _loaded(body))]
-        return [_hashed(_plain(node)) for node in body], used
-    if type(item) in (list, tuple, dict):
-        items = list(item.values() if isinstance(item, dict) else item)
-        return [], items if len(items) <= 100 else []  # a longer one holds data
-    if isinstance(item, functools.partial):
-        return [], [item.func, *item.args, *item.keywords.values()]
-    if isinstance(item, types.MethodType):
-        return [], [item.__func__, item.__self__]
-    if isinstance(item, types.FunctionType):
-        used = [*enclosed(item), *(item.__defaults__ or ()), *(item.__kwdefaults__ or {}).values()]
-        if is_library(item):
-            return [], used
-        node = _function_node(item.__code__)
-        # Without source, its constants are its identity, because instructions differ between versions of Python.
-        digest = _constants(item.__code__) if node is None else _hashed(_plain(node, top=True))
-        return [digest], used + _globals(sys.modules.get(item.__module__), _names(item.__code__))
-    if isinstance(item, type):
-        if is_library(item):
+    match item:
+        case _Global(module, name):
+            known = _read(None if is_library(module) else getattr(module, "__file__", None))
+            body = known.assigned.get(name, [])
+            used = [vars(module)[name], *known.imported(item), *_globals(module, _loaded(body))]
+            return [_hashed(_plain(node)) for node in body], used
+        case functools.partial():
+            return [], [item.func, *item.args, *item.keywords.values()]
+        case types.MethodType():
+            return [], [item.__func__, item.__self__]
+        case types.FunctionType():
+            used = [*enclosed(item), *(item.__defaults__ or ()), *(item.__kwdefaults__ or {}).values()]
+            if is_library(item):
+                return [], used
+            node = _function_node(item.__code__)
+            # Without source, its constants are its identity, because instructions differ between versions of Python.
+            digest = _constants(item.__code__) if node is None else _hashed(_plain(node, top=True))
+            return [digest], used + _globals(sys.modules.get(item.__module__), _names(item.__code__))
+        case type():
+            if is_library(item):
+                return [], []
+            functions = [function for member in vars(item).values() for function in _functions_in(member)]
+            home = sys.modules.get(item.__module__)
+            tree = _read(getattr(home, "__file__", None)).classes.get(item.__qualname__)
+            if tree is None:
+                return [""], [*item.__bases__, *functions]
+            # The functions of the class without generated ones, and the definitions that its body uses.
+            written = [function for function in functions if not function.__code__.co_filename.startswith("<")]
+            return [_hashed(_plain(tree, top=True))], [*item.__bases__, *written, *_globals(home, _loaded([tree]))]
+        case types.ModuleType():
             return [], []
-        functions = [function for member in vars(item).values() for function in _functions_in(member)]
-        module = sys.modules.get(item.__module__)
-        tree = _read(getattr(module, "__file__", None)).classes.get(item.__qualname__)
-        if tree is None:
-            return [""], [*item.__bases__, *functions]
-        # The functions of the class without generated ones, and the definitions that its body uses.
-        written = [function for function in functions if not function.__code__.co_filename.startswith("<")]
-        return [_hashed(_plain(tree, top=True))], [*item.__bases__, *written, *_globals(module, _loaded([tree]))]
+    if type(item) in (list, tuple, dict):
+        items = list(item.values() if type(item) is dict else item)
+        return [], items if len(items) <= 100 else []  # a longer one holds data
     attributes = getattr(item, "__dict__", None)
     if attributes is None:
         return [], [type(item)]
-    if inspect.ismodule(item):
-        return [], []
     if is_library(type(item)) and not is_own(type(item)):
         return [], [attributes["__wrapped__"]] if "__wrapped__" in attributes else []  # e.g. functools.cache
     return [], [type(item), *attributes.values()]
@@ -153,7 +154,9 @@ def _names(code: types.CodeType) -> set[str]:
 def _loaded(nodes: Iterable[ast.AST]) -> set[str]:
     names: set[str] = set()
     for node in nodes:
-        names |= {node.id} if isinstance(node, ast.Name) else {node.attr} if isinstance(node, ast.Attribute) else set()
+        match node:
+            case ast.Name(id=name) | ast.Attribute(attr=name):
+                names.add(name)
         names |= _loaded(child for child in ast.iter_child_nodes(node) if not isinstance(child, _Function))
     return names
 
@@ -203,23 +206,26 @@ def _parsed(source: str) -> _Source:
     def visit(parent: ast.AST, path: str) -> None:
         for node in ast.iter_child_nodes(parent):
             inside = path
-            if isinstance(node, ast.ClassDef):
-                definitions.classes[f"{path}{node.name}"] = node
-                inside = f"{path}{node.name}."
-            elif isinstance(node, _Function):
-                definitions.functions.setdefault(getattr(node, "name", "<lambda>"), []).append(node)
-                inside = path if isinstance(node, ast.Lambda) else f"{path}{node.name}.<locals>."
-            elif isinstance(node, ast.ImportFrom):
-                place = "." * node.level + (node.module or "")
-                definitions.imports.update((alias.asname or alias.name, (place, alias.name)) for alias in node.names)
+            match node:
+                case ast.ClassDef(name=name):
+                    definitions.classes[f"{path}{name}"] = node
+                    inside = f"{path}{name}."
+                case ast.Lambda():
+                    definitions.functions.setdefault("<lambda>", []).append(node)
+                case ast.FunctionDef(name=name) | ast.AsyncFunctionDef(name=name):
+                    definitions.functions.setdefault(name, []).append(node)
+                    inside = f"{path}{name}.<locals>."
+                case ast.ImportFrom(names=names):
+                    place = "." * node.level + (node.module or "")
+                    definitions.imports.update((alias.asname or alias.name, (place, alias.name)) for alias in names)
             visit(node, inside)
 
     visit(tree, "")
-    for node in tree.body:
-        if isinstance(node, ast.Assign | ast.AnnAssign | ast.AugAssign):
-            for name in ast.walk(node):
-                if isinstance(name, ast.Name) and isinstance(name.ctx, ast.Store):
-                    definitions.assigned.setdefault(name.id, []).append(node)
+    for statement in tree.body:
+        for part in ast.walk(statement):
+            match statement, part:
+                case ast.Assign() | ast.AnnAssign() | ast.AugAssign(), ast.Name(id=name, ctx=ast.Store()):
+                    definitions.assigned.setdefault(name, []).append(statement)
     return definitions
 
 
@@ -236,13 +242,12 @@ def _function_node(code: types.CodeType) -> ast.AST | None:
 
 
 def _covers(node: ast.expr, place: tuple[int | None, int | None, int | None, int | None]) -> bool:
-    line, last_line, column, last_column = place
-    if line is None or last_line is None or column is None or last_column is None:
-        return True
-    if (line, column) == (last_line, last_column):
-        return True  # an instruction that the compiler added, such as the one at the start of a function
-    end = (node.end_lineno or 0, node.end_col_offset or 0)
-    return (node.lineno, node.col_offset) <= (line, column) and (last_line, last_column) <= end
+    match place:
+        # An instruction at one place was added by the compiler, such as the one at the start of a function.
+        case (int(line), int(last_line), int(column), int(last)) if (line, column) != (last_line, last):
+            end = (node.end_lineno or 0, node.end_col_offset or 0)
+            return (node.lineno, node.col_offset) <= (line, column) and (last_line, last) <= end
+    return True
 
 
 def _is_text(node: ast.AST) -> bool:

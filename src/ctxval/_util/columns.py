@@ -16,13 +16,13 @@ import numpy as np
 
 from ctxval._util.arrays import Array
 from ctxval._util.files import MOST_BYTES, open_regular
+from ctxval._util.refusals import reworded
 from ctxval._util.texts import enumerated, unguarded
 from ctxval.errors import InputError
 
 # Units. Angles have a dimension of their own here: ``pint`` converts 1 Hz to 1 rad/s, and degrees to numbers.
 
-Powers = tuple[int, int, int, int, int]
-"""Powers of m, kg, s, A and rad."""
+Powers = tuple[int, int, int, int, int]  #: powers of m, kg, s, A and rad
 
 _UNITS: dict[str, tuple[float, Powers]] = {
     **{"1": (1.0, (0, 0, 0, 0, 0)), "m": (1.0, (1, 0, 0, 0, 0)), "kg": (1.0, (0, 1, 0, 0, 0))},
@@ -300,19 +300,17 @@ class CsvTable:
                     raise InputError("it is not text in UTF-8: it has NUL bytes")
                 yield last
 
-        try:
-            with (
-                open_regular(self.path, self._most) as file,
-                io.TextIOWrapper(file, encoding="utf-8-sig", newline="") as text,
-            ):
-                rest = lines(text)
-                head = [*itertools.takewhile(lambda line: not line.strip(), rest), last]
-                unquoted = re.sub('"[^"]*"', "", last)
-                self._separator = next((mark for mark in ("\t", ";") if mark in unquoted), ",")
-                reader = csv.reader(itertools.chain(head, rest), delimiter=self._separator)
-                for row in reader:
-                    in_row = 0
-                    if len(row) > 1 or (row and row[0].strip()):
-                        yield reader.line_num, row
-        except (InputError, OSError, UnicodeDecodeError, csv.Error) as error:
-            raise InputError(f"{self.path} cannot be read as CSV: {str(error).removesuffix('.')}.") from error
+        with (
+            reworded(f"{self.path} cannot be read as CSV", InputError, OSError, UnicodeDecodeError, csv.Error),
+            open_regular(self.path, self._most) as file,
+            io.TextIOWrapper(file, encoding="utf-8-sig", newline="") as text,
+        ):
+            rest = lines(text)
+            head = [*itertools.takewhile(lambda line: not line.strip(), rest), last]
+            unquoted = re.sub('"[^"]*"', "", last)
+            self._separator = next((mark for mark in ("\t", ";") if mark in unquoted), ",")
+            reader = csv.reader(itertools.chain(head, rest), delimiter=self._separator)
+            for row in reader:
+                in_row = 0
+                if len(row) > 1 or (row and row[0].strip()):
+                    yield reader.line_num, row

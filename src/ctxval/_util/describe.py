@@ -10,7 +10,7 @@ import functools
 import inspect
 import math
 import numbers
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -25,14 +25,15 @@ def describe(value: Any, depth: int = 6) -> Any:
     An object of this package has its type and its public values, or the result of its ``describe()``; any other object
     has its type and the digest of its source.
     """
-    if isinstance(value, str | int | bool | type(None)):
-        return value
-    if isinstance(value, np.bool_):
-        return bool(value)
-    if isinstance(value, float | np.number):
-        return float(value) if math.isfinite(value) else str(value)
-    if isinstance(value, numbers.Number | range):
-        return repr(value)
+    match value:
+        case str() | int() | None:
+            return value
+        case np.bool_():
+            return bool(value)
+        case float() | np.number():
+            return float(value) if math.isfinite(value) else str(value)
+        case numbers.Number() | range():
+            return repr(value)
     if depth == 0:
         return type(value).__qualname__
     if isinstance(value, np.ndarray):
@@ -52,13 +53,14 @@ def describe(value: Any, depth: int = 6) -> Any:
         return {"function": name, **described, **_source(value)}
     if not is_library(type(value)):
         return {"type": type(value).__qualname__, **_source(value)}
-    if isinstance(value, Mapping):
-        return {str(key): describe(item, depth - 1) for key, item in value.items()}
-    if isinstance(value, set | frozenset):
-        # Sorted, because the order of a set of strings changes from process to process.
-        return sorted((describe(item, depth - 1) for item in value), key=repr)
-    if isinstance(value, Sequence) and not isinstance(value, bytes | bytearray | memoryview):
-        return [describe(item, depth - 1) for item in value]
+    match value:
+        case Mapping():
+            return {str(key): describe(item, depth - 1) for key, item in value.items()}
+        case set() | frozenset():
+            # Sorted, because the order of a set of strings changes from process to process.
+            return sorted((describe(item, depth - 1) for item in value), key=repr)
+        case [*items]:  # bytes are no sequence here
+            return [describe(item, depth - 1) for item in items]
     settings: Mapping[str, Any] = {}
     if is_own(type(value)) and hasattr(type(value), "describe"):
         settings = value.describe()

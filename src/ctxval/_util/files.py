@@ -18,6 +18,7 @@ import sqlite3
 import stat
 import sys
 import tempfile
+import tomllib
 import warnings
 import weakref
 import zipfile
@@ -29,6 +30,7 @@ from typing import IO, Any, BinaryIO
 import numpy as np
 import numpy.typing as npt
 
+from ctxval._util.refusals import reworded
 from ctxval.errors import InputError
 
 MOST_BYTES = 256 * 2**20  # largest size of a file in bytes, enough for 33 million numbers of a trajectory
@@ -90,22 +92,25 @@ def read_json(path: str | Path) -> Any:
         raise InputError(f"it is not JSON: {error}") from error
 
 
+def read_toml(path: str | Path) -> dict[str, Any]:
+    with reworded(f"{path} cannot be read", InputError):
+        content = read_bytes(path)
+    with reworded(f"{path} is not valid TOML", ValueError, RecursionError):
+        return tomllib.loads(content.decode("utf-8"))
+
+
 def require_made_by_us(path: Path, mark: bytes = MADE_BY.encode()) -> None:
     """Check that ctxval wrote a file, if there is one, so that it may be replaced."""
-    try:
+    with reworded(f"{path} cannot be written", InputError):
         known = not path.exists() or mark in read_bytes(path, 2**32)
-    except InputError as error:
-        raise InputError(f"{path} cannot be written: {error}.") from error
     if not known:
         advice = "give another name, or --force to replace it"
         raise InputError(f"{path} is there already, and ctxval did not write it: {advice}.")
 
 
 def make_folder_of(path: str | Path) -> None:
-    try:
+    with reworded(f"{path} cannot be written", OSError):
         Path(path).parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{path} cannot be written: {error.strerror or error}.") from error
 
 
 @contextmanager
@@ -121,11 +126,10 @@ def written_whole(path: str | Path, *, text: bool = False) -> Iterator[IO[Any]]:
         raise InputError(f"{path} is a store or another database, which is never replaced.")
     beside = target.with_name(f"{target.name}.{secrets.token_hex(4)}.part")
     try:
-        with beside.open("x", encoding="utf-8", newline="") if text else beside.open("x+b") as file:
-            yield file
-        beside.replace(target)
-    except OSError as error:
-        raise InputError(f"{path} cannot be written: {error.strerror or error}.") from error
+        with reworded(f"{path} cannot be written", OSError):
+            with beside.open("x", encoding="utf-8", newline="") if text else beside.open("x+b") as file:
+                yield file
+            beside.replace(target)
     finally:
         with suppress(OSError):
             beside.unlink(missing_ok=True)

@@ -6,6 +6,7 @@ import functools
 import json
 import os
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -79,8 +80,8 @@ class JsonLines(Mapping[Key, Record]):
 
 
 def _parsed(line: bytes) -> Record | None:
-    try:
-        record = json.loads(line)
-    except ValueError:
-        return None
-    return record if isinstance(record, dict) else None
+    with suppress(ValueError):
+        match json.loads(line):
+            case dict() as record:
+                return record
+    return None

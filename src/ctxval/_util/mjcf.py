@@ -10,9 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from ctxval._util.extras import require_extra
 from ctxval._util.files import read_bytes
-from ctxval._util.texts import shortened
+from ctxval._util.refusals import require_extra, reworded
 from ctxval.errors import InputError
 
 
@@ -22,16 +21,12 @@ def is_mjcf_text(mjcf: str | Path) -> bool:
 
 def compile_mjcf(mjcf: str | Path) -> tuple[str, Any]:
     """Return the digest of a model's files, and the compiled ``mujoco.MjModel``."""
-    loader = require_extra("mujoco", "mujoco", "models of MuJoCo").MjModel
-    try:
-        if is_mjcf_text(mjcf):
-            return _digest(str(mjcf).encode(), Path()), loader.from_xml_string(str(mjcf))
-        return _digest(read_bytes(mjcf), Path(mjcf).parent), loader.from_xml_path(str(mjcf))
-    except InputError as error:
-        raise InputError(f"the MuJoCo model {str(mjcf)!r} cannot be read: {error}.") from error
-    except ValueError as error:
-        reason = shortened(" ".join(str(error).split())).rstrip(".")  # MuJoCo writes several lines
-        raise InputError(f"MuJoCo cannot compile the model: {reason}.") from error
+    loader = require_extra("mujoco", "mujoco", "models of MuJoCo need").MjModel
+    with reworded(f"the MuJoCo model {str(mjcf)!r} cannot be read", InputError):
+        is_text = is_mjcf_text(mjcf)
+        digest = _digest(str(mjcf).encode(), Path()) if is_text else _digest(read_bytes(mjcf), Path(mjcf).parent)
+    with reworded("MuJoCo cannot compile the model", ValueError):
+        return digest, loader.from_xml_string(str(mjcf)) if is_text else loader.from_xml_path(str(mjcf))
 
 
 def warning_of(counts: Any) -> str:

@@ -10,8 +10,8 @@ from typing import Any, Self
 import numpy as np
 
 from ctxval._util.arrays import Array, rows_of
-from ctxval._util.extras import require_extra
 from ctxval._util.files import MADE_BY, make_folder_of, read_bytes, written_whole
+from ctxval._util.refusals import require_extra, reworded
 from ctxval._util.representation import ShortRepr
 from ctxval.errors import InputError, ModelError, ShapeError
 
@@ -35,23 +35,19 @@ class OnnxNetwork(ShortRepr):
         contents = [source] if isinstance(source, bytes) else []
         if not isinstance(source, bytes):
             path, weights = Path(source), Path(f"{source}.data")  # PyTorch may write weights into a second file
-            try:
+            with reworded(f"the ONNX file {path} cannot be read", InputError):
                 # The largest size refuses endless files, not large networks.
                 contents = [read_bytes(file, most=2**34) for file in (path, weights) if file == path or file.exists()]
-            except InputError as error:
-                raise InputError(f"the ONNX file {path} cannot be read: {error}.") from error
         # A single file goes to other processes as its bytes. Weights in a second file are found only by the path.
         self._source: bytes | str = contents[0] if len(contents) == 1 else str(Path(str(source)).absolute())
         self._digest = hashlib.sha256(b"".join(contents)).hexdigest()[:16]
-        onnxruntime = require_extra("onnxruntime", "onnx", "ONNX networks")
+        onnxruntime = require_extra("onnxruntime", "onnx", "ONNX networks need")
         options = onnxruntime.SessionOptions()
         # Small networks are slower on many threads, and their last bits depend on the number of threads.
         options.intra_op_num_threads = options.inter_op_num_threads = 1
         options.log_severity_level = 4
-        try:
+        with reworded("the file cannot be read as an ONNX network", Exception):
             self._session = onnxruntime.InferenceSession(self._source, options, providers=["CPUExecutionProvider"])
-        except Exception as error:
-            raise InputError(f"the file cannot be read as an ONNX network: {error}") from error
         self._recurrent = recurrent
         given, returned = self._session.get_inputs(), self._session.get_outputs()
         self.names = tuple(node.name for node in given)
@@ -104,10 +100,10 @@ class OnnxNetwork(ShortRepr):
 
     def _run(self, rows: list[Array]) -> list[Array]:
         feeds = {port.name: port.fed(row) for port, row in zip(self._inputs, rows, strict=True)}
-        try:
+        with reworded(
+            "the network cannot be evaluated", Exception, to=ModelError
+        ):  # onnxruntime's exceptions have no base class of their own
             outputs = self._session.run([port.name for port in self._outputs], feeds)
-        except Exception as error:  # onnxruntime's exceptions have no base class of their own
-            raise ModelError(f"the network cannot be evaluated: {error}") from error
         return [port.read(output) for port, output in zip(self._outputs, outputs, strict=True)]
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -158,7 +154,7 @@ def _port(node: Any, layered: bool = False) -> _Port:
 
 def require_onnx() -> Any:
     """Return the module onnx, if it is installed."""
-    return require_extra("onnx", "fit", "ONNX files")
+    return require_extra("onnx", "fit", "ONNX files need")
 
 
 @dataclass(frozen=True, eq=False)

@@ -37,8 +37,7 @@ class Progress:
     ended: bool = False
 
 
-Listener = Callable[[Progress], None]
-"""Called with each report; it should return soon."""
+Listener = Callable[[Progress], None]  #: called with each report; it should return soon
 
 
 @dataclass

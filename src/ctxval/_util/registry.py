@@ -7,12 +7,13 @@ import importlib
 import inspect
 import sys
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import KW_ONLY, dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from ctxval._util.checked import checked
-from ctxval._util.texts import reason_of
-from ctxval.errors import CtxvalError, InputError, UnknownNameError
+from ctxval._util.refusals import reworded
+from ctxval.errors import InputError, UnknownNameError
 
 if TYPE_CHECKING:  # importlib.metadata is slow to import, and is needed only for names that are not built in
     from importlib.metadata import EntryPoint
@@ -48,10 +49,9 @@ _declarations: dict[Any, Declaration] = {}
 
 def declaration_of(made: Any) -> Declaration | None:
     """Return how a class or a function was declared; None if it was not. A subclass does not inherit it."""
-    try:
+    with suppress(TypeError):  # it cannot be hashed
         return _declarations.get(made)
-    except TypeError:  # it cannot be hashed
-        return None
+    return None
 
 
 class Registry(Mapping[str, Any], Generic[Made]):
@@ -85,10 +85,9 @@ class Registry(Mapping[str, Any], Generic[Made]):
     @property
     def installed(self) -> tuple[str, ...]:
         """The names of the parts that other installed packages add, sorted; none if their metadata is damaged."""
-        try:
+        with suppress(InputError):
             return tuple(sorted({point.name for point in self._entry_points()} - {*self.built_in}))
-        except InputError:
-            return ()
+        return ()
 
     def is_data(self, name: Any) -> bool:
         """Return whether a part with plain arguments runs no code; what is not built in always counts as code.
@@ -114,10 +113,8 @@ class Registry(Mapping[str, Any], Generic[Made]):
             both = " and ".join(packages)
             raise InputError(f"two installed packages have a {self.kind} {name!r}: {both}; uninstall one of them.")
         what, value = f"the {self.kind} {name!r} of the installed package {packages[0]}", points[0].value
-        try:
+        with reworded(f"{what} cannot be loaded from {value!r}"):
             made = points[0].load()
-        except (Exception, SystemExit) as error:
-            raise InputError(f"{what} cannot be loaded from {value!r}: {reason_of(error)}.") from error
         if not callable(made) or (isinstance(made, type) and not has_method(made, self.method)):
             wanted = "a function" if self.method is None else f"a class with the method {self.method}"
             raise InputError(f"{what} must be {wanted}, which {value!r} is not.")
@@ -156,11 +153,9 @@ class Registry(Mapping[str, Any], Generic[Made]):
     def _entry_points(self) -> list[EntryPoint]:
         from importlib.metadata import entry_points
 
-        try:
+        # Metadata is files of others, in which anything may stand.
+        with reworded(f"the entry points of installed packages cannot be read, in which a {self.kind} is sought"):
             return list(entry_points(group=self.group))
-        except Exception as error:  # metadata is files of others, in which anything may stand
-            what = f"the entry points of installed packages cannot be read, in which a {self.kind} is sought"
-            raise InputError(f"{what}: {reason_of(error)}.") from error
 
 
 def has_method(cls: type, method: str | None) -> bool:
@@ -169,13 +164,9 @@ def has_method(cls: type, method: str | None) -> bool:
 
 
 def construct(what: str, build: Any, arguments: Mapping[str, Any], *first: Any) -> Any:
-    try:
+    with reworded(f"{what} cannot be made"):
         taken = inspect.signature(build).parameters
         open_ended = any(parameter.kind is parameter.VAR_KEYWORD for parameter in taken.values())
         for key in () if open_ended else [key for key in arguments if key not in taken]:
             raise UnknownNameError.among(f"argument of {what}", key, taken)
         return build(*first, **arguments)
-    except CtxvalError:
-        raise
-    except Exception as error:
-        raise InputError(f"{what} cannot be made: {reason_of(error)}.") from error

@@ -100,28 +100,31 @@ def options(owner: object) -> dict[str, Any]:
 
 def shown(value: Any, depth: int = 3) -> str:
     """Return any value as a short text: numbers to four digits, of arrays and collections the size."""
-    if isinstance(value, Shown) or value is None or isinstance(value, bool | np.bool_):
-        return str(value)
-    if isinstance(value, str | PurePath):
-        return cut(visible(repr(shortened(plain(value), _VALUE))), 2 * _VALUE)
-    if isinstance(value, bytes | bytearray | memoryview):
-        return f"{len(value)} bytes"
-    if isinstance(value, np.ndarray):
-        return array(value)
-    if isinstance(value, numbers.Number):
-        return number(value)
-    if isinstance(value, type | partial) or inspect.isroutine(value):
+    match value:
+        case Shown() | None | bool() | np.bool_():
+            return str(value)
+        case str() | PurePath():
+            return cut(visible(repr(shortened(plain(value), _VALUE))), 2 * _VALUE)
+        case bytes() | bytearray() | memoryview():
+            return f"{len(value)} bytes"
+        case np.ndarray():
+            return array(value)
+        case numbers.Number():
+            return number(value)
+        case type() | partial():
+            return name_of(value)
+        case Mapping() | Sequence() | AbstractSet():
+            if depth == 0:
+                return f"{type(value).__name__} of {len(value)}"
+            first = list(islice(value, _ITEMS))
+            texts, ends = [shown(item, depth - 1) for item in first], "[]" if isinstance(value, list) else "()"
+            if isinstance(value, Mapping):
+                texts = [f"{key}: {shown(value[name], depth - 1)}" for key, name in zip(texts, first, strict=True)]
+                ends = "{}"
+            single = "," if ends == "()" and len(value) == 1 else ""
+            return cut(f"{ends[0]}{', '.join([*texts, *_rest(len(value))])}{single}{ends[1]}", 2 * _VALUE)
+    if inspect.isroutine(value):
         return name_of(value)
-    if isinstance(value, Mapping | Sequence | AbstractSet):
-        if depth == 0:
-            return f"{type(value).__name__} of {len(value)}"
-        first = list(islice(value, _ITEMS))
-        texts = [shown(item, depth - 1) for item in first]
-        if isinstance(value, Mapping):
-            texts = [f"{key}: {shown(value[name], depth - 1)}" for key, name in zip(texts, first, strict=True)]
-        opening, closing = "{}" if isinstance(value, Mapping) else "[]" if isinstance(value, list) else "()"
-        single = "," if opening == "(" and len(value) == 1 else ""
-        return cut(f"{opening}{', '.join([*texts, *_rest(len(value))])}{single}{closing}", 2 * _VALUE)
     # What an object says of itself in one line, of ours the first; its class if that is nothing readable.
     kind: Any = type(value)
     if kind.__repr__ is object.__repr__:

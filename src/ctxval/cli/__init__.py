@@ -7,6 +7,5 @@ __all__ = ["app", "main"]
 
 
 def main() -> None:
-    """Run the command line."""
     print_anything()
     app(prog_name="ctxval")

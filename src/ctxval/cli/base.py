@@ -35,8 +35,7 @@ from ctxval.searches import REGISTRY as SEARCHES
 
 FALSIFIED, BAD_INPUT, CANNOT_GO_ON, INTERRUPTED, CUT_OFF = 1, 2, 3, 130, 141
 
-RUN = "run"
-"""Key under which a store keeps the verdict of its last run and the report that was written."""
+RUN = "run"  #: key under which a store keeps the verdict of its last run and the report that was written
 
 ERROR = ("error: ", "bold red")
 
@@ -187,12 +186,10 @@ def _show_warning(message: Warning | str, category: type[Warning], *place: Any, 
 
 
 def status_of(verdict: Verdict | None) -> int:
-    """Return the exit status of a verdict."""
     return FALSIFIED if verdict is not None and verdict.answer == "falsified" else 0
 
 
 def worst_of(trial: Trial | None) -> dict[str, Any] | None:
-    """Return the task and the distance of a trial."""
     return None if trial is None else {"task": trial.parameters, "distance": trial.distance}
 
 
@@ -207,7 +204,6 @@ def failures_of(trials: Iterable[Trial]) -> list[dict[str, Any]]:
 
 
 def print_failures(failures: list[dict[str, Any]]) -> None:
-    """Print the most frequent reasons of failures."""
     for failure in failures[:3]:
         count = len(failure["trials"])
         which = f"trial {failure['trials'][0]}" if count == 1 else f"{count} trials"
@@ -254,7 +250,6 @@ def print_other_stores(others: list[str]) -> None:
 
 
 def print_verdict(verdict: Verdict, units: str = "") -> None:
-    """Print the verdict, its reason and its assumptions."""
     colour = {"validated": "green", "falsified": "red", "undecided": "yellow"}[verdict.answer]
     threshold = f"{verdict.threshold:g} {units}".rstrip()
     out.say((verdict.answer.upper(), f"bold {colour}"), f" against {threshold}: {verdict.reason}", wrap=True)

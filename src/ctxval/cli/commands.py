@@ -49,12 +49,10 @@ class Commands(TyperGroup):
         return super().resolve_command(ctx, args)
 
     def make_context(self, *args: Any, **extra: Any) -> Any:
-        """Read the arguments."""
         with _harmless_errors():
             return super().make_context(*args, **extra)
 
     def invoke(self, ctx: Any) -> Any:
-        """Read the arguments of a command, and run it."""
         with _harmless_errors():
             return super().invoke(ctx)
 

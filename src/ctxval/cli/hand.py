@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import functools
-import importlib
 import shlex
 from pathlib import Path
 from typing import Any
 
 from ctxval._util.checked import NonNegativeFloat, require
 from ctxval._util.progress import advance, stage
+from ctxval._util.refusals import require_extra
 from ctxval._util.texts import enumerated
 from ctxval.campaign.by_hand import (
     TRIAL_FILES,
@@ -34,8 +34,7 @@ from ctxval.core.trial import CONVERGED, Trial
 from ctxval.errors import InputError
 from ctxval.web.jobs import ServedCampaign
 
-_WAIT = 60.0
-"""Seconds to wait for other terminals: each of them locks the store while it chooses a task."""
+_WAIT = 60.0  #: seconds to wait for other terminals: each of them locks the store while it chooses a task
 
 
 @command()
@@ -246,7 +245,4 @@ def _served(opened: Opened, threshold: float | None, budget: int | None) -> Serv
 
 def web_server() -> Any:
     """Return the module of the server, which needs the extra ``web``."""
-    try:
-        return importlib.import_module("ctxval.web.server")
-    except ImportError as error:
-        raise InputError(f"the page needs {error.name}: pip install 'ctxval[web]'.") from error
+    return require_extra("ctxval.web.server", "web", "the page needs")

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from ctxval._util.files import make_folder_of, require_made_by_us
+from ctxval._util.refusals import reworded
 from ctxval.errors import InputError
 
 
@@ -22,7 +24,6 @@ class Allowed:
 
 
 def named_values(given: Sequence[str] | None, flag: str = "--option", /, **named: Any) -> dict[str, Any]:
-    """Return the options that a command line states, by name."""
     values = {name: value for name, value in named.items() if value is not None}
     for text in given or ():
         name, equals, value = text.partition("=")
@@ -37,12 +38,11 @@ def named_values(given: Sequence[str] | None, flag: str = "--option", /, **named
 
 def parsed(text: str) -> Any:
     """Return the number, Boolean, list or quoted text that a TOML file would contain, or else the text itself."""
-    try:
-        content = tomllib.loads(f"value = {text}")
-    except (tomllib.TOMLDecodeError, RecursionError):
-        return text
-    value = content.get("value")
-    return value if len(content) == 1 and isinstance(value, str | int | float | bool | list) else text
+    with suppress(tomllib.TOMLDecodeError, RecursionError):
+        match tomllib.loads(f"value = {text}"):
+            case {"value": str() | int() | float() | list() as value, **others} if not others:
+                return value
+    return text
 
 
 # Files that options name: never onto an input, and never onto the work of others
@@ -60,11 +60,9 @@ def require_outputs(outputs: Mapping[str, Path | None], inputs: Iterable[object]
         if suffix and path.suffix.lower() != suffix:
             raise InputError(f"{name} must be a file that ends in {suffix}, got {str(path)!r}.")
         make_folder_of(path)
-        try:
+        with reworded(f"{path} cannot be written", OSError, RuntimeError, ValueError):
             place, there = path.resolve(), path.exists()
             is_input = there and any(each.exists() and each.samefile(path) for each in read)
-        except (OSError, RuntimeError, ValueError) as error:
-            raise InputError(f"{path} cannot be written: {error}.") from error
         if place in named:
             raise InputError(f"{named[place]} and {name} must be different files, and both are {path}.")
         named[place] = name

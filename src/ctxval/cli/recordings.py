@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, get_args
 
+from ctxval._util.refusals import reworded
 from ctxval._util.representation import task_text
 from ctxval._util.texts import shortened
 from ctxval.cli.base import CANNOT_GO_ON, FALSIFIED, command, err, notes, out, print_columns
@@ -116,11 +117,9 @@ class StepFunction:
 
     @property
     def bounds(self) -> dict[str, Any]:
-        """The bounds of the parameters by name."""
         return named_values(self.parameter, "--parameter")
 
     def load(self) -> Any:
-        """Return the function; None if none is named."""
         if self.step is None:
             return None
         return require_function(f"--step {self.step}", reference(self.step), "(x, u, theta) -> x_next")
@@ -280,7 +279,6 @@ def require_model_file(path: Path | None, inputs: Iterable[object], *, force: bo
 
 
 def print_parameters(parameters: Sequence[FittedParameter]) -> None:
-    """Print parameters with their intervals."""
     for each in parameters:
         note = f"; {each.note}" if each.note else ""
         between = f"between {each.low:.6g} and {each.high:.6g} with confidence 0.95{note}"
@@ -327,10 +325,8 @@ def collect(
         raise InputError(f"--amplitude must be a number or a list such as [1.0, 0.5], got {amplitude!r}.")
     allowed = None if limits is None else parsed(limits)
     excitation = Excitation(experiment.validation, kind, size, allowed, seed)  # type: ignore[arg-type]
-    try:
+    with reworded(f"{out_} cannot be made", OSError):
         out_.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{out_} cannot be made: {error.strerror}.") from error
     paths = [out_ / f"run{number:04d}.csv" for number in range(runs)]
     missing = [number for number, path in enumerate(paths) if not path.exists()]
     recorded, failed, known = list[str](), list[dict[str, Any]](), runs - len(missing)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import os
 import sys
 import webbrowser
@@ -13,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ctxval._util.progress import also_listening
+from ctxval._util.refusals import require_extra, reworded
 from ctxval._util.texts import reason_of
 from ctxval.campaign.interval_search import IntervalSearch
 from ctxval.campaign.storage.other_stores import other_stores
@@ -192,14 +192,9 @@ def _workers(workers: int | None, dask: str | None) -> Iterator[dict[str, Any]]:
     if dask is None:
         yield {"workers": workers}
         return
-    try:
-        distributed: Any = importlib.import_module("distributed")
-    except ImportError as error:
-        raise InputError("--dask needs dask.distributed: pip install 'ctxval[dask]'.") from error
-    try:
+    distributed = require_extra("distributed", "dask", "--dask needs")
+    with reworded(f"there is no Dask scheduler at {dask}"):
         client = distributed.Client(dask, timeout=10)
-    except (OSError, ValueError, TypeError) as error:
-        raise InputError(f"there is no Dask scheduler at {dask}: {type(error).__name__}: {error}.") from error
     with client:
         threads = sum(client.nthreads().values())
         if not threads:

@@ -132,7 +132,6 @@ class Asked:
     option: list[str] | None = None
 
     def options(self, settings: Settings, kind: str | None) -> CertificateOptions:
-        """Return the kind, the options and the confidence of the certificate."""
         names = ("discard", "volume", "resolution", "tests", "quantile")
         given = {name: getattr(self, name) for name in names}
         level = settings.confidence if self.confidence is None else self.confidence
@@ -233,7 +232,6 @@ def write_report(
 
 
 def page_path(store: Path) -> Path:
-    """Return the path of the report of a store."""
     return store.with_suffix(".report.html")
 
 

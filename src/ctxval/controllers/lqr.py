@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from ctxval._util.arrays import Array, ArrayLike, as_weight
+from ctxval._util.refusals import reworded
 from ctxval._util.registry import part
 from ctxval._util.representation import ShortRepr
 from ctxval.core.controller import AffineFeedback, Limits, LimitsLike
@@ -189,10 +190,8 @@ def _stationary_gain(cost: QuadraticCost, A: Array, B: Array) -> Array:
     from scipy.linalg import solve_discrete_are
 
     failure = "no stationary feedback stabilises the model at the goal"
-    try:
+    with reworded(f"{failure}", np.linalg.LinAlgError, ValueError, to=DesignError):
         P = solve_discrete_are(A, B, cost.Q, cost.R)
-    except (np.linalg.LinAlgError, ValueError) as error:
-        raise DesignError(f"{failure}: {error}") from error
     K = -np.linalg.solve(cost.R + B.T @ P @ B, B.T @ P @ A)
     radius = float(np.abs(np.linalg.eigvals(A + B @ K)).max())
     if not radius < 1:

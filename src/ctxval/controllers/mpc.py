@@ -9,7 +9,7 @@ import numpy as np
 
 from ctxval._util.arrays import Array, ArrayLike, Mask, as_floats
 from ctxval._util.checked import PositiveFloat, PositiveInt
-from ctxval._util.extras import require_extra
+from ctxval._util.refusals import require_extra
 from ctxval._util.registry import part
 from ctxval._util.representation import ShortRepr
 from ctxval.controllers.lqr import QuadraticCost
@@ -61,7 +61,7 @@ class MPC(ShortRepr):
         self.limits = Limits.of(np.inf if limits is None else limits, m)
         self.state_limits = Limits.of(np.inf if state_limits is None else state_limits, n)
         self.violation_cost = violation_cost
-        require_extra("casadi", "mpc", "MPC controllers")
+        require_extra("casadi", "mpc", "MPC controllers need")
 
     def design(self, task: Task, model: Model) -> RecedingHorizon:
         self.cost.require_task(task)
@@ -194,7 +194,7 @@ def _quadratic_program(
 
     Return z and the largest multiplier of a row; None if there is no solution.
     """
-    casadi = require_extra("casadi", "mpc", "MPC controllers")
+    casadi = require_extra("casadi", "mpc", "MPC controllers need")
     dense = casadi.Sparsity.dense
     sizes = {"h": dense(*hessian.shape), "a": dense(len(rows), len(slope))}
     # DAQP is an active-set method, exact up to rounding, and prints nothing.

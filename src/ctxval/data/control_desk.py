@@ -45,11 +45,9 @@ class ControlDeskLog(Log):
         self._whole = dict(zip(paths, signals, strict=True))
 
     def fields(self) -> tuple[str, ...]:
-        """Return the names of the signals."""
         return tuple(self._known)
 
     def signals(self, fields: Sequence[str], clock: Clock) -> dict[str, Signal]:
-        """Return fields over time; see :meth:`Log.signals`."""
         if clock.field is not None:
             raise InputError(
                 f"{self.source} is a recording of ControlDesk, whose signals have times of their own: the mapping must "

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ctxval._util.arrays import Mask
-from ctxval._util.texts import enumerated, reason_of
+from ctxval._util.refusals import reworded
+from ctxval._util.texts import enumerated
 from ctxval.core.trajectory import Trajectory
 from ctxval.data.mapping import LogMapping, Observer
 from ctxval.data.sampling import Break
@@ -76,10 +77,8 @@ def _with_observer(recordings: Recordings, observer: Observer) -> Recordings:
     breaks, widths = list(recordings.breaks), set[int]()
     for run in recordings.runs:
         old = run.trajectory
-        try:
+        with reworded(f"the observer {name} failed on {run.source}"):  # the user's function
             x = np.asarray(observer.function(old.states.copy(), old.inputs.copy(), recordings.dt), dtype=np.float64)
-        except Exception as error:  # the user's function
-            raise InputError(f"the observer {name} failed on {run.source}: {reason_of(error)}.") from error
         if x.ndim != 2 or len(x) != len(old.states) or not x.shape[1]:
             wanted = f"states of shape ({len(old.states)}, n)"
             raise InputError(f"the observer {name} must return {wanted}, got {x.shape}.")

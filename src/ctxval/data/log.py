@@ -22,8 +22,7 @@ from ctxval._util.representation import ShortRepr
 from ctxval._util.texts import enumerated, quoted, reason_of
 from ctxval.errors import InputError
 
-LISTED = 24
-"""Largest number of fields that a message names."""
+LISTED = 24  #: largest number of fields that a message names
 
 Located = TypeVar("Located")
 
@@ -42,54 +41,35 @@ def reading(source: object, kind: str = "") -> Iterator[None]:
 
 @dataclass(frozen=True, eq=False)
 class Signal(ShortRepr):
-    """One field of a log over time.
+    """One field of a log over time."""
 
-    Attributes:
-        times: seconds, in the order of the log, shape ``(N,)``.
-        values: NaN where the log has none, shape ``(N, k)``; k is 1 unless the field is a vector.
-        first: the number of the first sample in messages: the line of a CSV file, the index of a message.
-        word: what such a number counts: ``line``, ``row`` or ``message``.
-        unit: the unit that the name of the column states; empty if it states none.
-        clock: where the times of messages come from; empty for tables.
-    """
-
-    times: Array
-    values: Array
-    first: int = 0
-    word: str = "row"
-    unit: str = ""
-    clock: str = ""
+    times: Array  #: seconds, in the order of the log, shape ``(N,)``
+    values: Array  #: NaN where the log has none, shape ``(N, k)``; k is 1 unless the field is a vector
+    first: int = 0  #: the number of the first sample in messages: the line of a CSV file, the index of a message
+    word: str = "row"  #: what such a number counts: ``line``, ``row`` or ``message``
+    unit: str = ""  #: the unit that the name of the column states; empty if it states none
+    clock: str = ""  #: where the times of messages come from; empty for tables
 
 
 @dataclass(frozen=True)
 class Clock:
-    """Where the times of a log come from.
+    """Where the times of a log come from."""
 
-    Attributes:
-        field: the column of the times of a table; None to look for ``t``, ``time``, ``times`` or ``timestamp``.
-        unit: the unit of this column: s, ms, us, ns, min or h; empty for that in its name, else seconds.
-        period: seconds between two rows of a table that has no times; None if it has times.
-        stamp: the time of a message: ``log``, when it was recorded; ``publish``, when it was sent; ``header``, the
-            ``header.stamp`` or the ``timestamp`` in it; or ``auto``, ``header`` if all messages have plausible ones,
-            else ``log``.
-    """
-
+    #: the column of the times of a table; None to look for ``t``, ``time``, ``times`` or ``timestamp``
     field: str | None = None
-    unit: str = ""
-    period: float | None = None
+    unit: str = ""  #: the unit of this column: s, ms, us, ns, min or h; empty for that in its name, else seconds
+    period: float | None = None  #: seconds between two rows of a table that has no times; None if it has times
+    #: the time of a message: ``log``, when it was recorded; ``publish``, when it was sent; ``header``, the
+    #: ``header.stamp`` or the ``timestamp`` in it; or ``auto``, ``header`` if all messages have plausible ones, else
+    #: ``log``
     stamp: str = "auto"
 
 
 class Log(ShortRepr, ABC):
-    """One recording, such as a file or an episode of a data set.
+    """One recording, such as a file or an episode of a data set."""
 
-    Attributes:
-        source: the file, and the episode in it, for messages.
-        period: seconds between two samples, if the log states it.
-    """
-
-    source: str
-    period: float | None = None
+    source: str  #: the file, and the episode in it, for messages
+    period: float | None = None  #: seconds between two samples, if the log states it
 
     @abstractmethod
     def fields(self) -> tuple[str, ...]:
@@ -154,11 +134,9 @@ class Table(Log):
         self._marks = marks or (lambda name: columns([name])[name])
 
     def fields(self) -> tuple[str, ...]:
-        """Return the names of the columns."""
         return self._names
 
     def signals(self, fields: Sequence[str], clock: Clock) -> dict[str, Signal]:
-        """Return fields over time; see :meth:`Log.signals`."""
         require_distinct(self.source, self._names)
         find = partial(column_of, self.source, self._names)
         located = {field: self._located(field, find) for field in fields}

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
@@ -12,10 +11,11 @@ from typing import Any, Literal
 from ctxval._util.arrays import Array
 from ctxval._util.checked import FiniteFloat, NonNegativeInt, Seconds, checked, require
 from ctxval._util.columns import column_of, conversion, named_unit
-from ctxval._util.files import read_bytes
+from ctxval._util.files import read_toml
+from ctxval._util.refusals import reworded
 from ctxval._util.representation import ShortRepr
 from ctxval._util.texts import enumerated
-from ctxval.data.log import LISTED, Clock, Log, reading
+from ctxval.data.log import LISTED, Clock, Log
 from ctxval.errors import InputError, UnknownNameError
 
 Stamp = Literal["auto", "log", "publish", "header"]
@@ -26,33 +26,26 @@ _VALID = re.compile(r"\s*(\S.*?)\s*(==|!=)\s*([+-]?\d+(?:\.\d*)?)\s*")
 @checked
 @dataclass(frozen=True)
 class Field:
-    """Where one state or input is in a log; the value is ``factor * recorded + offset``.
+    """Where one state or input is in a log; the value is ``factor * recorded + offset``."""
 
-    Attributes:
-        path: the name of a column, such as ``angle`` or ``observation.state[2]``, or a field of a message, such as
-            ``/joint_states.position[0]``. A vector stands for all its components.
-        unit: the unit in which the model takes the value.
-        recorded: the unit in the log, if it is another one and the name of the column does not state it. Known units
-            are converted.
-        factor: the factor, if the units are not known; None for that of the units.
-        offset: added to the value, in the unit of the model.
-        angle: whether it is an angle in radians that the log may keep between -pi and pi: it is continued over turns.
-        held: whether a value holds until the next one is logged, however long that takes, such as that of a command
-            that is sent only if it changes.
-        derivative_of: the name of a recorded state of which this one is the derivative; it has no path then. It is that
-            of a parabola through ``window`` records, half of which come later.
-        window: the number of these records, an odd number of at least 3.
-    """
-
+    #: the name of a column, such as ``angle`` or ``observation.state[2]``, or a field of a message, such as
+    #: ``/joint_states.position[0]``. A vector stands for all its components.
     path: str = ""
-    unit: str = ""
+    unit: str = ""  #: the unit in which the model takes the value
+    #: the unit in the log, if it is another one and the name of the column does not state it. Known units are
+    #: converted.
     recorded: str = ""
-    factor: FiniteFloat | None = None
-    offset: FiniteFloat = 0.0
+    factor: FiniteFloat | None = None  #: the factor, if the units are not known; None for that of the units
+    offset: FiniteFloat = 0.0  #: added to the value, in the unit of the model
+    #: whether it is an angle in radians that the log may keep between -pi and pi: it is continued over turns
     angle: bool = False
+    #: whether a value holds until the next one is logged, however long that takes, such as that of a command that is
+    #: sent only if it changes
     held: bool = False
+    #: the name of a recorded state of which this one is the derivative; it has no path then. It is that of a parabola
+    #: through ``window`` records, half of which come later.
     derivative_of: str = ""
-    window: int = 7
+    window: int = 7  #: the number of these records, an odd number of at least 3
 
     def __post_init__(self) -> None:
         if self.derivative_of:
@@ -69,29 +62,24 @@ class Field:
         """Return the factor of the recorded value; ``stated`` is the unit that the log itself states, if any."""
         if self.factor is not None:
             return float(self.factor)
-        try:
+        with reworded(f"the field {self.path}", InputError):
             if stated and self.recorded and conversion(stated, self.recorded) != 1:
                 raise InputError(f"it is recorded in {stated}, and the mapping states {self.recorded}.")
             recorded = stated or self.recorded
             return conversion(recorded, self.unit) if recorded and (self.unit or not stated) else 1.0
-        except InputError as error:
-            raise InputError(f"the field {self.path}: {error}") from error
 
 
 @dataclass(frozen=True)
 class Observer(ShortRepr):
-    """A function of the user's own that estimates states from the records of one recording.
+    """A function of the user's own that estimates states from the records of one recording."""
 
-    Attributes:
-        function: ``(y, u, dt) -> x``, from the recorded states ``(H + 1, p)``, the inputs ``(H, m)`` and the time step
-            in seconds to states ``(H + 1, n)``. The first states may be NaN, while it settles; they are left out. None
-            until it is loaded.
-        states: the names of the n states with their units; empty for those of the records, or else x0, x1, ...
-        reference: ``module:attr`` of the function, which the command line loads from the folder of the mapping's file.
-    """
-
+    #: ``(y, u, dt) -> x``, from the recorded states ``(H + 1, p)``, the inputs ``(H, m)`` and the time step in seconds
+    #: to states ``(H + 1, n)``. The first states may be NaN, while it settles; they are left out. None until it is
+    #: loaded.
     function: Callable[[Array, Array, float], Array] | None
+    #: the names of the n states with their units; empty for those of the records, or else x0, x1, ..
     states: Mapping[str, str] = field(default_factory=dict)
+    #: ``module:attr`` of the function, which the command line loads from the folder of the mapping's file
     reference: str = ""
 
     def __post_init__(self) -> None:
@@ -102,33 +90,27 @@ class Observer(ShortRepr):
 
 @dataclass(frozen=True)
 class LogMapping(ShortRepr):
-    """How recordings become states and inputs at equal steps.
+    """How recordings become states and inputs at equal steps."""
 
-    Attributes:
-        states, inputs: the fields of the states and inputs by name, in the order of the model.
-        time, time_unit, stamp: where the times come from, as in :class:`Clock`.
-        dt: length of a step in seconds; None for the median period of the first state. A table without times has one
-            row for each step.
-        delay: seconds between the time at which an input is logged and the time from which it acts on the states.
-        longest_gap: longest time in seconds between two samples of one field over which it is interpolated or held;
-            None for 1.5 median periods of the field. A recording is split at longer gaps and at missing values.
-        lags: the number of earlier steps whose states and inputs are further states, if the records at one step do not
-            determine the next ones.
-        valid: which rows count, such as ``status == 0``: a field, ``==`` or ``!=``, and a number; None for all rows.
-        observer: a function that estimates the states from the recorded ones, or an :class:`Observer`; None if they are
-            the states.
-    """
-
-    states: Mapping[str, Field]
+    states: Mapping[str, Field]  #: the fields of the states and inputs by name, in the order of the model
     inputs: Mapping[str, Field] = field(default_factory=dict)
-    time: str | None = None
+    time: str | None = None  #: where the times come from, as in :class:`Clock`
     time_unit: str = ""
     stamp: Stamp = "auto"
+    #: length of a step in seconds; None for the median period of the first state. A table without times has one row for
+    #: each step.
     dt: float | None = None
+    #: seconds between the time at which an input is logged and the time from which it acts on the states
     delay: float = 0.0
+    #: longest time in seconds between two samples of one field over which it is interpolated or held; None for 1.5
+    #: median periods of the field. A recording is split at longer gaps and at missing values.
     longest_gap: float | None = None
+    #: the number of earlier steps whose states and inputs are further states, if the records at one step do not
+    #: determine the next ones
     lags: int = 0
+    #: which rows count, such as ``status == 0``: a field, ``==`` or ``!=``, and a number; None for all rows
     valid: str | None = None
+    #: a function that estimates the states from the recorded ones, or an :class:`Observer`; None if they are the states
     observer: Observer | Callable[[Array, Array, float], Array] | None = None
 
     def __post_init__(self) -> None:
@@ -189,36 +171,35 @@ class LogMapping(ShortRepr):
         _require_known("entry of the mapping of recordings", table, [field.name for field in fields(LogMapping)])
         parts = dict[str, Any]()
         for kind in ("states", "inputs"):
-            named = table.get(kind, {})
-            named = [named] if isinstance(named, str) else named
-            if isinstance(named, list):
-                named = {str(item.get("path") if isinstance(item, Mapping) else item): item for item in named}
-            if not isinstance(named, Mapping):
-                raise InputError(f"{kind} must be a table of fields or a list of paths, got {named!r}.")
-            parts[kind] = named
+            match table.get(kind, {}):
+                case {} as named:
+                    parts[kind] = named
+                case str(path):
+                    parts[kind] = {path: path}
+                case [*listed]:
+                    parts[kind] = {
+                        str(item.get("path") if isinstance(item, Mapping) else item): item for item in listed
+                    }
+                case named:
+                    raise InputError(f"{kind} must be a table of fields or a list of paths, got {named!r}.")
         if "states" not in table:
             raise InputError("the mapping of recordings needs states.")
-        if "observer" in table:  # module:attr, or a table
-            given = table["observer"]
-            observer: Any = {"function": given} if isinstance(given, str) else given
-            if not isinstance(observer, Mapping) or not isinstance(observer.get("function"), str):
+        match table:
+            case {"observer": str(function)}:
+                parts["observer"] = Observer(None, {}, function)
+            case {"observer": {"function": str(function)} as observer}:
+                _require_known("entry of the observer", observer, ["function", "states"])
+                parts["observer"] = Observer(None, observer.get("states", {}), function)
+            case {"observer": given}:
                 raise InputError(f"an observer must name a function module:attr, got {given!r}.")
-            _require_known("entry of the observer", observer, ["function", "states"])
-            parts["observer"] = Observer(None, observer.get("states", {}), observer["function"])
         return LogMapping(**{**table, **parts})
 
     @staticmethod
     def from_toml(path: str | Path) -> LogMapping:
         """Return the mapping in a TOML file, or in the table ``[recordings]`` of an experiment file."""
-        with reading(path):
-            content = read_bytes(path)
-        try:
-            table = tomllib.loads(content.decode("utf-8"))
+        table = read_toml(path)
+        with reworded(str(path), InputError):
             return LogMapping.from_table(table.get("recordings", table))
-        except InputError as error:
-            raise InputError(f"{path}: {error}") from error
-        except (ValueError, RecursionError) as error:
-            raise InputError(f"{path} is not valid TOML: {error}.") from error
 
     @staticmethod
     def usual(log: Log, states: Mapping[str, str] | None = None, inputs: Mapping[str, str] | None = None) -> LogMapping:
@@ -261,15 +242,14 @@ def _require_known(what: str, table: Mapping[str, Any], names: Sequence[str]) ->
 
 
 def _field(name: str, described: Any) -> Field:
-    if isinstance(described, Field):
-        return described
-    if isinstance(described, str):
-        return Field(described)
+    match described:
+        case Field():
+            return described
+        case str():
+            return Field(described)
     if not isinstance(described, Mapping):
         raise InputError(f"the field {name} must be a path or a table, got {described!r}.")
     table = {("path" if key == "field" else key): value for key, value in described.items()}
     _require_known(f"entry of the field {name}", table, [field.name for field in fields(Field)])
-    try:
+    with reworded(f"the field {name}", InputError):
         return Field(**({} if "derivative_of" in table else {"path": name}) | table)
-    except InputError as error:
-        raise InputError(f"the field {name}: {error}") from error

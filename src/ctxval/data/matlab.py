@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 
 from ctxval._util.arrays import Array
-from ctxval._util.extras import require_extra
 from ctxval._util.files import MOST_BYTES, open_regular
+from ctxval._util.refusals import require_extra
 from ctxval._util.texts import quoted
 from ctxval.data.control_desk import X_FIELDS, Y_FIELDS, ControlDeskLog, is_control_desk
 from ctxval.data.log import Log, MemoryTable, reading
@@ -57,12 +57,13 @@ def _numeric(before: str, content: Mapping[str, Any], depth: int) -> Iterator[tu
         path = f"{before}.{name}".removeprefix(".")
         if str(name).startswith("__"):
             continue  # what the reader says of the file
-        if isinstance(value, Mapping):
-            yield from _numeric(path, value, depth - 1) if depth else ()
-        elif isinstance(value, np.ndarray | int | float):
-            array = np.asarray(value)
-            if array.dtype.kind in "biuf" and array.ndim <= 2 and array.size:
-                yield path, array.astype(np.float64)
+        match value:
+            case {}:
+                yield from _numeric(path, value, depth - 1) if depth else ()
+            case np.ndarray() | int() | float():
+                array = np.asarray(value)
+                if array.dtype.kind in "biuf" and array.ndim <= 2 and array.size:
+                    yield path, array.astype(np.float64)
 
 
 def _version_7_3(path: Path) -> dict[str, Any]:
@@ -71,7 +72,7 @@ def _version_7_3(path: Path) -> dict[str, Any]:
     HDF5 lets a file name others: by links, as the storage of a data set, and as the source of a virtual one. A
     stranger's file would name any file of the user. MATLAB writes none of these.
     """
-    h5py = require_extra("h5py", "logs", "MATLAB files of version 7.3")
+    h5py = require_extra("h5py", "logs", "MATLAB files of version 7.3 need")
     checked, numeric, size = dict[str, Any](), list[str](), 0
     with h5py.File(path, "r") as file:
         for count, (name, identifier) in enumerate(_hdf5_objects(h5py, file.id)):

@@ -13,7 +13,7 @@ import io
 import itertools
 import json
 import zlib
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, redirect_stderr, suppress
 from functools import partial
 from pathlib import Path
@@ -22,22 +22,21 @@ from typing import IO, Any
 import numpy as np
 
 from ctxval._util.arrays import Array
-from ctxval._util.extras import require_extra
 from ctxval._util.files import open_regular
+from ctxval._util.refusals import require_extra, reworded
 from ctxval._util.texts import quoted, reason_of
 from ctxval.data.log import reading
 from ctxval.data.topics import Message, TopicLog
 from ctxval.errors import InputError
 
-Decoder = Callable[[bytes], Any]
-"""A function that decodes the bytes of one message."""
+Decoder = Callable[[bytes], Any]  #: A function that decodes the bytes of one message
 
 Definition = tuple[Callable[[str, bytes], Decoder], str, bytes]
 """A function that makes a decoder, and its arguments: the name of a type of messages, and the text that defines it."""
 
 _MOST_CHUNK = 128 * 2**20  # largest size of a record, and of a chunk of records after it is decompressed, in bytes
 
-_library = partial(require_extra, extra="logs", purpose="logs of messages")
+_library = partial(require_extra, extra="logs", needs="logs of messages need")
 
 
 class _FileOfMessages(TopicLog):
@@ -49,7 +48,6 @@ class _FileOfMessages(TopicLog):
         self._decoders: dict[Any, Decoder] = {}
 
     def topics(self) -> tuple[str, ...]:
-        """Return the names of the topics."""
         return tuple(self._topics)
 
     def _decoded(
@@ -58,14 +56,8 @@ class _FileOfMessages(TopicLog):
         """Return the content of a message, decoded by the definition of its channel."""
         if channel not in self._decoders:
             make, name, text = definition()
-            try:
+            with reworded(f"{self.source}: the definition of the messages of {topic}, {name}, cannot be read"):
                 self._decoders[channel] = make(name, text)
-            except InputError:
-                raise
-            except Exception as error:  # the definition in a file may be anything
-                raise InputError(
-                    f"{self.source}: the definition of the messages of {topic}, {name}, cannot be read."
-                ) from error
         try:
             return self._decoders[channel](data)
         except Exception as error:  # decoders raise many kinds
@@ -107,7 +99,6 @@ class McapLog(_FileOfMessages):
                 yield from library.StreamReader(chunk, **{**inside, "skip_magic": True}).records
 
     def messages(self, topics: Iterable[str]) -> Iterator[Message]:
-        """Yield decoded messages; see :meth:`TopicLog.messages`."""
         wanted = set(topics)
         schemas, channels = dict[int, Any](), dict[int, Any]()
         with self._opened() as file:
@@ -165,7 +156,6 @@ class BagLog(_FileOfMessages):
             reader.close()
 
     def messages(self, topics: Iterable[str]) -> Iterator[Message]:
-        """Yield decoded messages; see :meth:`TopicLog.messages`."""
         wanted = set(topics)
         with self._reader() as reader:
             records = reader.messages([connection for connection in reader.connections if connection.topic in wanted])
@@ -184,14 +174,10 @@ class BagLog(_FileOfMessages):
         if self._version == 2 and definition.format.name != "MSG":
             # Bags before ROS 2 Iron do not hold the definitions of their messages.
             typesys = _library("rosbags.typesys")
-            try:
+            what = f"the definition of the messages of {connection.topic}, {connection.msgtype}"
+            with reworded(f"{self.source}: {what}, is not in the bag, and is not one of ROS 2 itself"):
                 known = typesys.get_typestore(typesys.Stores.LATEST)
                 text, _ = known.generate_msgdef(connection.msgtype, ros_version=2)
-            except Exception as error:
-                raise InputError(
-                    f"{self.source}: the definition of the messages of {connection.topic}, {connection.msgtype}, is "
-                    "not in the bag, and is not one of ROS 2 itself."
-                ) from error
         make = ros1_decoder if self._version == 1 else ros2_decoder
         return make, connection.msgtype, text.encode()
 
@@ -253,10 +239,11 @@ def _plain(value: Any) -> Any:
         fields = value.DESCRIPTOR.fields
         known = [field.name for field in fields if not field.has_presence or value.HasField(field.name)]
         return {name: _plain(getattr(value, name)) for name in known}
-    if isinstance(value, Mapping):
-        return {str(key): _plain(item) for key, item in value.items()}
-    if isinstance(value, bool | int | float | str | bytes):
-        return value
+    match value:
+        case {}:
+            return {str(key): _plain(item) for key, item in value.items()}
+        case int() | float() | str() | bytes():
+            return value
     return [_plain(item) for item in value]
 
 

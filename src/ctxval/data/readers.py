@@ -16,10 +16,10 @@ from typing import Any
 import numpy as np
 
 from ctxval._util.arrays import Array
+from ctxval._util.checked import PositiveFloat, require
 from ctxval._util.columns import CsvTable
-from ctxval._util.extras import require_extra
 from ctxval._util.files import MOST_BYTES, Archive, read_bytes, read_json, require_regular_file
-from ctxval._util.texts import quoted, reason_of
+from ctxval._util.refusals import require_extra, reworded
 from ctxval.data.log import Log, MemoryTable, Table, reading
 from ctxval.data.matlab import read_mat
 from ctxval.data.messages import BagLog, McapLog
@@ -69,7 +69,7 @@ def read_npz(path: Path) -> list[Log]:
 
 def read_parquet(path: Path, period: float | None = None) -> list[Log]:
     """Return the log in a Parquet file, each column of which is read when it is needed; a missing value is NaN."""
-    library = require_extra("pyarrow.parquet", "logs", "Parquet files")
+    library = require_extra("pyarrow.parquet", "logs", "Parquet files need")
     with reading(path, "Parquet"):
         require_regular_file(path)
         file = library.ParquetFile(path)
@@ -82,14 +82,14 @@ def read_parquet(path: Path, period: float | None = None) -> list[Log]:
 
 def _parquet_column(path: Path, file: Any, name: str) -> Array:
     """Return a column, ``(N,)`` or ``(N, k)``."""
-    compute = require_extra("pyarrow.compute", "logs", "Parquet files")
+    compute = require_extra("pyarrow.compute", "logs", "Parquet files need")
     about = file.metadata
     groups = map(about.row_group, range(about.num_row_groups))
     parts = [group.column(index) for group in groups for index in range(about.num_columns)]
     size = sum(part.total_uncompressed_size for part in parts if part.path_in_schema.partition(".")[0] == name)
     if max(size, 8 * about.num_rows) > MOST_BYTES:
         raise InputError(f"{path}: {name} is too large: {MOST_BYTES} bytes may be read.")
-    try:
+    with reworded(f"{path}: {name} does not hold numbers"):
         column = file.read(columns=[name]).column(name).combine_chunks()
         kind = str(column.type)
         if kind.startswith("timestamp"):
@@ -101,10 +101,6 @@ def _parquet_column(path: Path, file: Any, name: str) -> Array:
             raise InputError(f"{path}: the vectors of {name} must have one length, got {lengths.tolist()}.")
         values = compute.list_flatten(column).cast("float64").to_numpy(zero_copy_only=False)
         return np.asarray(values.reshape(len(column), int(lengths[0])))
-    except InputError:
-        raise
-    except Exception as error:
-        raise InputError(f"{path}: {name} does not hold numbers ({quoted(reason_of(error))}).") from error
 
 
 def read_lerobot(path: Path) -> list[Log]:
@@ -113,9 +109,8 @@ def read_lerobot(path: Path) -> list[Log]:
     with reading(info):
         about = read_json(info)
     fps = about.get("fps") if isinstance(about, Mapping) else None
-    if not isinstance(fps, int | float) or isinstance(fps, bool) or not 0 < fps < float("inf"):
-        raise InputError(f"{info}: fps must be a positive number, got {quoted(fps)}.")
-    logs = [log for file in sorted(path.glob("data/*/*.parquet")) for log in read_parquet(file, 1 / fps)]
+    period = 1 / require(f"{info}: fps", PositiveFloat, fps)
+    logs = [log for file in sorted(path.glob("data/*/*.parquet")) for log in read_parquet(file, period)]
     if not logs:
         raise InputError(f"{path} has no file data/chunk-*/*.parquet.")
     return logs
@@ -148,15 +143,13 @@ def read_json_records(path: Path) -> list[Log]:
     in ``.gz`` are decompressed.
     """
     packed = read_bytes(path)
-    try:
+    with reworded(f"{path} cannot be read as JSON", OSError, EOFError, zlib.error, ValueError, RecursionError):
         if path.suffix.lower() == ".gz":
             with gzip.open(path) as file:
                 packed = file.read(MOST_BYTES + 1)
             if len(packed) > MOST_BYTES:
                 raise InputError(f"{path} has more than {MOST_BYTES} bytes when it is decompressed.")
         content = json.loads(packed.decode("utf-8"))
-    except (OSError, EOFError, zlib.error, ValueError, RecursionError) as error:
-        raise InputError(f"{path} cannot be read as JSON: {error}.") from error
     records = _records(path, content)
     rows = [dict(_numbers("", record, 4)) for record in records]
     columns = {name: _column([row.get(name) for row in rows]) for name in dict.fromkeys(k for row in rows for k in row)}
@@ -169,10 +162,8 @@ def read_json_records(path: Path) -> list[Log]:
 
 
 def _records(path: Path, content: Any) -> list[Mapping[str, Any]]:
-    lists = [content] if isinstance(content, list) else content.values() if isinstance(content, Mapping) else ()
-    tables = [
-        each for each in lists if isinstance(each, list) and each and all(isinstance(row, Mapping) for row in each)
-    ]
+    lists = content.values() if isinstance(content, Mapping) else [content]
+    tables = [each for each in lists if each and type(each) is list and {type(row) for row in each} == {dict}]
     if len(tables) != 1:
         raise InputError(
             f'{path} must have one list of records, as [{{"t": 0.0, "x": 1.5}}, ...]; it has {len(tables)} such lists.'
@@ -183,21 +174,20 @@ def _records(path: Path, content: Any) -> list[Mapping[str, Any]]:
 def _numbers(before: str, record: Mapping[str, Any], depth: int) -> Iterator[tuple[str, Any]]:
     for name, value in record.items():
         path = f"{before}.{name}".removeprefix(".")
-        if isinstance(value, Mapping):
-            if depth:
-                yield from _numbers(path, value, depth - 1)
-        elif not isinstance(value, str):
-            yield path, value
+        match value:
+            case {}:
+                yield from _numbers(path, value, depth - 1) if depth else ()
+            case int() | float() | [*_] | None:
+                yield path, value
 
 
 def _column(values: list[Any]) -> Array | None:
     """Return a field of all records, ``(N,)`` or ``(N, k)``; None if it does not hold numbers."""
     width = next((len(value) for value in values if isinstance(value, list)), None)
     missing = np.nan if width is None else [np.nan] * width
-    try:
+    with suppress(TypeError, ValueError, OverflowError):
         return np.array([missing if value is None else value for value in values], dtype=np.float64)
-    except (TypeError, ValueError, OverflowError):
-        return None
+    return None
 
 
 # Files and folders

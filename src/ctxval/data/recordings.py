@@ -36,22 +36,14 @@ class Recording(ShortRepr):
 
 @dataclass(frozen=True, eq=False)
 class Recordings(ShortRepr):
-    """Recordings of one system with one time step.
+    """Recordings of one system with one time step."""
 
-    Attributes:
-        runs: the recordings.
-        breaks: where logs were split, and why.
-        dt: length of a step, seconds.
-        states, inputs: the names of the states and inputs with their units.
-        notes: sentences on how the logs were read.
-    """
-
-    runs: tuple[Recording, ...]
-    breaks: tuple[Break, ...]
-    dt: float
-    states: dict[str, str]
+    runs: tuple[Recording, ...]  #: the recordings
+    breaks: tuple[Break, ...]  #: where logs were split, and why
+    dt: float  #: length of a step, seconds
+    states: dict[str, str]  #: the names of the states and inputs with their units
     inputs: dict[str, str]
-    notes: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()  #: sentences on how the logs were read
 
     @property
     def steps(self) -> int:
@@ -252,7 +244,6 @@ class Recorded(ShortRepr):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The names of the tasks."""
         return tuple(self.runs)
 
     def execute(self, controller: Controller, task: Task) -> Trajectory:

@@ -20,20 +20,13 @@ Interval = tuple[float, float]
 
 @dataclass(frozen=True)
 class Break:
-    """A place at which a log was split.
-
-    Attributes:
-        time: the time of the last sample before it in the log, seconds.
-        seconds: the time that is left out; 0 if the times go back.
-        field: the name of the state or input.
-        reason: what is missing.
-    """
+    """A place at which a log was split."""
 
     source: str
-    time: float
-    seconds: float
-    field: str
-    reason: str
+    time: float  #: the time of the last sample before it in the log, seconds
+    seconds: float  #: the time that is left out; 0 if the times go back
+    field: str  #: the name of the state or input
+    reason: str  #: what is missing
 
     def __str__(self) -> str:
         return f"{self.source}, {self.time:g} s: {self.field} {self.reason}"
@@ -41,26 +34,17 @@ class Break:
 
 @dataclass(frozen=True, eq=False)
 class Channel(ShortRepr):
-    """One state or input over time, in the unit of the model.
-
-    Attributes:
-        of_input: whether it is an input, which holds until the next sample; a state is interpolated.
-        times, values: its samples, shape ``(N,)``; NaN where there is no value.
-        angle: whether it is an angle that is continued over turns.
-        held: whether a value holds until the next one, however long that takes.
-        path: its field in the log.
-        place: what counts its samples in messages, and the number of the first one.
-    """
+    """One state or input over time, in the unit of the model."""
 
     name: str
     unit: str
-    of_input: bool
-    times: Array
+    of_input: bool  #: whether it is an input, which holds until the next sample; a state is interpolated
+    times: Array  #: its samples, shape ``(N,)``; NaN where there is no value
     values: Array
-    angle: bool = False
-    held: bool = False
-    path: str = ""
-    place: tuple[str, int] = ("row", 0)
+    angle: bool = False  #: whether it is an angle that is continued over turns
+    held: bool = False  #: whether a value holds until the next one, however long that takes
+    path: str = ""  #: its field in the log
+    place: tuple[str, int] = ("row", 0)  #: what counts its samples in messages, and the number of the first one
 
     @property
     def period(self) -> float:

@@ -54,7 +54,6 @@ class TopicLog(Log):
         return tuple(names)
 
     def signals(self, fields: Sequence[str], clock: Clock) -> dict[str, Signal]:
-        """Return fields over time; see :meth:`Log.signals`."""
         split = {field: self._split(field) for field in fields}
         records: dict[str, list[tuple[dict[str, Any], dict[str, Array]]]] = {topic: [] for topic, _ in split.values()}
         size = 0
@@ -146,15 +145,14 @@ def _plausible(stamps: Mapping[str, Sequence[Mapping[str, Any]]]) -> bool:
 
 def _resolved(content: Any, path: Sequence[str | int]) -> Any:
     for step in path:
-        if isinstance(step, int):
-            content = content[step] if hasattr(content, "__getitem__") and step < len(content) else None
-        elif isinstance(content, Mapping):
-            content = content.get(step)
-        else:
-            # Only fields that the message's class declares: attributes of Python are not data.
-            content = getattr(content, step, None) if step in getattr(type(content), "__slots__", ()) else None
-        if content is None:
-            return None
+        match step, content:
+            case int(), _:
+                content = content[step] if hasattr(content, "__getitem__") and step < len(content) else None
+            case _, Mapping():
+                content = content.get(step)
+            case _:
+                # Only fields that the message's class declares: attributes of Python are not data.
+                content = getattr(content, step, None) if step in getattr(type(content), "__slots__", ()) else None
     return content
 
 
@@ -163,14 +161,18 @@ def _first(content: Any, *paths: Sequence[str | int]) -> Any:
 
 
 def _leaves(content: Any, before: str = "", depth: int = 6) -> Iterator[str]:
-    if isinstance(content, bool | int | float | np.number):
-        yield before
-    elif depth and isinstance(content, Mapping):
-        for name, part in content.items():
-            yield from _leaves(part, f"{before}.{name}".removeprefix("."), depth - 1)
-    elif depth and isinstance(content, list | tuple | np.ndarray):
-        for index, part in enumerate(content[:16]):
-            yield from _leaves(part, f"{before}[{index}]", depth - 1)
-    elif depth and not isinstance(content, str | bytes):
-        for name in getattr(type(content), "__slots__", ()):
-            yield from _leaves(getattr(content, name), f"{before}.{name}".removeprefix("."), depth - 1)
+    parts: Iterable[tuple[str, Any]] = ()
+    match content:
+        case int() | float() | np.number():
+            yield before
+        case str() | bytes():
+            return
+        case Mapping():
+            parts = ((f"{before}.{name}", part) for name, part in content.items())
+        case list() | tuple() | np.ndarray():
+            parts = ((f"{before}[{index}]", part) for index, part in enumerate(content[:16]))
+        case _:
+            names = getattr(type(content), "__slots__", ())
+            parts = ((f"{before}.{name}", getattr(content, name)) for name in names)
+    for path, part in parts if depth else ():
+        yield from _leaves(part, path.removeprefix("."), depth - 1)

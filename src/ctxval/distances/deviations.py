@@ -25,21 +25,17 @@ class StateNorm(NamedStates):
 
     Each difference is multiplied by its weight, divided by its scale, and then enters the norm. With a scale in the
     unit of its state, such as 0.1 m and 0.05 rad, differences of one scale count the same.
-
-    Attributes:
-        norm: order of the norm: 1, 2 or infinity.
-        components: the states that are compared, by index or by the name in the experiment; all states by default.
-        weights: one number >= 0 for each compared state; 1 by default.
-        scales: the unit of comparison of each compared state, a positive number; 1 by default.
-        angles: the states that are angles in radians, by index or name: the difference is taken on the circle, so it
-            is at most pi.
     """
 
-    norm: Norm = 1
+    norm: Norm = 1  #: order of the norm: 1, 2 or infinity
+    #: the states that are compared, by index or by the name in the experiment; all states by default
     components: Sequence[int | str] | None = None
     _: KW_ONLY
-    weights: Sequence[float] | None = None
+    weights: Sequence[float] | None = None  #: one number >= 0 for each compared state; 1 by default
+    #: the unit of comparison of each compared state, a positive number; 1 by default
     scales: Sequence[float] | None = None
+    #: the states that are angles in radians, by index or name: the difference is taken on the circle, so it is at most
+    #: pi
     angles: Sequence[int | str] = ()
 
     def __post_init__(self) -> None:
@@ -341,17 +337,13 @@ class CrossingTime(NamedStates):
     """Difference in seconds between the times at which M and S first cross a level; interpolated between samples.
 
     A trajectory that does not cross the level counts as if it crossed it at its end.
-
-    Attributes:
-        state: index or name of the state that crosses the level, which is in the unit of this state.
-        direction: ``up``, ``down`` or ``either``: the direction in which the state crosses the level.
-        angle: whether the state is an angle in radians, which crosses the level on the circle.
     """
 
-    state: int | str = 0
+    state: int | str = 0  #: index or name of the state that crosses the level, which is in the unit of this state
     level: FiniteFloat = 0.0
+    #: ``up``, ``down`` or ``either``: the direction in which the state crosses the level
     direction: Direction = "either"
-    angle: bool = False
+    angle: bool = False  #: whether the state is an angle in radians, which crosses the level on the circle
 
     def __call__(self, model_trajectory: Trajectory, system_trajectory: Trajectory, task: Task) -> Array:
         [state] = require_indices("state", [self.state], model_trajectory.states.shape[-1])

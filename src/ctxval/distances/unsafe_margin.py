@@ -33,22 +33,16 @@ class UnsafeMargin(ShortRepr):
       larger than the largest deviation of the states that the specification looks at.
     - with a margin c, ``max(0, min(rho_M, c - rho_S))``. It exceeds c if and only if ``rho_M > c`` and ``rho_S < 0``:
       with the threshold c, a campaign asks whether every task with ``rho_M > c`` is safe.
-
-    Attributes:
-        spec: the specification, or a table of its arguments with its ``type``, by default ``ReachAvoid``.
-        margin: the margin of M that shall suffice; None to find it.
-        penalty: how much each unit of rho_S counts without a margin, at least 1.
     """
 
-    to_task: ClassVar[bool] = True
-    """Whether it measures trajectories against the task."""
+    to_task: ClassVar[bool] = True  #: whether it measures trajectories against the task
 
     kinked: ClassVar[bool] = True
     """Whether it is a continuous function of the trajectories with kinks, which are no jumps."""
 
-    spec: Any
-    margin: PositiveFloat | None = None
-    penalty: PositiveFloat = 2.0
+    spec: Any  #: the specification, or a table of its arguments with its ``type``, by default ``ReachAvoid``
+    margin: PositiveFloat | None = None  #: the margin of M that shall suffice; None to find it
+    penalty: PositiveFloat = 2.0  #: how much each unit of rho_S counts without a margin, at least 1
 
     def __post_init__(self) -> None:
         if isinstance(self.spec, dict):

@@ -16,8 +16,7 @@ from ctxval.errors import InputError, ShapeError
 from ctxval.models.scaling import standardised_pairs
 from ctxval.models.smooth_maps import SmoothMap, affine, kernel_sum, matern, total
 
-Linearised = Literal["corrected", "model"]
-"""Whose Jacobian controllers are designed with."""
+Linearised = Literal["corrected", "model"]  #: whose Jacobian controllers are designed with
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,16 +11,15 @@ import numpy as np
 
 from ctxval._util.arrays import Array, rows_of
 from ctxval._util.checked import Seconds
-from ctxval._util.extras import require_extra
 from ctxval._util.mjcf import compile_mjcf, is_mjcf_text
+from ctxval._util.refusals import require_extra
 from ctxval._util.registry import part
 from ctxval._util.representation import ShortRepr
 from ctxval.core.model import paired
 from ctxval.core.trajectory import Transitions
 from ctxval.errors import InputError, ShapeError
 
-_SYSID = "params_x_hat.yaml"
-"""A file that ``mujoco.sysid.save_results`` writes beside the identified models."""
+_SYSID = "params_x_hat.yaml"  #: A file that ``mujoco.sysid.save_results`` writes beside the identified models
 
 
 @part(files=("mjcf",))
@@ -69,7 +68,7 @@ class MuJoCo(ShortRepr):
         """
         another = copy.copy(self)
         if change is not None:
-            mujoco = require_extra("mujoco", "mujoco", "models of MuJoCo")
+            mujoco = require_extra("mujoco", "mujoco", "models of MuJoCo need")
             another._model = copy.copy(self._model)
             change(another._model)
             mujoco.mj_setConst(another._model, mujoco.MjData(another._model))
@@ -85,7 +84,7 @@ class MuJoCo(ShortRepr):
         batch = np.broadcast_shapes(x.shape[:-1], u.shape[:-1])
         states, inputs = map(rows_of, paired(x, u))
         reached = np.full(states.shape, np.nan)
-        mujoco = require_extra("mujoco", "mujoco", "models of MuJoCo")
+        mujoco = require_extra("mujoco", "mujoco", "models of MuJoCo need")
         data = mujoco.MjData(model)
         for k in np.flatnonzero(np.isfinite(states).all(axis=1) & np.isfinite(inputs).all(axis=1)).tolist():
             mujoco.mj_resetData(model, data)

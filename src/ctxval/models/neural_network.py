@@ -11,7 +11,7 @@ import numpy as np
 
 from ctxval._util.arrays import ArrayLike, as_finite, single_threaded
 from ctxval._util.checked import NonNegativeInt, PositiveInt, checked
-from ctxval._util.extras import require_extra
+from ctxval._util.refusals import require_extra
 from ctxval.core.trajectory import Transitions
 from ctxval.errors import ShapeError
 from ctxval.models.scaling import IncrementModel, IncrementScaling
@@ -65,8 +65,8 @@ class FeedforwardReLU(IncrementModel):
         """
         scaling = IncrementScaling.of(data)
         seeds = np.random.SeedSequence(seed).generate_state(restarts)
-        perceptron = require_extra("sklearn.neural_network", "cases", "learned networks").MLPRegressor
-        ignored = require_extra("sklearn.exceptions", "cases", "learned networks").ConvergenceWarning
+        perceptron = require_extra("sklearn.neural_network", "cases", "learned networks need").MLPRegressor
+        ignored = require_extra("sklearn.exceptions", "cases", "learned networks need").ConvergenceWarning
         trained, targets = [], scaling.targets(data)
         targets = targets.ravel() if targets.shape[1] == 1 else targets  # else it warns
         with single_threaded(), warnings.catch_warnings():

@@ -12,6 +12,7 @@ import numpy as np
 
 from ctxval._util.arrays import Array
 from ctxval._util.files import MADE_BY, Archive, read_bytes, written_whole
+from ctxval._util.refusals import reworded
 from ctxval._util.registry import part
 from ctxval.core.model import Model
 from ctxval.core.trajectory import Transitions
@@ -28,8 +29,7 @@ _DATA = ("x", "u", "x_next")
 _CORRECTED = "corrected_"  # before the names of the arrays of the model that a correction belongs to
 
 _PLAIN = (Linear, FeedforwardReLU, GaussianProcessModel)
-SavedModel = Linear | FeedforwardReLU | GaussianProcessModel | Corrected
-"""The models that can be written to a file."""
+SavedModel = Linear | FeedforwardReLU | GaussianProcessModel | Corrected  #: the models that can be written to a file
 
 
 def write_model(path: str | Path, model: Model, note: dict[str, Any] | None = None) -> None:
@@ -62,13 +62,13 @@ def is_savable(model: Model) -> bool:
 
 def read_note(source: str | Path) -> dict[str, Any]:
     """Return the plain values that were kept beside a model; empty if there are none."""
-    try:
+    with reworded(f"{source} cannot be read as a model", InputError, ValueError):
         arrays = Archive(read_bytes(source))
         about = json.loads(arrays.text("about")) if "about" in arrays else {}
-    except (InputError, ValueError) as error:
-        raise InputError(f"{source} cannot be read as a model: {str(error).removesuffix('.')}.") from error
-    note = about.get("note") if isinstance(about, dict) else None
-    return note if isinstance(note, dict) else {}
+    match about:
+        case {"note": {} as note}:
+            return dict(note)
+    return {}
 
 
 def write_transitions(path: str | Path, data: Transitions | None) -> None:
@@ -109,13 +109,14 @@ def read_model(source: str | Path) -> SavedModel:
 
 def read_refined(source: str | Path, before: Model | None) -> SavedModel:
     """Return a model from a file, as :func:`read_model` does; a correction alone is added to the model before."""
-    try:
+    known_kinds = "an NPZ file of ctxval, or one with the matrices A (n, n) and B (n, m)"
+    with reworded(f"{source} cannot be read as a model ({known_kinds})", ValueError, TypeError, IndexError):
         arrays = Archive(read_bytes(source))
         about: Any = {"format": _FORMAT, "version": 1, "kind": "Linear"}
         if "about" in arrays:
             about = json.loads(arrays.text("about"))
         plain = tuple(kind.__name__ for kind in _PLAIN)
-        if not isinstance(about, dict) or about.get("format") != _FORMAT or about.get("version") != 1:
+        if not isinstance(about, dict) or (about.get("format"), about.get("version")) != (_FORMAT, 1):
             raise InputError(f"its format must be {_FORMAT!r} of version 1")
         for key, kinds in (("kind", (*plain, "Corrected")), ("corrects", (*plain, None))):
             if about.get(key) not in kinds:
@@ -133,10 +134,6 @@ def read_refined(source: str | Path, before: Model | None) -> SavedModel:
             raise InputError(f"it does not state whose Jacobian is used, got {str(linearised)[:40]!r}")
         correction = Correction(*(arrays.numbers(field.name) for field in fields(Correction)))
         return Corrected(corrected, correction, linearised=linearised, data=data)
-    except (InputError, ValueError, TypeError, IndexError) as error:
-        known = "an NPZ file of ctxval, or one with the matrices A (n, n) and B (n, m)"
-        reason = str(error).removesuffix(".")
-        raise InputError(f"{source} cannot be read as a model ({known}): {reason}.") from error
 
 
 def _plain_model(arrays: Archive, kind: str, data: Transitions | None, prefix: str = "") -> SavedModel:
@@ -155,14 +152,17 @@ def _plain_model(arrays: Archive, kind: str, data: Transitions | None, prefix: s
 
 
 def _arrays(model: Model) -> dict[str, Any]:
-    if isinstance(model, Linear):
-        return {"A": model.A, "B": model.B, "c": model.c}
-    if not isinstance(model, FeedforwardReLU | GaussianProcessModel):
-        known = "linear models, networks, Gaussian processes and corrections"
-        raise InputError(f"only {known} can be written, got {model!r}.")
-    scaling = {name: getattr(model.scaling, name) for name in _SCALING}
-    if isinstance(model, FeedforwardReLU):
-        layers = {f"weights_{i}": weight for i, weight in enumerate(model.weights)}
-        return scaling | layers | {f"biases_{i}": bias for i, bias in enumerate(model.biases)}
-    covariance = {"variance": model.covariance.variance, "length_scales": model.covariance.length_scales}
-    return scaling | covariance | {"centres": model.centres, "weights": model.weights}
+    arrays: dict[str, Any]
+    match model:
+        case Linear():
+            return {name: getattr(model, name) for name in "ABc"}
+        case FeedforwardReLU():
+            layers = {f"weights_{i}": weight for i, weight in enumerate(model.weights)}
+            arrays = layers | {f"biases_{i}": bias for i, bias in enumerate(model.biases)}
+        case GaussianProcessModel():
+            covariance = {"variance": model.covariance.variance, "length_scales": model.covariance.length_scales}
+            arrays = {**covariance, "centres": model.centres, "weights": model.weights}
+        case _:
+            known = "linear models, networks, Gaussian processes and corrections"
+            raise InputError(f"only {known} can be written, got {model!r}.")
+    return {name: getattr(model.scaling, name) for name in _SCALING} | arrays

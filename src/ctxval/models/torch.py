@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ctxval._util.arrays import Array, rows_of
-from ctxval._util.extras import require_extra
+from ctxval._util.refusals import require_extra, reworded
 from ctxval._util.registry import part
 from ctxval._util.representation import ShortRepr
 from ctxval.core.model import paired
@@ -92,9 +92,8 @@ class Torch(ShortRepr):
         if training:
             self.module.eval()
         try:
-            yield
-        except RuntimeError as error:
-            raise ModelError(f"the module cannot be evaluated: {error}") from error
+            with reworded("the module cannot be evaluated", RuntimeError, to=ModelError):
+                yield
         finally:
             torch.set_num_threads(threads)
             if training:
@@ -102,7 +101,7 @@ class Torch(ShortRepr):
 
 
 def _torch() -> Any:
-    return require_extra("torch", "torch", "torch modules")
+    return require_extra("torch", "torch", "torch modules need")
 
 
 def _floats(tensor: Any) -> Array:

@@ -20,8 +20,7 @@ from ctxval._util.representation import ShortRepr
 from ctxval.certificates.bounds import at_most
 from ctxval.report.markup import element, joined, number
 
-SMALL = {"width": 340, "height": 220}
-"""Size of a chart of which several stand side by side."""
+SMALL = {"width": 340, "height": 220}  #: size of a chart of which several stand side by side
 
 _LEFT, _RIGHT, _TOP, _BOTTOM = 62, 14, 12, 46
 
@@ -47,18 +46,12 @@ _MARKS: dict[str, str] = {
 
 @dataclass(frozen=True)
 class Axis(ShortRepr):
-    """One axis of a chart.
+    """One axis of a chart."""
 
-    Attributes:
-        label: its name with the unit.
-        low, high: its ends; if they are equal or not finite, it is widened to a range around them.
-        whole: whether its ticks are whole numbers.
-    """
-
-    label: str
-    low: float
+    label: str  #: its name with the unit
+    low: float  #: its ends; if they are equal or not finite, it is widened to a range around them
     high: float
-    whole: bool = False
+    whole: bool = False  #: whether its ticks are whole numbers
 
     @classmethod
     def over(cls, label: str, *values: ArrayLike, zero: bool = False, room: float = 0.06) -> Axis:
@@ -98,18 +91,12 @@ class Axis(ShortRepr):
 
 @dataclass(eq=False)
 class Chart(ShortRepr):
-    """A chart with two axes, to which lines, bands and marks are added in the order of drawing.
+    """A chart with two axes, to which lines, bands and marks are added in the order of drawing."""
 
-    Attributes:
-        title: what it shows; screen readers read it, and it stands below the chart.
-        x, y: the axes.
-        width, height: its size in its own units.
-    """
-
-    title: str
-    x: Axis
+    title: str  #: what it shows; screen readers read it, and it stands below the chart
+    x: Axis  #: the axes
     y: Axis
-    width: int = 480
+    width: int = 480  #: its size in its own units
     height: int = 280
     _parts: list[Markup] = field(default_factory=list, init=False, repr=False)
     _legend: dict[str, Markup] = field(default_factory=dict, init=False, repr=False)

@@ -48,32 +48,21 @@ class TrajectoryPair(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class ReportContext(ShortRepr):
-    """Everything that the sections of a report read.
+    """Everything that the sections of a report read."""
 
-    Attributes:
-        name: the name of the experiment.
-        trials: all trials, in the order of asking.
-        verdict: the verdict; None if there is no threshold.
-        validation: the map p -> d(p), which is never executed; None if the experiment is not loaded.
-        dynamics: what the campaign has learned; None if the experiment is not loaded.
-        missing: why the experiment is not loaded, as a sentence; empty if it is.
-        budget: the budget of the campaign; None if it is not known.
-        provenance: what a certificate knows besides the trials.
-        envelope: the tasks on which the threshold is kept; None if it was not computed.
-    """
-
-    name: str
+    name: str  #: the name of the experiment
     space: TaskSpace
-    trials: tuple[Trial, ...]
+    trials: tuple[Trial, ...]  #: all trials, in the order of asking
     store: Store
-    verdict: Verdict | None = None
+    verdict: Verdict | None = None  #: the verdict; None if there is no threshold
+    #: the map p -> d(p), which is never executed; None if the experiment is not loaded
     validation: Validation | None = None
-    dynamics: CampaignDynamics | None = None
-    missing: str = ""
+    dynamics: CampaignDynamics | None = None  #: what the campaign has learned; None if the experiment is not loaded
+    missing: str = ""  #: why the experiment is not loaded, as a sentence; empty if it is
     labels: Labels = field(default_factory=Labels)
-    budget: int | None = None
-    provenance: Provenance = field(default_factory=Provenance)
-    envelope: Envelope | None = None
+    budget: int | None = None  #: the budget of the campaign; None if it is not known
+    provenance: Provenance = field(default_factory=Provenance)  #: what a certificate knows besides the trials
+    envelope: Envelope | None = None  #: the tasks on which the threshold is kept; None if it was not computed
 
     @functools.cached_property
     def settings(self) -> Mapping[str, Any]:

@@ -31,21 +31,13 @@ class Band(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class DistanceModel:
-    """The Gaussian process of the distance, or of its logarithm if that fits clearly better.
+    """The Gaussian process of the distance, or of its logarithm if that fits clearly better."""
 
-    Attributes:
-        points: points of the unit cube with a known distance ``(n, d)``.
-        values: their distances ``(n,)``.
-        learned: its hyperparameters and its scale.
-        process: the process, conditioned on the distances.
-        suite: the tasks of a suite, points of the unit cube ``(N, d)``; None if tasks fill the box.
-    """
-
-    points: Array
-    values: Array
-    learned: SurrogateHyperparameters
-    process: GaussianProcess
-    suite: Array | None = None
+    points: Array  #: points of the unit cube with a known distance ``(n, d)``
+    values: Array  #: their distances ``(n,)``
+    learned: SurrogateHyperparameters  #: its hyperparameters and its scale
+    process: GaussianProcess  #: the process, conditioned on the distances
+    suite: Array | None = None  #: the tasks of a suite, points of the unit cube ``(N, d)``; None if tasks fill the box
 
     @classmethod
     def of(cls, completed: Sequence[Trial], suite: Array | None = None) -> DistanceModel | None:

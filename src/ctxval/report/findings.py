@@ -39,19 +39,12 @@ WORDS: dict[Light, str] = {light: light for light in get_args(Light)} | {"bad": 
 
 @dataclass(frozen=True)
 class Finding(ShortRepr):
-    """One thing that the trials show.
+    """One thing that the trials show."""
 
-    Attributes:
-        name: what it is about, in a few words.
-        light: how it is to be taken.
-        text: one or more sentences with the numbers.
-        numbers: the same numbers for JSON, by name.
-    """
-
-    name: str
-    light: Light
-    text: str
-    numbers: dict[str, Any] = field(default_factory=dict)
+    name: str  #: what it is about, in a few words
+    light: Light  #: how it is to be taken
+    text: str  #: one or more sentences with the numbers
+    numbers: dict[str, Any] = field(default_factory=dict)  #: the same numbers for JSON, by name
 
 
 Answer = tuple[Light, str, dict[str, Any]]

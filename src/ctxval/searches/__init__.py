@@ -36,8 +36,7 @@ __all__ = [
 REGISTRY: Registry[Search] = Registry("search", __name__, method="ask")
 """The searches that are found by name: those of this package, and those that installed packages add."""
 
-DEFAULT = "auto"
-"""The default search of a campaign, in Python, in experiment files and on the command line."""
+DEFAULT = "auto"  #: the default search of a campaign, in Python, in experiment files and on the command line
 
 
 def by_name(name: str, *, repeats: int = 1, **options: Any) -> Search:

@@ -15,8 +15,7 @@ from ctxval._util.representation import ShortRepr, call, options
 from ctxval.errors import InputError, ShapeError
 from ctxval.gp.surrogate import Surrogate
 
-Note = dict[str, Any]
-"""What a search records about the choice of a point, in types that JSON has."""
+Note = dict[str, Any]  #: what a search records about the choice of a point, in types that JSON has
 
 
 @dataclass(frozen=True)
@@ -97,17 +96,13 @@ class BaseSearch(Search):
     """Base class of searches with more than the three methods of :class:`Search`; all ready-made ones inherit it.
 
     A subclass implements these three methods. All others have a default, which does nothing.
-
-    Attributes:
-        iid: whether every point is an independent uniform draw. If the task space has a distribution of tasks, a
-            campaign replaces the points by draws from it.
-        initial: number of points at the start that are an initial design.
-        discard: number of the largest values that the estimate of the maximum leaves out.
     """
 
+    #: whether every point is an independent uniform draw. If the task space has a distribution of tasks, a campaign
+    #: replaces the points by draws from it.
     iid: bool = False
-    initial: int = 0
-    discard: int = 0
+    initial: int = 0  #: number of points at the start that are an initial design
+    discard: int = 0  #: number of the largest values that the estimate of the maximum leaves out
 
     def __init__(self) -> None:
         """Take no options; a protocol without a constructor would take any."""

@@ -9,7 +9,7 @@ import numpy as np
 
 from ctxval._util.arrays import Array, single_threaded
 from ctxval._util.checked import PositiveFloat, PositiveInt
-from ctxval._util.extras import require_extra
+from ctxval._util.refusals import require_extra
 from ctxval._util.registry import part
 from ctxval.errors import InputError
 from ctxval.searches.base import SequentialSearch
@@ -17,7 +17,7 @@ from ctxval.searches.base import SequentialSearch
 if TYPE_CHECKING:
     from cmaes import CMA
 
-_library = partial(require_extra, "cmaes", "searches", "CMA-ES searches")
+_library = partial(require_extra, "cmaes", "searches", "CMA-ES searches need")
 
 
 @part("cma-es")

@@ -294,13 +294,11 @@ def _log_error(expected: Array, values: Array) -> float:
 
 Thinking = Literal["balanced", "fast", "thorough"]
 
-FAST = 0.15
-"""Share of the largest number of points that fast thinking predicts."""
+FAST = 0.15  #: share of the largest number of points that fast thinking predicts
 _SHARES = (1.0, 0.4, FAST)
 """Shares of the largest number of points that are predicted for one choice, from thorough to fast."""
 
-DESIGNS = "designs"
-"""Key in a note: the number of points that are predicted for each choice of the campaign."""
+DESIGNS = "designs"  #: key in a note: the number of points that are predicted for each choice of the campaign
 
 
 @part("auto")

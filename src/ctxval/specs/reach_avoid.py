@@ -42,17 +42,13 @@ class ReachAvoid(NamedStates):
     The robustness is the smaller one of the least signed distance to the sets that are avoided, over all recorded
     times, and the depth in the reach set at its deepest within the times. What happens between two recorded times is
     not seen.
-
-    Attributes:
-        avoid: the sets that are never entered; one set, a list, or their tables.
-        reach: the set that is reached, or its table; None if there is none.
-        times: the first and the last second at which it may be reached; by default, it is reached at the end.
-        components: the states that are positions, by index or by the name in the experiment; all states by default.
     """
 
-    avoid: Any = ()
-    reach: Any = None
+    avoid: Any = ()  #: the sets that are never entered; one set, a list, or their tables
+    reach: Any = None  #: the set that is reached, or its table; None if there is none
+    #: the first and the last second at which it may be reached; by default, it is reached at the end
     times: Sequence[float] | None = None
+    #: the states that are positions, by index or by the name in the experiment; all states by default
     components: Sequence[int | str] | None = None
 
     def __post_init__(self) -> None:

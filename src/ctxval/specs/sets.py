@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Self
@@ -23,8 +23,7 @@ from ctxval._util.representation import ShortRepr
 from ctxval.core.task import Task
 from ctxval.errors import InputError, ShapeError, UnknownNameError
 
-Place = ArrayLike | str
-"""Numbers ``(k,)``, or the name of an entry of the task's environment."""
+Place = ArrayLike | str  #: numbers ``(k,)``, or the name of an entry of the task's environment
 
 
 class Set(ShortRepr, ABC):
@@ -44,15 +43,12 @@ class Set(ShortRepr, ABC):
 
 @dataclass(frozen=True, eq=False)
 class _Placed(Set):
-    """A set with a place of its own, which may move.
+    """A set with a place of its own, which may move."""
 
-    Attributes:
-        center: the place of the set, numbers ``(k,)``, a row for each time ``(H + 1, k)``, or the name of an entry of
-            the task's environment.
-        velocity: how the place changes with time, per second, given like the center; None if it does not.
-    """
-
+    #: the place of the set, numbers ``(k,)``, a row for each time ``(H + 1, k)``, or the name of an entry of the task's
+    #: environment
     center: Place = 0.0
+    #: how the place changes with time, per second, given like the center; None if it does not
     velocity: Place | None = None
 
     def __post_init__(self) -> None:
@@ -81,10 +77,9 @@ class _Placed(Set):
             place = task.environment[given][..., None, :]
         else:
             place = np.asarray(given, dtype=np.float64)
-            if place.ndim > 1:
-                if len(place) < times:
-                    raise ShapeError(f"a {what} that moves needs a row for each of {times} times, got {len(place)}.")
-                place = place[:times]
+            if place.ndim > 1 and len(place) < times:
+                raise ShapeError(f"a {what} that moves needs a row for each of {times} times, got {len(place)}.")
+            place = place[:times] if place.ndim > 1 else place
         if place.ndim and place.shape[-1] != k:
             raise _other_dimension(what, place.shape[-1], k)
         return place
@@ -115,14 +110,10 @@ class Ball(_Placed):
 @checked
 @dataclass(frozen=True, eq=False)
 class Box(_Placed):
-    """All positions between two corners, which are relative to the center.
-
-    Attributes:
-        low, high: the corners, ``(k,)``; infinite or None where there is no end. One of them may be left out.
-    """
+    """All positions between two corners, which are relative to the center."""
 
     _: dataclasses.KW_ONLY
-    low: Any = None
+    low: Any = None  #: the corners, ``(k,)``; infinite or None where there is no end. One of them may be left out.
     high: Any = None
 
     def __post_init__(self) -> None:
@@ -165,15 +156,11 @@ class Polytope(_Placed):
     """All positions with ``A x <= b``, where x is relative to the center.
 
     The signed distance is the largest one to the planes of the faces. Outside it is at most the Euclidean distance.
-
-    Attributes:
-        A: one row for each face, ``(q, k)``.
-        b: ``(q,)``.
     """
 
     _: dataclasses.KW_ONLY
-    A: Any
-    b: Any
+    A: Any  #: one row for each face, ``(q, k)``
+    b: Any  #: ``(q,)``
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -207,13 +194,9 @@ class Polytope(_Placed):
 @checked
 @dataclass(frozen=True, eq=False)
 class Union(Set):
-    """All positions that are in one of several sets.
+    """All positions that are in one of several sets."""
 
-    Attributes:
-        sets: the sets, or tables of their arguments with their ``type``.
-    """
-
-    sets: Sequence[Any]
+    sets: Sequence[Any]  #: the sets, or tables of their arguments with their ``type``
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "sets", as_sets("sets of a Union", self.sets))
@@ -236,13 +219,9 @@ class Union(Set):
 @checked
 @dataclass(frozen=True, eq=False)
 class Outside(Set):
-    """All positions that are not in a set; to avoid them is to stay in the set.
+    """All positions that are not in a set; to avoid them is to stay in the set."""
 
-    Attributes:
-        of: the set, or a table of its arguments with its ``type``.
-    """
-
-    of: Any
+    of: Any  #: the set, or a table of its arguments with its ``type``
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "of", as_set("the set of Outside", self.of))
@@ -265,14 +244,13 @@ SETS: Registry[Set] = Registry(
 
 def as_set(what: str, given: Any) -> Set:
     """Return a set from itself, or from a table of its arguments with its ``type``."""
-    if isinstance(given, Set):
-        return given
-    if isinstance(given, Mapping) and isinstance(given.get("type"), str):
-        arguments = dict(given)
-        name = arguments.pop("type")
-        if name not in SETS.built_in:  # a table runs no code of other packages
-            raise UnknownNameError.among("set", name, SETS.built_in)
-        return SETS.make(name, **arguments)
+    match given:
+        case Set():
+            return given
+        case {"type": str(name), **arguments}:
+            if name not in SETS.built_in:  # a table runs no code of other packages
+                raise UnknownNameError.among("set", name, SETS.built_in)
+            return SETS.make(name, **{str(key): value for key, value in arguments.items()})
     raise InputError(f"{what} must be a set, such as Box(low=[0, 0], high=[1, 1]), or its table, got {given!r}.")
 
 

@@ -8,9 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ctxval._util.arrays import Array
-from ctxval._util.extras import require_extra
+from ctxval._util.refusals import require_extra, reworded
 from ctxval._util.registry import part
-from ctxval._util.texts import reason_of
 from ctxval.core.distance import NamedStates, selected
 from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory
@@ -26,19 +25,15 @@ class STL(NamedStates):
     the time step. An entry ``obstacle`` of the task's environment is known to the formula as ``obstacle_0``,
     ``obstacle_1`` and so on. The robustness changes by at most as much as the states if each predicate compares one
     state with a constant; with other predicates, scale them.
-
-    Attributes:
-        formula: the formula.
-        variables: a name in the formula for each state that it looks at.
-        components: these states, by index or by the name in the experiment; the first ones by default.
     """
 
-    formula: str
-    variables: Sequence[str]
+    formula: str  #: the formula
+    variables: Sequence[str]  #: a name in the formula for each state that it looks at
+    #: these states, by index or by the name in the experiment; the first ones by default
     components: Sequence[int | str] | None = None
 
     def __post_init__(self) -> None:
-        require_extra("rtamt", "stl", "specifications in signal temporal logic")
+        require_extra("rtamt", "stl", "specifications in signal temporal logic need")
         if not len(self.variables):
             raise InputError("a formula needs the name of at least one state in variables, got none.")
         if self.components is None:
@@ -63,19 +58,17 @@ class STL(NamedStates):
         return np.array([self._of_one(names, row, task) for row in rows]).reshape(batch)
 
     def _of_one(self, names: Sequence[str], signals: Array, task: Task) -> float:
-        rtamt = require_extra("rtamt", "stl", "specifications in signal temporal logic")
+        rtamt = require_extra("rtamt", "stl", "specifications in signal temporal logic need")
         monitor = rtamt.StlDiscreteTimeSpecification()
         monitor.unit = "s"
         monitor.set_sampling_period(task.dt, "s", 0.1)
         for name in names:
             monitor.declare_var(name, "float")
         monitor.spec = self.formula
-        try:
+        with reworded(f"the formula {self.formula!r} cannot be evaluated"):  # whatever rtamt raises
             monitor.parse()
             data = dict(zip(names, signals.tolist(), strict=True))
             rho = float(monitor.evaluate({"time": task.times[: signals.shape[1]].tolist(), **data})[0][1])
-        except Exception as error:  # whatever rtamt raises
-            raise InputError(f"the formula {self.formula!r} cannot be evaluated: {reason_of(error)}.") from error
         if not np.isfinite(rho):
             raise InputError(f"the formula {self.formula!r} needs times after the end of the task.")
         return rho

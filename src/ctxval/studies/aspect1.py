@@ -52,34 +52,28 @@ class SimulatedTask:
 
 @dataclass(frozen=True, eq=False)
 class Aspect1Report:
-    """What simulations of M show of its tasks and controllers. The system is never executed.
+    """What simulations of M show of its tasks and controllers. The system is never executed."""
 
-    Attributes:
-        distance, units: the distance between the trajectory of M and its task; the units are empty if not known.
-        threshold: the largest error with which a task counts as completed; None if there is none.
-        simulated: all tasks, the worst first; tasks without an error come before those with one.
-        verdict: the verdict on M against the threshold, with a bound over all tasks; None if there is no threshold.
-        share: the share of all tasks that M does not complete is at most this with confidence 0.95, because so many of
-            the independent draws among the simulated tasks exceed the threshold; None if there is no threshold.
-        distribution: the distribution of tasks as a text, under which the share is a probability; None if it is
-            uniform.
-        flips, flipped: how much the controllers of neighbouring tasks differ, and the parameters of two such tasks;
-            None if no tasks are neighbours.
-        saturation: the share of the steps at which each of the ``inputs`` is at a limit; None if there are no inputs.
-        not_converged, designs: the tasks whose design did not converge, and how many designs tell this.
-    """
-
-    distance: Distance
+    distance: Distance  #: the distance between the trajectory of M and its task; the units are empty if not known
     units: str
-    threshold: float | None
+    threshold: float | None  #: the largest error with which a task counts as completed; None if there is none
+    #: all tasks, the worst first; tasks without an error come before those with one
     simulated: tuple[SimulatedTask, ...]
+    #: the verdict on M against the threshold, with a bound over all tasks; None if there is no threshold
     verdict: Verdict | None
+    #: the share of all tasks that M does not complete is at most this with confidence 0.95, because so many of the
+    #: independent draws among the simulated tasks exceed the threshold; None if there is no threshold
     share: float | None
+    #: the distribution of tasks as a text, under which the share is a probability; None if it is uniform
     distribution: str | None
+    #: how much the controllers of neighbouring tasks differ, and the parameters of two such tasks; None if no tasks are
+    #: neighbours
     flips: Flips | None
     flipped: tuple[dict[str, Any], dict[str, Any]] | None
+    #: the share of the steps at which each of the ``inputs`` is at a limit; None if there are no inputs
     saturation: InputSaturation | None
     inputs: tuple[str, ...]
+    #: the tasks whose design did not converge, and how many designs tell this
     not_converged: tuple[dict[str, Any], ...]
     designs: int
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -51,47 +52,30 @@ _STATES = (
 
 @dataclass(frozen=True)
 class FieldSummary(ShortRepr):
-    """One field of a log.
+    """One field of a log."""
 
-    Attributes:
-        path, unit: its name and its unit; the unit is empty if the log states none.
-        records, period: number of records, and median seconds between two of them.
-        low, high: its smallest and its largest value.
-        role: whether it is taken as a state, as an input, or not at all.
-        remark: what is unusual, such as that it never changes.
-    """
-
-    path: str
+    path: str  #: its name and its unit; the unit is empty if the log states none
     unit: str
-    records: int
+    records: int  #: number of records, and median seconds between two of them
     period: float
-    low: float
+    low: float  #: its smallest and its largest value
     high: float
-    role: Role
-    remark: str
+    role: Role  #: whether it is taken as a state, as an input, or not at all
+    remark: str  #: what is unusual, such as that it never changes
 
 
 @dataclass(frozen=True, eq=False)
 class Survey(ShortRepr):
-    """What logs hold, and how well models that are learned from them predict others of them.
+    """What logs hold, and how well models that are learned from them predict others of them."""
 
-    Attributes:
-        sources: the files and episodes.
-        fields: the fields of the first log.
-        mapping, guesses: which fields are taken as states and inputs, and what was guessed, one sentence each.
-        fit: a linear model and one with what this leaves, each with its errors.
-        replay: what the recordings show of the better one.
-        reach: number of steps for which its errors are close, and those that were compared.
-    """
-
-    sources: tuple[str, ...]
-    fields: tuple[FieldSummary, ...]
-    mapping: LogMapping
+    sources: tuple[str, ...]  #: the files and episodes
+    fields: tuple[FieldSummary, ...]  #: the fields of the first log
+    mapping: LogMapping  #: which fields are taken as states and inputs, and what was guessed, one sentence each
     guesses: tuple[str, ...]
     recordings: Recordings
-    fit: FitReport
-    replay: ReplayReport
-    reach: tuple[int, int]
+    fit: FitReport  #: a linear model and one with what this leaves, each with its errors
+    replay: ReplayReport  #: what the recordings show of the better one
+    reach: tuple[int, int]  #: number of steps for which its errors are close, and those that were compared
 
     @property
     def best(self) -> FittedModel:
@@ -227,12 +211,10 @@ def _is(path: str, words: str) -> bool:
 
 def _guessed(log: Log, fields: Sequence[FieldSummary], clock: Clock, guesses: list[str]) -> LogMapping:
     """Return the mapping by usual names, or by words in the names of fields; say how it was found."""
-    try:
+    with suppress(InputError):
         usual = LogMapping.usual(log)
         guesses.append(f"states and inputs have their usual names: {enumerated(usual.fields, 12)}")
         return usual
-    except InputError:
-        pass
     moving = [each for each in fields if each.records and not each.remark.startswith((_NEVER, _HARDLY))]
     still = [each.path for each in fields if each not in moving]
     inputs = [each.path for each in moving if _is(each.path, _INPUTS)]

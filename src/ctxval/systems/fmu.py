@@ -12,6 +12,7 @@ import sys
 import tempfile
 import weakref
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +20,8 @@ import numpy as np
 
 from ctxval._util.arrays import Array
 from ctxval._util.checked import Seconds
-from ctxval._util.extras import require_extra
 from ctxval._util.files import require_regular_file
+from ctxval._util.refusals import require_extra, reworded
 from ctxval._util.registry import part
 from ctxval._util.representation import ShortRepr
 from ctxval.core.controller import Controller
@@ -207,21 +208,20 @@ def _clean(idle: dict[int, list[_Process]], unpacked: str, owner: int) -> None:
 
 
 def _unpacked(path: Path) -> tuple[Any, str]:
-    fmpy = require_extra("fmpy", "fmu", "FMUs")
-    try:
+    fmpy = require_extra("fmpy", "fmu", "FMUs need")
+    with reworded(
+        f"{path} cannot be read as an FMU", Exception
+    ):  # of many kinds: no file, not a zip, not XML, not valid by the schema
         require_regular_file(path)
         description = fmpy.read_model_description(str(path))
-    except Exception as error:  # of many kinds: no file, not a zip, not XML, not valid by the schema
-        raise InputError(f"{path} cannot be read as an FMU: {error}") from error
     if description.coSimulation is None or not description.fmiVersion.startswith(("2", "3")):
         got = f"FMI {description.fmiVersion}{'' if description.coSimulation else ' without co-simulation'}"
         raise InputError(f"{path} must be an FMU for co-simulation, FMI 2 or 3, got {got}.")
     folder = tempfile.mkdtemp(prefix="ctxval-")
-    try:
+    with ExitStack() as stack, reworded(f"{path} cannot be unpacked", Exception):
+        stack.callback(shutil.rmtree, folder, ignore_errors=True)
         fmpy.extract(str(path), folder)
-    except Exception as error:
-        shutil.rmtree(folder, ignore_errors=True)
-        raise InputError(f"{path} cannot be unpacked: {error}") from error
+        stack.pop_all()
     return description, folder
 
 

@@ -7,6 +7,7 @@ from typing import Any, NoReturn
 
 from ctxval._util.arrays import as_floats
 from ctxval._util.checked import Seconds
+from ctxval._util.refusals import reworded
 from ctxval._util.registry import part
 from ctxval._util.representation import ShortRepr
 from ctxval.core.controller import Controller, Feedback, started
@@ -34,12 +35,10 @@ class Function(ShortRepr):
         returned = self.function(started(controller, task), task)
         if isinstance(returned, Trajectory):
             return returned
-        try:
+        wanted = f"a Trajectory, or states (H + 1, n) and inputs (H, m) with H = {task.horizon}"
+        with reworded(f"the system's function must return {wanted}", TypeError, ValueError, to=ExecutionError):
             states, inputs = (as_floats(name, part) for name, part in zip(("states", "inputs"), returned, strict=True))
             return Trajectory(task.times, states, inputs)
-        except (InputError, TypeError, ValueError) as error:
-            wanted = f"a Trajectory, or states (H + 1, n) and inputs (H, m) with H = {task.horizon}"
-            raise ExecutionError(f"the system's function must return {wanted}: {error}") from error
 
 
 @part()
@@ -49,13 +48,11 @@ class Manual(ShortRepr):
     States and inputs are names of the components with their units, for files.
     """
 
-    manual = True
-    """Mark of a system that a program cannot execute."""
+    manual = True  #: mark of a system that a program cannot execute
 
     def __init__(self, *, states: Mapping[str, str], inputs: Mapping[str, str], dt: Seconds) -> None:
         self.states, self.inputs = dict(states), dict(inputs)
-        texts = [*self.states.items(), *self.inputs.items()]
-        if not self.states or not all(isinstance(text, str) for pair in texts for text in pair):
+        if not self.states:
             raise InputError(f"states and inputs must be names with units, got {self.states} and {self.inputs}.")
         require_names(self.states, self.inputs)
         self.dt = float(dt)

@@ -6,14 +6,14 @@ import contextlib
 import copy
 import os
 from collections.abc import Callable
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
 from ctxval._util.arrays import Array, as_floats
-from ctxval._util.checked import NonNegativeInt, Seconds
-from ctxval._util.extras import require_extra
+from ctxval._util.checked import Must, NonNegativeInt, Seconds, require
 from ctxval._util.mjcf import warning_of
+from ctxval._util.refusals import require_extra, reworded
 from ctxval._util.registry import part
 from ctxval._util.representation import ShortRepr
 from ctxval.core.controller import Controller
@@ -87,9 +87,9 @@ class Gymnasium(ShortRepr):
         self.inputs = int(np.prod(space.shape))
         bare = first.unwrapped
         stated = getattr(bare, "dt", None)
-        step = stated if dt is None else dt
-        if not isinstance(step, int | float | np.number) or not (np.isfinite(step) and step > 0):
-            raise InputError(f"dt must be the positive number of seconds in one step of the environment, got {step!r}.")
+        step: Any = stated if dt is None else dt
+        positive = Must("the positive number of seconds in one step of the environment", lambda dt: 0 < dt < np.inf)
+        require("dt", Annotated[float, positive], step)
         if stated is not None and not np.isclose(stated, step, rtol=1e-9, atol=0):
             raise InputError(f"dt must be that of the environment, {stated:g} s, got {step:g} s.")
         self.dt = float(step)
@@ -135,16 +135,20 @@ class Gymnasium(ShortRepr):
             self._idle.pop().close()
 
     def _made(self) -> Any:
-        gymnasium = require_extra("gymnasium", "mujoco", "environments")
+        gymnasium = require_extra("gymnasium", "mujoco", "environments need")
         if self._given:
             return self.environment if not hasattr(self, "_idle") else copy.deepcopy(self.environment)
         if not isinstance(self.environment, str):
             return self.environment(**{**self.options, **self._files})
-        try:
+        with reworded(
+            f"the environment {self.environment!r} cannot be made",
+            gymnasium.error.Error,
+            ImportError,
+            TypeError,
+            AttributeError,
+        ):
             # The passive checker would warn of actions outside the action space, but the environment clips them.
             return gymnasium.make(self.environment, **{"disable_env_checker": True, **self.options, **self._files})
-        except (gymnasium.error.Error, ImportError, TypeError, AttributeError) as error:
-            raise InputError(f"the environment {self.environment!r} cannot be made: {error}") from error
 
     def _start(self, environment: Any, task: Task) -> None:
         environment.reset(seed=self.seed)

@@ -23,6 +23,7 @@ from typing import IO
 
 from ctxval._util.checked import TimeLimit
 from ctxval._util.files import temporary_folder
+from ctxval._util.refusals import reworded
 from ctxval._util.registry import part
 from ctxval._util.representation import ShortRepr
 from ctxval.core.controller import Controller
@@ -47,10 +48,8 @@ def run_supervised(
     """
     if os.name != "posix":
         # Run a command on a system without process groups; processes that it starts may outlive it.
-        try:
+        with reworded("the command cannot be started", OSError, to=ExecutionError):
             process = subprocess.Popen(command, cwd=folder, stdin=subprocess.DEVNULL, stdout=stdout, stderr=stderr)
-        except OSError as error:
-            raise ExecutionError(f"the command cannot be started: {error}") from error
         try:
             return process.wait(timeout)
         except subprocess.TimeoutExpired:
@@ -62,7 +61,7 @@ def run_supervised(
     # -I, because modules in the folder of the program have the same names as other modules. A session of its own,
     # because Ctrl-C is for the campaign, which ends after the running executions.
     program = [sys.executable, "-I", "-S", str(_PROGRAM), str(os.getpid()), *map(str, descriptors), *command]
-    try:
+    with reworded("the command cannot be started", OSError, to=ExecutionError):
         supervisor = subprocess.Popen(
             program,
             stdin=subprocess.PIPE,
@@ -73,8 +72,6 @@ def run_supervised(
             pass_fds=descriptors,
             start_new_session=True,
         )
-    except OSError as error:
-        raise ExecutionError(f"the command cannot be started: {error}") from error
     assert supervisor.stdout is not None
     child = 0
     try:
@@ -206,15 +203,14 @@ class Subprocess(ShortRepr):
 
 def signal_name(number: int) -> str:
     """Return the name of a signal, also of one that Python does not know."""
-    try:
+    with contextlib.suppress(ValueError):
         return signal.Signals(number).name
-    except ValueError:
-        return f"signal {number}"
+    return f"signal {number}"
 
 
 def _trajectory(folder: Path, task: Task) -> Trajectory:
     shape = task.horizon + 1, task.initial_state.size
-    try:
+    with reworded("the command's trajectory cannot be used", InputError, OSError, MemoryError, to=ExecutionError):
         if os.path.lexists(folder / "trajectory.npz"):
             trajectory = Trajectory.from_npz(folder / "trajectory.npz", shape=shape)
         elif os.path.lexists(folder / "trajectory.csv"):
@@ -225,6 +221,4 @@ def _trajectory(folder: Path, task: Task) -> Trajectory:
             if trajectory.states.shape != shape:
                 raise InputError(f"it must have states of shape {shape}, got {trajectory.states.shape}")
             require_times(trajectory, task.times)
-    except (InputError, OSError, MemoryError) as error:
-        raise ExecutionError(f"the command's trajectory cannot be used: {error}") from error
     return trajectory

@@ -129,7 +129,6 @@ class OperatorPage(PageRoutes):
         self.service = service
 
     def routes(self) -> list[BaseRoute]:
-        """Return the further routes, too."""
         return [
             *super().routes(),
             Route("/choose", self._inside(self._choose), methods=["POST"]),
@@ -226,8 +225,6 @@ async def _form(request: Request, **limits: int) -> AsyncIterator[tuple[dict[str
 
 
 def application(state: PageState, access: Access, hosts: Hosts) -> Guard:
-    """Return the ASGI application of a campaign."""
-
     @contextlib.asynccontextmanager
     async def running(app: Starlette) -> AsyncIterator[None]:
         await state.start()

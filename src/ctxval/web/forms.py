@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import TypeVar
 
@@ -18,12 +19,10 @@ from ctxval.web.jobs import TaskRequest
 
 Number = TypeVar("Number", int, float)
 
-Fields = Mapping[str, str]
-"""The fields of a form that are texts."""
+Fields = Mapping[str, str]  #: the fields of a form that are texts
 
 
 def task_request(fields: Fields, space: TaskSpace) -> TaskRequest:
-    """Return what an operator asks for."""
     seen = _read(fields, "seen", "the number of trials on the page must be a whole number", int)
     match fields.get("how"):
         case "next":
@@ -72,12 +71,10 @@ def _number(fields: Fields, field: str, name: str) -> float:
 
 def _read(fields: Fields, field: str, sentence: str, kind: Callable[[str], Number]) -> Number:
     given = fields.get(field, "").strip()
-    try:
+    with suppress(ValueError, OverflowError):  # a whole number may be too large for a float
         value = kind(given)
         if math.isfinite(value):
             return value
-    except (ValueError, OverflowError):  # a whole number may be too large for a float
-        pass
     raise InputError(f"{sentence}, got {given[:60]!r}.")
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import tempfile
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -25,11 +26,9 @@ from ctxval.core.labels import labels_of
 from ctxval.core.trial import Trial
 from ctxval.errors import InputError
 
-Files = dict[str, bytes]
-"""The files of a trial by name."""
+Files = dict[str, bytes]  #: the files of a trial by name
 
-Pictures = dict[str, bytes | str]
-"""Pictures by name as SVG; a text says why a picture is missing."""
+Pictures = dict[str, bytes | str]  #: pictures by name as SVG; a text says why a picture is missing
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,12 +56,10 @@ class Snapshot:
 
     @property
     def executions(self) -> int:
-        """The number of executions of S that have ended."""
         return sum(trial.executed for trial in self.trials)
 
     @property
     def worst(self) -> Trial | None:
-        """The trial with the largest distance."""
         known = (trial for trial in self.trials if trial.state == "completed")
         return max(known, key=lambda trial: trial.distance or 0.0, default=None)
 
@@ -79,18 +76,16 @@ class ServedCampaign:
 
     @property
     def store_name(self) -> str:
-        """The name of the file of the store."""
         path = self.campaign.store.path
         return "a store in memory" if path is None else path.name
 
     @property
     def decides(self) -> bool:
         """Whether executions can be chosen that decide the verdict."""
-        try:
+        with suppress(InputError):
             require_decisive(self.certificate)
-        except InputError:
-            return False
-        return self.threshold is not None
+            return self.threshold is not None
+        return False
 
     def read(self) -> Snapshot:
         """Read the trials in the store, with what people must know of the open tasks before they execute them."""
@@ -112,21 +107,15 @@ OpenCampaign = Callable[[], ServedCampaign]
 
 @dataclass(frozen=True)
 class TaskRequest:
-    """What the operator asks for: by default, the task that the search chooses.
-
-    Attributes:
-        again: the number of an earlier trial whose task is executed again, ``because`` something was changed.
-        draw: whether the task is an independent draw, for an audit.
-        trials: the number of trials that the operator has seen; None to skip the check.
-        decides: whether the task is the one that is expected to decide the verdict soonest.
-    """
+    """What the operator asks for: by default, the task that the search chooses."""
 
     parameters: Mapping[str, Any] | None = None
+    #: the number of an earlier trial whose task is executed again, ``because`` something was changed
     again: int | None = None
     because: str | None = None
-    draw: bool = False
-    trials: int | None = None
-    decides: bool = False
+    draw: bool = False  #: whether the task is an independent draw, for an audit
+    trials: int | None = None  #: the number of trials that the operator has seen; None to skip the check
+    decides: bool = False  #: whether the task is the one that is expected to decide the verdict soonest
 
     def require_current(self, trials: int) -> None:
         """Refuse a request if another task was opened since the operator looked."""
@@ -161,7 +150,6 @@ def choose(served: ServedCampaign, request: TaskRequest) -> tuple[int, Files] | 
 
 
 def files_of(served: ServedCampaign, number: int) -> Files:
-    """Return the files of an open trial."""
     with stage(f"preparing the files of trial {number}"):
         return _files(served, served.campaign.reopen(number))
 
@@ -187,14 +175,12 @@ def judge(served: ServedCampaign) -> Verdict | None:
 
 
 def draw(served: ServedCampaign) -> Pictures:
-    """Return the pictures of the present trials."""
     with stage("drawing the pictures"):
         served.campaign.refresh()
         return pictures_of(served)
 
 
 def pictures_of(served: ServedCampaign) -> Pictures:
-    """Return the pictures of the trials that the campaign knows."""
     import matplotlib
     from matplotlib.figure import Figure
 

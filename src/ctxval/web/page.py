@@ -185,9 +185,12 @@ def values_of(parameters: Mapping[str, Any], units: Mapping[str, str]) -> list[t
 
 
 def _value(value: Any) -> str:
-    if isinstance(value, str):
-        return line(value, 120)
-    return f"[{', '.join(map(_value, value))}]" if isinstance(value, list) else f"{value:.6g}"
+    match value:
+        case str():
+            return line(value, 120)
+        case [*items]:
+            return f"[{', '.join(map(_value, items))}]"
+    return f"{value:.6g}"
 
 
 def in_words(trial: Trial, units: Mapping[str, str]) -> str:

@@ -22,8 +22,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from ctxval._util.representation import call
 from ctxval.errors import InputError
 
-MOST_UPLOAD = 64 * 2**20
-"""Largest size of a recording in bytes."""
+MOST_UPLOAD = 64 * 2**20  #: largest size of a recording in bytes
 
 HEADERS = {
     # Nothing from elsewhere, and no script or style inside the page.
@@ -69,11 +68,9 @@ class Access:
         return name if name and _same(self._signed("session", name), signature) else None
 
     def form_token(self, session: str) -> str:
-        """Return the token that each form of a session must contain."""
         return self._signed("form", session)
 
     def allows_form(self, session: str, token: str) -> bool:
-        """Return whether a form is one of this session."""
         return _same(self.form_token(session), token)
 
     def _signed(self, purpose: str, text: str) -> str:
@@ -100,7 +97,6 @@ class Hosts:
 
     @staticmethod
     def of(host: str, more: Iterable[str] = ()) -> Hosts:
-        """Return the permitted names of a server."""
         names = {"localhost", "127.0.0.1", "::1", host.lower(), *(name.lower() for name in more)}
         local = is_loopback(host)
         if not local:
@@ -109,22 +105,17 @@ class Hosts:
         return Hosts(frozenset(names), not local)
 
     def permit(self, header: str | None) -> bool:
-        """Return whether a Host header names this server."""
-        try:
+        with contextlib.suppress(ValueError):
             place = urlsplit(f"//{header or ''}")
-        except ValueError:
-            return False
-        name = None if "@" in place.netloc else place.hostname
-        return bool(name) and (name in self.names or (self.any_address and is_address(str(name))))
+            name = None if "@" in place.netloc else place.hostname
+            return bool(name) and (name in self.names or (self.any_address and is_address(str(name))))
+        return False
 
 
 def is_address(host: str) -> bool:
-    """Return whether a host is an IP address and not a name."""
-    try:
-        ipaddress.ip_address(host.partition("%")[0])
-    except ValueError:
-        return False
-    return True
+    with contextlib.suppress(ValueError):
+        return bool(ipaddress.ip_address(host.partition("%")[0]))
+    return False
 
 
 def is_loopback(host: str) -> bool:
@@ -187,7 +178,6 @@ class Guard:
         self.app, self.hosts, self.access = app, hosts, access
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer a request."""
         if scope["type"] != "http":
             # There are no WebSockets here; only the start and the end of the server are left.
             await (self.app(scope, receive, send) if scope["type"] == "lifespan" else send({"type": "websocket.close"}))

@@ -16,6 +16,7 @@ from typing import Any
 import uvicorn
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
+from ctxval._util.refusals import reworded
 from ctxval.errors import InputError
 from ctxval.web.app import application
 from ctxval.web.jobs import OpenCampaign
@@ -91,7 +92,6 @@ class Server(uvicorn.Server):
         self._state = state
 
     def handle_exit(self, sig: int, frame: FrameType | None) -> None:
-        """End the server at a signal."""
         super().handle_exit(sig, frame)  # which asks whether the end has begun already
         self.end()
 
@@ -102,15 +102,11 @@ class Server(uvicorn.Server):
 
 
 def listening(host: str, port: int) -> socket.socket:
-    """Return a socket that listens at an address."""
     if not 0 <= port <= 65535:
         raise InputError(f"the port must be from 0 to 65535, got {port}.")
-    try:
+    with reworded(f"the page cannot be served at {host}, port {port}", OSError, UnicodeError):
         family, *_, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
         return socket.create_server(address[:2], family=family, backlog=128)
-    except (OSError, UnicodeError) as error:
-        reason = getattr(error, "strerror", None) or str(error)
-        raise InputError(f"the page cannot be served at {host}, port {port}: {reason}.") from error
 
 
 def page_address(host: str, port: int) -> str:
@@ -157,17 +153,14 @@ class Connection(H11Protocol):
         self.app_state = {**self.app_state, "connection": self}
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """Begin to wait for a request."""
         super().connection_made(transport)
         self.waiting.add(self)
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Wait no longer."""
         self.waiting.remove(self)
         super().connection_lost(exc)
 
     def on_response_complete(self) -> None:
-        """Wait for the next request."""
         if not self.transport.is_closing():
             self.waiting.add(self)
         super().on_response_complete()

@@ -50,14 +50,12 @@ class CampaignService(PageState):
         self._judge = BackgroundProcess(reopen, self._follow_progress("judging"))
 
     async def start(self) -> None:
-        """Start the background processes and the observation of the store."""
         await super().start()
         self._spawn(self._background(self._chooser, jobs.warm_up))
         self._follow()
         self._spawn(self._watch())
 
     async def stop(self) -> None:
-        """End all work in progress, and close everything."""
         await super().stop()
         await self._loop.run_in_executor(None, self.close)
 
@@ -73,7 +71,6 @@ class CampaignService(PageState):
     # What operators do
 
     def choose(self, request: TaskRequest) -> None:
-        """Start to choose the next task."""
         if self.choosing is not None:
             raise InputError("a task is already being chosen.")
         request.require_current(len(self.snapshot.trials))
@@ -142,12 +139,10 @@ class CampaignService(PageState):
     async def _watch(self) -> None:
         while True:
             await asyncio.sleep(1.0)
-            try:
+            with contextlib.suppress(CtxvalError):  # looking again says why
                 signature = await self._in_thread(lambda: self.served.campaign.store.signature())
                 if signature == self.snapshot.signature and self.store_error is None:
                     continue
-            except CtxvalError:
-                pass  # looking again says why
             await self._look()
 
     async def _look(self) -> None:

@@ -31,7 +31,6 @@ class Work:
 
     @staticmethod
     def begun(stage: str) -> Work:
-        """Return work that begins now."""
         now = time.monotonic()
         return Work(Progress(stage, 0, None, ""), now, now)
 
@@ -56,7 +55,6 @@ class Innermost:
         self._running: dict[int, Progress] = {}
 
     def __call__(self, progress: Progress) -> None:
-        """Hear the progress of any stage."""
         if progress.ended:
             self._running.pop(progress.depth, None)
         else:
@@ -100,11 +98,9 @@ class PageState:
         self._closing = False
 
     async def start(self) -> None:
-        """Begin to follow the campaign."""
         self._loop = asyncio.get_running_loop()
 
     async def stop(self) -> None:
-        """End all work in progress."""
         self.end_events()
         for task in self._tasks:
             task.cancel()
@@ -144,7 +140,6 @@ class PageState:
         self._notify()
 
     def update(self, **changes: Any) -> None:
-        """Change what the page shows."""
         vars(self).update(changes)
         self.version += 1
         self._notify()
@@ -191,7 +186,6 @@ class LiveCampaign(PageState):
         self.started = threading.Event()
 
     async def start(self) -> None:
-        """Begin to follow the campaign."""
         await super().start()
         self._spawn(self._watch())
         self.started.set()
@@ -213,7 +207,6 @@ class LiveCampaign(PageState):
         self._post(changes)
 
     def end(self, verdict: Verdict | None, certificate: Certificate | None, report: str | None) -> None:
-        """Show the verdict, and the path of the report."""
         outcome = "the campaign has ended, and so will this page" + (f". The report is {report}" if report else "")
         shown = {"verdict": verdict, "certificate": certificate, "pictures": pictures_of(self.served)}
         self._post({**shown, "choosing": None, "interval": None, "outcome": outcome})

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -180,12 +181,10 @@ def _model(validation: Validation, counts: Mapping[str, int]) -> Findings:
 
 def _batches(validation: Validation, plans: Sequence[Plan]) -> Findings:
     points = np.stack([plan.parameters.points for plan in plans])
-    try:
+    batch = None
+    with suppress(Exception):
         batch = validation.task_at(validation.space.parameters(points))
-        same = isinstance(batch, Task) and batch.batch_shape == (len(points),)
-    except Exception:
-        same = False
-    if not same:
+    if batch is None or batch.batch_shape != (len(points),):
         yield "noted", "the task function takes one point at a time, so --truth is slower"
         return
     for index, plan in enumerate(plans):

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin, get_type_hints
@@ -16,7 +17,9 @@ from pydantic.errors import PydanticUserError
 from pydantic_core import SchemaError
 
 from ctxval import controllers, distances, models, systems
+from ctxval._util.checked import require
 from ctxval._util.files import Archive, read_bytes
+from ctxval._util.refusals import reworded
 from ctxval._util.registry import Declaration, Registry, construct, declaration_of
 from ctxval.cli.config.references import accepts, is_function, reference, require_function, require_part
 from ctxval.core.experiment import Experiment
@@ -27,7 +30,7 @@ from ctxval.core.task_distribution import Normal
 from ctxval.core.trajectory import Transitions
 from ctxval.core.validation import Validation
 from ctxval.data import LogMapping, read_recordings
-from ctxval.errors import CtxvalError, InputError, ShapeError, UnknownNameError
+from ctxval.errors import InputError, UnknownNameError
 from ctxval.models.saved import stored_transitions
 from ctxval.paper import cases
 
@@ -87,15 +90,14 @@ def _built(kind: str, what: str, build: Any, arguments: dict[str, Any], folder: 
 
 def argument(value: Any, folder: Path | None = None) -> Any:
     """Return an argument unchanged, or the object that ``{ref = "module:attr"}`` names."""
-    if isinstance(value, Mapping):
-        if set(value) == {"ref"}:
-            named = reference(str(value["ref"]), folder)
+    match value:
+        case {"ref": text, **others} if not others:
+            named = reference(str(text), folder)
             if inspect.ismodule(named) or (inspect.isroutine(named) and not inspect.isfunction(named)):
-                raise InputError(
-                    f"{value['ref']} must be an object, a class or a function written in Python, got {named!r}."
-                )
+                raise InputError(f"{text} must be an object, a class or a function written in Python, got {named!r}.")
             return named
-        return {key: argument(item, folder) for key, item in value.items()}
+        case {}:
+            return {key: argument(item, folder) for key, item in value.items()}
     return value
 
 
@@ -106,18 +108,14 @@ def recorded(files: Any, folder: Path | None = None) -> Transitions:
         mapping = LogMapping.from_table({key: value for key, value in files.items() if key != "logs"})
         files = files.get("logs")
     paths = [files] if isinstance(files, str) else files
-    if not isinstance(paths, list) or not paths or not all(isinstance(path, str) for path in paths):
+    if not paths or type(paths) is not list or {*map(type, paths)} != {str}:
         raise InputError(f"data must be a file of recorded trajectories or a list of files, got {files!r}.")
     parts, logs = list[Transitions](), dict[str, list[Path]]()
     for path in (Path(folder or "", path) for path in paths):
         stored = None
         if mapping is None and path.suffix == ".npz":
-            try:
+            with reworded(f"{path} cannot be read as recorded data", InputError):
                 stored = stored_transitions(Archive(read_bytes(path)))
-            except ShapeError:
-                raise
-            except InputError as error:
-                raise InputError(f"{path} cannot be read as recorded data: {error}.") from error
         if stored is not None:
             parts.append(stored)
         else:  # arrays in NPZ files have other names than columns
@@ -136,14 +134,12 @@ class TaskTable:
     environment: dict[str, list[float | str]] = field(default_factory=dict)
 
     def __call__(self, p: Parameters) -> Task:
-        """Return the task, or the batch of tasks."""
         start = [_component(entry, p) for entry in self.initial_state]
         goal = None if self.goal is None else [_component(entry, p) for entry in self.goal]
         around = {name: [_component(entry, p) for entry in entries] for name, entries in self.environment.items()}
         return Task(start, goal=goal, horizon=self.horizon, dt=self.dt, environment=around)
 
     def describe(self) -> dict[str, Any]:
-        """Return what identifies this task function in a store."""
         known = {name: getattr(self, name) for name in ("initial_state", "goal", "horizon", "dt")}
         return known | ({"environment": self.environment} if self.environment else {})
 
@@ -169,21 +165,15 @@ def task_function(given: str | Mapping[str, Any], space: TaskSpace, system: Any,
     missing = [key for key in ("initial_state", "horizon", "dt") if table.get(key) is None]
     if missing:
         raise InputError(f"[task] needs {', '.join(missing)}.")
-    around = table.get("environment", {})
-    if not isinstance(around, dict):
-        raise InputError(f"environment of [task] must be a table of names and lists, got {around!r}.")
+    around = require("environment of [task]", Mapping, table.get("environment", {}))
     of_environment = {f"environment {name!r}": entries for name, entries in around.items()}
     for name, entries in {"initial_state": table["initial_state"], "goal": table["goal"], **of_environment}.items():
-        plain = isinstance(entries, list) and entries and all(type(entry) in (int, float, str) for entry in entries)
+        plain = type(entries) is list and entries and {*map(type, entries)} <= {int, float, str}
         if not plain and (name, entries) != ("goal", None):
             raise InputError(f"{name} of [task] must be a list of numbers and of names of parameters, got {entries!r}.")
     task = TaskTable(**table)
-    try:
+    with reworded("[task] cannot be used"):
         task(space.parameters(space.low))
-    except (ValueError, IndexError, TypeError) as error:
-        if isinstance(error, CtxvalError):
-            raise
-        raise InputError(f"[task] cannot be used: {error}.") from error
     return task
 
 
@@ -283,12 +273,9 @@ def plain_options(case: str) -> dict[str, Any]:
 
     The default of an option that must be given is None.
     """
-    try:
-        hints = get_type_hints(cases.REGISTRY.find(case))
-    except InputError:
-        raise
-    except Exception:  # annotations that are texts are evaluated, and anything may stand in them
-        hints = {}
+    hints, made = dict[str, Any](), cases.REGISTRY.find(case)
+    with suppress(Exception):  # annotations that are texts are evaluated, and anything may stand in them
+        hints = get_type_hints(made)
 
     def is_plain(hint: Any) -> bool:
         return get_origin(hint) is Literal or bool({hint, *get_args(hint)} & {str, int, float, bool})

@@ -8,17 +8,16 @@ import inspect
 import os
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from importlib.machinery import PathFinder
 from pathlib import Path
 from typing import Any
 
+from ctxval._util.refusals import reworded
 from ctxval._util.registry import Registry, has_method
-from ctxval._util.texts import reason_of
-from ctxval.errors import CtxvalError, InputError
+from ctxval.errors import InputError
 
-_added: set[str] = set()
-"""Folders of experiments that this module has put on ``sys.path``."""
+_added: set[str] = set()  #: folders of experiments that this module has put on ``sys.path``
 
 
 def reference(text: str, folder: Path | None = None) -> Any:
@@ -28,14 +27,11 @@ def reference(text: str, folder: Path | None = None) -> Any:
         raise InputError(f"a reference must be module:attr, such as 'my_rig:experiment', got {text!r}.")
     with _searched_first(os.path.realpath(folder or _here())) as home:
         _require_place(text, module.partition(".")[0], home)
-        try:
+        with (
+            reworded(f"{module} failed while it was loaded"),
+            reworded(f"{text} cannot be loaded", ImportError, AttributeError, ValueError, TypeError),
+        ):
             return getattr(importlib.import_module(module), attribute)
-        except (ImportError, AttributeError, ValueError, TypeError) as error:
-            raise InputError(f"{text} cannot be loaded: {error}.") from error
-        except CtxvalError:
-            raise
-        except Exception as error:
-            raise InputError(f"{module} failed while it was loaded: {reason_of(error)}.") from error
 
 
 @contextmanager
@@ -57,10 +53,9 @@ def _searched_first(home: str) -> Iterator[str]:
 
 
 def _here() -> str:
-    try:
+    with suppress(OSError):  # it was deleted
         return os.getcwd()
-    except OSError:  # it was deleted
-        return os.devnull
+    return os.devnull
 
 
 def _require_place(text: str, module: str, home: str) -> None:
@@ -152,20 +147,18 @@ def is_function(value: Any) -> bool:
 
 def _unwrapped(value: Any) -> Any:
     """Return the function inside decorators, such as those of compilers."""
-    try:
+    with suppress(ValueError, AttributeError):
         return inspect.unwrap(value)
-    except (ValueError, AttributeError):
-        return value
+    return value
 
 
 def accepts(function: Any, count: int, /, **named: Any) -> bool:
     """Return whether a function can be called with this number of positional arguments and these named ones."""
-    try:
-        inspect.signature(function).bind(*range(count), **named)
-    except TypeError:
-        return False
-    except ValueError:  # the function has no signature
-        return True
+    with suppress(ValueError):  # the function has no signature
+        try:
+            inspect.signature(function).bind(*range(count), **named)
+        except TypeError:
+            return False
     return True
 
 

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shlex
-import tomllib
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -13,6 +13,7 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 from pydantic_core import PydanticCustomError
 
+from ctxval._util.files import read_toml
 from ctxval.campaign.campaign import Campaign
 from ctxval.campaign.interval_search import is_decisive
 from ctxval.campaign.storage.store import Store
@@ -39,30 +40,27 @@ from ctxval.searches import Search, by_name
 from ctxval.studies.aspect1 import TASKS
 from ctxval.studies.safety import judged_by
 
-Part = str | dict[str, Any]
-"""``module:attr``, or a table with a type and its arguments."""
+Part = str | dict[str, Any]  #: ``module:attr``, or a table with a type and its arguments
 
 
 class CertificateTable(BaseModel):
     """The table ``[certificate]``: the certificate for the verdict, chosen before the campaign is run.
 
     A kind of certificate from another package has its own options in the table.
-
-    Attributes:
-        volume: the share of the task space that may exceed the threshold.
-        tests: the number of executions that must have been predicted beforehand at tasks drawn over the task space.
-        quantile: the share of the executions of each task that the verdict is about, if they differ by noise.
-        resolution: the largest distance between a task and its nearest trial, in diagonals of the task space.
-        discard: the number of largest distances to discard, for ``sampling-discarding``.
     """
 
     model_config = ConfigDict(extra="allow")
 
     kind: str = "auto"
+    #: the share of the task space that may exceed the threshold
     volume: float = Field(default=0.0, ge=0, le=MOST_VOLUME, strict=True)
+    #: the number of executions that must have been predicted beforehand at tasks drawn over the task space
     tests: int = Field(default=TESTS, ge=0, strict=True)
+    #: the share of the executions of each task that the verdict is about, if they differ by noise
     quantile: float = Field(default=QUANTILE, ge=0.5, lt=1, strict=True)
+    #: the largest distance between a task and its nearest trial, in diagonals of the task space
     resolution: float = Field(default=RESOLUTION, gt=0, allow_inf_nan=False, strict=True)
+    #: the number of largest distances to discard, for ``sampling-discarding``
     discard: int | None = Field(default=None, ge=0)
 
     @model_validator(mode="after")
@@ -84,7 +82,6 @@ class CertificateTable(BaseModel):
     def options(
         self, confidence: float, *, kind: str | None = None, stated: Mapping[str, Any] | None = None
     ) -> CertificateOptions:
-        """Return the kind, the options and the confidence of the certificate for the verdict."""
         given, chosen = dict(stated or {}), KINDS.find(kind or self.kind)
         require_use(chosen.name, given)
         if kind in (None, self.kind):
@@ -104,7 +101,6 @@ class SearchTable(BaseModel):
     repeats: int = Field(default=1, ge=1)
 
     def build(self, folder: Path | None = None) -> Search:
-        """Return the search."""
         options = {key: argument(value, folder) for key, value in (self.model_extra or {}).items()}
         options = require_types(f"search {self.name!r}", SEARCHES.find(self.name), options)
         return by_name(self.name, repeats=self.repeats, **options)
@@ -148,16 +144,6 @@ class Settings(BaseModel):
     """The content of an experiment file, overridden by the options of the command line.
 
     Either ``experiment`` names the experiment, or ``name`` to ``units`` describe it completely.
-
-    Attributes:
-        suite: the parameters of each task by its name, in the place of the space, if tasks are a list.
-        distribution: see :func:`~ctxval.cli.config.parts.with_distribution`; a named experiment may have one too.
-        judge: whether the distance is judged or, as by ``ctxval safe``, the specification.
-        physical: the task parameters that change the dynamics of the system; a named experiment may have some too.
-        outputs: the indices of M's states that are recorded, or the function ``module:attr`` of them.
-        explore, within: as the options of ``ctxval run``, so that a store knows the command that made it.
-        refined: the file of a model that `ctxval refine` has learned from executions; it replaces the given model.
-        folder: the folder of modules and files, which is that of the experiment file; None for the current folder.
     """
 
     model_config = ConfigDict(extra="forbid")
@@ -166,7 +152,9 @@ class Settings(BaseModel):
     options: dict[str, Any] = Field(default_factory=dict)
     name: str | None = None
     space: dict[str, list[Any]] | None = None
+    #: the parameters of each task by its name, in the place of the space, if tasks are a list
     suite: dict[str, dict[str, float | str]] | None = None
+    #: see :func:`~ctxval.cli.config.parts.with_distribution`; a named experiment may have one too
     distribution: dict[str, dict[str, Any]] | None = None
     task: Part | None = None
     system: Part | None = None
@@ -179,9 +167,11 @@ class Settings(BaseModel):
     budget: int | None = Field(default=None, ge=1)
     threshold: float | None = Field(default=None, gt=0, allow_inf_nan=False, strict=True)
     longest: int | None = Field(default=None, ge=1, strict=True)
+    #: the task parameters that change the dynamics of the system; a named experiment may have some too
     physical: list[str] | None = None
+    #: the indices of M's states that are recorded, or the function ``module:attr`` of them
     outputs: str | list[int] | None = None
-    explore: bool | None = None
+    explore: bool | None = None  #: as the options of ``ctxval run``, so that a store knows the command that made it
     within: float = Field(default=WITHIN, gt=0, allow_inf_nan=False, strict=True)
     confidence: float = Field(default=CONFIDENCE, ge=LEAST_CONFIDENCE, lt=1, strict=True)
     certificate: CertificateTable = Field(default_factory=CertificateTable)
@@ -190,13 +180,15 @@ class Settings(BaseModel):
     search: SearchTable = Field(default_factory=SearchTable)
     aspect1: Aspect1Table = Field(default_factory=Aspect1Table)
     spec: SpecTable | None = None
+    #: whether the distance is judged or, as by ``ctxval safe``, the specification
     judge: Literal["distance", "spec"] = "distance"
+    #: the file of a model that `ctxval refine` has learned from executions; it replaces the given model
     refined: Path | None = None
     recordings: dict[str, Any] | None = None
+    #: the folder of modules and files, which is that of the experiment file; None for the current folder
     folder: Path | None = None
 
     def load(self) -> Experiment:
-        """Return the experiment."""
         if self.experiment is None:
             experiment = self._described()
         else:
@@ -298,7 +290,6 @@ class Settings(BaseModel):
 
     @property
     def certificate_options(self) -> CertificateOptions:
-        """The certificate for the verdict."""
         return self.certificate.options(self.confidence)
 
     @property
@@ -313,7 +304,6 @@ class Settings(BaseModel):
 
     @property
     def log_mapping(self) -> LogMapping | None:
-        """The mapping of logs; None if there is none."""
         return None if self.recordings is None else LogMapping.from_table(self.recordings)
 
     def store_path(self, name: str) -> Path:
@@ -333,16 +323,10 @@ def read_settings(target: str, overrides: dict[str, Any]) -> Settings:
         raise InputError(not_an_experiment(target))
     content: dict[str, Any] = {"experiment": target}
     if is_file:
-        path = Path(target)
-        try:
-            content = tomllib.loads(path.read_bytes().decode("utf-8"))
-        except FileNotFoundError:
-            example = f"`ctxval init {shlex.quote(str(path))}` writes an example"
-            raise InputError(f"there is no experiment file {path}; {example}.") from None
-        except OSError as error:
-            raise InputError(f"the experiment file {path} cannot be read: {error.strerror}.") from error
-        except (ValueError, RecursionError) as error:
-            raise InputError(f"{path} is not valid TOML: {error}.") from error
+        if not os.path.lexists(target):
+            example = f"`ctxval init {shlex.quote(target)}` writes an example"
+            raise InputError(f"there is no experiment file {target}; {example}.")
+        content = read_toml(target)
     if "folder" in content:
         where = "modules and files are read from the folder of this file"
         raise InputError(f"{target}: no setting is called 'folder'; {where}.")

@@ -25,8 +25,7 @@ from ctxval.cli.config.parts import REGISTRIES
 from ctxval.errors import InputError
 from ctxval.paper import cases
 
-SIGNATURES = "signatures"
-"""The key of the signatures in the settings of a store."""
+SIGNATURES = "signatures"  #: the key of the signatures in the settings of a store
 
 _BYTES = 32
 
@@ -54,16 +53,14 @@ def signed(settings: Mapping[str, Any], before: Mapping[str, Any]) -> dict[str, 
 
 def verifies(settings: Mapping[str, Any]) -> bool:
     """Return whether settings carry a valid signature of this user."""
-    signatures = _signatures(settings)
-    try:
-        key = _read_key(key_path()) if signatures else None
-    except OSError:
-        return False
-    return key is not None and any(hmac.compare_digest(_signature(key, settings), each) for each in signatures)
+    if signatures := _signatures(settings):
+        with suppress(OSError):
+            signature = _signature(_read_key(key_path()), settings)
+            return any(hmac.compare_digest(signature, each) for each in signatures)
+    return False
 
 
 def unsigned(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Return settings without their signatures."""
     return {key: value for key, value in settings.items() if key != SIGNATURES}
 
 
@@ -77,8 +74,10 @@ def why_no_key() -> str | None:
 
 
 def _signatures(settings: Mapping[str, Any]) -> list[str]:
-    kept = settings.get(SIGNATURES)
-    return [each for each in kept if isinstance(each, str) and each.isascii()] if isinstance(kept, list) else []
+    match settings.get(SIGNATURES):
+        case [*kept]:
+            return [each for each in kept if isinstance(each, str) and each.isascii()]
+    return []
 
 
 def _signature(key: bytes, settings: Mapping[str, Any]) -> str:
@@ -147,9 +146,9 @@ def code_named(settings: Mapping[str, Any]) -> list[str]:
     ]
     try:
         code = [_shown(key, settings[key]) for key in ("task", "outputs") if isinstance(settings.get(key), str)]
-        recordings = settings.get("recordings")
-        if isinstance(recordings, Mapping) and "observer" in recordings:
-            code.append(_shown("recordings.observer", recordings["observer"]))
+        match settings:
+            case {"recordings": {"observer": observer}}:
+                code.append(_shown("recordings.observer", observer))
         for key, name_key, registry in named:
             code += _parts(key, settings.get(key), name_key, registry)
         return [*code, *_references("", settings)]
@@ -171,14 +170,15 @@ def _parts(where: str, given: Any, name_key: str, registry: Any) -> Iterator[str
 
 
 def _references(where: str, value: Any) -> Iterator[str]:
-    if isinstance(value, Mapping):
-        if "ref" in value:
-            yield _shown(where, value["ref"])
-        for key, item in value.items():
-            yield from _references(f"{where}.{key}" if where else str(key), item)
-    elif isinstance(value, list):
-        for item in value:
-            yield from _references(where, item)
+    match value:
+        case {}:
+            if "ref" in value:
+                yield _shown(where, value["ref"])
+            for key, item in value.items():
+                yield from _references(f"{where}.{key}" if where else str(key), item)
+        case [*items]:
+            for item in items:
+                yield from _references(where, item)
 
 
 def _shown(where: str, value: Any) -> str:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -64,14 +65,12 @@ def trusted_settings(store: Store, *, experiment: str | None = None, trust: bool
     if experiment is not None and trust:
         raise InputError("--trust and --experiment cannot be given together.")
     if experiment is not None:
-        named = read_settings(experiment, {})
-        try:
+        named, same = read_settings(experiment, {}), dict[str, Any]()
+        with suppress(InputError):
             stored = _of_store(kept)
-        except InputError:
-            return named
-        same: dict[str, Any] = {"seed": stored.seed}
-        if not code_named({"search": kept.get("search", {})}):
-            same["search"] = stored.search
+            same["seed"] = stored.seed
+            if not code_named({"search": kept.get("search", {})}):
+                same["search"] = stored.search
         return named.model_copy(update=same)
     settings, code = _of_store(kept), code_named(kept)
     folder = settings.folder or Path().resolve()
@@ -117,14 +116,15 @@ def _files_outside(kept: dict[str, Any], folder: Path, home: Path) -> list[str]:
 
 def _texts(value: Any, path: bool) -> Iterator[str]:
     """Yield the texts in settings that are paths, or a MuJoCo model as its text."""
-    if isinstance(value, dict):
-        for key, item in value.items():
-            yield from _texts(item, path or key in _FILE_KEYS)
-    elif isinstance(value, list):
-        for item in value:
-            yield from _texts(item, path)
-    elif path and isinstance(value, str):
-        yield value
+    match value:
+        case {}:
+            for key, item in value.items():
+                yield from _texts(item, path or key in _FILE_KEYS)
+        case [*items]:
+            for item in items:
+                yield from _texts(item, path)
+        case str() if path:
+            yield value
 
 
 # Campaigns
@@ -153,7 +153,6 @@ def budget_of(experiment: Experiment, settings: Settings, given: int | None = No
 
 
 def open_store(path: Path, allowed: Allowed, *, remeasure: bool = False) -> Opened:
-    """Build the experiment of a store, and its campaign."""
     store = Store.existing(path)
     settings = trusted_settings(store, experiment=allowed.experiment, trust=allowed.trust)
     asked = (allowed.trust or allowed.experiment is not None) and not verifies(store.settings())

@@ -53,55 +53,45 @@ MJCF = """
 </mujoco>
 """
 
-END_EFFECTOR = (4, 5)
-"""Indices of y and z in the state; these are the paper's names of the coordinates on the table."""
+END_EFFECTOR = (4, 5)  #: indices of y and z in the state; these are the paper's names of the coordinates on the table
 
 
 @dataclass(frozen=True)
 class Settings:
-    """Every free parameter of the case, with the reason for its value; the paper gives none of them.
+    """Every free parameter of the case, with the reason for its value; the paper gives none of them."""
 
-    Attributes:
-        substeps: MuJoCo steps in one control step; dt is 0.1 s, a tenth of the joints' time constant (armature over
-            damping). Reacher's 20 ms would take five times as many steps, over which the network's errors add up.
-        horizon: steps; in 1.5 s iLQR ends within 3 cm of the targets (median 8 mm) on a model without error. The
-            exception are targets straight ahead (z = 0 exactly), for which the extended arm has no reason to bend to
-            either side.
-        y, z: m; the table in front of the arm. All of it is within the arm's reach of 0.21 m: the far corners are
-            0.206 m away. All of it is also at least 4 cm from the shoulder; the elbow's stops keep the fingertip out
-            of that circle. So every target can be reached. Targets behind the shoulder would have no single best way.
-        position_weight: weight of the end effector's deviation, 1/m^2; the task is about this deviation.
-        rate_weight: s^2/rad^2; small. Without it, passing the target at full speed would be as good as stopping there.
-        torque_weight: weight of the torque in units of the motors' 200 N m; with it at most an eighth of them is used,
-            about as much as in the recordings.
-        final_position_weight, final_rate_weight: weights of the last state, ten times those of the other states.
-        iterations: largest number of iLQR iterations; on smooth models more iterations gain almost nothing, on the
-            network they follow its kinks.
-        rollouts, steps: recorded for learning: 500 x 4 transitions from rest, 200 s in all.
-        torque: recorded torques are uniform within +-0.12 of the motors' range, which gives joint rates like those of
-            the closed loop, 5 rad/s.
-        elbow: rad; recordings start at any angle of the shoulder and at elbow angles within +-2.2. They cover the bent
-            arm, and fewer than one in a hundred reaches the elbow's stops at 3 rad.
-        points: number of data points of the Gaussian process; with more points it is slower and more accurate.
-        restarts, training: number of trainings of the network, of which the best is kept, and largest number of
-            iterations of one training.
-    """
-
+    #: MuJoCo steps in one control step; dt is 0.1 s, a tenth of the joints' time constant (armature over damping).
+    #: Reacher's 20 ms would take five times as many steps, over which the network's errors add up.
     substeps: int = 10
+    #: steps; in 1.5 s iLQR ends within 3 cm of the targets (median 8 mm) on a model without error. The exception are
+    #: targets straight ahead (z = 0 exactly), for which the extended arm has no reason to bend to either side.
     horizon: int = 15
+    #: m; the table in front of the arm. All of it is within the arm's reach of 0.21 m: the far corners are 0.206 m
+    #: away. All of it is also at least 4 cm from the shoulder; the elbow's stops keep the fingertip out of that circle.
+    #: So every target can be reached. Targets behind the shoulder would have no single best way.
     y: tuple[float, float] = (0.04, 0.18)
     z: tuple[float, float] = (-0.1, 0.1)
-    position_weight: float = 1.0
+    position_weight: float = 1.0  #: weight of the end effector's deviation, 1/m^2; the task is about this deviation
+    #: s^2/rad^2; small. Without it, passing the target at full speed would be as good as stopping there.
     rate_weight: float = 1e-3
+    #: weight of the torque in units of the motors' 200 N m; with it at most an eighth of them is used, about as much as
+    #: in the recordings
     torque_weight: float = 1.0
-    final_position_weight: float = 10.0
+    final_position_weight: float = 10.0  #: weights of the last state, ten times those of the other states
     final_rate_weight: float = 1e-2
+    #: largest number of iLQR iterations; on smooth models more iterations gain almost nothing, on the network they
+    #: follow its kinks
     iterations: int = 15
-    rollouts: int = 500
+    rollouts: int = 500  #: recorded for learning: 500 x 4 transitions from rest, 200 s in all
     steps: int = 4
+    #: recorded torques are uniform within +-0.12 of the motors' range, which gives joint rates like those of the closed
+    #: loop, 5 rad/s
     torque: float = 0.12
+    #: rad; recordings start at any angle of the shoulder and at elbow angles within +-2.2. They cover the bent arm, and
+    #: fewer than one in a hundred reaches the elbow's stops at 3 rad.
     elbow: float = 2.2
-    points: int = 200
+    points: int = 200  #: number of data points of the Gaussian process; with more points it is slower and more accurate
+    #: number of trainings of the network, of which the best is kept, and largest number of iterations of one training
     restarts: int = 4
     training: int = 1000
 
@@ -172,16 +162,11 @@ def experiment(seed: int = 0, model: str = "fnn", settings: Settings | None = No
 
 @dataclass(frozen=True, eq=False)
 class Aspects:
-    """The final distances of the closed loops from their targets ``(N, 2)`` in m, the two aspects of Remark 1.
-
-    Attributes:
-        model_error: Aspect-1, the final distance of the model's end effector from its target, shape ``(N,)``, m.
-        system_error: the same distance of the arm under the same controllers; NaN if the execution failed.
-    """
+    """The final distances of the closed loops from their targets ``(N, 2)`` in m, the two aspects of Remark 1."""
 
     targets: Array
-    model_error: Array
-    system_error: Array
+    model_error: Array  #: Aspect-1, the final distance of the model's end effector from its target, shape ``(N,)``, m
+    system_error: Array  #: the same distance of the arm under the same controllers; NaN if the execution failed
 
     def __str__(self) -> str:
         return "; ".join(

@@ -24,8 +24,7 @@ from ctxval import (
 )
 from ctxval.errors import UnknownNameError
 
-WAVES = 10
-"""Sine components of the reference, as in the paper."""
+WAVES = 10  #: sine components of the reference, as in the paper
 
 
 def root_mean_square(model_trajectory: Trajectory, system_trajectory: Trajectory, task: Task) -> Array:
@@ -67,43 +66,35 @@ class Settings:
     case agrees in the median over seeds (docs/reproduction.md). The printed formula gives a tenth of these values. The
     mean deviation of the position is smaller: 3.5 m, several times the mean height of the waves, would need a closed
     loop on S that is nearly unstable.
-
-    Attributes:
-        horizon: steps, the paper's H.
-        dt: s; with it the ten waves have 0.1 to 1 Hz. From 0.2 s on, the closed loop on S begins to lose stability.
-        heading_weight: weight of the heading's deviation, 1/rad^2, if a position weighs 1/m^2. It is small, because the
-            reference heading of 0 is not that of the waves; with 1 the car hardly turns, and no task is much worse
-            than most others.
-        input_weight: s^2/m^2 and s^2/rad^2. At 0.05 and below, the closed loop on S loses stability in some tasks.
-        samples: recorded steps; with so many the models of all seeds are similar, and their closed loops on S stable.
-        heading: rad; recorded headings are uniform within plus or minus a quarter turn. Over a full turn the effect of
-            the speed cancels, so that in the model no input moves y.
-        speed: m/s; recorded speeds are uniform from 0 to this. When the model steers z, it takes the mean of the
-            recorded speeds as the speed of the car: the lower this mean, the harder it turns. This sets the root mean
-            square d*: 2.9 m for 2, 3.6 m for 1.75, 5 m for 1.5, 8 m for 1.25.
-        turn_rate: rad/s; recorded turn rates are uniform within plus or minus this. The heading is linear in the turn
-            rate, so any value would do.
-        position: m; recorded positions are uniform within plus or minus this. Only the model's errors depend on them.
-        limit: m/s and rad/s; the largest input. Without it a loop that loses stability grows until rounding errors
-            dominate.
-        first_seed: added to the seed of the data.
-        distance: a name of ``DISTANCES``.
-        threshold: m; the threshold for that distance, between the largest distance of random tasks and d*.
     """
 
-    horizon: int = 100
+    horizon: int = 100  #: steps, the paper's H
+    #: s; with it the ten waves have 0.1 to 1 Hz. From 0.2 s on, the closed loop on S begins to lose stability.
     dt: float = 0.1
+    #: weight of the heading's deviation, 1/rad^2, if a position weighs 1/m^2. It is small, because the reference
+    #: heading of 0 is not that of the waves; with 1 the car hardly turns, and no task is much worse than most others.
     heading_weight: float = 0.1
+    #: s^2/m^2 and s^2/rad^2. At 0.05 and below, the closed loop on S loses stability in some tasks.
     input_weight: float = 0.1
+    #: recorded steps; with so many the models of all seeds are similar, and their closed loops on S stable
     samples: int = 1000
+    #: rad; recorded headings are uniform within plus or minus a quarter turn. Over a full turn the effect of the speed
+    #: cancels, so that in the model no input moves y.
     heading: float = np.pi / 2
+    #: m/s; recorded speeds are uniform from 0 to this. When the model steers z, it takes the mean of the recorded
+    #: speeds as the speed of the car: the lower this mean, the harder it turns. This sets the root mean square d*: 2.9
+    #: m for 2, 3.6 m for 1.75, 5 m for 1.5, 8 m for 1.25.
     speed: float = 1.75
+    #: rad/s; recorded turn rates are uniform within plus or minus this. The heading is linear in the turn rate, so any
+    #: value would do.
     turn_rate: float = 1.0
+    #: m; recorded positions are uniform within plus or minus this. Only the model's errors depend on them.
     position: float = 1.0
+    #: m/s and rad/s; the largest input. Without it a loop that loses stability grows until rounding errors dominate.
     limit: float = np.inf
-    first_seed: int = 0
-    distance: str = "printed"
-    threshold: float = 0.25
+    first_seed: int = 0  #: added to the seed of the data
+    distance: str = "printed"  #: a name of ``DISTANCES``
+    threshold: float = 0.25  #: m; the threshold for that distance, between the largest distance of random tasks and d*
 
 
 VARIANTS: dict[str, Settings] = {

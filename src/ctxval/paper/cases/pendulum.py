@@ -49,28 +49,18 @@ class Settings:
     The paper gives none of them. With the defaults d* is about 0.3 rad, with weak regions around +-pi/2, as in the
     paper. The paper suspects a bias in its training data. With the variant ``biased``, whose data are of one half of
     the circle, d* is also at the paper's goal of 2 rad.
-
-    Attributes:
-        dt: s; 20 ms resolve the pendulum's fastest mode, 3.8 rad/s, more than 80 times.
-        horizon: steps; 3 s are enough for the model to reach every goal.
-        angle_weight, rate_weight: weights of the deviation, 1/rad^2 and s^2/rad^2; the task is about the angle.
-        torque_weight: 1/(N m)^2; small, so that the torque restricts no motion.
-        final_factor: ratio of the weight of the last state to that of the other states.
-        rollouts, steps: recorded for learning: 20 x 20 transitions.
-        torque: N m; recorded torques are uniform within +-5, about the 4.9 that hold the rod level.
-        angles: rad; recordings start at angles within these, and transitions from beyond a part of the circle are left
-            out.
     """
 
-    dt: float = 0.02
-    horizon: int = 150
-    angle_weight: float = 1.0
+    dt: float = 0.02  #: s; 20 ms resolve the pendulum's fastest mode, 3.8 rad/s, more than 80 times
+    horizon: int = 150  #: steps; 3 s are enough for the model to reach every goal
+    angle_weight: float = 1.0  #: weights of the deviation, 1/rad^2 and s^2/rad^2; the task is about the angle
     rate_weight: float = 0.1
-    torque_weight: float = 1e-4
-    final_factor: float = 10.0
-    rollouts: int = 20
+    torque_weight: float = 1e-4  #: 1/(N m)^2; small, so that the torque restricts no motion
+    final_factor: float = 10.0  #: ratio of the weight of the last state to that of the other states
+    rollouts: int = 20  #: recorded for learning: 20 x 20 transitions
     steps: int = 20
-    torque: float = 5.0
+    torque: float = 5.0  #: N m; recorded torques are uniform within +-5, about the 4.9 that hold the rod level
+    #: rad; recordings start at angles within these, and transitions from beyond a part of the circle are left out
     angles: tuple[float, float] = (-np.pi, np.pi)
 
 

@@ -25,8 +25,7 @@ from ctxval.paper.cases import pendulum
 WHOLE, FINAL = distances.WholeTrajectory(norm=np.inf), distances.FinalState(norm=1)
 """The distance of OLDT and CCDT, and that of OLCD and CuSTOM."""
 
-PAPERS_GOAL = 0.04
-"""The goal angle of the paper's Fig. 2, rad, where CCDT is largest in the paper."""
+PAPERS_GOAL = 0.04  #: the goal angle of the paper's Fig. 2, rad, where CCDT is largest in the paper.
 
 BOUND = pendulum.Settings().torque
 """Bound of the open-loop torques, N m. It is that of the training data, so that the model does not extrapolate.

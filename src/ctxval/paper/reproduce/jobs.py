@@ -37,22 +37,14 @@ DISCARDED = 5  # the paper's k in sampling and discarding
 
 @dataclass(frozen=True)
 class Job:
-    """One run, completely defined by its fields.
+    """One run, completely defined by its fields."""
 
-    Attributes:
-        kind: ``search``, ``truth``, ``profile``, ``frameworks``, ``aspects`` or ``loops``.
-        seed: seed of the data, the model and the search.
-        options: options of the case, as pairs of name and value.
-        search: the name of the search, for the kind ``search``.
-        budget: the number of executions, or of grid points on each axis.
-    """
-
-    kind: str
+    kind: str  #: ``search``, ``truth``, ``profile``, ``frameworks``, ``aspects`` or ``loops``
     case: str
-    seed: int
-    options: tuple[tuple[str, Any], ...] = ()
-    search: str = ""
-    budget: int = 0
+    seed: int  #: seed of the data, the model and the search
+    options: tuple[tuple[str, Any], ...] = ()  #: options of the case, as pairs of name and value
+    search: str = ""  #: the name of the search, for the kind ``search``
+    budget: int = 0  #: the number of executions, or of grid points on each axis
 
     @property
     def key(self) -> str:
@@ -63,7 +55,6 @@ class Job:
         return re.sub(r"[^a-zA-Z0-9._-]+", "-", "_".join(filter(None, parts)))
 
     def experiment(self) -> Experiment:
-        """Return the case that the job runs on."""
         return cases.by_name(self.case, self.seed, **dict(self.options))
 
 

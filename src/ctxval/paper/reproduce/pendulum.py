@@ -56,7 +56,6 @@ class FourFrameworks(Study):
         return [Job("frameworks", "pendulum", seed, budget=scale.of(1001)) for seed in scale.seeds] + profiles
 
     def fill(self, axes: Axes, results: Results, scale: Scale) -> None:
-        """Draw the four profiles of the first trial."""
         profile = results[self.jobs(scale)[SHOWN]]
         goals = np.array(profile["goals"])
         for label, values, colour, line in (
@@ -294,7 +293,6 @@ class ConvergedGP(Study):
         return [self.campaign, self.curve]
 
     def fill(self, axes: Axes, results: Results, scale: Scale) -> None:
-        """Draw the GP with its band, the truth, the samples and the maximum."""
         x, y = np.ravel(results[self.campaign]["points"]), np.array(results[self.campaign]["distances"])
         goals, truth, mean, deviation = (np.array(column) for column in self.data(results, scale).values())
         low, high = mean - 1.96 * deviation, mean + 1.96 * deviation

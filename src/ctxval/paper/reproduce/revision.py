@@ -15,11 +15,9 @@ from threadpoolctl import threadpool_info
 
 from ctxval._util.code_digest import module_digest
 
-SEARCHES = ("gp", "searches")
-"""The folders of the package that choose tasks from distances."""
+SEARCHES = ("gp", "searches")  #: the folders of the package that choose tasks from distances
 
-AUTO = (*SEARCHES, "learning")
-"""The folders of the package that choose tasks from trajectories."""
+AUTO = (*SEARCHES, "learning")  #: the folders of the package that choose tasks from trajectories
 
 _PACKAGE = Path(__file__).parents[2]
 

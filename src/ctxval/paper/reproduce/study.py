@@ -37,7 +37,6 @@ class Scale:
 
     @property
     def seeds(self) -> range:
-        """The seeds of the trials."""
         return range(self.trials)
 
     def of(self, full: int) -> int:
@@ -69,8 +68,7 @@ class Claim:
     remark: str = ""
 
 
-Columns = dict[str, Sequence[float | str]]
-"""The data behind a figure, as columns of equal length."""
+Columns = dict[str, Sequence[float | str]]  #: the data behind a figure, as columns of equal length
 
 
 class Study(ABC):
@@ -105,7 +103,6 @@ class Study(ABC):
         """Return the paper's claims about the figure, with the measured numbers."""
 
     def draw(self, results: Results, scale: Scale) -> Figure:
-        """Return the figure."""
         from matplotlib.figure import Figure  # imported here, because only figures need it
 
         figure = Figure(figsize=(6.4, 4.2), layout="constrained")
@@ -127,16 +124,11 @@ class Place(NamedTuple):
 
 
 class ExecutionsWithin(Study):
-    """Executions until the estimate is within some per cent of d*, for each technique and place.
+    """Executions until the estimate is within some per cent of d*, for each technique and place."""
 
-    Attributes:
-        column: the name of the places in the data.
-        dodge: the horizontal distance between the triangles of two techniques.
-    """
-
-    column: str
+    column: str  #: the name of the places in the data
     places: tuple[Place, ...]
-    dodge: float
+    dodge: float  #: the horizontal distance between the triangles of two techniques
 
     @abstractmethod
     def budget(self, search: str, scale: Scale) -> int:

@@ -94,7 +94,6 @@ class ArmModels(Study):
         return [self._job(kind, *pair) for kind in ("search", "truth", "aspects") for pair in pairs]
 
     def fill(self, axes: Axes, results: Results, scale: Scale) -> None:
-        """Draw the first trial: the distance found against executions, and the truths."""
         for model, (label, colour, line, marker) in MODELS.items():
             estimates = running_estimate(distances_of(results[self._job("search", model, 0)]), "gp-ucb")
             counts = np.arange(1, len(estimates) + 1)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from importlib.metadata import entry_points
 from typing import Protocol, runtime_checkable
 
-from ctxval._util.texts import reason_of
+from ctxval._util.refusals import reworded
 from ctxval.errors import InputError
 from ctxval.report.context import ReportContext
 from ctxval.report.sections.appendix import for_the_file
@@ -22,13 +22,9 @@ GROUP = "ctxval.report_sections"
 
 @runtime_checkable
 class Section(Protocol):
-    """A section of a report.
+    """A section of a report."""
 
-    Attributes:
-        title: its heading.
-    """
-
-    title: str
+    title: str  #: its heading
 
     def render(self, context: ReportContext) -> str:
         """Return the content: ``Markup`` stays as it is, any other text becomes one escaped paragraph.
@@ -60,11 +56,9 @@ def all_sections(added: Sequence[Section]) -> list[Section]:
     """Return the sections of every report, those of installed packages, and those that the user adds."""
     installed: list[Section] = []
     for point in sorted(entry_points(group=GROUP), key=lambda point: point.name):
-        try:
+        with reworded(f"the section {point.name!r} cannot be loaded"):  # another package's code
             loaded = point.load()
             installed.append(loaded() if isinstance(loaded, type) else loaded)
-        except Exception as error:  # another package's code
-            raise InputError(f"the section {point.name!r} cannot be loaded: {reason_of(error)}.") from error
     sections = [*SECTIONS, *installed, *added]
     for section in sections:
         if not isinstance(section, Section) or not isinstance(section.title, str):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
+
 import numpy as np
 from markupsafe import Markup
 
@@ -67,13 +69,11 @@ def _estimated(context: ReportContext, unit: Array) -> Band | None:
         return None if model is None else model.predict(unit)
     errors = np.array([replay.distance - context.recordings[k].distance for k, replay in context.replays.items()])
     if model is None or (errors**2).mean() <= ((model.left_out.median - model.values) ** 2).mean():
-        try:
-            with stage("predicting distances", len(unit), "tasks"):
-                values = learned.expected(unit, len(context.trials))
+        # The user's parts, at states that no execution has reached, must not end a report.
+        with suppress(Exception), stage("predicting distances", len(unit), "tasks"):
+            values = learned.expected(unit, len(context.trials))
             if np.isfinite(values).any():
                 return Band(values, values, values)
-        except Exception:  # the user's parts, at states that no execution has reached, must not end a report
-            pass
     return None if model is None else model.predict(unit)
 
 

@@ -18,19 +18,13 @@ from ctxval.studies.causes.plant import Joint, Plant
 
 @dataclass(frozen=True)
 class Candidate(ShortRepr):
-    """A cause whose sizes are to be fitted.
-
-    Attributes:
-        low, high: bounds of the sizes.
-        scales: changes of the sizes that matter, for the steps of the fit.
-        starts: first guesses, of which the best one is refined.
-    """
+    """A cause whose sizes are to be fitted."""
 
     cause: Cause
-    low: tuple[float, ...] = ()
+    low: tuple[float, ...] = ()  #: bounds of the sizes
     high: tuple[float, ...] = ()
-    scales: tuple[float, ...] = ()
-    starts: tuple[tuple[float, ...], ...] = ((),)
+    scales: tuple[float, ...] = ()  #: changes of the sizes that matter, for the steps of the fit
+    starts: tuple[tuple[float, ...], ...] = ((),)  #: first guesses, of which the best one is refined
 
 
 def _of_size(cause: Cause, low: float, high: float, scale: float, *starts: float) -> Candidate:

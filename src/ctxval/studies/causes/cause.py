@@ -28,14 +28,11 @@ class Cause(ShortRepr):
     """Something that a model lacks, with its sizes in physical units.
 
     A subclass changes one of the hooks below. All of them take batches.
-
-    Attributes:
-        name: what it is in two or three words.
-        remembers: whether the inputs that act depend on earlier ones, so that it cannot be a part of a step.
     """
 
     sizes: tuple[float, ...]
-    name: ClassVar[str]
+    name: ClassVar[str]  #: what it is in two or three words
+    #: whether the inputs that act depend on earlier ones, so that it cannot be a part of a step
     remembers: ClassVar[bool] = False
 
     def with_sizes(self, sizes: Sequence[float]) -> Cause:

@@ -168,18 +168,12 @@ class Evidence:
 
 @dataclass(frozen=True, eq=False)
 class Explanation(ShortRepr):
-    """Causes with fitted sizes, and how well they explain the records.
+    """Causes with fitted sizes, and how well they explain the records."""
 
-    Attributes:
-        candidates: those that were fitted, with the causes of ``repaired``.
-        criterion: the Bayesian information criterion; the smaller, the better.
-        left: the share of the squared residuals of M that is left.
-    """
-
-    candidates: tuple[Candidate, ...]
+    candidates: tuple[Candidate, ...]  #: those that were fitted, with the causes of ``repaired``
     repaired: Repaired
-    criterion: float
-    left: float
+    criterion: float  #: the Bayesian information criterion; the smaller, the better
+    left: float  #: the share of the squared residuals of M that is left
 
     @property
     def sizes(self) -> list[float]:

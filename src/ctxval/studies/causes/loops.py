@@ -33,17 +33,11 @@ class ExecutedTask(ShortRepr):
 
 @dataclass(frozen=True, eq=False)
 class Predicted(ShortRepr):
-    """What a model with causes predicts of an execution.
+    """What a model with causes predicts of an execution."""
 
-    Attributes:
-        deviation: the mean squared deviation of the execution from the mean of the loops, in shares of ranges.
-        by_noise: those of loops with noise from their mean, shape ``(K,)``; 0 without noise.
-        distance: between the execution and the mean of the loops.
-    """
-
-    deviation: float
-    by_noise: Array
-    distance: float
+    deviation: float  #: the mean squared deviation of the execution from the mean of the loops, in shares of ranges
+    by_noise: Array  #: those of loops with noise from their mean, shape ``(K,)``; 0 without noise
+    distance: float  #: between the execution and the mean of the loops
 
 
 class ClosedLoops:
@@ -135,8 +129,6 @@ class ClosedLoops:
         return squares
 
     def _distance(self, execution: ExecutedTask, loop: Trajectory) -> float:
-        try:
-            with np.errstate(all="ignore"):
-                return float(self.validation.distance(loop.copy(), execution.executed.copy(), execution.plan.task))
-        except Exception:  # the user's distance
-            return np.inf
+        with contextlib.suppress(Exception), np.errstate(all="ignore"):  # the user's distance
+            return float(self.validation.distance(loop.copy(), execution.executed.copy(), execution.plan.task))
+        return np.inf

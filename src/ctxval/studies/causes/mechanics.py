@@ -17,25 +17,19 @@ from ctxval.studies.causes.plant import Joint, Plant
 
 @dataclass(frozen=True)
 class Force(Cause):
-    """A force on a joint, in units of its input, of MuJoCo, or of an acceleration; held over a step.
+    """A force on a joint, in units of its input, of MuJoCo, or of an acceleration; held over a step."""
 
-    Attributes:
-        joint: where it enters.
-        probe: a force that is typical of the joint, with which its effect in M is measured.
-        dt: seconds.
-    """
-
+    #: where it enters
     joint: Joint = Joint(0)  # noqa: RUF009  # it is frozen
-    probe: float = 1.0
-    dt: float = 1.0
+    probe: float = 1.0  #: a force that is typical of the joint, with which its effect in M is measured
+    dt: float = 1.0  #: seconds
 
-    def effect(self, model: Model, x: Array, u: Array, free: Array) -> Array:
+    def effect(self, model: Any, x: Array, u: Array, free: Array) -> Array:
         """Return the change of the next state ``free`` of the model by one unit of the force, shape ``(..., n)``."""
-        if self.joint.dof is not None:
-            assert isinstance(model, MuJoCo)
+        if self.joint.dof is not None:  # of a model of MuJoCo
             forces = np.zeros(model.compiled.nv)
             forces[self.joint.dof] = self.probe
-            return (model.changed(forces=forces).step(x, u) - free) / self.probe
+            return np.asarray((model.changed(forces=forces).step(x, u) - free) / self.probe)
         if self.joint.input is not None:
             moved = np.array(u)
             moved[..., self.joint.input] += self.probe
@@ -50,7 +44,7 @@ class Force(Cause):
         """
         raise NotImplementedError
 
-    def load(self, model: Model, x: Array, u: Array) -> Array:
+    def load(self, model: Any, x: Array, u: Array) -> Array:
         """Return the magnitude of the force that the gears carry ``(...)``; 0 if the force does not depend on it."""
         return np.zeros(x.shape[:-1])
 
@@ -134,17 +128,13 @@ class LoadFriction(Force):
     """Friction in proportion to the load that the gears carry. Sizes: the share of the load, and the part without it.
 
     The load is the difference between the force of the motor and what everything else pulls with, as M has it.
-
-    Attributes:
-        rates: the rates of all joints that inputs drive.
     """
 
     name: ClassVar[str] = "load-dependent friction"
-    rates: tuple[int, ...] = ()
+    rates: tuple[int, ...] = ()  #: the rates of all joints that inputs drive
 
-    def load(self, model: Model, x: Array, u: Array) -> Array:
+    def load(self, model: Any, x: Array, u: Array) -> Array:
         if self.joint.dof is not None:
-            assert isinstance(model, MuJoCo)
             return np.abs(_pulls(model, x, u)[..., self.joint.dof])
         unmoved, m = np.asarray(model.step(x, np.zeros_like(u))), u.shape[-1]
         if self.joint.input is None:
@@ -195,16 +185,11 @@ def _accelerated(reached: Array, joints: Sequence[Joint], gained: Array, dt: flo
 
 @dataclass(frozen=True)
 class Inertia(Cause):
-    """Joints have another inertia. Size: the inertia divided by that of M.
-
-    Attributes:
-        joints: those whose accelerations are divided by the size.
-        dt: seconds.
-    """
+    """Joints have another inertia. Size: the inertia divided by that of M."""
 
     name: ClassVar[str] = "inertia"
-    joints: tuple[Joint, ...] = ()
-    dt: float = 1.0
+    joints: tuple[Joint, ...] = ()  #: those whose accelerations are divided by the size
+    dt: float = 1.0  #: seconds
 
     def pushed(self, model: Model, x: Array, u: Array, free: Array, reached: Array) -> Array:
         return _accelerated(reached, self.joints, (1.0 / self.sizes[0] - 1.0) * (reached - x), self.dt)
@@ -216,18 +201,12 @@ class Inertia(Cause):
 
 @dataclass(frozen=True)
 class Gravity(Cause):
-    """What pulls at joints at rest has another size, such as the weight of links. Size: divided by that of M.
-
-    Attributes:
-        joints: those that it pulls at.
-        rates: indices of all states that are 0 at rest.
-        dt: seconds.
-    """
+    """What pulls at joints at rest has another size, such as the weight of links. Size: divided by that of M."""
 
     name: ClassVar[str] = "gravity"
-    joints: tuple[Joint, ...] = ()
-    rates: tuple[int, ...] = ()
-    dt: float = 1.0
+    joints: tuple[Joint, ...] = ()  #: those that it pulls at
+    rates: tuple[int, ...] = ()  #: indices of all states that are 0 at rest
+    dt: float = 1.0  #: seconds
 
     def pushed(self, model: Model, x: Array, u: Array, free: Array, reached: Array) -> Array:
         still = np.array(x)
@@ -262,21 +241,17 @@ class OfMuJoCo(Cause):
         """Change a copy of the compiled model, a ``mujoco.MjModel``."""
         raise NotImplementedError
 
-    def model(self, model: Model) -> Model:
-        assert isinstance(model, MuJoCo)
-        return model.changed(self.change)
+    def model(self, model: Any) -> Model:
+        changed: Model = model.changed(self.change)
+        return changed
 
 
 @dataclass(frozen=True)
 class JointAttribute(OfMuJoCo):
-    """Damping, Coulomb friction or armature of a joint. Size: what is added to the value in M, in SI units.
-
-    Attributes:
-        attribute: ``damping``, ``frictionloss`` or ``armature``.
-    """
+    """Damping, Coulomb friction or armature of a joint. Size: what is added to the value in M, in SI units."""
 
     name: ClassVar[str] = "joint attribute"
-    attribute: str = "damping"
+    attribute: str = "damping"  #: ``damping``, ``frictionloss`` or ``armature``
     joint: Joint = Joint(0)  # noqa: RUF009  # it is frozen
 
     def change(self, compiled: Any) -> None:

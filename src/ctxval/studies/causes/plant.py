@@ -16,43 +16,27 @@ from ctxval.models import MuJoCo
 
 @dataclass(frozen=True)
 class Joint(ShortRepr):
-    """A rate that forces change, and where the forces enter.
+    """A rate that forces change, and where the forces enter."""
 
-    Attributes:
-        rate: index of the state.
-        position: index of the state whose derivative it is; None if no state is.
-        share: the weight of the rate at the end of a step in the change of the position.
-        input: index of the input that drives the joint; None if no input does.
-        dof: index of the degree of freedom of a MuJoCo model; None for other models.
-    """
-
-    rate: int
-    position: int | None = None
-    share: float = 0.5
-    input: int | None = None
-    dof: int | None = None
+    rate: int  #: index of the state
+    position: int | None = None  #: index of the state whose derivative it is; None if no state is
+    share: float = 0.5  #: the weight of the rate at the end of a step in the change of the position
+    input: int | None = None  #: index of the input that drives the joint; None if no input does
+    dof: int | None = None  #: index of the degree of freedom of a MuJoCo model; None for other models
 
 
 @dataclass(frozen=True, eq=False)
 class Plant(ShortRepr):
-    """What sentences, sizes and forces need to know of a model.
-
-    Attributes:
-        states, inputs: names with units.
-        joints: one for each rate of a position; if no state is a position, one for each state.
-        ports: where forces on joints may enter; a joint may have several.
-        changes: typical changes of the states in a step, shape ``(n,)``.
-        commanded: largest magnitudes of the inputs, shape ``(m,)``.
-    """
+    """What sentences, sizes and forces need to know of a model."""
 
     model: Model
     dt: float
-    states: Mapping[str, str]
+    states: Mapping[str, str]  #: names with units
     inputs: Mapping[str, str]
-    joints: tuple[Joint, ...]
-    ports: tuple[Joint, ...]
-    changes: Array
-    commanded: Array
+    joints: tuple[Joint, ...]  #: one for each rate of a position; if no state is a position, one for each state
+    ports: tuple[Joint, ...]  #: where forces on joints may enter; a joint may have several
+    changes: Array  #: typical changes of the states in a step, shape ``(n,)``
+    commanded: Array  #: largest magnitudes of the inputs, shape ``(m,)``
 
     def state(self, index: int) -> tuple[str, str]:
         """Return the name and the unit of a state."""

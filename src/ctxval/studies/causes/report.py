@@ -18,24 +18,17 @@ from ctxval.studies.causes.plant import Plant
 
 @dataclass(frozen=True, eq=False)
 class Explained(ShortRepr):
-    """Causes that were tried in closed loop, each execution predicted without itself.
-
-    Attributes:
-        share: the share of the squared closed-loop deviations of M that the causes explain, except for what simulated
-            noise of the measurements makes of them.
-        uncertainty: the standard deviation of the share, because of noise.
-        structure, uncertain_structure: the same for the squared residuals of M after several steps.
-        distance: the largest distance between an execution and its prediction.
-        spreads: the range of each size if one execution is left out.
-    """
+    """Causes that were tried in closed loop, each execution predicted without itself."""
 
     explanation: Explanation
+    #: the share of the squared closed-loop deviations of M that the causes explain, except for what simulated noise of
+    #: the measurements makes of them
     share: float
-    uncertainty: float
-    structure: float
+    uncertainty: float  #: the standard deviation of the share, because of noise
+    structure: float  #: the same for the squared residuals of M after several steps
     uncertain_structure: float
-    distance: float
-    spreads: tuple[float, ...]
+    distance: float  #: the largest distance between an execution and its prediction
+    spreads: tuple[float, ...]  #: the range of each size if one execution is left out
 
     @property
     def causes(self) -> tuple[Cause, ...]:
@@ -63,18 +56,12 @@ class Explained(ShortRepr):
 
 @dataclass(frozen=True)
 class Separating(ShortRepr):
-    """The task that tells two causes apart.
-
-    Attributes:
-        distance, gap: between what the two causes predict of it: the distance, and the largest difference of a state in
-            shares of its range.
-        other: the number of the second cause among those that were explained; the first one is 0.
-    """
+    """The task that tells two causes apart."""
 
     task: Mapping[str, Any]
-    distance: float
-    other: int
-    gap: float = 0.0
+    distance: float  #: between what the two causes predict of it
+    other: int  #: the number of the second cause among those that were explained; the first one is 0
+    gap: float = 0.0  #: the largest difference of a state in both predictions, in shares of its range
 
 
 @dataclass(frozen=True, eq=False)

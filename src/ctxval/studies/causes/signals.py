@@ -29,14 +29,10 @@ def _exchanged(values: Array, first: Sequence[int], second: Sequence[int]) -> Ar
 
 @dataclass(frozen=True)
 class InputGain(Cause):
-    """An input has more or less effect: a weak motor, or a wrong constant. Size: the share of its effect in M.
-
-    Attributes:
-        input: index of the input; None for all of them together.
-    """
+    """An input has more or less effect: a weak motor, or a wrong constant. Size: the share of its effect in M."""
 
     name: ClassVar[str] = "input gain"
-    input: int | None = 0
+    input: int | None = 0  #: index of the input; None for all of them together
 
     def follow(self, u: Array, memory: Any) -> tuple[Array, Any]:
         return u * _at(u, self.input, self.sizes[0], 1.0), None
@@ -208,14 +204,10 @@ class SensorOffset(Cause):
 
 @dataclass(frozen=True)
 class SensorScale(Cause):
-    """A position and its rate are recorded with a wrong scale. Size: what is recorded, divided by the state.
-
-    Attributes:
-        states: indices of the states that are scaled.
-    """
+    """A position and its rate are recorded with a wrong scale. Size: what is recorded, divided by the state."""
 
     name: ClassVar[str] = "sensor scale"
-    states: tuple[int, ...] = (0,)
+    states: tuple[int, ...] = (0,)  #: indices of the states that are scaled
 
     def true(self, recorded: Array) -> Array:
         return recorded / _at(recorded, list(self.states), self.sizes[0], 1.0)
@@ -229,15 +221,11 @@ class SensorScale(Cause):
 
 @dataclass(frozen=True)
 class SwappedJoints(Cause):
-    """The recorded states of two joints are exchanged.
-
-    Attributes:
-        first, second: indices of their states, in the same order.
-    """
+    """The recorded states of two joints are exchanged."""
 
     sizes: tuple[float, ...] = ()
     name: ClassVar[str] = "swapped joints"
-    first: tuple[int, ...] = (0,)
+    first: tuple[int, ...] = (0,)  #: indices of their states, in the same order
     second: tuple[int, ...] = (1,)
 
     def true(self, recorded: Array) -> Array:

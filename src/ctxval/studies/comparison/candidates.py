@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from typing import Any, Literal
@@ -31,8 +31,7 @@ Question = Literal["worst", "mean"]
 Executed = Sequence[tuple[Array, Trajectory]]
 """Executed tasks, points of the unit cube ``(d,)``, with the system's trajectories."""
 
-OnTrial = Callable[[str, Trial], None]
-"""Called with the name of a candidate and each of its trials that has ended."""
+OnTrial = Callable[[str, Trial], None]  #: called with the name of a candidate and each of its trials that has ended
 
 
 @dataclass(frozen=True)
@@ -52,23 +51,17 @@ class Decision:
 
 @dataclass(frozen=True)
 class TrialNote:
-    """What a comparison stores with a trial, before its execution.
+    """What a comparison stores with a trial, before its execution."""
 
-    Attributes:
-        step: the number of the execution among those of all candidates, from 0; a shared execution has one number.
-        draw: the number of the task among the independent draws; None if the task is no draw.
-        predicted, centre: the distance that was predicted for a draw before it was drawn, and its mean over others.
-        shared: the name of the candidate that executed the task and the number of its trial; None if this one did.
-        decided: what had been decided about the largest distances.
-    """
-
-    step: int
+    step: int  #: the number of the execution among those of all candidates, from 0; a shared execution has one number
     question: Question
-    draw: int | None = None
+    draw: int | None = None  #: the number of the task among the independent draws; None if the task is no draw
+    #: the distance that was predicted for a draw before it was drawn, and its mean over others
     predicted: float | None = None
     centre: float | None = None
+    #: the name of the candidate that executed the task and the number of its trial; None if this one did
     shared: tuple[str, int] | None = None
-    decided: tuple[Decision, ...] = ()
+    decided: tuple[Decision, ...] = ()  #: what had been decided about the largest distances
 
     def to_note(self) -> dict[str, Any]:
         """Return the note of the trial."""
@@ -169,26 +162,20 @@ class Candidate:
     def _prediction(self, executed: Executed) -> Prediction | None:
         key = tuple(id(trajectory) for _, trajectory in executed)
         if self._last is None or self._last[0] != key:
-            try:
-                prediction = self._study.predict(list(executed))
-            except Exception:  # the user's parts, at states that no execution has reached, must not end a comparison
-                prediction = None
-            self._last = key, prediction
+            self._last = key, None
+            with suppress(Exception):  # the user's parts, at states that no execution has reached
+                self._last = key, self._study.predict(list(executed))
         return self._last[1]
 
 
 @dataclass(eq=False)
 class Executions:
-    """Executes tasks one at a time, and records each execution for all candidates whose controllers agree.
-
-    Attributes:
-        most: a number that no distance can exceed; None if none is stated.
-        decided: the decisions on d* so far, by the names of the candidates; each new trial keeps them in its note.
-    """
+    """Executes tasks one at a time, and records each execution for all candidates whose controllers agree."""
 
     candidates: Sequence[Candidate]
-    most: float | None
+    most: float | None  #: a number that no distance can exceed; None if none is stated
     on_trial: OnTrial
+    #: the decisions on d* so far, by the names of the candidates; each new trial keeps them in its note
     decided: dict[tuple[str, str], Decision] = field(default_factory=dict, init=False)
     _examined: set[tuple[str, int, str]] = field(default_factory=set, init=False)
     _hidden: Array | None = field(default=None, init=False)

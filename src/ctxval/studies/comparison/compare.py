@@ -23,8 +23,7 @@ from ctxval.studies.comparison.candidates import Candidate, Executions, OnTrial,
 from ctxval.studies.comparison.questions import MeanQuestion, WorstQuestion
 from ctxval.studies.comparison.result import CandidateResult, Comparison
 
-BUDGET = 100
-"""Default of the largest number of executions."""
+BUDGET = 100  #: default of the largest number of executions
 
 Compared = Validation | Experiment | Campaign
 

@@ -30,24 +30,16 @@ PAIRS = ("question", "smaller", "than", "difference", "interval", "tasks")
 
 @dataclass(frozen=True)
 class CandidateResult(ShortRepr):
-    """What is known of one candidate; a value that is not known is None.
-
-    Attributes:
-        executions, failed: the number of executions that were made for it, and of those that failed.
-        shared: the number of executions of other candidates that count for it too, because its controllers agree.
-        largest, task: the largest executed distance, and the parameters of this task.
-        bound: what d* is at most, if a decision needed it.
-        draws, mean: the number of its independent draws, and the mean of their distances.
-    """
+    """What is known of one candidate; a value that is not known is None."""
 
     name: str
-    executions: int
-    shared: int
-    failed: int
-    largest: float | None
+    executions: int  #: the number of executions that were made for it
+    shared: int  #: the number of executions of other candidates that count for it too, because its controllers agree
+    failed: int  #: how many of its executions failed
+    largest: float | None  #: the largest executed distance, and the parameters of this task
     task: dict[str, Point] | None
-    bound: float | None
-    draws: int
+    bound: float | None  #: what d* is at most, if a decision needed it
+    draws: int  #: the number of its independent draws, and the mean of their distances
     mean: float | None
 
     @property
@@ -60,26 +52,19 @@ class CandidateResult(ShortRepr):
 
 @dataclass(frozen=True)
 class PairResult:
-    """The decision on one question about two candidates.
-
-    Attributes:
-        smaller: the name of the one with the smaller value; None if this is not decided.
-        reason: why, or what is missing, in one sentence.
-        estimate, low, high: the expected distance of the first minus that of the second, and its confidence sequence.
-        tasks: the number of tasks that both have executed for it.
-        variance_left: the variance that the predictions leave of the differences, as a share.
-    """
+    """The decision on one question about two candidates."""
 
     question: Question
     first: str
     second: str
-    smaller: str | None
-    reason: str
+    smaller: str | None  #: the name of the one with the smaller value; None if this is not decided
+    reason: str  #: why, or what is missing, in one sentence
+    #: the expected distance of the first minus that of the second, and its confidence sequence
     estimate: float | None = None
     low: float | None = None
     high: float | None = None
-    tasks: int = 0
-    variance_left: float | None = None
+    tasks: int = 0  #: the number of tasks that both have executed for it
+    variance_left: float | None = None  #: the variance that the predictions leave of the differences, as a share
 
     @property
     def larger(self) -> str:
@@ -111,22 +96,15 @@ class PairResult:
 
 @dataclass(frozen=True)
 class Comparison:
-    """The result of a comparison.
-
-    Attributes:
-        confidence: the probability with which all decisions and intervals hold together.
-        executions, budget: the number of executions of the system, and the largest one; a shared one counts once.
-        units: the units of the distances.
-        assumptions: what the decisions assume, one sentence each.
-    """
+    """The result of a comparison."""
 
     candidates: tuple[CandidateResult, ...]
     pairs: tuple[PairResult, ...]
-    confidence: float
-    executions: int
+    confidence: float  #: the probability with which all decisions and intervals hold together
+    executions: int  #: the number of executions of the system, and the largest one; a shared one counts once
     budget: int
-    units: str
-    assumptions: tuple[str, ...]
+    units: str  #: the units of the distances
+    assumptions: tuple[str, ...]  #: what the decisions assume, one sentence each
 
     @property
     def decided(self) -> bool:

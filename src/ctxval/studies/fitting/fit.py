@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import Any, Literal, get_args
+from typing import Annotated, Any, Literal, get_args
 
 import numpy as np
 from scipy.optimize import least_squares
 from scipy.special import stdtrit
 
 from ctxval._util.arrays import Array, single_threaded
+from ctxval._util.checked import Must, require
 from ctxval._util.representation import ShortRepr, counted
 from ctxval.core.model import Model, require_time_step
 from ctxval.core.trajectory import Trajectory, Transitions
@@ -23,44 +24,30 @@ from ctxval.studies.replay.report import plain_numbers
 
 Kind = Literal["linear", "network", "gaussian-process", "parameters", "given"]
 KINDS: tuple[Kind, ...] = get_args(Kind)[:4]
-STEPS = (1, 20)
-"""Numbers of steps after which the held-out errors are computed, unless others are given."""
-HOLD_OUT = 0.25
-"""Share of the recordings that is held out, unless another one is given."""
+STEPS = (1, 20)  #: numbers of steps after which the held-out errors are computed, unless others are given
+HOLD_OUT = 0.25  #: share of the recordings that is held out, unless another one is given
 
 
 @dataclass(frozen=True)
 class FittedParameter(ShortRepr):
-    """One parameter of a model.
-
-    Attributes:
-        value, low, high: the estimate and the confidence interval, which is infinite if the recordings determine none.
-        note: what is unusual: the value is at a bound, or depends on others; empty otherwise.
-    """
+    """One parameter of a model."""
 
     name: str
-    value: float
+    value: float  #: the estimate and the confidence interval, which is infinite if the recordings determine none
     low: float
     high: float
-    note: str = ""
+    note: str = ""  #: what is unusual: the value is at a bound, or depends on others; empty otherwise
 
 
 @dataclass(frozen=True, eq=False)
 class FittedModel(ShortRepr):
-    """A model that was learned from recordings.
+    """A model that was learned from recordings."""
 
-    Attributes:
-        kind: ``given`` for a model that existed before.
-        errors: those on the held-out recordings.
-        parameters: those of the user's function; none for other kinds.
-        notes: sentences on the fit, such as how well the recordings determine a linear model.
-    """
-
-    kind: Kind
+    kind: Kind  #: ``given`` for a model that existed before
     model: Model
-    errors: tuple[StepError, ...]
-    parameters: tuple[FittedParameter, ...] = ()
-    notes: tuple[str, ...] = ()
+    errors: tuple[StepError, ...]  #: those on the held-out recordings
+    parameters: tuple[FittedParameter, ...] = ()  #: those of the user's function; none for other kinds
+    notes: tuple[str, ...] = ()  #: sentences on the fit, such as how well the recordings determine a linear model
 
     @property
     def relative(self) -> float:
@@ -207,8 +194,8 @@ def split(recordings: Recordings, share: float, seed: int) -> tuple[Recordings, 
 
     Whole recordings are held out, drawn at random. Of a single recording, the last part is held out.
     """
-    if not isinstance(share, int | float) or not 0 < share < 1:
-        raise InputError(f"the share that is held out must be between 0 and 1, got {share!r}.")
+    inside = Must("between 0 and 1", lambda share: 0 < share < 1)
+    require("the share that is held out", Annotated[float, inside], share)
     runs = recordings.runs
     if len(runs) == 1:
         run, horizon = runs[0], runs[0].trajectory.horizon
@@ -305,10 +292,9 @@ def as_bounds(bounds: Mapping[str, tuple[float, float]]) -> tuple[Array, Array]:
     """Return the lower and the upper bounds of parameters, shapes ``(p,)``."""
     if not bounds:
         raise InputError("at least one parameter with its bounds is needed, such as mass = [0.5, 2.0].")
+    ordered = Must("two numbers, the lower one first", lambda pair: -np.inf < pair[0] < pair[1] < np.inf)
     for name, pair in bounds.items():
-        valid = isinstance(pair, Sequence) and not isinstance(pair, str) and len(pair) == 2
-        if not valid or not all(isinstance(b, int | float) and np.isfinite(b) for b in pair) or pair[0] >= pair[1]:
-            raise InputError(f"the bounds of {name} must be two numbers, the lower one first, got {pair!r}.")
+        require(f"the bounds of {name}", Annotated[tuple[float, float], ordered], pair)
     ends = np.array([[float(b) for b in pair] for pair in bounds.values()])
     return ends[:, 0], ends[:, 1]
 

@@ -6,6 +6,7 @@ An ONNX file has double precision, for robots and other programs; it needs onnx 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -78,10 +79,9 @@ def write_model_file(path: Path, model: Model, step: str | None = None) -> list[
         write_model(path, model)
         return [str(path)]
     write_onnx(path, model)
-    data = getattr(model, "data", None)
+    data, beside = getattr(model, "data", None), path.with_suffix(".data.npz")
     if data is None:
         return [str(path)]
-    beside = path.with_suffix(".data.npz")
     write_transitions(beside, data)
     return [str(path), str(beside)]
 
@@ -105,23 +105,22 @@ def _require_onnx(model: Model | None) -> None:
         )
 
 
-def _next_state(z: GraphValue, model: Model) -> tuple[GraphValue, int, int]:
+def _next_state(z: GraphValue, model: Any) -> tuple[GraphValue, int, int]:
     """Return the next state of a model at ``z = (x, u)``, and the numbers of states and inputs."""
-    if isinstance(model, Linear):
-        n, m = model.B.shape
-        return z.affine(np.concatenate([model.A, model.B], axis=1).T, model.c), n, m
     if isinstance(model, Corrected):
         before, n, m = _next_state(z, model.model)
         return before + _correction(z, model.correction), n, m
-    assert isinstance(model, FeedforwardReLU | GaussianProcessModel)  # _require_onnx has checked it
+    if isinstance(model, Linear):
+        n, m = model.B.shape
+        return z.affine(np.concatenate([model.A, model.B], axis=1).T, model.c), n, m
     scaling = model.scaling
     n, width = len(scaling.shift_out), len(scaling.shift_in)
     h = z.affine(np.diag(1 / scaling.scale_in), -scaling.shift_in / scaling.scale_in)
     if isinstance(model, FeedforwardReLU):
-        layers = list(zip(model.weights, model.biases, strict=True))
-        for weight, bias in layers[:-1]:
+        *layers, last = zip(model.weights, model.biases, strict=True)
+        for weight, bias in layers:
             h = h.affine(weight, bias).node("Relu")
-        change = h.affine(*layers[-1]).affine(np.diag(scaling.scale_out), scaling.shift_out)
+        change = h.affine(*last).affine(np.diag(scaling.scale_out), scaling.shift_out)
     else:
         half = h.squared_distances(model.centres, model.covariance.length_scales, 0.5)
         weights = model.covariance.variance * model.weights * scaling.scale_out
@@ -135,10 +134,11 @@ def _correction(z: GraphValue, given: Correction) -> GraphValue:
     r2 = pair.squared_distances(given.centres, given.length_scales, 5.0)
     r = r2.node("Sqrt")
     covariances = (r + r2 * np.array([1 / 3]) + np.array([1.0])) * r.node("Neg").node("Exp")
-    unlimited = covariances.affine(given.weights, np.zeros(given.states)) + pair.affine(
-        given.linear[:-1], given.linear[-1]
+    kernels, linear = (
+        covariances.affine(given.weights, np.zeros(given.states)),
+        pair.affine(*np.split(given.linear, [-1])),
     )
-    limited = unlimited.node("Min", given.limit).node("Max", -given.limit)
+    limited = (kernels + linear).node("Min", given.limit).node("Max", -given.limit)
     beyond = pair.node("Sub", pair.node("Min", given.high).node("Max", given.low))
     far = beyond.squared_distances(np.zeros((1, len(given.fade))), given.fade, 0.5)
     return limited * far.node("Neg").node("Exp")

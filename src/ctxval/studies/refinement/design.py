@@ -26,15 +26,11 @@ class SameControllers:
 
     The distance of the refined model on such a task is known without another execution, if the system is
     deterministic. The model has learned from them, so they can falsify it, and they never count for it.
-
-    Attributes:
-        tasks, same: number of executed tasks that were compared, and of those with numerically the same controller.
-        worst: the largest distance of the refined model on the latter; None if there are none.
     """
 
-    tasks: int = 0
+    tasks: int = 0  #: number of executed tasks that were compared, and of those with numerically the same controller
     same: int = 0
-    worst: float | None = None
+    worst: float | None = None  #: the largest distance of the refined model on the latter; None if there are none
 
 
 def with_best_jacobian(validation: Validation, refined: Refined) -> tuple[Refined, str | None]:
@@ -77,27 +73,25 @@ def _linearises_once(validation: Validation, model: Linear) -> bool:
             return np.broadcast_to(A, (*batch, *A.shape[-2:])), np.broadcast_to(B, (*batch, *B.shape[-2:]))
 
     counted = Counted()
-    try:
+    with suppress(CtxvalError):
         validation.with_model(counted).plan(validation.space.from_unit(np.full(validation.space.dimension, 0.5)))
-    except CtxvalError:
-        return False
-    return 1 <= counted.points <= 2
+        return 1 <= counted.points <= 2
+    return False
 
 
 def _typical_cost(validation: Validation) -> float:
     """Return the median cost of random tasks on a model; infinity if their controllers cannot be designed."""
     space, rng = validation.space, np.random.default_rng(0)
-    try:
-        with single_threaded():
-            loops = closed_loops_on_model(validation)
-            if loops is None or loops.states.ndim == 2:  # designs cannot be made in a batch
-                plans = map(validation.plan, space.from_unit(rng.random((8, space.dimension))))
-                return float(np.median([_cost(validation, plan.task, plan.model_trajectory) for plan in plans]))
-            points = space.from_unit(rng.random((len(loops.states), space.dimension)))
-            costs = _cost(validation, validation.task_at(space.parameters(points)), loops)
-            return float(np.median(costs)) if np.isfinite(costs).all() else np.inf
-    except Exception:  # users' tasks, synthesizers and costs may raise anything, on tasks that may never be executed
-        return np.inf
+    # Users' tasks, synthesizers and costs may raise anything, on tasks that may never be executed.
+    with suppress(Exception), single_threaded():
+        loops = closed_loops_on_model(validation)
+        if loops is None or loops.states.ndim == 2:  # designs cannot be made in a batch
+            plans = map(validation.plan, space.from_unit(rng.random((8, space.dimension))))
+            return float(np.median([_cost(validation, plan.task, plan.model_trajectory) for plan in plans]))
+        points = space.from_unit(rng.random((len(loops.states), space.dimension)))
+        costs = _cost(validation, validation.task_at(space.parameters(points)), loops)
+        return float(np.median(costs)) if np.isfinite(costs).all() else np.inf
+    return np.inf
 
 
 def _cost(validation: Validation, task: Task, loops: Trajectory) -> Array:

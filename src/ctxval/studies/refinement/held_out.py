@@ -6,6 +6,7 @@ These errors by regions of states and inputs are what a robust controller must a
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -81,24 +82,18 @@ class Records(ShortRepr):
 
 @dataclass(frozen=True, eq=False)
 class HeldOut(ShortRepr):
-    """One-step errors ``S(x, u) - M(x, u)`` on N transitions that the model was not learned from.
+    """One-step errors ``S(x, u) - M(x, u)`` on N transitions that the model was not learned from."""
 
-    Attributes:
-        pairs: the states and inputs, shape ``(N, n + m)``.
-        errors, before: those of the learned model and of the first one, shapes ``(N, n)``.
-        changes: the recorded changes of the states in one step, shape ``(N, n)``.
-        later, later_before: errors after ten steps along held-out executions, of both models, shapes ``(K, n)``. They
-            choose corrections, because noise of the records hides in one step what adds up in several.
-        new: which transitions are of executions that the model itself had not seen, shape ``(N,)``; the errors on all
-            others are of models that were learned without a part of the records. None if there are no new ones.
-    """
-
-    pairs: Array
-    errors: Array
+    pairs: Array  #: the states and inputs, shape ``(N, n + m)``
+    errors: Array  #: those of the learned model and of the first one, shapes ``(N, n)``
     before: Array
-    changes: Array
+    changes: Array  #: the recorded changes of the states in one step, shape ``(N, n)``
+    #: errors after ten steps along held-out executions, of both models, shapes ``(K, n)``. They choose corrections,
+    #: because noise of the records hides in one step what adds up in several.
     later: Array
     later_before: Array
+    #: which transitions are of executions that the model itself had not seen, shape ``(N,)``; the errors on all others
+    #: are of models that were learned without a part of the records. None if there are no new ones.
     new: Mask | None = None
 
     @property
@@ -156,10 +151,9 @@ def held_out(learn: Callable[[Records], Model], before: Model, records: Records)
     """
     parts = []
     for known, held in records.folds():
-        try:
+        model = before
+        with suppress(CtxvalError):
             model = learn(known)
-        except CtxvalError:
-            model = before
         parts.append(_compared(held.transitions, held.executed, model, before))
     return _joined(parts)
 
@@ -181,13 +175,12 @@ def _errors_later(model: Model, runs: Sequence[Trajectory], n: int) -> Array:
     if not long:
         return np.zeros((0, n))
     x, after = (np.concatenate([run.states[part] for run in long]) for part in (slice(-_LATER), slice(_LATER, None)))
-    try:
+    with suppress(Exception):  # users' models, at states that were not recorded
         for k in range(_LATER):
             u = np.concatenate([run.inputs[k : run.horizon - _LATER + 1 + k] for run in long])
             x = np.asarray(model.step(x, u))
-    except Exception:  # users' models, at states that were not recorded
-        return np.full_like(after, np.nan)
-    return np.asarray(after - x)
+        return np.asarray(after - x)
+    return np.full_like(after, np.nan)
 
 
 def _joined(parts: list[HeldOut]) -> HeldOut:
@@ -197,18 +190,12 @@ def _joined(parts: list[HeldOut]) -> HeldOut:
 
 @dataclass(frozen=True, eq=False)
 class ResidualRegion(ShortRepr):
-    """The magnitude of the residual in one region.
+    """The magnitude of the residual in one region."""
 
-    Attributes:
-        low, high: the box of states and inputs, shapes ``(n + m,)``; infinite where it has no end.
-        steps: number of held-out transitions in it.
-        quantile, largest: 0.95 quantile and maximum of the residual of each state in one step, shapes ``(n,)``.
-    """
-
-    low: Array
+    low: Array  #: the box of states and inputs, shapes ``(n + m,)``; infinite where it has no end
     high: Array
-    steps: int
-    quantile: Array
+    steps: int  #: number of held-out transitions in it
+    quantile: Array  #: 0.95 quantile and maximum of the residual of each state in one step, shapes ``(n,)``
     largest: Array
 
 
@@ -217,18 +204,15 @@ class MeasuredResidual(ShortRepr):
     """The residual ``S(x, u) - M'(x, u)`` of one step, measured on transitions that M' was not learned from.
 
     It is measured and not guaranteed: another state or input may have a larger one.
-
-    Attributes:
-        whole: the residual in all regions together, whose box is the range of the records.
-        left_out: the residual of models that were learned without a part of the records, on that part; it is larger if
-            the records are few. None if no execution was new to M', so that ``whole`` and the regions are of these.
-        regions: disjoint regions that cover all states and inputs, those with small residuals first.
     """
 
     states: dict[str, str]
     inputs: dict[str, str]
-    whole: ResidualRegion
+    whole: ResidualRegion  #: the residual in all regions together, whose box is the range of the records
+    #: disjoint regions that cover all states and inputs, those with small residuals first
     regions: tuple[ResidualRegion, ...]
+    #: the residual of models that were learned without a part of the records, on that part; it is larger if the records
+    #: are few. None if no execution was new to M', so that ``whole`` and the regions are of these.
     left_out: ResidualRegion | None = None
 
     @property

@@ -5,12 +5,14 @@ from __future__ import annotations
 import functools
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
 
 from ctxval._util.arrays import Array, Mask, single_threaded
+from ctxval._util.checked import checked, require
 from ctxval._util.representation import ShortRepr
 from ctxval._util.texts import reason_of
 from ctxval.campaign.campaign import Campaign
@@ -36,8 +38,7 @@ RefitKind = Literal["linear", "network", "gaussian-process"]
 _KINDS: dict[str, type[Model]] = {
     "linear": Linear, "network": FeedforwardReLU, "gaussian-process": GaussianProcessModel
 }  # fmt: skip
-NAMES = ("residual", "causes", *_KINDS, "parameters", "fit")
-"""The names of the methods on the command line."""
+NAMES = ("residual", "causes", *_KINDS, "parameters", "fit")  #: the names of the methods on the command line
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,8 +177,7 @@ class Refit(ShortRepr, _Replacement):
     name: str = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        if self.kind not in _KINDS:
-            raise UnknownNameError.among("kind of model", str(self.kind), _KINDS)
+        require("kind", RefitKind, self.kind)
         object.__setattr__(self, "name", self.kind)
         object.__setattr__(self, "makes", _KINDS[self.kind])
 
@@ -188,19 +188,13 @@ class Refit(ShortRepr, _Replacement):
 
 @dataclass(frozen=True, eq=False)
 class ParameterFit(ShortRepr, _Replacement):
-    """New values of the parameters of a user's function ``(x, u, theta) -> x_next``, by least squares.
+    """New values of the parameters of a user's function ``(x, u, theta) -> x_next``, by least squares."""
 
-    Attributes:
-        bounds: the bounds of each parameter by name, in the order of theta.
-        step: the function; None for that of the first model, which must then be a ``Parametric``.
-        vectorized: whether ``step`` takes whole batches.
-        seed: seed of the starting points.
-    """
-
-    bounds: Mapping[str, tuple[float, float]]
+    bounds: Mapping[str, tuple[float, float]]  #: the bounds of each parameter by name, in the order of theta
+    #: the function; None for that of the first model, which must then be a ``Parametric``
     step: ParametricStep | None = None
-    vectorized: bool = False
-    seed: int = 0
+    vectorized: bool = False  #: whether ``step`` takes whole batches
+    seed: int = 0  #: seed of the starting points
     name: str = field(default="parameters", init=False)
     makes = Parametric
 
@@ -218,16 +212,13 @@ class ParameterFit(ShortRepr, _Replacement):
         return fit_parameters(step, self.bounds, data, vectorized=vectorized, seed=self.seed)
 
 
+@checked
 @dataclass(frozen=True, eq=False)
 class UserFit(ShortRepr, _Replacement):
     """The user's own function ``fit(data) -> model``, which must always return the same for the same data."""
 
     fit: Callable[[Transitions], Model | Step]
     name: str = field(default="fit", init=False)
-
-    def __post_init__(self) -> None:
-        if not callable(self.fit):
-            raise InputError(f"fit must be a function (data) -> model, got {self.fit!r}.")
 
     def _fit(self, model: Model, data: Transitions) -> tuple[Model, tuple[FittedParameter, ...]]:
         try:
@@ -300,15 +291,15 @@ def averaged_correction(model: Model, records: Records) -> Correction | None:
         ]
     data = records.transitions
     k = data.x.shape[1] + data.u.shape[1]
-    try:
-        with single_threaded(), np.errstate(all="ignore"):
-            sizes = np.sqrt(((data.x_next - model.step(data.x, data.u)) ** 2).mean(axis=0))
-            live = sizes > NEGLIGIBLE * standard_deviations(data.x_next - data.x)
-            if not live.any():
-                return None
+    fit = None
+    # Numbers may not be finite.
+    with suppress(np.linalg.LinAlgError, ValueError), single_threaded(), np.errstate(all="ignore"):
+        sizes = np.sqrt(((data.x_next - model.step(data.x, data.u)) ** 2).mean(axis=0))
+        live = sizes > NEGLIGIBLE * standard_deviations(data.x_next - data.x)
+        if live.any():
             history = History(model, Structure(), np.eye(len(live)))
             fit = fit_lagged(history, runs, np.zeros((0, k)), None, live, products=False)
-    except (np.linalg.LinAlgError, ValueError):  # numbers that are not finite
+    if fit is None:
         return None
     scaled, features, function = fit.scaled, fit.features, fit.features.function(fit.weights)
     linear = features.linear * np.roll(function.linear[: k + 1], -1, axis=0)  # the constant is the last row

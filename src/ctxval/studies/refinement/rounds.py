@@ -25,25 +25,17 @@ from ctxval.studies.refinement.held_out import MeasuredResidual
 
 @dataclass(frozen=True, eq=False)
 class Round(ShortRepr):
-    """One model, and what its executions showed.
+    """One model, and what its executions showed."""
 
-    Attributes:
-        number, method: 0 and ``given`` for the first model; then 1, 2, ... and the method by which it was learned.
-        campaign: the campaign of the model, whose store belongs to it alone.
-        verdict, confidence: the verdict on the model, and the confidence of this round.
-        learned_from: number of transitions that the model was learned from.
-        notes: sentences on the model.
-        unchanged: executed tasks of earlier rounds whose controllers have not changed.
-    """
-
-    number: int
+    number: int  #: 0 and ``given`` for the first model; then 1, 2, ... and the method by which it was learned.
     method: str
-    campaign: Campaign
-    verdict: Verdict
+    campaign: Campaign  #: the campaign of the model, whose store belongs to it alone
+    verdict: Verdict  #: the verdict on the model, and the confidence of this round
     confidence: float
-    learned_from: int = 0
+    learned_from: int = 0  #: number of transitions that the model was learned from
     model_file: Path | None = None
-    notes: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()  #: sentences on the model
+    #: executed tasks of earlier rounds whose controllers have not changed
     unchanged: SameControllers = field(default_factory=SameControllers)
 
     @property
@@ -96,26 +88,17 @@ class Round(ShortRepr):
 
 @dataclass(frozen=True, eq=False)
 class Refinement:
-    """A sequence of models of one system, each validated by executions under its own controllers.
+    """A sequence of models of one system, each validated by executions under its own controllers."""
 
-    Attributes:
-        rounds: the first model and the refined ones.
-        threshold, units: tau, and the units of the distance.
-        confidence: the confidence of the whole sequence.
-        budget: the largest total number of executions.
-        ended: why the sequence ended, in one sentence.
-        residual: the measured residual of the last model; None if no model was learned.
-        accuracy: the one-step errors on held-out executions, before and after, for each state.
-        parameters: the parameters of the user's function in the last model; none for other methods.
-    """
-
-    rounds: tuple[Round, ...]
-    threshold: float
-    confidence: float
-    budget: int
-    ended: str
-    residual: MeasuredResidual | None = None
+    rounds: tuple[Round, ...]  #: the first model and the refined ones
+    threshold: float  #: tau
+    confidence: float  #: the confidence of the whole sequence
+    budget: int  #: the largest total number of executions
+    ended: str  #: why the sequence ended, in one sentence
+    residual: MeasuredResidual | None = None  #: the measured residual of the last model; None if no model was learned
+    #: the one-step errors on held-out executions, before and after, for each state
     accuracy: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    #: the parameters of the user's function in the last model; none for other methods
     parameters: tuple[FittedParameter, ...] = ()
     units: str = ""
 

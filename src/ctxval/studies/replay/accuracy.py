@@ -17,26 +17,21 @@ from ctxval.errors import CtxvalError, ModelError
 
 @dataclass(frozen=True)
 class StepError(ShortRepr):
-    """The error of one state after a number of steps.
-
-    Attributes:
-        rms: root mean square of the error; ``lowest`` and ``highest`` are the smallest and largest over the recordings.
-        median, upper, largest: median, 0.95 quantile and maximum of the magnitude of the error.
-        change: root mean square of the recorded change of the state, which is the error of a model that predicts none.
-        count, diverged: number of predictions, and the share that diverged, which is left out of the numbers above.
-    """
+    """The error of one state after a number of steps."""
 
     state: str
     unit: str
     steps: int
+    #: root mean square of the error; ``lowest`` and ``highest`` are the smallest and largest over the recordings
     rms: float
     lowest: float
     highest: float
-    median: float
+    median: float  #: median, 0.95 quantile and maximum of the magnitude of the error
     upper: float
     largest: float
+    #: root mean square of the recorded change of the state, which is the error of a model that predicts none
     change: float
-    count: int
+    count: int  #: number of predictions, and the share that diverged, which is left out of the numbers above
     diverged: float
 
     @property
@@ -47,20 +42,16 @@ class StepError(ShortRepr):
 
 @dataclass(frozen=True)
 class Region(ShortRepr):
-    """The one-step error in a range of one state or input, with so many recorded steps.
-
-    Attributes:
-        error: root mean square over the states of the one-step error, as a share of the typical change of each state.
-        ratio: this error, divided by that over all steps.
-    """
+    """The one-step error in a range of one state or input, with so many recorded steps."""
 
     variable: str
     unit: str
     low: float
     high: float
     count: int
+    #: root mean square over the states of the one-step error, as a share of the typical change of each state
     error: float
-    ratio: float
+    ratio: float  #: this error, divided by that over all steps
 
 
 class RecordedSteps:

@@ -22,24 +22,18 @@ from ctxval.studies.replay.accuracy import RecordedSteps, Windows, squared, step
 
 @dataclass(frozen=True)
 class ResidualShare(ShortRepr):
-    """How much of the one-step residual of a state can be explained, measured on held-out recordings.
-
-    Attributes:
-        rms, rest: root mean square of the residual, and of what state and input do not explain.
-        linear: share of its mean square that an affine function of state and input explains; at least 0.
-        explained: share that a Gaussian process of state and input explains, or the affine function if that is more;
-            at least 0.
-        history: share of the rest that the previous state, input and residual explain; at least 0. If it is large, the
-            system has a state that is not recorded, or a delay.
-    """
+    """How much of the one-step residual of a state can be explained, measured on held-out recordings."""
 
     state: str
     unit: str
-    rms: float
-    linear: float
+    rms: float  #: root mean square of the residual
+    linear: float  #: share of its mean square that an affine function of state and input explains; at least 0
+    #: share that a Gaussian process of state and input explains, or the affine function if that is more; at least 0
     explained: float
+    #: share of the rest that the previous state, input and residual explain; at least 0. If it is large, the system has
+    #: a state that is not recorded, or a delay.
     history: float
-    rest: float
+    rest: float  #: root mean square of what state and input do not explain
 
 
 def residual_shares(model: Model, recorded: RecordedSteps, seed: int) -> tuple[ResidualShare, ...]:
@@ -106,16 +100,11 @@ def _learned(model: Model, where: Windows, folds: Rows, held: Mask, seed: int) -
 
 @dataclass(frozen=True)
 class Suggestion(ShortRepr):
-    """A change of timing with which the model predicts held-out recordings clearly better.
-
-    Attributes:
-        value: the delay, or the time step of the model, in seconds.
-        ratio: the held-out one-step error with the change, divided by that without it.
-    """
+    """A change of timing with which the model predicts held-out recordings clearly better."""
 
     kind: Literal["delay", "time step"]
-    value: float
-    ratio: float
+    value: float  #: the delay, or the time step of the model, in seconds
+    ratio: float  #: the held-out one-step error with the change, divided by that without it
     sentence: str
 
 

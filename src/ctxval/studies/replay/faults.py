@@ -30,21 +30,14 @@ FaultKind = Literal["turn", "frozen", "spike", "file"]
 
 @dataclass(frozen=True)
 class Fault(ShortRepr):
-    """A fault of recordings, and its part in the one-step error of a model.
-
-    Attributes:
-        state: the state concerned; empty for a file.
-        source, steps: the first file concerned, and the number of steps.
-        share: their share of the model's squared one-step error, of states in units of their typical changes.
-        sentence: what it is, and what would help.
-    """
+    """A fault of recordings, and its part in the one-step error of a model."""
 
     kind: FaultKind
-    state: str
-    source: str
+    state: str  #: the state concerned; empty for a file
+    source: str  #: the first file concerned, and the number of steps
     steps: int
-    share: float
-    sentence: str
+    share: float  #: their share of the model's squared one-step error, of states in units of their typical changes
+    sentence: str  #: what it is, and what would help
 
     @property
     def explains(self) -> bool:

@@ -5,11 +5,12 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
 from ctxval._util.arrays import single_threaded
+from ctxval._util.checked import Must, require
 from ctxval._util.columns import unit_advice
 from ctxval._util.representation import ShortRepr, counted, task_text
 from ctxval.core.model import Model, require_time_step
@@ -23,56 +24,40 @@ from ctxval.studies.replay.causes import ResidualShare, Suggestion, residual_sha
 from ctxval.studies.replay.faults import EXPLAINS, Fault, faults
 from ctxval.studies.replay.untested import PredictedTasks, predicted_tasks
 
-STEPS = (1, 5, 20, 100)
-"""Numbers of steps after which errors are computed, unless others are given."""
+STEPS = (1, 5, 20, 100)  #: numbers of steps after which errors are computed, unless others are given
 
 
 @dataclass(frozen=True)
 class RecordedData(ShortRepr):
-    """The recordings that were compared with the model.
+    """The recordings that were compared with the model."""
 
-    Attributes:
-        sources: the files and episodes.
-        recordings, steps: the numbers of recordings and of steps.
-        states, inputs: the names of the states and inputs with their units.
-        breaks, notes: where logs were split and why, and sentences on how they were read.
-        seen: number of recordings that are in the data from which the model was learned. They are left out of the
-            errors, unless all recordings are.
-    """
-
-    sources: tuple[str, ...]
-    recordings: int
+    sources: tuple[str, ...]  #: the files and episodes
+    recordings: int  #: the numbers of recordings and of steps
     steps: int
     dt: float
-    states: dict[str, str]
+    states: dict[str, str]  #: the names of the states and inputs with their units
     inputs: dict[str, str]
-    breaks: tuple[Break, ...]
+    breaks: tuple[Break, ...]  #: where logs were split and why, and sentences on how they were read
     notes: tuple[str, ...]
+    #: number of recordings that are in the data from which the model was learned. They are left out of the errors,
+    #: unless all recordings are.
     seen: int
 
 
 @dataclass(frozen=True, eq=False)
 class ReplayReport(ShortRepr):
-    """What recordings show of a model.
-
-    Attributes:
-        errors: the error of each state after each number of steps.
-        regions: the one-step error in ranges of each state and input.
-        residuals: how much of the one-step residual of each state can be explained.
-        suggestions, faults: changes of timing, and faults of the recordings, that explain errors.
-        tasks: what the recordings predict of the tasks of an experiment; None without an experiment, or if the
-            recordings teach nothing.
-        insights: what follows, in sentences, the most important one first.
-    """
+    """What recordings show of a model."""
 
     data: RecordedData
-    errors: tuple[StepError, ...]
-    regions: tuple[Region, ...]
-    residuals: tuple[ResidualShare, ...]
-    suggestions: tuple[Suggestion, ...]
+    errors: tuple[StepError, ...]  #: the error of each state after each number of steps
+    regions: tuple[Region, ...]  #: the one-step error in ranges of each state and input
+    residuals: tuple[ResidualShare, ...]  #: how much of the one-step residual of each state can be explained
+    suggestions: tuple[Suggestion, ...]  #: changes of timing, and faults of the recordings, that explain errors
     faults: tuple[Fault, ...]
+    #: what the recordings predict of the tasks of an experiment; None without an experiment, or if the recordings teach
+    #: nothing
     tasks: PredictedTasks | None
-    insights: tuple[str, ...]
+    insights: tuple[str, ...]  #: what follows, in sentences, the most important one first
 
     def to_json(self) -> dict[str, Any]:
         """Return all results as plain values; numbers that are not finite are None."""
@@ -97,8 +82,8 @@ def replay(
         validation: an experiment with this model, whose tasks are then judged too; its system is never executed.
         executions: number of executions of the experiment that are proposed.
     """
-    if not steps or not all(isinstance(k, int) and not isinstance(k, bool) and k >= 1 for k in steps):
-        raise InputError(f"steps must be positive integers, got {list(steps)}.")
+    positive = Must("positive integers", lambda steps: len(steps) > 0 and min(steps) >= 1)
+    require("steps", Annotated[Sequence[int], positive], steps)
     if validation is not None:
         validation.require_states("a replay")
         space = validation.space

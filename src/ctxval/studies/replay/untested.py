@@ -19,41 +19,29 @@ from ctxval.learning.closed_loops import loop_pairs
 
 @dataclass(frozen=True, eq=False)
 class PredictedTask(ShortRepr):
-    """The predicted distance of one task.
-
-    Attributes:
-        median, low, high: median, 0.05 and 0.95 quantile of the distance over posterior samples of the dynamics.
-        resolved: for a proposed execution, the share of the variance of the distances of likely worst tasks that it and
-            those before it resolve; None for others.
-    """
+    """The predicted distance of one task."""
 
     parameters: dict[str, Any]
-    median: float
+    median: float  #: median, 0.05 and 0.95 quantile of the distance over posterior samples of the dynamics
     low: float
     high: float
+    #: for a proposed execution, the share of the variance of the distances of likely worst tasks that it and those
+    #: before it resolve; None for others
     resolved: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class PredictedTasks(ShortRepr):
-    """What recordings predict of the tasks of an experiment. No execution has tested it.
+    """What recordings predict of the tasks of an experiment. No execution has tested it."""
 
-    Attributes:
-        worst: tasks with large predicted distances, the largest first.
-        median, upper: median and 0.95 quantile of the largest distance over all tasks, over posterior samples.
-        executions: the executions that would tell most of the largest distance, in this order.
-        draws: number of posterior samples of the dynamics.
-        unplanned: share of the tasks for which no controller can be designed, or on which the model diverges.
-        beyond, beyond_of: how far the closed loops of the tasks lead beyond all records of one state or input, as a
-            share of the range that they visit, and the index of this state or input; states come before inputs.
-    """
-
-    worst: tuple[PredictedTask, ...]
-    median: float
+    worst: tuple[PredictedTask, ...]  #: tasks with large predicted distances, the largest first
+    median: float  #: median and 0.95 quantile of the largest distance over all tasks, over posterior samples
     upper: float
-    executions: tuple[PredictedTask, ...]
-    draws: int
-    unplanned: float
+    executions: tuple[PredictedTask, ...]  #: the executions that would tell most of the largest distance, in this order
+    draws: int  #: number of posterior samples of the dynamics
+    unplanned: float  #: share of the tasks for which no controller can be designed, or on which the model diverges
+    #: how far the closed loops of the tasks lead beyond all records of one state or input, as a share of the range that
+    #: they visit, and the index of this state or input; states come before inputs
     beyond: float
     beyond_of: int
 

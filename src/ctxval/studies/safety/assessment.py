@@ -34,73 +34,48 @@ from ctxval.learning.closed_loops import LoopPlanner
 from ctxval.specs import ReachAvoid
 from ctxval.studies.safety.draws import on_model, spec_distance
 
-TASKS = 4000
-"""Number of tasks on M that the shares are of; of designs that are made one by one, a tenth of it."""
+TASKS = 4000  #: number of tasks on M that the shares are of; of designs that are made one by one, a tenth of it
 
 
 @dataclass(frozen=True)
 class UnsafeTask(ShortRepr):
-    """An executed task that M satisfies and S violates.
+    """An executed task that M satisfies and S violates."""
 
-    Attributes:
-        trial: the number of its trial.
-        parameters: the task.
-        on_model, on_system: the robustness of both trajectories.
-    """
-
-    trial: int
-    parameters: dict[str, Any]
-    on_model: float
+    trial: int  #: the number of its trial
+    parameters: dict[str, Any]  #: the task
+    on_model: float  #: the robustness of both trajectories
     on_system: float
 
 
 @dataclass(frozen=True, eq=False)
 class SafetyReport(ShortRepr):
-    """Which tasks are safe on S.
+    """Which tasks are safe on S."""
 
-    Attributes:
-        spec: the specification.
-        margin: the robustness of M that was asked for; None if it was to be found.
-        answer: whether every task with a larger one is safe, ``validated``, ``falsified`` or ``undecided``; None if no
-            margin was asked for.
-        reason: why.
-        d_a: the largest executed deviation of the states that the specification looks at.
-        d_a_bound: what the learned dynamics bound it by; no prediction of it was tested. None if it is not known.
-        d_b: the largest executed rho_M of a task that S violates; 0 if there is none.
-        d_b_bound: the certified bound; None if there is none.
-        counterexamples: the executed tasks that M satisfies and S violates, the largest rho_M first.
-        certificate: the certificate of the bound; None if there is none.
-        doubt: why there is no bound; None if there is one.
-        tasks: number of drawn tasks, on M alone, that the shares are of.
-        share_satisfied: the share of the tasks that M satisfies.
-        share_certified: the share whose rho_M exceeds the bound of d_b; None if there is none.
-        share_by_deviation: the share whose rho_M exceeds the bound of d_a; None if there is none.
-        tightened: the specification whose sets to avoid have grown, and whose set to reach has shrunk, by the bound;
-            None if there is no bound, no sets, or nothing left of the set to reach.
-        executions: the number of executions of S.
-        confidence: the confidence of the certificate.
-        units: the unit of all distances.
-    """
-
-    spec: Any
-    margin: float | None
+    spec: Any  #: the specification
+    margin: float | None  #: the robustness of M that was asked for; None if it was to be found
+    #: whether every task with a larger one is safe, ``validated``, ``falsified`` or ``undecided``; None if no margin
+    #: was asked for
     answer: Answer | None
-    reason: str | None
-    d_a: float
+    reason: str | None  #: why
+    d_a: float  #: the largest executed deviation of the states that the specification looks at
+    #: what the learned dynamics bound it by; no prediction of it was tested. None if it is not known.
     d_a_bound: float | None
-    d_b: float
-    d_b_bound: float | None
+    d_b: float  #: the largest executed rho_M of a task that S violates; 0 if there is none
+    d_b_bound: float | None  #: the certified bound; None if there is none
+    #: the executed tasks that M satisfies and S violates, the largest rho_M first
     counterexamples: tuple[UnsafeTask, ...]
-    certificate: Certificate | None
-    doubt: str | None
-    tasks: int
-    share_satisfied: float
-    share_certified: float | None
-    share_by_deviation: float | None
+    certificate: Certificate | None  #: the certificate of the bound; None if there is none
+    doubt: str | None  #: why there is no bound; None if there is one
+    tasks: int  #: number of drawn tasks, on M alone, that the shares are of
+    share_satisfied: float  #: the share of the tasks that M satisfies
+    share_certified: float | None  #: the share whose rho_M exceeds the bound of d_b; None if there is none
+    share_by_deviation: float | None  #: the share whose rho_M exceeds the bound of d_a; None if there is none
+    #: the specification whose sets to avoid have grown, and whose set to reach has shrunk, by the bound; None if there
+    #: is no bound, no sets, or nothing left of the set to reach
     tightened: ReachAvoid | None
-    executions: int
-    confidence: float
-    units: str
+    executions: int  #: the number of executions of S
+    confidence: float  #: the confidence of the certificate
+    units: str  #: the unit of all distances
 
     def to_dict(self) -> dict[str, Any]:
         """Return everything as plain values."""
@@ -273,12 +248,10 @@ def _deviation_bound(campaign: Campaign, spec: Any, confidence: float) -> float 
     """Return the bound that learned dynamics give on the largest deviation; None if they give none."""
     validation = campaign.validation.with_distance(MaximumDeviation(2, getattr(spec, "components", None)))
     pairs = [(trial.unit_point, system) for trial, system in executed_trials(campaign.store, campaign.trials)]
-    try:
+    with suppress(Exception):  # users' parts, at states that no execution has reached
         learned = DynamicsStudy(validation, campaign.seed).learn(pairs)
-        if learned is None:
-            return None
-        maxima = learned.worst_case_of(draws_for(confidence)).maxima
-    except Exception:  # users' parts, at states that no execution has reached
-        return None
-    bound = float(np.sort(maxima)[min(rank_of(confidence, len(maxima)), len(maxima)) - 1])
-    return bound if np.isfinite(bound) else None
+        if learned is not None:
+            maxima = learned.worst_case_of(draws_for(confidence)).maxima
+            bound = float(np.sort(maxima)[min(rank_of(confidence, len(maxima)), len(maxima)) - 1])
+            return bound if np.isfinite(bound) else None
+    return None

@@ -31,22 +31,14 @@ class Disturbance(ShortRepr):
 
     It holds for tasks from the distribution of the draws, under the controllers that executed them: after these have
     changed, other states are visited, and fresh draws are needed.
-
-    Attributes:
-        half_widths: one for each state, ``(n,)``.
-        volume: the share of the tasks that may have a step outside of W.
-        confidence: the probability of this statement.
-        draws: the number N of independent tasks.
-        discarded: the number k of those that were discarded.
-        largest: the largest residuals of all draws, ``(n,)``, for comparison.
     """
 
-    half_widths: Array
-    volume: float
-    confidence: float
-    draws: int
-    discarded: int
-    largest: Array
+    half_widths: Array  #: one for each state, ``(n,)``
+    volume: float  #: the share of the tasks that may have a step outside of W
+    confidence: float  #: the probability of this statement
+    draws: int  #: the number N of independent tasks
+    discarded: int  #: the number k of those that were discarded
+    largest: Array  #: the largest residuals of all draws, ``(n,)``, for comparison
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values."""

@@ -51,20 +51,13 @@ class DrawnTasks(ShortRepr):
     """What independent draws show of the tasks that M satisfies with a robustness above a margin.
 
     Nothing is assumed of the dynamics, and a failed execution counts as unsafe.
-
-    Attributes:
-        margin: the margin.
-        draws: number of executed draws.
-        unsafe: number of those that S violates.
-        share: with the confidence, at most this share of these tasks is unsafe (Clopper and Pearson 1934).
-        confidence: the confidence.
     """
 
-    margin: float
-    draws: int
-    unsafe: int
-    share: float
-    confidence: float
+    margin: float  #: the margin
+    draws: int  #: number of executed draws
+    unsafe: int  #: number of those that S violates
+    share: float  #: with the confidence, at most this share of these tasks is unsafe (Clopper and Pearson 1934)
+    confidence: float  #: the confidence
 
 
 @dataclass(frozen=True, eq=False)

@@ -26,19 +26,12 @@ from ctxval.studies.safety.disturbance import Disturbance
 
 @dataclass(frozen=True, eq=False)
 class Tube(ShortRepr):
-    """How far states and inputs of S are from those of M at most, if every disturbance lies in a box.
+    """How far states and inputs of S are from those of M at most, if every disturbance lies in a box."""
 
-    Attributes:
-        states: half-widths of the states at each time, ``(H + 1, n)``.
-        inputs: half-widths of the inputs at each step, ``(H, m)``.
-        loops: the matrices ``A + B K_t`` of the closed loop, ``(H, n, n)``.
-        half_widths: the box of disturbances, ``(n,)``.
-    """
-
-    states: Array
-    inputs: Array
-    loops: Array
-    half_widths: Array
+    states: Array  #: half-widths of the states at each time, ``(H + 1, n)``
+    inputs: Array  #: half-widths of the inputs at each step, ``(H, m)``
+    loops: Array  #: the matrices ``A + B K_t`` of the closed loop, ``(H, n, n)``
+    half_widths: Array  #: the box of disturbances, ``(n,)``
 
     def support(self, direction: ArrayLike) -> Array:
         """Return the largest error in a direction ``(n,)`` at each time, ``(H + 1,)``."""
