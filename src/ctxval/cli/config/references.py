@@ -154,11 +154,12 @@ def _unwrapped(value: Any) -> Any:
 
 def accepts(function: Any, count: int, /, **named: Any) -> bool:
     """Return whether a function can be called with this number of positional arguments and these named ones."""
-    with suppress(ValueError):  # the function has no signature
-        try:
-            inspect.signature(function).bind(*range(count), **named)
-        except TypeError:
-            return False
+    try:
+        inspect.signature(function).bind(*range(count), **named)
+    except TypeError:
+        return False
+    except ValueError:  # the function has no signature
+        return True
     return True
 
 
