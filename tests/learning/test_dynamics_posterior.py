@@ -320,8 +320,9 @@ def test_components_of_equal_hyperparameters_are_drawn_as_if_alone() -> None:
     assert len(set(names)) < len(names)  # resampling repeats likely hyperparameters
     together = posterior.draw(posterior.data.pairs, np.random.default_rng(0))
     rng = np.random.default_rng(0)
+    settings = posterior.covariances.settings
     alone = [
-        draw_functions([one], posterior.data.pairs, posterior.settings.functions, posterior.settings.pivots, rng)[0]
+        draw_functions([one], posterior.data.pairs, settings.functions, settings.pivots, rng)[0]
         for one in posterior.components
     ]
     assert len(together) == sum(len(one.weights) for one in alone)
@@ -345,7 +346,7 @@ def test_few_draws_do_not_depend_on_what_was_computed_before() -> None:
     for whole in (False, True):
         posterior = learn(transitions)
         if whole:
-            assert len(posterior.components) == posterior.settings.hyperparameters
+            assert len(posterior.components) == posterior.covariances.settings.hyperparameters
         draws = posterior.draw(posterior.data.pairs + 0.1, np.random.default_rng(0), 1, 8)
         found.append(draws.step(np.ones((len(draws), 1, 2)), np.ones((len(draws), 1, 1))))
     np.testing.assert_array_equal(*found)

@@ -186,7 +186,7 @@ def test_a_smooth_model_is_that_of_the_posterior() -> None:
     assert posterior is not None
     assert not posterior.covariances.without_model
     assert posterior.model is model
-    assert posterior.settings == SETTINGS
+    assert posterior.covariances.settings == SETTINGS
 
 
 def test_numbers_that_are_too_large_for_a_linear_model_keep_the_model() -> None:

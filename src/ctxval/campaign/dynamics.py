@@ -226,8 +226,17 @@ class CampaignDynamics:
         if doubt_of(replace(evidence, tests=0), best, bound):  # how many tests a verdict needs is not known here
             return evidence
         # Many closed loops, which only matter to a bound that nothing else withdraws.
-        evidence = _with_jumps(evidence, learned, bound)
-        evidence = replace(evidence, pocket=learned.pocket())
+        jump = learned.study.search.largest_jump(learned.drawn_from)
+        evidence = replace(evidence, jump=jump, pocket=learned.pocket())
+        # The maxima of a distance with kinks lie on ridges, which deeper searches climb higher.
+        if is_kinked(learned.study.given.distance) or (evidence.dense and jumps(evidence, bound)):
+            values, points = learned.deeper
+            low, high = values.min(), values.max()
+            evidence = replace(evidence, disagreement=float(1 - low / high) if high > 0 else 0.0)
+            if high > evidence.highest:
+                elites = np.concatenate([points[values.argmax()][None], evidence.elites])
+                missed = float(high / evidence.highest)
+                evidence = replace(evidence, missed=missed, highest=float(high), elites=elites)
         if learned.noisy is not None:
             return evidence  # a push is compared with residuals of state and input, which do not hold here
         push, rates = learned.push_response, []
@@ -353,20 +362,3 @@ class LearnedFromTrials:
         """Return independent draws of tasks, points of the unit cube ``(count, d)``."""
         # This random stream is none of those of trials.
         return self.validation.space.unit_draws(count, np.random.default_rng([seed, 0x7461]))
-
-
-def _with_jumps(evidence: DynamicsEvidence, learned: LearnedDynamics, bound: float) -> DynamicsEvidence:
-    """Return evidence with the largest jump between tasks; if there are jumps, with what deeper searches have found.
-
-    The maxima of a distance with kinks lie on ridges, which deeper searches climb higher.
-    """
-    evidence = replace(evidence, jump=learned.largest_jump)
-    if not (is_kinked(learned.study.given.distance) or (evidence.dense and jumps(evidence, bound))):
-        return evidence
-    values, points = learned.deeper
-    low, high = values.min(), values.max()
-    evidence = replace(evidence, disagreement=float(1 - low / high) if high > 0 else 0.0)
-    if high <= evidence.highest:
-        return evidence
-    elites = np.concatenate([points[values.argmax()][None], evidence.elites])
-    return replace(evidence, missed=float(high / evidence.highest), highest=float(high), elites=elites)

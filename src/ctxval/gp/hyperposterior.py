@@ -99,20 +99,7 @@ class Hyperparameters(ShortRepr):
 
     def kernel(self, X: Array, Z: Array) -> Array:
         """Return the correlations ``(n, m)`` of g between points ``(n, d)`` and ``(m, d)``."""
-        return Matern(self.nu, ard=True)(self._theta, X, Z)
-
-    def kernel_pull(self, X: Array, Z: Array, weights: Array) -> Array:
-        """Return ``sum_j weights_ij dk(x_i, z_j)/dx_i``, shape ``(n, d)``."""
-        return Matern(self.nu, ard=True).weighted_input_gradient(self._theta, X, Z, weights)
-
-    def as_rough_as(self, other: Hyperparameters) -> Hyperparameters:
-        """Return these hyperparameters with a smoothness and a mean length-scale that are at most those of another."""
-        shrink = min(0.0, float((other.log_scales - self.log_scales).mean()))
-        return Hyperparameters(min(self.nu, other.nu), self.log_scales + shrink, self.log_noise)
-
-    @property
-    def _theta(self) -> Array:
-        return np.concatenate([[0.0], self.log_scales])
+        return Matern(self.nu, ard=True)(np.concatenate([[0.0], self.log_scales]), X, Z)
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,7 +151,10 @@ def draw_hyperparameters(
         gaps[first] = -np.inf
         rows = np.sort([first, *farthest_rows(X, gaps, apart - 1)])
         rougher = _chain(X[rows], y[rows], prior, count, rng)
-        drawn = [(draw.as_rough_as(other), warp) for (draw, warp), (other, _) in zip(drawn, rougher, strict=True)]
+        for k, ((draw, warp), (other, _)) in enumerate(zip(drawn, rougher, strict=True)):
+            shrink = min(0.0, float((other.log_scales - draw.log_scales).mean()))
+            as_rough = Hyperparameters(min(draw.nu, other.nu), draw.log_scales + shrink, draw.log_noise)
+            drawn[k] = as_rough, warp
     return [condition(draw, X, y, warp) for draw, warp in drawn]
 
 
@@ -251,15 +241,15 @@ class Paths:
 
     def __call__(self, Z: Array) -> Array:
         """Return the values of all paths at the same points ``(m, d)``, shape ``(m, s)``."""
-        waves = _waves(Z, self.frequencies) @ self.amplitudes
-        return np.asarray(self.means + self.scales * (waves + self._correlations(Z) @ self.corrections))
+        waves, kernel = _waves(Z, self.frequencies) @ self.amplitudes, self.conditioned.hyperparameters.kernel
+        return np.asarray(self.means + self.scales * (waves + kernel(Z, self.X) @ self.corrections))
 
     def roughly(self, Z: Array) -> Array:
         """Return the same values with waves in single precision: ten times as fast, and enough to choose candidates."""
-        single = np.float32
+        single, kernel = np.float32, self.conditioned.hyperparameters.kernel
         waves = _waves(Z.astype(single), self.frequencies.astype(single)) @ self.amplitudes.astype(single)
         # The corrections are sums of large terms that cancel, so they need double precision.
-        return np.asarray(self.means + self.scales * (waves + self._correlations(Z) @ self.corrections))
+        return np.asarray(self.means + self.scales * (waves + kernel(Z, self.X) @ self.corrections))
 
     def own(self, Z: Array) -> Array:
         """Return the values of each path at its own points ``(s, q, d)``, shape ``(s, q)``."""
@@ -270,7 +260,9 @@ class Paths:
         s, q, d = Z.shape
         flat = Z.reshape(-1, d)
         waves = _waves(flat, self.frequencies).reshape(s, q, -1)
-        correlations = self._correlations(flat).reshape(s, q, -1)
+        known = self.conditioned.hyperparameters
+        kernel, theta = Matern(known.nu, ard=True), np.concatenate([[0.0], known.log_scales])
+        correlations = kernel(theta, flat, self.X).reshape(s, q, -1)
         values = np.einsum("sqf,fs->sq", waves, self.amplitudes) + np.einsum(
             "sqn,ns->sq", correlations, self.corrections
         )
@@ -282,12 +274,9 @@ class Paths:
         )
         slopes = turned @ self.frequencies
         weights = np.repeat(self.corrections.T, q, axis=0)
-        slopes += self.conditioned.hyperparameters.kernel_pull(flat, self.X, weights).reshape(s, q, d)
+        slopes += kernel.weighted_input_gradient(theta, flat, self.X, weights).reshape(s, q, d)
         scales = self.scales[:, None]
         return self.means[:, None] + scales * values, scales[..., None] * slopes
-
-    def _correlations(self, Z: Array) -> Array:
-        return self.conditioned.hyperparameters.kernel(Z, self.X)
 
 
 def _waves(Z: Array, frequencies: Array) -> Array:

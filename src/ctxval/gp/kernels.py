@@ -45,11 +45,8 @@ class Kernel(Covariance, Protocol):
     def weighted_gradient(self, theta: Array, X: Array, W: Array) -> Array:
         """Return ``sum_ij W_ij dK_ij/dtheta`` for K = k(X, X) and a symmetric W, in the shape of theta."""
 
-    def input_gradient(self, theta: Array, X: Array, Z: Array) -> Array:
-        """Return ``dk(x_i, z_j)/dx_i``, shape ``(n, m, d)``."""
-
-    def diagonal_input_gradient(self, theta: Array, X: Array) -> Array:
-        """Return ``dk(x, x)/dx``, shape ``(n, d)``."""
+    def input_gradient(self, theta: Array, X: Array, Z: Array) -> tuple[Array, Array]:
+        """Return ``dk(x_i, z_j)/dx_i``, shape ``(n, m, d)``, and ``dk(x, x)/dx``, shape ``(n, d)``."""
 
 
 @dataclass(frozen=True)
@@ -103,20 +100,17 @@ class Matern(Kernel):
             by_scales = np.array([np.vdot(G, r**2)])
         return np.concatenate([[by_variance], by_scales])
 
-    def input_gradient(self, theta: Array, X: Array, Z: Array) -> Array:
+    def input_gradient(self, theta: Array, X: Array, Z: Array) -> tuple[Array, Array]:
         scales = np.exp(theta[1:])
         Y, V = X / scales, Z / scales
         slope = np.exp(theta[0]) * self.profile_and_slope(cdist(Y, V))[1]
-        return np.asarray(-slope[:, :, None] * (Y[:, None, :] - V[None, :, :]) / scales)
+        return -slope[:, :, None] * (Y[:, None, :] - V[None, :, :]) / scales, np.zeros_like(X)
 
     def weighted_input_gradient(self, theta: Array, X: Array, Z: Array, weights: Array) -> Array:
         """Return ``sum_j weights_ij dk(x_i, z_j)/dx_i``, shape ``(n, d)``, without the ``(n, m, d)`` of its terms."""
         scales = np.exp(theta[1:])
         pulls = np.exp(theta[0]) * weights * self.profile_and_slope(cdist(X / scales, Z / scales))[1]
         return np.asarray((pulls @ Z - pulls.sum(axis=1)[:, None] * X) / scales**2)
-
-    def diagonal_input_gradient(self, theta: Array, X: Array) -> Array:
-        return np.zeros_like(X)
 
     def profile_and_slope(self, r: Array) -> tuple[Array, Array]:
         """Return k(r) and ``-k'(r) / r``, which is finite at r = 0, for unit variance and length-scale."""
@@ -174,12 +168,10 @@ class Linear(Kernel):
         Y = X - self.centre
         return np.array([np.exp(theta[0]) * W.sum(), np.exp(theta[1]) * (Y * (W @ Y)).sum()])
 
-    def input_gradient(self, theta: Array, X: Array, Z: Array) -> Array:
-        gradient = np.exp(theta[1]) * (Z - self.centre)
-        return np.broadcast_to(gradient, (len(X), *Z.shape))
-
-    def diagonal_input_gradient(self, theta: Array, X: Array) -> Array:
-        return np.asarray(2 * np.exp(theta[1]) * (X - self.centre))
+    def input_gradient(self, theta: Array, X: Array, Z: Array) -> tuple[Array, Array]:
+        slope = np.exp(theta[1])
+        gradient = np.broadcast_to(slope * (Z - self.centre), (len(X), *Z.shape))
+        return gradient, np.asarray(2 * slope * (X - self.centre))
 
 
 @dataclass(frozen=True)
@@ -215,10 +207,7 @@ class Sum(Kernel):
         a, b = self._split(theta, X.shape[1])
         return np.concatenate([self.first.weighted_gradient(a, X, W), self.second.weighted_gradient(b, X, W)])
 
-    def input_gradient(self, theta: Array, X: Array, Z: Array) -> Array:
+    def input_gradient(self, theta: Array, X: Array, Z: Array) -> tuple[Array, Array]:
         a, b = self._split(theta, X.shape[1])
-        return self.first.input_gradient(a, X, Z) + self.second.input_gradient(b, X, Z)
-
-    def diagonal_input_gradient(self, theta: Array, X: Array) -> Array:
-        a, b = self._split(theta, X.shape[1])
-        return self.first.diagonal_input_gradient(a, X) + self.second.diagonal_input_gradient(b, X)
+        (first, of_first), (second, of_second) = self.first.input_gradient(a, X, Z), self.second.input_gradient(b, X, Z)
+        return first + second, of_first + of_second

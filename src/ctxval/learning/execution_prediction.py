@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
 from typing import Any, Self
 
@@ -91,15 +91,19 @@ class ExecutionPrediction(ShortRepr):
                 _rows(values["states"]),
                 _rows(values["deviations"]),
                 float(values["diverged"]),
-                _noise(values.get("noise")),
             )
+            if (noise := values.get("noise")) is not None:
+                (roughness,), distances = _rows([noise["roughness"]]), _with_infinity(noise["distances"])
+                noise = NoisePrediction(int(noise["runs"]), distances, roughness, _rows(noise["statistics"]))
+                if {len(row) for row in (distances, *noise.statistics)} != {len(LEVELS)} or len(noise.statistics) != 3:
+                    return None
         except (KeyError, TypeError, ValueError, OverflowError):
             return None
         widths = {len(row) for row in (*prediction.states, *prediction.deviations)}
         lengths = {len(prediction.steps), len(prediction.states), len(prediction.deviations)}
         ordered = all(low <= high for low, high in pairwise(prediction.quantiles))
         consistent = len(prediction.quantiles) == len(_QUANTILES) and ordered and len(lengths) == len(widths) == 1
-        return prediction if consistent else None
+        return replace(prediction, noise=noise) if consistent else None
 
     def score(self, executed: Trajectory, distance: float) -> PredictionScore | None:
         """Return how an execution agrees with the prediction; None if they do not fit together."""
@@ -186,16 +190,6 @@ def predict_execution(
         float(1 - kept.mean()),
         noise,
     )
-
-
-def _noise(values: Mapping[str, Any] | None) -> NoisePrediction | None:
-    if values is None:
-        return None
-    (roughness,), distances = _rows([values["roughness"]]), _with_infinity(values["distances"])
-    noise = NoisePrediction(int(values["runs"]), distances, roughness, _rows(values["statistics"]))
-    if {len(row) for row in (noise.distances, *noise.statistics)} != {len(LEVELS)} or len(noise.statistics) != 3:
-        raise ValueError("other numbers of quantiles")
-    return noise
 
 
 def _rows(listed: Iterable[Iterable[Any]]) -> tuple[tuple[float, ...], ...]:

@@ -30,7 +30,7 @@ from ctxval.core.validation import Validation
 from ctxval.learning.actuators import ActuatedController, Actuator
 from ctxval.learning.histories import Record
 from ctxval.learning.prediction import Executed
-from ctxval.learning.recorded import closed_loops_on_model
+from ctxval.learning.recorded import closed_loops_on_model, scheduled
 from ctxval.learning.state_estimates import StateEstimates
 
 
@@ -128,11 +128,12 @@ class ExtendedValidation:
         pairs = pairs[np.isfinite(pairs).all(axis=1)]
         return np.asarray(pairs[:: max(1, len(pairs) // 600)])
 
-    def executions(self, executed: Executed, some: int) -> Executed | None:
+    def executions(self, executed: Executed, some: int | None = None) -> Executed | None:
         """Return executions as closed loops of the other validation; None if states of M cannot be estimated.
 
-        Estimates are learned from the first ``some`` of them.
+        Estimates are learned from the first ``some`` of them, by default as many as are scheduled.
         """
+        some = scheduled(len(executed)) if some is None else some
         acting = [(point, self._actuated(trajectory)) for point, trajectory in executed]
         if self.given.outputs is not None:
             states = None if self.estimates is None else self.estimates.of(acting, some)

@@ -166,11 +166,6 @@ class LearnedDynamics(ShortRepr):
         return self._worst_cases[functions]
 
     @functools.cached_property
-    def largest_jump(self) -> float:
-        """The largest jump of the distance on the posterior mean between nearly equal tasks."""
-        return self.study.search.largest_jump(self.drawn_from)
-
-    @functools.cached_property
     def deeper(self) -> tuple[Array, Array]:
         """The largest distances on the posterior mean ``(2,)`` in two deeper searches, and their points ``(2, d)``."""
         return self.study.search.deeper(self.drawn_from, self._rng(3))
@@ -210,11 +205,19 @@ class LearnedDynamics(ShortRepr):
 
         The gap is a share of the parameter's range; None if there is no such parameter.
         """
-        members = self.study.validation.space.members
-        gaps = [
-            (j, *_widest_gap(self.executed[:, j], None if members is None else members[:, j]))
-            for j in self.study.unseen_parameters
-        ]
+        members, gaps = self.study.validation.space.members, list[tuple[int, float, float]]()
+        for j in self.study.unseen_parameters:
+            ordered = np.sort(self.executed[:, j])
+            if not len(ordered):
+                gaps.append((j, 1.0, 0.5))
+                continue
+            if members is not None:
+                places = members[:, j]
+                away = np.abs(places[:, None] - ordered).min(axis=1)
+            else:  # the ends of the range, and the middles between neighbours
+                places = np.concatenate([[0.0], 0.5 * (ordered[1:] + ordered[:-1]), [1.0]])
+                away = np.concatenate([[ordered[0]], 0.5 * np.diff(ordered), [1 - ordered[-1]]])
+            gaps.append((j, float(away.max()), float(places[away.argmax()])))
         if not gaps:
             return None
         j, gap, value = max(gaps, key=lambda each: each[1])
@@ -254,21 +257,8 @@ class LearnedDynamics(ShortRepr):
                     return None
                 relevant = pairs[rng.permutation(len(pairs))[:300]]
             draws = self.drawn_from.draw(relevant, rng)
-            return predict_execution(planner, draws, point, len(self.executed), self.study.recorded, noisy=is_noisy)
+            recorded = self.study.extended.recorded
+            return predict_execution(planner, draws, point, len(self.executed), recorded, noisy=is_noisy)
 
     def _rng(self, purpose: int) -> np.random.Generator:
         return np.random.default_rng([self.study.seed, len(self.executed), purpose])
-
-
-def _widest_gap(values: Array, of: Array | None) -> tuple[float, float]:
-    """Return the largest distance from a number in [0, 1], or from one of a suite, to the nearest value; and it."""
-    ordered = np.sort(values)
-    if not len(ordered):
-        return 1.0, 0.5
-    if of is not None:
-        away = np.abs(of[:, None] - ordered).min(axis=1)
-        return float(away.max()), float(of[away.argmax()])
-    middles = 0.5 * (ordered[1:] + ordered[:-1])
-    places = np.concatenate([[0.0], middles, [1.0]])
-    gaps = np.concatenate([[ordered[0]], 0.5 * np.diff(ordered), [1 - ordered[-1]]])
-    return float(gaps.max()), float(places[gaps.argmax()])

@@ -17,7 +17,7 @@ from ctxval._util.arrays import Array, Mask, Rows, single_threaded
 from ctxval._util.latest import Latest
 from ctxval.core.model import Model
 from ctxval.errors import InputError
-from ctxval.learning.closed_loops import LoopPlanner, PlannedTasks
+from ctxval.learning.closed_loops import LoopPlanner, PlannedTasks, Together
 from ctxval.learning.draws import DisturbedDynamics
 from ctxval.learning.dynamics_posterior import DynamicsPosterior
 from ctxval.learning.extended import ExtendedValidation
@@ -133,10 +133,19 @@ class NoiseStudy:
         scatter = posterior.scatter if isinstance(posterior, NoisyPosterior) else np.zeros(1)
         if not _matters(posterior.deviations, posterior) and not _matters(scatter, posterior):
             return 0.0
+
+        def noise(ways: Rows, x: Array) -> Array:
+            # The noise is a function of the states, so that a loop is the same each time.
+            seed = np.frombuffer(np.ascontiguousarray(x).tobytes()[-64:], dtype=np.uint32)
+            rng = np.random.default_rng([int(ways[0]), *seed.tolist()])
+            return posterior.deviations * rng.standard_normal(x.shape)
+
         with single_threaded(), np.errstate(all="ignore"):
             planned, count, largest = self._largest(posterior)
             runs = np.full((_RUNS, count), np.nan)
-            noisy = posterior.mean if isinstance(posterior, NoisyPosterior) else _shaken(posterior)
+            noisy: Together = posterior.mean
+            if isinstance(posterior, DynamicsPosterior):  # white noise as large as was learned, several times
+                noisy = DisturbedDynamics(posterior.mean, np.arange(_RUNS), noise)
             for plan, loops in zip(planned, self.planner.run(noisy, planned), strict=True):
                 runs[: len(loops.distances), plan.rows] = loops.distances[:_RUNS]
         return _share(runs, largest)
@@ -184,19 +193,6 @@ def _matters(deviations: Array, posterior: DynamicsPosterior | NoisyPosterior) -
     """Return whether standard deviations ``(n,)`` of states are more than rounding."""
     # Standard deviation of noise, as a share of a state's, below which it is rounding.
     return bool((deviations > 1e-5 * posterior.data.scale[: len(posterior.data.sizes)]).any())
-
-
-def _shaken(posterior: DynamicsPosterior) -> DisturbedDynamics:
-    """Return the posterior mean with white noise as large as was learned, several times."""
-    deviations = posterior.deviations
-
-    def noise(ways: Rows, x: Array) -> Array:
-        # The noise is a function of the states, so that a loop is the same each time.
-        seed = np.frombuffer(np.ascontiguousarray(x).tobytes()[-64:], dtype=np.uint32)
-        rng = np.random.default_rng([int(ways[0]), *seed.tolist()])
-        return deviations * rng.standard_normal(x.shape)
-
-    return DisturbedDynamics(posterior.mean, np.arange(_RUNS), noise)
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,7 +14,7 @@ import numpy as np
 from ctxval._util.arrays import Array, Mask, Rows
 from ctxval.core.model import Model
 from ctxval.core.trajectory import Transitions
-from ctxval.learning.hyperparameters import highest_log_posterior, learning_rows
+from ctxval.learning.hyperparameters import FAMILIES, ResidualKernel, climbed, learning_rows
 from ctxval.models.linear import Linear
 from ctxval.models.scaling import standard_deviations, standardised_pairs
 
@@ -85,11 +85,15 @@ def smoother_than(data: ResidualData, count: int) -> tuple[Model, ResidualData] 
     The hyperparameters are learned from ``count`` transitions.
     """
     # With at least 10 transitions for each coefficient, the fit itself explains little.
-    if len(data.pairs) < 10 * (data.pairs.shape[1] + 1) or _is_linear(data):
+    if len(data.pairs) < 10 * (data.pairs.shape[1] + 1):
         return None
+    known = data.transitions
+    predicted = known.x_next - data.outputs * data.units
+    deviations = predicted - _fitted(known, predicted).step(known.x, known.u)
+    if (np.sqrt((deviations**2).mean(axis=0)) <= 1e-3 * data.sizes).all():
+        return None  # the model of these residuals is linear itself, as far as it matters for them
     rows = learning_rows(data.pairs, data.inputs, count)
     needed = _log_density(data, rows) + len(rows) * len(data.sizes)  # a gain of 1 for each recorded number
-    known = data.transitions
     # If S itself is linear, its linear model leaves no residual. The change of its state has the same prior.
     for linear in (_fitted(known, known.x_next), Identity()):
         other = residual_data(linear, known, data.sources)
@@ -109,16 +113,9 @@ class Identity:
 def _log_density(data: ResidualData, rows: Rows) -> float:
     """Return the log density of transitions in the units of the system, up to a constant that all models share."""
     sizes = np.maximum(data.sizes, NEGLIGIBLE * data.steps)
-    learned = highest_log_posterior(data.pairs[rows], data.outputs[rows][:, data.learned], data.inputs)
+    kernel = ResidualKernel(*FAMILIES[0], data.inputs)
+    learned, _ = climbed(kernel, data.pairs[rows], data.outputs[rows][:, data.learned])[0]
     return learned - len(rows) * float(np.log(sizes).sum())
-
-
-def _is_linear(data: ResidualData) -> bool:
-    """Return whether the model of these residuals is linear, as far as it matters for them."""
-    known = data.transitions
-    predicted = known.x_next - data.outputs * data.units
-    deviations = predicted - _fitted(known, predicted).step(known.x, known.u)
-    return bool((np.sqrt((deviations**2).mean(axis=0)) <= 1e-3 * data.sizes).all())
 
 
 def _fitted(known: Transitions, following: Array) -> Linear:

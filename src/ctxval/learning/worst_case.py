@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ctxval._util.arrays import Array, Mask, Rows, single_threaded
+from ctxval._util.arrays import Array, Mask, single_threaded
 from ctxval._util.boxes import latin_hypercube, moves_to_bounds, separated_rows
 from ctxval.gp.ascent import ascend
 from ctxval.gp.global_search import search_globally
@@ -83,12 +83,7 @@ class WorstCaseSearch:
         self.members = planner.validation.space.members
         if self.members is not None:  # nothing lies between tasks of a suite
             self.settings = replace(self.settings, pool=len(self.members), evaluations=len(self.members), rounds=0)
-        self._seed = seed
-
-    @property
-    def dimension(self) -> int:
-        """The dimension d of the task space."""
-        return self.planner.validation.space.dimension
+        self.dimension, self._seed = planner.validation.space.dimension, seed
 
     def expected_loops(self, draws: int) -> int:
         """Return about how many closed loops a search with so many draws runs, on M and on the draws."""
@@ -145,7 +140,7 @@ class WorstCaseSearch:
             of_rows = self.planner.distances(posterior.mean, planned, tasks.shape[0] * 3)[0].reshape(-1, 3)
             if is_kinked(self.planner.validation.distance):
                 of_rows = self._nearer(posterior, tasks, of_rows)
-        jumps = _bend(of_rows)
+        jumps = np.abs(of_rows[:, 1] - 0.5 * (of_rows[:, 0] + of_rows[:, 2]))
         return float(jumps[np.isfinite(jumps)].max(initial=0.0))
 
     def _nearer(self, posterior: AnyPosterior, tasks: Array, distances: Array) -> Array:
@@ -154,7 +149,8 @@ class WorstCaseSearch:
         Of each row, the half with the larger change is kept, which a jump is in.
         """
         # Rows of such tasks that are looked at more closely if the distance has kinks.
-        rows = np.argsort(-np.nan_to_num(_bend(distances), nan=0.0, posinf=0.0), kind="stable")[:64]
+        bends = np.abs(distances[:, 1] - 0.5 * (distances[:, 0] + distances[:, 2]))
+        rows = np.argsort(-np.nan_to_num(bends, nan=0.0, posinf=0.0), kind="stable")[:64]
         tasks, distances = tasks[rows], distances[rows]
         for _ in range(int(np.log2(_NEARER))):
             later = np.abs(distances[:, 2] - distances[:, 1]) > np.abs(distances[:, 1] - distances[:, 0])
@@ -210,7 +206,7 @@ class WorstCaseSearch:
             evaluations = max(len(starts) + 50, settings.evaluations - len(self.pool))
             maximum = search_globally(distance, self.dimension, starts, rng, evaluations=evaluations)
         elites = np.concatenate([maximum.points[:1], maximum.elites[: settings.elites]])
-        return self._of_mean(posterior, float(maximum.values[0]), elites, maximum.evaluations)
+        return self._of_mean(posterior, float(maximum.values[0]), elites, len(maximum.values))
 
     def _of_mean(self, posterior: AnyPosterior, highest: float, elites: Array, evaluations: int) -> WorstCase:
         if posterior.searched is not posterior.mean:
@@ -309,13 +305,17 @@ class WorstCaseSearch:
         values, loops = self._on_shared(draws, tasks)
         order = np.argsort(-values, axis=1, kind="stable")
         best, points = np.take_along_axis(values, order[:, :1], 1)[:, 0], tasks[order[:, 0]]
-        second, searched = _others(tasks, order), np.arange(len(draws))
+        # The best task of each draw that is not next to its best one; the second best if all are.
+        ordered = tasks[order]
+        apart = np.linalg.norm(ordered - ordered[:, :1], axis=2) > _APART * np.sqrt(self.dimension)
+        rows = np.where(apart.any(axis=1), apart.argmax(axis=1), min(1, len(tasks) - 1))
+        second, searched = ordered[np.arange(len(ordered)), rows], np.arange(len(draws))
         for round_, share in enumerate((0.1, 0.05, 0.02, 0.007)[: self.settings.rounds]):
             before = best.copy()
             if round_ == 2:
                 # Each draw tries the best tasks of all others.
-                ordered = points[np.argsort(-best, kind="stable")]
-                shown = ordered[separated_rows(ordered, 0.02 * np.sqrt(self.dimension), _SHOWN)]
+                best_first = points[np.argsort(-best, kind="stable")]
+                shown = best_first[separated_rows(best_first, 0.02 * np.sqrt(self.dimension), _SHOWN)]
                 distances = self._distances(draws, shown)
                 points, best = _better(points, best, np.broadcast_to(shown, (len(best), *shown.shape)), distances)
                 loops += distances.size
@@ -329,7 +329,10 @@ class WorstCaseSearch:
             random = np.clip(around + share * few * rng.normal(size=shape), 0, 1)
             moved = np.concatenate([to_bounds, random], axis=1)
             distances = _finite(self.planner.own_distances(some, moved))
-            together = _together(at, highest, moved, distances)[:, None]
+            # Each point after all moves to bounds that help; of two that help, the better one.
+            down, up = np.split(distances[:, : 2 * self.dimension], 2, axis=1)
+            helps = np.maximum(down, up) > highest[:, None]
+            together = np.where(helps, np.where(down > up, 0.0, 1.0), at)[:, None]
             known = np.concatenate([at[:, None], moved], axis=1)
             if (together == known).all(axis=2).any(axis=1).all():
                 last = np.full((len(at), 1), -np.inf)  # none of them is a new task
@@ -365,11 +368,6 @@ class WorstCaseSearch:
         return values, len(first) * len(tasks) + len(others) * len(chosen)
 
 
-def _bend(distances: Array) -> Array:
-    """Return how far the distances of tasks in rows ``(k, 3)`` are from the middle of those on both sides."""
-    return np.asarray(np.abs(distances[:, 1] - 0.5 * (distances[:, 0] + distances[:, 2])))
-
-
 def is_kinked(distance: object) -> bool:
     """Return whether a distance, or the user's distance in it, has kinks."""
     while distance is not None:
@@ -377,14 +375,6 @@ def is_kinked(distance: object) -> bool:
             return True
         distance = getattr(distance, "distance", None)
     return False
-
-
-def _others(tasks: Array, order: Rows) -> Array:
-    """Return, for each draw, its best task ``(d,)`` that is not next to its best one; the second best if all are."""
-    ordered = tasks[order]
-    apart = np.linalg.norm(ordered - ordered[:, :1], axis=2) > _APART * np.sqrt(tasks.shape[1])
-    at = np.where(apart.any(axis=1), apart.argmax(axis=1), min(1, len(tasks) - 1))
-    return np.asarray(ordered[np.arange(len(ordered)), at])
 
 
 def _finite(distances: Array) -> Array:
@@ -397,11 +387,3 @@ def _better(points: Array, best: Array, tried: Array, distances: Array) -> tuple
     row, at = np.arange(len(points)), distances.argmax(axis=1)
     better = distances[row, at] > best
     return np.where(better[:, None], tried[row, at], points), np.where(better, distances[row, at], best)
-
-
-def _together(points: Array, best: Array, moved: Array, distances: Array) -> Array:
-    """Return each point ``(d,)`` after all moves to bounds that help; of two that help, the better one."""
-    d = points.shape[1]
-    down, up = distances[:, :d], distances[:, d : 2 * d]
-    at_bounds = np.where(down > up, 0.0, 1.0)
-    return np.where(np.maximum(down, up) > best[:, None], at_bounds, points)
