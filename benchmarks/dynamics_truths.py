@@ -156,7 +156,7 @@ def search(found: Experiment, samples: int = SAMPLES) -> dict[str, Any]:
         "distance": float(values(point[None])[0]),
         "point": validation.space.from_unit(point).tolist(),
         "repeats": [top for top, _ in tops],
-        "evaluations": len(deep.values) * len(noisy),
+        "evaluations": deep.evaluations * len(noisy),
         "median": _median(validation),
         "seconds": round(time.process_time() - started, 2),
     }

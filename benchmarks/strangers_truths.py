@@ -82,7 +82,7 @@ def search(entry: Stranger, seed: int) -> dict[str, Any]:
         "outside": outside,
         "near": float(np.mean(values > 0.95 * distance)),
         "failed": float(np.mean(~np.isfinite(values))),
-        "evaluations": len(deep.values),
+        "evaluations": deep.evaluations,
         "seconds": round(time.process_time() - started, 2),
     }
 
