@@ -311,15 +311,15 @@ class Campaign:
         if because is not None and (parameters is None or not because.strip()):
             raise InputError('because needs the parameters of an earlier task and a reason, such as "fuse replaced".')
         # An operator's time is worth a prediction: it is stored, and the execution tests it.
-        predicts = self.recorder.search.uses_prediction
-        with progress_shown(progress), self.store.sole_writer(wait), self.recorder.predicting(predicts):
-            self.refresh()
+        recorder, predicts = self.recorder, self.recorder.search.uses_prediction
+        with progress_shown(progress), recorder.store.sole_writer(wait), recorder.predicting(predicts):
+            recorder.refresh()
             if parameters is None:
-                return self.recorder.open(Choice(self.recorder.draw(), "iid") if draw else Choice())
-            space = self.validation.space
+                return recorder.open(Choice(recorder.draw(), "iid") if draw else Choice())
+            space = recorder.validation.space
             point = space.point(parameters)
             choice = Choice(space.to_unit(point), "manual", because, parameters=space.describe_point(point))
-            return self.recorder.open(choice)
+            return recorder.open(choice)
 
     @checked
     def ask_for_verdict(
@@ -383,10 +383,10 @@ class Campaign:
             ExecutionError: if the trajectory is not a complete execution of the task; the trial stays open.
             DistanceError: if the distance function gives no usable number; the execution is stored.
         """
-        self.refresh()
+        recorder, ended = self.recorder, replace is not None
+        recorder.refresh()
         if replace is not None and not replace.strip():
             raise InputError('replace needs a reason, such as "wrong file".')
-        recorder, ended = self.recorder, replace is not None
         trial = recorder.trial(opened.number if isinstance(opened, OpenTrial) else opened, ended=ended)
         if isinstance(opened, OpenTrial) and not np.array_equal(opened.trial.unit_point, trial.unit_point):
             raise InputError(f"the open trial {opened.number} belongs to another campaign.")
@@ -395,7 +395,7 @@ class Campaign:
             trial = recorder.trial(trial.number, ended=ended)
             if trajectory is not None:
                 plan = opened.plan if isinstance(opened, OpenTrial) else recorder.plan(trial)
-                execution = execution.measured(self.validation, plan, start_tolerance)
+                execution = execution.measured(recorder.validation, plan, start_tolerance)
             return recorder.close(trial, execution, replacing=replace)
 
     @checked
@@ -450,15 +450,15 @@ class Campaign:
     @property
     def provenance(self) -> Provenance:
         """What a certificate needs besides the trials: the task space, the search, changes, and what M predicts."""
-        validation, trials = self.validation, self.trials
+        recorder, validation, trials = self.recorder, self.recorder.validation, self.recorder.trials
         offsets = [
             (start_offset(validation, validation.space.point(trial.parameters), executed), trial.number)
-            for trial, executed in executed_trials(self.store, trials)
+            for trial, executed in executed_trials(recorder.store, trials)
         ]
         return replaced(
-            provenance_of_store(self.store),
+            provenance_of_store(recorder.store),
             space=validation.space,
-            learned=LearnedFromTrials(validation, trials, self.recorder.dynamics),
+            learned=LearnedFromTrials(validation, trials, recorder.dynamics),
             start=max(((offset.size, f"{offset.text} (trial {number})") for offset, number in offsets), default=None),
             units=validation.labels.units,
         )
@@ -500,10 +500,10 @@ class Campaign:
         Raises:
             CertificateError: if an option of the certificate is not valid.
         """
-        options = CertificateOptions.or_automatic(certificate, confidence, resolution)
-        self.state_threshold(threshold)
+        options, recorder = CertificateOptions.or_automatic(certificate, confidence, resolution), self.recorder
+        recorder.store.state_threshold(float(threshold))
         with progress_shown(progress), stage("certifying"):
-            return with_next_task(judge(self.trials, threshold, options, self.provenance), self.recorder, options)
+            return with_next_task(judge(recorder.trials, threshold, options, self.provenance), recorder, options)
 
     @checked
     def certify(

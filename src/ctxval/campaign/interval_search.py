@@ -255,7 +255,7 @@ class IntervalSearch:
         if self._lacks_tests_alone(evidence):
             return self.test()
         learned = self.recorder.dynamics.learned(trials)
-        steady = Steadiness(self.recorder.dynamics.planner, None if learned is None else learned.expected)
+        steady = Steadiness(self.recorder.dynamics.study.planner, None if learned is None else learned.expected)
         point = next_task(evidence, self._points(self._ended), best, limit, confidence, steady, self._near)
         waiting = waiting_points(trials)
         if len(waiting) and (point is None or np.abs(waiting - point).max(axis=1).min() <= NEAR):
