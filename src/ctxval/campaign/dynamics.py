@@ -30,6 +30,7 @@ from ctxval.core.trial import REDEFINED, Trial
 from ctxval.core.validation import Validation
 from ctxval.errors import CertificateError
 from ctxval.learning import DynamicsStudy, ExecutionPrediction, LearnedDynamics
+from ctxval.learning.coverage import untried_corner
 from ctxval.learning.prediction import Executed
 from ctxval.learning.tolerance import LEVELS
 from ctxval.learning.worst_case import WorstCase, is_kinked
@@ -259,7 +260,7 @@ class CampaignDynamics:
             learned.coverage,
             unplanned=worst.unplanned,
             untried=None if untried is None else UntriedParameter(names[untried[0]], *untried[1:]),
-            corner=learned.untried_corner,
+            corner=untried_corner(learned.executed, self.study.validation.space, learned.coverage.task),
             sharpness=worst.sharpness,
             dense=worst.points.shape[1] <= DENSE and self.study.planner.batched,
             quantile=noisy.quantile if noisy is not None and noisy.is_noisy else None,

@@ -14,6 +14,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.distance import cdist
 
 from ctxval._util.arrays import Array, ArrayLike
 from ctxval._util.boxes import climb, farthest_rows, polish
@@ -239,17 +240,16 @@ class Paths:
     def __len__(self) -> int:
         return len(self.means)
 
-    def __call__(self, Z: Array) -> Array:
-        """Return the values of all paths at the same points ``(m, d)``, shape ``(m, s)``."""
-        waves, kernel = _waves(Z, self.frequencies) @ self.amplitudes, self.conditioned.hyperparameters.kernel
-        return np.asarray(self.means + self.scales * (waves + kernel(Z, self.X) @ self.corrections))
+    def __call__(self, Z: Array, precision: type = np.float64) -> Array:
+        """Return the values of all paths at the same points ``(m, d)``, shape ``(m, s)``.
 
-    def roughly(self, Z: Array) -> Array:
-        """Return the same values with waves in single precision: ten times as fast, and enough to choose candidates."""
-        single, kernel = np.float32, self.conditioned.hyperparameters.kernel
-        waves = _waves(Z.astype(single), self.frequencies.astype(single)) @ self.amplitudes.astype(single)
+        With waves in single precision they are ten times as fast, and good enough to choose candidates.
+        """
+        parts: list[Array] = [part.astype(precision, copy=False) for part in (Z, self.frequencies, self.amplitudes)]
+        waves = _waves(*parts[:2]) @ parts[2]
         # The corrections are sums of large terms that cancel, so they need double precision.
-        return np.asarray(self.means + self.scales * (waves + kernel(Z, self.X) @ self.corrections))
+        correlations = self.conditioned.hyperparameters.kernel(Z, self.X)
+        return np.asarray(self.means + self.scales * (waves + correlations @ self.corrections))
 
     def own(self, Z: Array) -> Array:
         """Return the values of each path at its own points ``(s, q, d)``, shape ``(s, q)``."""
@@ -261,8 +261,7 @@ class Paths:
         flat = Z.reshape(-1, d)
         waves = _waves(flat, self.frequencies).reshape(s, q, -1)
         known = self.conditioned.hyperparameters
-        kernel, theta = Matern(known.nu, ard=True), np.concatenate([[0.0], known.log_scales])
-        correlations = kernel(theta, flat, self.X).reshape(s, q, -1)
+        correlations = known.kernel(flat, self.X).reshape(s, q, -1)
         values = np.einsum("sqf,fs->sq", waves, self.amplitudes) + np.einsum(
             "sqn,ns->sq", correlations, self.corrections
         )
@@ -274,7 +273,10 @@ class Paths:
         )
         slopes = turned @ self.frequencies
         weights = np.repeat(self.corrections.T, q, axis=0)
-        slopes += kernel.weighted_input_gradient(theta, flat, self.X, weights).reshape(s, q, d)
+        lengths = np.exp(known.log_scales)
+        _, falls = Matern(known.nu).profile_and_slope(cdist(flat / lengths, self.X / lengths))
+        pulls = weights * falls
+        slopes += ((pulls @ self.X - pulls.sum(axis=1)[:, None] * flat) / lengths**2).reshape(s, q, d)
         scales = self.scales[:, None]
         return self.means[:, None] + scales * values, scales[..., None] * slopes
 
@@ -313,7 +315,7 @@ def maxima(paths: Paths, known: Array, rng: np.random.Generator) -> tuple[Array,
     near = np.clip(near + rng.normal(size=near.shape) * rng.choice([0.003, 0.03], (len(near), 1)), 0.0, 1.0)
     corners = rng.integers(0, 2, (min(2**d, 256), d)).astype(np.float64)
     candidates = np.concatenate([known, near, corners, rng.random((min(2048, 512 * d), d))])
-    values, groups = paths.roughly(candidates), 4 if d <= 2 else 4 * (1 + d)
+    values, groups = paths(candidates, np.float32), 4 if d <= 2 else 4 * (1 + d)
     best_of = [candidates[group::groups][values[group::groups].argmax(axis=0)] for group in range(groups)]
     starts = np.stack(best_of, axis=1)  # (s, groups, d)
     if d > 2:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
@@ -73,10 +74,7 @@ class ExecutionPrediction(ShortRepr):
 
     def to_json(self) -> dict[str, Any]:
         """Return all attributes, ready for JSON: infinity is None."""
-        rows = {name: [list(row) for row in getattr(self, name)] for name in ("states", "deviations")}
-        values = {**asdict(self), "quantiles": _without_infinity(self.quantiles), "steps": list(self.steps), **rows}
-        if self.noise is not None:
-            values["noise"]["distances"] = _without_infinity(self.noise.distances)
+        values: dict[str, Any] = json.loads(json.dumps(asdict(self)), parse_constant=lambda _: None)
         return values
 
     @classmethod
@@ -194,10 +192,6 @@ def predict_execution(
 
 def _rows(listed: Iterable[Iterable[Any]]) -> tuple[tuple[float, ...], ...]:
     return tuple(tuple(float(value) for value in row) for row in listed)
-
-
-def _without_infinity(values: Iterable[float]) -> list[float | None]:
-    return [None if np.isinf(value) else value for value in values]
 
 
 def _with_infinity(values: Iterable[Any]) -> tuple[float, ...]:

@@ -11,11 +11,11 @@ import numpy as np
 
 from ctxval._util.arrays import Array, single_threaded
 from ctxval._util.representation import ShortRepr
-from ctxval.core.coverage import StateInputCoverage, StatePocket, UntriedCorner
+from ctxval.core.coverage import StateInputCoverage, StatePocket
 from ctxval.core.labels import labels_of
 from ctxval.core.trajectory import Trajectory
 from ctxval.learning.closed_loops import AnyDraws, distances_of, loop_pairs
-from ctxval.learning.coverage import beyond_records, coverage, largest_pocket, untried_corner
+from ctxval.learning.coverage import beyond_records, coverage, largest_pocket
 from ctxval.learning.dynamics_posterior import DynamicsPosterior
 from ctxval.learning.execution_prediction import ExecutionPrediction, predict_execution
 from ctxval.learning.noisy_draws import SETTLED, NoisyDraws, NoisyPosterior
@@ -224,11 +224,6 @@ class LearnedDynamics(ShortRepr):
         task = self.coverage.task.copy()
         task[j] = value
         return j, gap, task
-
-    @property
-    def untried_corner(self) -> UntriedCorner | None:
-        """The corner of a position in space that is farthest from all executions; None if all were executed."""
-        return untried_corner(self.executed, self.study.validation.space, self.coverage.task)
 
     @property
     def coverage(self) -> StateInputCoverage:

@@ -63,7 +63,19 @@ class NoiseStudy:
             posterior: what the executions teach without noise.
             records: of these executions.
         """
-        if not self._is_needed(posterior, records):
+        # Executions do not follow from task, state and input if noise, or what is not recorded, acts.
+        is_needed = (
+            float((posterior.most_probable.noise**2).max()) > NOISY
+            or self._effect_of_noise(posterior) > MATTERS
+            or self._effect_of_starts(posterior, records) > MATTERS
+        )
+        if not is_needed and len(records) >= 3:
+            last = records[-1]
+            with contextlib.suppress(np.linalg.LinAlgError, InputError, ValueError), np.errstate(all="ignore"):
+                mean = posterior.means_without([[len(records) - 1]])
+                predicted: Array = mean.step(last.states[None, :-1], last.inputs[None])[0]
+                is_needed = predicted_by_history(posterior, records, self.extended.pairs, predicted)
+        if not is_needed:
             return None
         some = scheduled(len(records))
         key = digest(records[:some])
@@ -109,21 +121,6 @@ class NoiseStudy:
             return None
         horizon, seed = max(len(record.inputs) for record in records), (self.seed, len(records))
         return NoisyPosterior(fit, data, _scatter_of(records), horizon, replicates, self.quantile, seed), chosen
-
-    def _is_needed(self, posterior: DynamicsPosterior, records: Sequence[Record]) -> bool:
-        """Return whether executions do not follow from task, state and input: noise, or what is not recorded, acts."""
-        if float((posterior.most_probable.noise**2).max()) > NOISY:
-            return True
-        if self._effect_of_noise(posterior) > MATTERS or self._effect_of_starts(posterior, records) > MATTERS:
-            return True
-        if len(records) < 3:
-            return False
-        last = records[-1]
-        with contextlib.suppress(np.linalg.LinAlgError, InputError, ValueError), np.errstate(all="ignore"):
-            mean = posterior.means_without([[len(records) - 1]])
-            predicted: Array = mean.step(last.states[None, :-1], last.inputs[None])[0]
-            return predicted_by_history(posterior, records, self.extended.pairs, predicted)
-        return False
 
     def _effect_of_noise(self, posterior: DynamicsPosterior | NoisyPosterior) -> float:
         """Return the largest standard deviation of the distance of a task over noise, as a share of the largest one.

@@ -226,8 +226,14 @@ class WorstCaseSearch:
             tasks = self._shared_tasks(of_mean, known, self.settings.shared // 4, rng)
             draws = posterior.draw(self.relevant(posterior, tasks, rng), rng, 1, _SCREENED[0])
             values = self._distances(draws, tasks)
-        best = values.argmax(axis=1)
-        return self._worst_case(of_mean, draws, values.max(axis=1), tasks[best], values.size, 0.0)
+        maxima, points = values.max(axis=1), tasks[values.argmax(axis=1)]
+        return replace(
+            of_mean,
+            maxima=np.where(maxima >= _DIVERGED, np.inf, maxima),
+            points=points,
+            evaluations=of_mean.evaluations + values.size,
+            left_out=draws.left_out,
+        )
 
     def maxima(
         self, posterior: AnyPosterior, of_mean: WorstCase, known: Array, rng: np.random.Generator, functions: int
@@ -242,7 +248,14 @@ class WorstCaseSearch:
                 settled = draws.with_replicates(SETTLED, rng)
                 maxima = _finite(self.planner.own_distances(settled, points[:, None]))[:, 0]
             sharpness = 0.0 if self.members is not None else self._sharpness(posterior.mean, of_mean.elites, rng)
-        return self._worst_case(of_mean, draws, maxima, points, loops, sharpness)
+        return replace(
+            of_mean,
+            maxima=np.where(maxima >= _DIVERGED, np.inf, maxima),
+            points=points,
+            evaluations=of_mean.evaluations + loops,
+            left_out=draws.left_out,
+            sharpness=sharpness,
+        )
 
     def _shared_tasks(self, of_mean: WorstCase, known: Array, count: int, rng: np.random.Generator) -> Array:
         """Return the tasks that draws share: elites, known tasks and random ones; of a suite, those not known."""
@@ -256,18 +269,6 @@ class WorstCaseSearch:
         """Return which tasks of a suite are not among points ``(k, d)``: the distance of the others is known."""
         assert self.members is not None
         return np.asarray(~(self.members[:, None] == known).all(axis=2).any(axis=1))
-
-    def _worst_case(
-        self, of_mean: WorstCase, draws: AnyDraws, maxima: Array, points: Array, loops: int, sharpness: float
-    ) -> WorstCase:
-        return replace(
-            of_mean,
-            maxima=np.where(maxima >= _DIVERGED, np.inf, maxima),
-            points=points,
-            evaluations=of_mean.evaluations + loops,
-            left_out=draws.left_out,
-            sharpness=sharpness,
-        )
 
     def _distances(self, draws: AnyDraws, points: Array) -> Array:
         """Return the distances ``(S, q)`` of draws on points ``(q, d)``, as a search takes them."""
