@@ -68,7 +68,7 @@ def test_mean_and_variance_are_those_of_the_normal_distribution(family: tuple[fl
     Z = 2 * np.random.default_rng(1).normal(size=(30, 2))
     mean, covariance = exact(one, Z)
     np.testing.assert_allclose(one.mean(Z[None])[0], mean, atol=1e-8)
-    np.testing.assert_allclose(one.variance(Z), np.diag(covariance), rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(one.whitened(Z)[1], np.diag(covariance), rtol=1e-6, atol=1e-9)
 
 
 def test_the_mean_passes_through_the_observations_within_the_noise() -> None:
@@ -153,7 +153,7 @@ def test_draws_differ_even_if_less_than_the_noise() -> None:
     Z = rng.normal(size=(400, 2))
     one = Component.conditioned(own, Z, np.sin(Z), rng)
     relevant = rng.uniform(-1, 1, (30, 2))
-    assert one.variance(relevant).max() < 0.5
+    assert one.whitened(relevant)[1].max() < 0.5
     _, covariance, left_out = moments(one, relevant, relevant, 50, 1000)
     assert left_out < 2e-3
     np.testing.assert_allclose(np.diag(covariance) / np.diag(exact(one, relevant)[1]), 1, atol=0.3)
@@ -199,7 +199,7 @@ def test_as_the_matern_part_vanishes_the_posterior_is_that_of_linear_regression(
     covariance = np.linalg.inv(features.T @ features / noise + prior)
     mean = at @ covariance @ features.T @ Y / noise
     np.testing.assert_allclose(one.mean(new[None])[0], mean, rtol=2e-2, atol=2e-2)
-    np.testing.assert_allclose(one.variance(new), np.diag(at @ covariance @ at.T), rtol=1e-2, atol=1e-2)
+    np.testing.assert_allclose(one.whitened(new)[1], np.diag(at @ covariance @ at.T), rtol=1e-2, atol=1e-2)
 
 
 def test_draws_of_a_linear_system_are_that_system() -> None:
@@ -424,7 +424,7 @@ def test_the_doubt_is_the_deviation_of_draws_as_a_share_of_a_typical_step() -> N
     most, data, place = posterior.most_probable, posterior.data, np.array([[0.9, 0.9, 0.9]])
     found = posterior.unfamiliarity(np.tile(place[:, None, :2], (1, 2, 1)), place[:, None, 2:])
     z = data.standardised(place[:, :2], place[:, 2:])
-    deviations = np.sqrt(most.variance(z) * most.squares / len(most.centres)) * data.sizes / data.steps
+    deviations = np.sqrt(most.whitened(z)[1] * most.squares / len(most.centres)) * data.sizes / data.steps
     np.testing.assert_allclose(found, np.sqrt((deviations**2).mean()), rtol=1e-9)
 
 

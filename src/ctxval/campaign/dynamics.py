@@ -208,7 +208,7 @@ class CampaignDynamics:
         evidence = replace(
             evidence,
             noise=learned.drawn_from.noise,
-            groups=len(evidence.maxima) // learned.drawn_from.groups,
+            groups=learned.drawn_from.functions_for(draws),
             without_model=learned.posterior.covariances.without_model,
         )
         best = largest_distance(trials)

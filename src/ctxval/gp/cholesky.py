@@ -51,13 +51,8 @@ class CholeskyFactor:
         """``L^-1``, shape ``(n, n)``."""
         return self.whiten(np.eye(len(self.L)))
 
-    @functools.cached_property
-    def precisions(self) -> Array:
-        """The diagonal of ``K^-1``, shape ``(n,)``: inverse variances of each observation given all others."""
-        return np.asarray((self.inverse_factor**2).sum(axis=0))
-
     def precisions_of(self, rows: Rows) -> Array:
-        """Return some entries of the diagonal of ``K^-1``, which takes less time than all of them."""
+        """Return entries of the diagonal of ``K^-1``: inverse variances of observations given all others, ``(k,)``."""
         units = np.zeros((len(self.L), len(rows)), order="F")
         units[rows, np.arange(len(rows))] = 1.0
         return np.asarray((self.whiten(units) ** 2).sum(axis=0))

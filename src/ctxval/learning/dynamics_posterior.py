@@ -80,20 +80,9 @@ class DynamicsPosterior(ShortRepr):
     covariances: LearnedCovariances
     data: ResidualData
 
-    @property
-    def model(self) -> Model:
-        """The model to which residuals are added."""
-        return self.covariances.model
-
-    @property
-    def groups(self) -> int:
-        """The number of draws of the hyperparameters."""
-        return len(self.components)
-
-    @property
-    def functions(self) -> int:
-        """The usual number of functions that are drawn for each of them."""
-        return self.covariances.settings.functions
+    def functions_for(self, draws: int) -> int:
+        """Return the number of functions for each draw of the hyperparameters that gives at least so many draws."""
+        return max(self.covariances.settings.functions, -(-draws // len(self.components)))
 
     @functools.cached_property
     def most_probable(self) -> Component:
@@ -217,7 +206,7 @@ class DynamicsPosterior(ShortRepr):
         return np.asarray(5.0 * np.abs(self.data.outputs).max(axis=0))
 
     def _limited(self, mean: KernelExpansion) -> DynamicsDraws:
-        return DynamicsDraws(self.model, self.data, (mean,), limit=self.limit[self.data.learned])
+        return DynamicsDraws(self.covariances.model, self.data, (mean,), limit=self.limit[self.data.learned])
 
     def unfamiliarity(self, states: Array, inputs: Array) -> Array:
         """Return the standard deviation of r along trajectories, as a share of a typical step, ``(q,)``.
@@ -228,7 +217,7 @@ class DynamicsPosterior(ShortRepr):
         horizon, data, most = inputs.shape[1], self.data, self.most_probable
         at = np.linspace(0, horizon - 1, min(12, horizon)).astype(int)
         Z = bounded(data.standardised(states[:, at], inputs[:, at]))
-        variance = most.variance(Z.reshape(-1, Z.shape[-1])).reshape(Z.shape[:2]).mean(axis=1)
+        variance = most.whitened(Z.reshape(-1, Z.shape[-1]))[1].reshape(Z.shape[:2]).mean(axis=1)
         sizes = (data.sizes / data.steps)[data.learned] ** 2 * most.squares / len(most.centres)
         return np.asarray(np.sqrt(variance * sizes.mean()))
 
@@ -248,7 +237,8 @@ class DynamicsPosterior(ShortRepr):
             functions: number of functions for each draw of the hyperparameters; that of the settings if None.
             hyperparameters: number of draws of the hyperparameters that are used; all if None.
         """
-        count = self.functions if functions is None else functions
+        model, settings = self.covariances.model, self.covariances.settings
+        count = settings.functions if functions is None else functions
         with single_threaded():
             if hyperparameters is None:
                 components = self.components
@@ -257,9 +247,9 @@ class DynamicsPosterior(ShortRepr):
                 components = self._components(np.unique(rows).tolist())
             # Adjacent components of the same hyperparameters share their pivots and are evaluated together.
             groups = [list(group) for _, group in groupby(components, lambda component: id(component.factor))]
-            drawn = [draw_functions(group, relevant, count, self.covariances.settings.pivots, rng) for group in groups]
+            drawn = [draw_functions(group, relevant, count, settings.pivots, rng) for group in groups]
         expansions, left_out = zip(*drawn, strict=True)
-        return DynamicsDraws(self.model, self.data, joined(expansions), max(left_out))
+        return DynamicsDraws(model, self.data, joined(expansions), max(left_out))
 
     @property
     def deviations(self) -> Array:

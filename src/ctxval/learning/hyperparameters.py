@@ -130,18 +130,16 @@ class Mode:
     @functools.cached_property
     def scale(self) -> Array:
         """A root ``(D, D)`` of the inverse of the curvature of the log posterior, by differences of its gradient."""
-
-        def slopes(parameters: Array) -> Array:
-            try:
-                return log_posterior(self.kernel, parameters, self.Z, self.Y)[1]
-            except InputError:  # the covariance is not positive definite
-                return np.zeros_like(parameters)
-
         low, high = self.kernel.box(self.Z.shape[1])
         curvature = np.empty((len(self.place), len(self.place)))
         for i, step in enumerate(np.eye(len(self.place)) * 0.05):
-            up, down = np.minimum(self.place + step, high), np.maximum(self.place - step, low)
-            curvature[i] = (slopes(down) - slopes(up)) / (up - down)[i]
+            ends, slopes = (np.minimum(self.place + step, high), np.maximum(self.place - step, low)), []
+            for end in ends:
+                try:
+                    slopes.append(log_posterior(self.kernel, end, self.Z, self.Y)[1])
+                except InputError:  # the covariance is not positive definite
+                    slopes.append(np.zeros_like(end))
+            curvature[i] = (slopes[1] - slopes[0]) / (ends[0] - ends[1])[i]
         values, vectors = np.linalg.eigh(0.5 * (curvature + curvature.T))
         # No direction is less certain than a standard deviation of 2 in the logarithm.
         return np.asarray(vectors / np.sqrt(np.maximum(values, 0.25)))

@@ -160,12 +160,8 @@ class Component:
         """The standard deviation of the noise of each standardised residual, shape ``(n,)``."""
         return np.asarray(np.sqrt(self.hyperparameters.noise) * self.amplitudes)
 
-    def variance(self, Z: Array) -> Array:
-        """Return the posterior variance at pairs ``(N, k)``, relative to the amplitudes, shape ``(N,)``."""
-        return self.whitened(Z)[1]
-
     def whitened(self, Z: Array) -> tuple[Array, Array]:
-        """Return ``L^-1 k(centres, Z)``, shape ``(M, N)``, and the posterior variance ``(N,)``."""
+        """Return ``L^-1 k(centres, Z)``, shape ``(M, N)``, and the posterior variance ``(N,)`` for unit amplitudes."""
         kernel, theta = self.hyperparameters.kernel, self.hyperparameters.theta
         # For many pairs, a product with the inverse factor is several times as fast as substitution.
         half = self.factor.whiten_many(kernel(theta, Z, self.centres).T)

@@ -128,7 +128,7 @@ class LearnedDynamics(ShortRepr):
         search, planner = self.study.search, self.study.planner
         with single_threaded():
             planned = planner.plan(points)
-            functions = self._functions(draws)
+            functions = self.drawn_from.functions_for(draws)
             key = functions, settled
             if key not in self._draws:
                 # Their pivots lie on the loops of all tasks.
@@ -152,13 +152,9 @@ class LearnedDynamics(ShortRepr):
                 crossed[plan.rows] = self.boundary.crossed(self.posterior, loop)
         return values, beyond, crossed
 
-    def _functions(self, draws: int) -> int:
-        """Return the number of functions for each draw of the hyperparameters that gives at least so many draws."""
-        return max(self.drawn_from.functions, -(-draws // self.drawn_from.groups))
-
     def worst_case_of(self, draws: int) -> WorstCase:
         """Return the largest distance over all tasks, for each of at least so many draws of the dynamics."""
-        functions = self._functions(draws)
+        functions = self.drawn_from.functions_for(draws)
         if functions not in self._worst_cases:
             search, known, rng = self.study.search, self.executed, self._rng(1)
             of_mean = search.on_mean(self.drawn_from, self._on_pool[0], known, rng)

@@ -152,7 +152,8 @@ def _residuals(learned: LearnedDynamics, record: Record) -> tuple[Array, Array, 
         residuals = record.states[1:] - DrawnModel(posterior.mean).step(record.states[:-1], record.inputs)
         Z = data.standardised(record.states[:-1], record.inputs)
         doubt = np.zeros(len(data.sizes))
-        doubt[data.learned] = most.variance(Z).mean() * most.squares / len(most.centres) * data.sizes[data.learned] ** 2
+        variance = most.whitened(Z)[1].mean() * most.squares / len(most.centres)
+        doubt[data.learned] = variance * data.sizes[data.learned] ** 2
         return residuals, doubt, posterior.deviations**2, Z
     fit = noisy.fit
     Z, _, residuals = fit.history.along([record], fit.residual)
