@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Mapping
 from dataclasses import replace as replaced
 from pathlib import Path
@@ -11,6 +12,7 @@ import numpy as np
 
 from ctxval._util.arrays import Array
 from ctxval._util.checked import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, Seconds, checked
+from ctxval._util.describe import describe
 from ctxval._util.progress import progress_shown, stage
 from ctxval.campaign import display
 from ctxval.campaign.choices import Choice, Execution, OpenTrial
@@ -19,7 +21,7 @@ from ctxval.campaign.envelope import EnvelopeSearch
 from ctxval.campaign.execution import ExecutionLoop
 from ctxval.campaign.executors import Executor, worker_pool
 from ctxval.campaign.history import executed_trials
-from ctxval.campaign.identity import description_of, identify, search_of
+from ctxval.campaign.identity import identify, search_of
 from ctxval.campaign.interval_search import IntervalSearch, with_next_task
 from ctxval.campaign.plot import overview
 from ctxval.campaign.storage.other_stores import provenance_of_store
@@ -86,7 +88,13 @@ class Campaign:
         self.name = name
         trials = store if isinstance(store, Store) else Store(store)
         self.search: Search = search_of(trials) if search is None else search
-        description = description_of(validation, self.search, self.seed, name)
+        described = {
+            "name": name,
+            "seed": self.seed,
+            "search": describe(self.search),
+            "validation": validation.describe(),
+        }
+        description: dict[str, Any] = json.loads(json.dumps(described))
         identify(trials, validation, description, accept_change, remeasure)
         self.recorder = TrialRecorder(validation, self.search, trials, self.seed, description)
         if remeasure:

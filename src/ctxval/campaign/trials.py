@@ -39,7 +39,7 @@ class TrialRecorder:
     Attributes:
         validation: the map p -> d(p), which :meth:`remeasure` replaces.
         store: the store of the trials, after a check that it belongs to this experiment.
-        description: the description of the experiment from :func:`ctxval.campaign.identity.description_of`.
+        description: what identifies the experiment in a store, in the form that JSON returns.
         search: with the optional methods of :class:`ctxval.searches.BaseSearch`.
         draws: chooses the points of an audit.
         dynamics: what the trajectories teach of the dynamics.

@@ -59,7 +59,7 @@ def search_globally(
             done.move_to_bounds(rng)
             best = done.best_first()[0][:100]
             near = best[np.argsort(np.linalg.norm(best - best[0], axis=1), kind="stable")[: 2 * dimension + 2]]
-            step = _geometric((0.02, 1e-5), batch / max(1, len(sizes) - 1))
+            step = 0.02 * (1e-5 / 0.02) ** (batch / max(1, len(sizes) - 1))
             done.evaluate(_offspring(best[:4], near, step, min(size, done.left), rng))
     return GlobalMaximum(*done.best_first(), _apart(done.finite(), _REACHES[-1]))
 
@@ -78,10 +78,6 @@ def _apart(points: Array, reach: float) -> Array:
     return points[separated_rows(points, reach * float(np.sqrt(points.shape[1])), 30)]
 
 
-def _geometric(ends: tuple[float, float], share: float) -> float:
-    return float(ends[0] * (ends[1] / ends[0]) ** share)
-
-
 # Evolution
 
 
@@ -97,7 +93,7 @@ def _evolve(done: Evaluations, rng: np.random.Generator) -> None:
         if not len(finite):
             done.evaluate(done.samples(size, rng))
             continue
-        reach, step = _geometric(_REACHES, share), _geometric(_STEPS, share)
+        reach, step = (first * (last / first) ** share for first, last in (_REACHES, _STEPS))
         everywhere, heights = done.in_order()
         rows, seen = np.concatenate([prominent, np.arange(seen, len(everywhere))]), len(everywhere)
         prominent = rows[np.argsort(-_prominences(everywhere, heights, rows), kind="stable")[:200]]
@@ -137,8 +133,11 @@ def _offspring(parents: Array, pool: Array, step: float, count: int, rng: np.ran
     children = [
         all_of + _normal(all_of.shape, step, rng),
         few_of + _normal(few_of.shape, max(step, _STEPS[0] / 3), rng) * _few(few_of.shape, rng),
-        differential + _differences(pool, differential.shape, rng),
     ]
+    # Shares of differences between two points of the pool, in a random part of the coordinates.
+    first, second = rng.integers(len(pool), size=(2, len(differential)))
+    factors = rng.uniform(0.2, 1.0, size=(len(differential), 1))
+    children.append(differential + factors * (pool[first] - pool[second]) * (rng.random(differential.shape) < 0.7))
     moved = bound + _normal(bound.shape, step, rng) * _few(bound.shape, rng)
     children.append(np.where(_few(bound.shape, rng) > 0, rng.integers(2, size=bound.shape), moved))
     return np.clip(np.concatenate(children), 0, 1)
@@ -155,10 +154,3 @@ def _few(shape: tuple[int, ...], rng: np.random.Generator) -> Array:
     chosen = rng.random(shape) < 1 / shape[1]
     chosen[np.arange(shape[0]), rng.integers(shape[1], size=shape[0])] = True
     return chosen.astype(np.float64)
-
-
-def _differences(pool: Array, shape: tuple[int, ...], rng: np.random.Generator) -> Array:
-    """Return shares of differences between two points of a pool, in a random part of the coordinates."""
-    first, second = rng.integers(len(pool), size=(2, shape[0]))
-    factor = rng.uniform(0.2, 1.0, size=(shape[0], 1))
-    return np.asarray(factor * (pool[first] - pool[second]) * (rng.random(shape) < 0.7))

@@ -72,13 +72,6 @@ class Prior:
     equally likely. None excludes the logarithm."""
     spread_share: float = 0.5  # share of the data from which hyperparameters are drawn a second time
 
-    def warps(self, y: Array) -> tuple[Warp, ...]:
-        """Return the scales that values ``(n,)`` may have."""
-        if self.offset is None or y.min() < 0:
-            return (Warp(),)
-        mean = float(y.mean())
-        return (Warp(unit=mean), Warp(self.offset * mean))
-
     def centre(self, dimension: int) -> float:
         """Return the mean of each length-scale's logarithm."""
         return float(np.log(self.length_scale) + 0.5 * np.log(dimension))
@@ -163,7 +156,9 @@ def _chain(
     X: Array, y: Array, prior: Prior, count: int, rng: np.random.Generator
 ) -> list[tuple[Hyperparameters, Warp]]:
     """Return draws of a Markov chain over (nu, log length-scales, log noise), two sweeps apart."""
-    d, warps, (low, high) = X.shape[1], prior.warps(y), np.log(prior.noise)
+    d, (low, high), warps = X.shape[1], np.log(prior.noise), [Warp()]
+    if prior.offset is not None and y.min() >= 0:
+        warps = [Warp(unit=float(y.mean())), Warp(prior.offset * float(y.mean()))]
     choices = [(nu, warp) for nu in prior.smoothness for warp in warps]
     choice, state = choices[0], np.append(np.full(d, prior.centre(d)), 0.5 * (low + high))
     # All length-scales together, each length-scale, and the noise.
@@ -236,9 +231,6 @@ class Paths:
     corrections: Array  # weights of the correlations with the data (n, s)
     means: Array  # mu of each path (s,)
     scales: Array  # sigma of each path (s,)
-
-    def __len__(self) -> int:
-        return len(self.means)
 
     def __call__(self, Z: Array, precision: type = np.float64) -> Array:
         """Return the values of all paths at the same points ``(m, d)``, shape ``(m, s)``.
@@ -324,7 +316,7 @@ def maxima(paths: Paths, known: Array, rng: np.random.Generator) -> tuple[Array,
         starts = np.take_along_axis(climbed, highest[..., None], axis=1)
     points = np.concatenate([starts, _climb(paths, starts, 30 if d <= 2 else 80)], axis=1)
     heights = paths.own(points)
-    best, rows = np.argmax(heights, axis=1), np.arange(len(paths))
+    best, rows = np.argmax(heights, axis=1), np.arange(len(paths.means))
     tops, where = heights[rows, best], points[rows, best]
     if d > 2:
         where, tops = polish(paths.own, where, tops, (np.zeros(d), np.ones(d)), d, 1e-9 * paths.scales)

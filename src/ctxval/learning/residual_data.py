@@ -34,22 +34,10 @@ class ResidualData:
     scale: Array
     sizes: Array  # root mean square of the residual of each state, (n,)
     steps: Array  # standard deviation of the change of each state in one step, (n,)
+    learned: Mask  # which states have a residual that is not negligible, (n,)
+    units: Array  # the unit of each standardised residual; 0 if it is negligible, (n,)
+    inputs: int  # the number m of inputs of the system
     transitions: Transitions
-
-    @property
-    def learned(self) -> Mask:
-        """Which states have a residual that is not negligible, shape ``(n,)``."""
-        return np.asarray(self.sizes > NEGLIGIBLE * self.steps)
-
-    @property
-    def inputs(self) -> int:
-        """The number m of inputs of the system."""
-        return len(self.shift) - len(self.sizes)
-
-    @property
-    def units(self) -> Array:
-        """The unit of each standardised residual, shape ``(n,)``; 0 if it is negligible."""
-        return np.where(self.learned, self.sizes, 0.0)
 
     def standardised(self, x: Array, u: Array) -> Array:
         """Return standardised pairs ``(..., n + m)`` of states and the first m inputs, which act."""
@@ -73,9 +61,18 @@ def residual_data(model: Model, transitions: Transitions, sources: Rows) -> Resi
     if not learned.any():
         return None
     shift, scale = pairs.mean(axis=0), standard_deviations(pairs)
-    outputs = residuals / np.where(learned, sizes, np.inf)
     return ResidualData(
-        (pairs - shift) / scale, outputs, sources[usable], shift, scale, sizes, typical, transitions[usable]
+        (pairs - shift) / scale,
+        residuals / np.where(learned, sizes, np.inf),
+        sources[usable],
+        shift,
+        scale,
+        sizes,
+        typical,
+        learned,
+        units=np.where(learned, sizes, 0.0),
+        inputs=transitions.u.shape[1],
+        transitions=transitions[usable],
     )
 
 
