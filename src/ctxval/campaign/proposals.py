@@ -231,10 +231,6 @@ class IndependentDraws:
     def __init__(self, store: Store, validation: Validation, seed: int) -> None:
         self._store, self._validation, self._seed = store, validation, seed
 
-    def search_seed(self) -> int:
-        """Return the seed of a search that depends on the model, because of independent draws or a refined model."""
-        return int(np.random.SeedSequence([self._seed, self.of_model()]).generate_state(1)[0])
-
     def point(self, trials: Sequence[Trial]) -> Array:
         """Return the next draw from the distribution of tasks, a point of the unit cube ``(d,)``."""
         space = self._validation.space

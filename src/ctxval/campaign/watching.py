@@ -75,7 +75,16 @@ class Watch:
                 channels.append(WatchedChannel(name, tuple(each.value for each in runs), freedom, information))
         self.state = WatchState(threshold, false_alarms, tuple(channels))
         if state is not None:
-            if not _is_same_watch(state, self.state):
+            begun = self.state
+            settings = len(state.channels), state.threshold, state.false_alarms
+            # It follows from the same beginning, up to the rounding of another processor.
+            same = settings == (len(channels), begun.threshold, begun.false_alarms) and all(
+                known.name == channel.name
+                and len(known.certified) == len(channel.certified)
+                and np.allclose(known.certified, channel.certified, rtol=1e-4)
+                for known, channel in zip(state.channels, channels, strict=True)
+            )
+            if not same:
                 raise InputError("the state belongs to a watch of another campaign, threshold or rate of false alarms.")
             self.state = state
 
@@ -162,14 +171,3 @@ class Watch:
 
     def __repr__(self) -> str:
         return f"Watch({self.state.sentence})"
-
-
-def _is_same_watch(state: WatchState, begun: WatchState) -> bool:
-    """Return whether a state follows from the beginning of a watch, up to the rounding of another processor."""
-    settings = len(state.channels), state.threshold, state.false_alarms
-    return settings == (len(begun.channels), begun.threshold, begun.false_alarms) and all(
-        known.name == channel.name
-        and len(known.certified) == len(channel.certified)
-        and np.allclose(known.certified, channel.certified, rtol=1e-4)
-        for known, channel in zip(state.channels, begun.channels, strict=True)
-    )

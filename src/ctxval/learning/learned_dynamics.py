@@ -97,11 +97,6 @@ class LearnedDynamics(ShortRepr):
         scale = np.sqrt((np.concatenate(of_model) ** 2).mean(axis=0))
         return float(np.sqrt(((np.concatenate(errors) / np.maximum(scale, 1e-300)) ** 2).mean()))
 
-    @property
-    def worst_case(self) -> WorstCase:
-        """The largest distance over all tasks, for each of the usual number of draws."""
-        return self.worst_case_of(1)
-
     @functools.cached_property
     def screened(self) -> WorstCase:
         """The largest distance over some tasks, for each of a few draws of the dynamics: a quick lower bound."""

@@ -247,14 +247,24 @@ class WorstCaseSearch:
                 # The search has chosen tasks with few sequences of noise, which its own maxima exaggerate.
                 settled = draws.with_replicates(SETTLED, rng)
                 maxima = _finite(self.planner.own_distances(settled, points[:, None]))[:, 0]
-            sharpness = 0.0 if self.members is not None else self._sharpness(posterior.mean, of_mean.elites, rng)
+            # The largest share that the distance of an elite loses at the median of the tasks next to it. If
+            # controllers jump from task to task, the largest distance is a needle that a search finds by chance. Kinks
+            # are no needles: they are flat between tasks that are nearer.
+            peaks = of_mean.elites[: 0 if self.members is not None else self.settings.peaks]
+            near = _NEARBY / _NEARER if is_kinked(self.planner.validation.distance) else _NEARBY
+            moves = rng.uniform(-near, near, (len(peaks), self.settings.nearby, self.dimension))
+            beside = np.concatenate([peaks[:, None], np.clip(peaks[:, None] + moves, 0, 1)], axis=1)
+            flat = self._distances(posterior.mean, beside.reshape(-1, self.dimension))[0]
+            distances = np.maximum(flat.reshape(beside.shape[:2]), 0.0)
+            peak, next_to_it = distances[:, 0], np.median(distances[:, 1:], axis=1)
+            lost = np.divide(peak - next_to_it, peak, out=np.zeros(len(peak)), where=peak > 0)
         return replace(
             of_mean,
             maxima=np.where(maxima >= _DIVERGED, np.inf, maxima),
             points=points,
             evaluations=of_mean.evaluations + loops,
             left_out=draws.left_out,
-            sharpness=sharpness,
+            sharpness=float(max(lost.max(initial=0.0), 0.0)),
         )
 
     def _shared_tasks(self, of_mean: WorstCase, known: Array, count: int, rng: np.random.Generator) -> Array:
@@ -277,22 +287,6 @@ class WorstCaseSearch:
     def _on_one(self, mean: AnyDraws) -> Callable[[Array], Array]:
         """Return the distances ``(q,)`` on one draw, such as the posterior mean, as a function of points."""
         return lambda points: np.asarray(self._distances(mean, points)[0])
-
-    def _sharpness(self, mean: AnyDraws, elites: Array, rng: np.random.Generator) -> float:
-        """Return the largest share that the distance of an elite loses at the median of the tasks next to it.
-
-        If controllers jump from task to task, the largest distance is a needle that a search finds by chance. Kinks are
-        no needles: they are flat between tasks that are nearer.
-        """
-        peaks = elites[: self.settings.peaks]
-        near = _NEARBY / _NEARER if is_kinked(self.planner.validation.distance) else _NEARBY
-        moves = rng.uniform(-near, near, (len(peaks), self.settings.nearby, self.dimension))
-        tasks = np.concatenate([peaks[:, None], np.clip(peaks[:, None] + moves, 0, 1)], axis=1)
-        flat = self._distances(mean, tasks.reshape(-1, self.dimension))[0]
-        distances = np.maximum(flat.reshape(tasks.shape[:2]), 0.0)
-        peak, next_to_it = distances[:, 0], np.median(distances[:, 1:], axis=1)
-        lost = np.divide(peak - next_to_it, peak, out=np.zeros(len(peak)), where=peak > 0)
-        return float(max(lost.max(initial=0.0), 0.0))
 
     def relevant(self, posterior: AnyPosterior, tasks: Array, rng: np.random.Generator) -> Array:
         """Return standardised pairs on the mean's closed loops, from which pivots are chosen; noisy draws have none."""
