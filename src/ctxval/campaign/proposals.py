@@ -71,8 +71,19 @@ class Steadiness:
                 return False
             rounded = space.rounded(point)
             beside = np.where(rounded > 0.5, rounded - 1e-9, rounded + 1e-9)
-            with stage("testing a task", unit="designs"):
-                self._tested[key] = self._alike(np.stack([point, rounded, beside]))
+            points = np.stack([point, rounded, beside])
+            self._tested[key] = True
+            # The user's own parts may fail here; this is reported when the task is planned.
+            with stage("testing a task", unit="designs"), suppress(Exception, SystemExit):
+                if self.expected is None:
+                    shares = self._pushed_loops(points)
+                else:
+                    values = self.expected(points)
+                    shares = values[:, None] / max(values[np.isfinite(values)].max(initial=0.0), 1e-300)
+                # The tasks have the same distance, or none of them a known one.
+                known = np.isfinite(shares).all(axis=1)
+                alike = known.all() and (np.ptp(shares, axis=0) <= 0.05).all()
+                self._tested[key] = not known.any() or bool(alike)
         return self._tested[key]
 
     def moved(self, point: Array, rng: np.random.Generator) -> Array:
@@ -83,19 +94,6 @@ class Steadiness:
         if steady is None:
             self._tested[point.tobytes()] = True  # it is executed, and so not rejected
         return point if steady is None else steady
-
-    def _alike(self, points: Array) -> bool:
-        """Return whether tasks ``(m, d)`` have the same distance, or none of them a known one."""
-        try:
-            if self.expected is None:
-                shares = self._pushed_loops(points)
-            else:
-                values = self.expected(points)
-                shares = values[:, None] / max(values[np.isfinite(values)].max(initial=0.0), 1e-300)
-        except (Exception, SystemExit):  # the user's own parts; their failure is reported when the task is planned
-            return True
-        known = np.isfinite(shares).all(axis=1)
-        return not known.any() or bool(known.all() and (np.ptp(shares, axis=0) <= 0.05).all())
 
     def _pushed_loops(self, points: Array) -> Array:
         """Return the states of M, disturbed by 1 % of their ranges in each step, as shares of these ranges.

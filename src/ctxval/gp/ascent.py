@@ -86,11 +86,8 @@ class Evaluations:
             return
         scale = max(float(np.abs(self.best_first()[1][0])), 1e-300)
         calls = max(2, budget // (len(starts) * (self.dimension + 1)))
-
-        def sloped(points: Array) -> tuple[Array, Array]:
-            return self._slopes(np.clip(points, self.low, self.high))
-
-        climb(sloped, starts, self.low, self.high, scale=scale, iterations=calls, evaluations=calls)
+        box = self.low, self.high
+        climb(lambda Z: self._slopes(np.clip(Z, *box)), starts, *box, scale=scale, iterations=calls, evaluations=calls)
 
     def search_lines(self, starts: Array, rounds: int) -> None:
         """Search along lines from all starts ``(s, d)`` at once, several times.

@@ -83,7 +83,7 @@ class ExecutionPrediction(ShortRepr):
         try:
             prediction = cls(
                 int(values["learned_from"]),
-                _with_infinity(values["quantiles"]),
+                tuple(np.inf if value is None else float(value) for value in values["quantiles"]),
                 float(values["deviation"]),
                 tuple(int(step) for step in values["steps"]),
                 _rows(values["states"]),
@@ -91,7 +91,8 @@ class ExecutionPrediction(ShortRepr):
                 float(values["diverged"]),
             )
             if (noise := values.get("noise")) is not None:
-                (roughness,), distances = _rows([noise["roughness"]]), _with_infinity(noise["distances"])
+                distances = tuple(np.inf if value is None else float(value) for value in noise["distances"])
+                (roughness,) = _rows([noise["roughness"]])
                 noise = NoisePrediction(int(noise["runs"]), distances, roughness, _rows(noise["statistics"]))
                 if {len(row) for row in (distances, *noise.statistics)} != {len(LEVELS)} or len(noise.statistics) != 3:
                     return None
@@ -192,10 +193,6 @@ def predict_execution(
 
 def _rows(listed: Iterable[Iterable[Any]]) -> tuple[tuple[float, ...], ...]:
     return tuple(tuple(float(value) for value in row) for row in listed)
-
-
-def _with_infinity(values: Iterable[Any]) -> tuple[float, ...]:
-    return tuple(np.inf if value is None else float(value) for value in values)
 
 
 def _rounded(values: ArrayLike) -> tuple[float, ...]:

@@ -144,14 +144,6 @@ class Mode:
         # No direction is less certain than a standard deviation of 2 in the logarithm.
         return np.asarray(vectors / np.sqrt(np.maximum(values, 0.25)))
 
-    def log_density(self, draws: Array) -> Array:
-        """Return the logarithms of the density ``(count,)`` of a t distribution around the mode."""
-        D = len(self.place)
-        constant = gammaln((_FREEDOM + D) / 2) - gammaln(_FREEDOM / 2) - 0.5 * D * np.log(_FREEDOM * np.pi)
-        squares = (np.linalg.solve(self.scale, (draws - self.place).T) ** 2).sum(axis=0)
-        log_volume = np.linalg.slogdet(self.scale)[1]
-        return np.asarray(constant - log_volume - 0.5 * (_FREEDOM + D) * np.log1p(squares / _FREEDOM))
-
 
 @dataclass(frozen=True, eq=False)
 class HyperparameterPosterior:
@@ -186,14 +178,19 @@ class HyperparameterPosterior:
         places, weights = [], []
         for family in self.families:
             kernel, Z, Y, D = family[0].kernel, family[0].Z, family[0].Y, len(family[0].place)
-            proposals, heights = [], []
+            proposals, heights, densities = [], [], []
             for mode in family:  # draws of t distributions around the modes
                 normal = rng.standard_normal((48 // len(family), D))
                 deviations = normal / np.sqrt(rng.chisquare(_FREEDOM, (len(normal), 1)) / _FREEDOM)
                 proposals.append(mode.place + deviations @ mode.scale.T)
             drawn = np.concatenate(proposals)
             # All modes of a family make one proposal distribution: the mixture of theirs in equal parts.
-            density = logsumexp([mode.log_density(drawn) for mode in family], axis=0) - np.log(len(family))
+            constant = gammaln((_FREEDOM + D) / 2) - gammaln(_FREEDOM / 2) - 0.5 * D * np.log(_FREEDOM * np.pi)
+            for mode in family:
+                squares = (np.linalg.solve(mode.scale, (drawn - mode.place).T) ** 2).sum(axis=0)
+                log_volume = np.linalg.slogdet(mode.scale)[1]
+                densities.append(constant - log_volume - 0.5 * (_FREEDOM + D) * np.log1p(squares / _FREEDOM))
+            density = logsumexp(densities, axis=0) - np.log(len(family))
             for place in drawn:
                 theta, noise = kernel.within(place)
                 try:

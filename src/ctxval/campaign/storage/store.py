@@ -337,7 +337,7 @@ class Store(Database):
                 statement = "SELECT trial, checksum FROM trajectories WHERE side = 'system'"
                 stored = dict(self._execute(statement)) if self._kept else {}
                 for number in [each for each, (checksum, _) in self._kept.items() if stored.get(each) != checksum]:
-                    self._forget(number)
+                    self._memory += _size(self._kept.pop(number)[1])
         executed = dict[int, Trajectory]()
         for number in numbers:
             if number not in self._kept:
@@ -353,9 +353,6 @@ class Store(Database):
                 executed[number] = trajectory
         return executed
 
-    def _forget(self, number: int) -> None:
-        self._memory += _size(self._kept.pop(number, (None, None))[1])
-
     def _read_trajectory(self, number: int, side: Side) -> tuple[int | None, Trajectory | None]:
         where = "FROM trajectories {} WHERE trial = ? AND side = ?"
         with self.snapshot():
@@ -370,7 +367,7 @@ class Store(Database):
 
     def _write_trajectory(self, number: int, side: Side, trajectory: Trajectory | None) -> None:
         if side == "system":
-            self._forget(number)
+            self._memory += _size(self._kept.pop(number, (None, None))[1])
         if trajectory is not None:
             npz = trajectory.to_npz()
             values = (number, side, npz, checksum_of((number, side, npz)))
