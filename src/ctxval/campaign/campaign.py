@@ -148,7 +148,9 @@ class Campaign:
 
     def start_offset(self, trial: Trial) -> StartOffset | None:
         """Return how far an execution started from the initial state of its task; None if it was not recorded."""
-        return self.recorder.start_offset(trial)
+        executed = self.store.trajectories([trial.number], "system").get(trial.number)
+        point = self.validation.space.point(trial.parameters)
+        return None if executed is None else start_offset(self.validation, point, executed)
 
     # Running
 

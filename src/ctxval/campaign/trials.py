@@ -24,7 +24,7 @@ from ctxval.campaign.storage.store import Store
 from ctxval.certificates import PLANNED
 from ctxval.core.controller import converged_of
 from ctxval.core.distance import Distance
-from ctxval.core.plan import Plan, StartOffset, start_offset, try_distance
+from ctxval.core.plan import Plan, try_distance
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import CONVERGED, Origin, Trial
 from ctxval.core.validation import Validation
@@ -100,12 +100,6 @@ class TrialRecorder:
     def plan(self, trial: Trial) -> Plan:
         """Return the plan of a trial, as :meth:`ctxval.Validation.plan` makes it."""
         return self.validation.plan(self.validation.space.point(trial.parameters))
-
-    def start_offset(self, trial: Trial) -> StartOffset | None:
-        """Return how far an execution started from the initial state of its task; None if it was not recorded."""
-        executed = self.store.trajectories([trial.number], "system").get(trial.number)
-        point = self.validation.space.point(trial.parameters)
-        return None if executed is None else start_offset(self.validation, point, executed)
 
     def draw(self) -> Array:
         """Return the next independent draw of a task, a point of the unit cube ``(d,)``."""

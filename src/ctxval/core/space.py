@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from typing import Annotated, Any
 
 import numpy as np
@@ -24,15 +23,18 @@ DISTRIBUTION = "_distribution"
 """Key of the distribution of tasks in the description of a space; no parameter can have this name."""
 
 
-@dataclass(slots=True, eq=False, repr=False)
 class Parameters:
     """Task parameters p by name, for one task or a batch of tasks.
 
     A scalar parameter such as ``p.goal`` has shape ``(...)``, a vector parameter such as ``p.amplitudes`` ``(..., k)``.
     """
 
-    _space: TaskSpace
-    points: Array  # the parameters as rows, shape (..., d), in the space's own units
+    __slots__ = ("_space", "points")
+
+    def __init__(self, space: TaskSpace, points: Array) -> None:
+        self._space = space
+        self.points = points
+        """The parameters as rows, shape ``(..., d)``, in the space's own units."""
 
     def __getattr__(self, name: str) -> Any:
         if name.startswith("__"):

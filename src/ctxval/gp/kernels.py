@@ -45,8 +45,11 @@ class Kernel(Covariance, Protocol):
     def weighted_gradient(self, theta: Array, X: Array, W: Array) -> Array:
         """Return ``sum_ij W_ij dK_ij/dtheta`` for K = k(X, X) and a symmetric W, in the shape of theta."""
 
-    def input_gradient(self, theta: Array, X: Array, Z: Array) -> tuple[Array, Array]:
-        """Return ``dk(x_i, z_j)/dx_i``, shape ``(n, m, d)``, and ``dk(x, x)/dx``, shape ``(n, d)``."""
+    def input_gradient(self, theta: Array, X: Array, Z: Array) -> Array:
+        """Return ``dk(x_i, z_j)/dx_i``, shape ``(n, m, d)``."""
+
+    def diagonal_input_gradient(self, theta: Array, X: Array) -> Array:
+        """Return ``dk(x, x)/dx``, shape ``(n, d)``."""
 
 
 @dataclass(frozen=True)
@@ -100,11 +103,14 @@ class Matern(Kernel):
             by_scales = np.array([np.vdot(G, r**2)])
         return np.concatenate([[by_variance], by_scales])
 
-    def input_gradient(self, theta: Array, X: Array, Z: Array) -> tuple[Array, Array]:
+    def input_gradient(self, theta: Array, X: Array, Z: Array) -> Array:
         scales = np.exp(theta[1:])
         Y, V = X / scales, Z / scales
         slope = np.exp(theta[0]) * self.profile_and_slope(cdist(Y, V))[1]
-        return -slope[:, :, None] * (Y[:, None, :] - V[None, :, :]) / scales, np.zeros_like(X)
+        return np.asarray(-slope[:, :, None] * (Y[:, None, :] - V[None, :, :]) / scales)
+
+    def diagonal_input_gradient(self, theta: Array, X: Array) -> Array:
+        return np.zeros_like(X)
 
     def profile_and_slope(self, r: Array) -> tuple[Array, Array]:
         """Return k(r) and ``-k'(r) / r``, which is finite at r = 0, for unit variance and length-scale."""
@@ -162,10 +168,12 @@ class Linear(Kernel):
         Y = X - self.centre
         return np.array([np.exp(theta[0]) * W.sum(), np.exp(theta[1]) * (Y * (W @ Y)).sum()])
 
-    def input_gradient(self, theta: Array, X: Array, Z: Array) -> tuple[Array, Array]:
-        slope = np.exp(theta[1])
-        gradient = np.broadcast_to(slope * (Z - self.centre), (len(X), *Z.shape))
-        return gradient, np.asarray(2 * slope * (X - self.centre))
+    def input_gradient(self, theta: Array, X: Array, Z: Array) -> Array:
+        gradient = np.exp(theta[1]) * (Z - self.centre)
+        return np.broadcast_to(gradient, (len(X), *Z.shape))
+
+    def diagonal_input_gradient(self, theta: Array, X: Array) -> Array:
+        return np.asarray(2 * np.exp(theta[1]) * (X - self.centre))
 
 
 @dataclass(frozen=True)
@@ -201,7 +209,10 @@ class Sum(Kernel):
         a, b = self._split(theta, X.shape[1])
         return np.concatenate([self.first.weighted_gradient(a, X, W), self.second.weighted_gradient(b, X, W)])
 
-    def input_gradient(self, theta: Array, X: Array, Z: Array) -> tuple[Array, Array]:
+    def input_gradient(self, theta: Array, X: Array, Z: Array) -> Array:
         a, b = self._split(theta, X.shape[1])
-        (first, of_first), (second, of_second) = self.first.input_gradient(a, X, Z), self.second.input_gradient(b, X, Z)
-        return first + second, of_first + of_second
+        return self.first.input_gradient(a, X, Z) + self.second.input_gradient(b, X, Z)
+
+    def diagonal_input_gradient(self, theta: Array, X: Array) -> Array:
+        a, b = self._split(theta, X.shape[1])
+        return self.first.diagonal_input_gradient(a, X) + self.second.diagonal_input_gradient(b, X)

@@ -51,7 +51,7 @@ class GaussianProcess:
     def predict_with_gradient(self, X: Array) -> tuple[Array, Array, Array, Array]:
         """Return mean and variance ``(m,)`` and their gradients ``(m, d)``; cheaper than two separate calls."""
         k = self.kernel(self.theta, X, self.X)
-        dk, d_diagonal = self.kernel.input_gradient(self.theta, X, self.X)
+        dk = self.kernel.input_gradient(self.theta, X, self.X)
         weights = self.factor.solve(k.T).T
         variance = np.maximum(self.kernel.diagonal(self.theta, X) - (k * weights).sum(axis=1), 0.0)
         d_mean = dk.transpose(0, 2, 1) @ self.alpha
@@ -60,7 +60,8 @@ class GaussianProcess:
             up, down = (self.mean((X[:, None, :] + m).reshape(-1, shape[1])).reshape(shape) for m in (moves, -moves))
             d_mean = d_mean + (up - down) / 2e-6
         pull = (dk.transpose(0, 2, 1) @ weights[:, :, None])[:, :, 0]
-        return self.mean(X) + k @ self.alpha, variance, d_mean, d_diagonal - 2 * pull
+        d_variance = self.kernel.diagonal_input_gradient(self.theta, X) - 2 * pull
+        return self.mean(X) + k @ self.alpha, variance, d_mean, d_variance
 
     def left_out(self) -> tuple[Array, Array]:
         """Return mean and variance ``(n,)`` of each observation given all others (Rasmussen and Williams, eq. 5.12)."""
