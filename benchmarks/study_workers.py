@@ -217,7 +217,7 @@ def study(one: tuple[str, str, int, int]) -> dict[str, Any]:
             decides = IntervalSearch(recorder, CertificateOptions.or_automatic(None, 0.95, 0.1), 1000, within=WITHIN)
 
         def rule() -> Choice | None:
-            over = pool.now >= LONGEST or len(ended) + recorder.executing >= MOST
+            over = pool.now >= LONGEST or len(ended) + len(recorder.executing) >= MOST
             if over or any(share >= 1 - WITHIN for _, _, share in ended):
                 return None
             return Choice() if decides is None else decides.choose()

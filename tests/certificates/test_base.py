@@ -142,7 +142,7 @@ def test_which_kinds_have_a_use_for_an_option_follows_from_their_fields() -> Non
         "discard": ("region", "sampling-discarding"),
         "predictions": ("region",),
     }
-    found = {option: tuple(kind for kind in KINDS.with_option(option) if kind in OWN) for option in uses}
+    found = {option: tuple(kind for kind in OWN if option in KINDS.find(kind).options()) for option in uses}
     assert found == uses
     with pytest.raises(UnknownNameError, match="did you mean 'resolution'"):
         require_use("posterior", ["resolutoin"])

@@ -25,8 +25,8 @@ def test_everything_agrees_with_dense_linear_algebra() -> None:
         np.testing.assert_allclose(factor.whiten_many(columns.copy("K")), factor.whiten(right), rtol=1e-9)
     np.testing.assert_allclose(factor.inverse(), inverse, rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(factor.inverse_factor @ factor.L, np.eye(7), atol=1e-12)
-    np.testing.assert_allclose(factor.precisions, np.diag(inverse), rtol=1e-9)
-    np.testing.assert_allclose(factor.precisions_of(np.array([6, 0, 3])), factor.precisions[[6, 0, 3]], rtol=1e-12)
+    rows = np.array([6, 0, 3])
+    np.testing.assert_allclose(factor.precisions_of(rows), np.diag(inverse)[rows], rtol=1e-9)
     sign, log_determinant = np.linalg.slogdet(K + 0.5 * np.eye(7))
     assert (sign, 2 * factor.half_log_determinant()) == pytest.approx((1.0, log_determinant), rel=1e-12)
 

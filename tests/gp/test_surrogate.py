@@ -286,11 +286,11 @@ def test_pivots_end_where_the_others_add_nothing() -> None:
 def test_a_pivoted_factor_is_that_of_the_chosen_rows(seed: int, count: int, rank: int) -> None:
     root = np.random.default_rng(seed).normal(size=(12, rank))
     matrix = root @ root.T
-    found = pivoted_cholesky(np.diag(matrix), lambda row: matrix[row].copy(), count, least=1e-9)
-    assert len(found.rows) == min(count, rank)
-    chosen = matrix[np.ix_(found.rows, found.rows)]
-    np.testing.assert_allclose(found.L @ found.L.T, chosen, atol=1e-8)
-    np.testing.assert_array_equal(np.triu(found.L, 1), 0.0)
-    others = matrix[found.rows]
+    rows, L, remaining = pivoted_cholesky(np.diag(matrix), lambda row: matrix[row].copy(), count, least=1e-9)
+    assert len(rows) == min(count, rank)
+    chosen = matrix[np.ix_(rows, rows)]
+    np.testing.assert_allclose(L @ L.T, chosen, atol=1e-8)
+    np.testing.assert_array_equal(np.triu(L, 1), 0.0)
+    others = matrix[rows]
     left = matrix - others.T @ np.linalg.pinv(chosen, rcond=1e-12) @ others if count else matrix
-    np.testing.assert_allclose(found.left, np.maximum(np.diag(left), 0.0), atol=1e-5 * np.trace(matrix))
+    np.testing.assert_allclose(remaining, np.maximum(np.diag(left), 0.0), atol=1e-5 * np.trace(matrix))

@@ -144,7 +144,7 @@ def test_the_posterior_is_of_the_inputs_that_act_and_predicts_what_is_recorded()
     outcome = validation.outcome(validation.space.from_unit(point))
     assert prediction is not None
     assert prediction.median == pytest.approx(outcome.distance, rel=0.01)
-    assert learned.study.recorded(learned.trajectories(point[None])[0][1]).inputs.shape == (H, 1)
+    assert learned.study.extended.recorded(learned.trajectories(point[None])[0][1]).inputs.shape == (H, 1)
 
 
 @pytest.mark.slow

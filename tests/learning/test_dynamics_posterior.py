@@ -68,7 +68,7 @@ def test_mean_and_variance_are_those_of_the_normal_distribution(family: tuple[fl
     Z = 2 * np.random.default_rng(1).normal(size=(30, 2))
     mean, covariance = exact(one, Z)
     np.testing.assert_allclose(one.mean(Z[None])[0], mean, atol=1e-8)
-    np.testing.assert_allclose(one.variance(Z), np.diag(covariance), rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(one.whitened(Z)[1], np.diag(covariance), rtol=1e-6, atol=1e-9)
 
 
 def test_the_mean_passes_through_the_observations_within_the_noise() -> None:
@@ -153,7 +153,7 @@ def test_draws_differ_even_if_less_than_the_noise() -> None:
     Z = rng.normal(size=(400, 2))
     one = Component.conditioned(own, Z, np.sin(Z), rng)
     relevant = rng.uniform(-1, 1, (30, 2))
-    assert one.variance(relevant).max() < 0.5
+    assert one.whitened(relevant)[1].max() < 0.5
     _, covariance, left_out = moments(one, relevant, relevant, 50, 1000)
     assert left_out < 2e-3
     np.testing.assert_allclose(np.diag(covariance) / np.diag(exact(one, relevant)[1]), 1, atol=0.3)
@@ -199,7 +199,7 @@ def test_as_the_matern_part_vanishes_the_posterior_is_that_of_linear_regression(
     covariance = np.linalg.inv(features.T @ features / noise + prior)
     mean = at @ covariance @ features.T @ Y / noise
     np.testing.assert_allclose(one.mean(new[None])[0], mean, rtol=2e-2, atol=2e-2)
-    np.testing.assert_allclose(one.variance(new), np.diag(at @ covariance @ at.T), rtol=1e-2, atol=1e-2)
+    np.testing.assert_allclose(one.whitened(new)[1], np.diag(at @ covariance @ at.T), rtol=1e-2, atol=1e-2)
 
 
 def test_draws_of_a_linear_system_are_that_system() -> None:
@@ -320,8 +320,9 @@ def test_components_of_equal_hyperparameters_are_drawn_as_if_alone() -> None:
     assert len(set(names)) < len(names)  # resampling repeats likely hyperparameters
     together = posterior.draw(posterior.data.pairs, np.random.default_rng(0))
     rng = np.random.default_rng(0)
+    settings = posterior.covariances.settings
     alone = [
-        draw_functions([one], posterior.data.pairs, posterior.settings.functions, posterior.settings.pivots, rng)[0]
+        draw_functions([one], posterior.data.pairs, settings.functions, settings.pivots, rng)[0]
         for one in posterior.components
     ]
     assert len(together) == sum(len(one.weights) for one in alone)
@@ -345,7 +346,7 @@ def test_few_draws_do_not_depend_on_what_was_computed_before() -> None:
     for whole in (False, True):
         posterior = learn(transitions)
         if whole:
-            assert len(posterior.components) == posterior.settings.hyperparameters
+            assert len(posterior.components) == posterior.covariances.settings.hyperparameters
         draws = posterior.draw(posterior.data.pairs + 0.1, np.random.default_rng(0), 1, 8)
         found.append(draws.step(np.ones((len(draws), 1, 2)), np.ones((len(draws), 1, 1))))
     np.testing.assert_array_equal(*found)
@@ -423,7 +424,7 @@ def test_the_doubt_is_the_deviation_of_draws_as_a_share_of_a_typical_step() -> N
     most, data, place = posterior.most_probable, posterior.data, np.array([[0.9, 0.9, 0.9]])
     found = posterior.unfamiliarity(np.tile(place[:, None, :2], (1, 2, 1)), place[:, None, 2:])
     z = data.standardised(place[:, :2], place[:, 2:])
-    deviations = np.sqrt(most.variance(z) * most.squares / len(most.centres)) * data.sizes / data.steps
+    deviations = np.sqrt(most.whitened(z)[1] * most.squares / len(most.centres)) * data.sizes / data.steps
     np.testing.assert_allclose(found, np.sqrt((deviations**2).mean()), rtol=1e-9)
 
 

@@ -163,7 +163,7 @@ def test_draws_of_the_prior_have_its_medians_within_the_bounds() -> None:
     theta = np.array([one.theta for one in drawn])
     np.testing.assert_allclose(np.median(theta, axis=0), np.log([3, 3, 3, 1, 1]), atol=0.3)
     np.testing.assert_allclose(theta[:, :3].std(axis=0), 1, atol=0.05)
-    low, high = np.array(ResidualKernel(2.5, 0.0, 1).bounds(3)).T
+    low, high = (ends[:-1] for ends in ResidualKernel(2.5, 0.0, 1).box(3))
     assert ((theta >= low) & (theta <= high)).all()
     assert all(0.999 * NOISE[0] < one.noise < 1.001 * NOISE[1] for one in drawn)
     families = [(one.kernel.nu, one.kernel.growth) for one in drawn]
@@ -188,7 +188,7 @@ seeds = st.integers(0, 2**32 - 1)
 
 
 def theta_of(kernel: ResidualKernel, dimension: int, rng: np.random.Generator) -> Array:
-    low, high = np.array(kernel.bounds(dimension)).T
+    low, high = (ends[:-1] for ends in kernel.box(dimension))
     return np.asarray(low + rng.random(len(low)) * (high - low))
 
 

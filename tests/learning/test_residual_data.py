@@ -174,7 +174,7 @@ def test_without_a_rough_model_the_system_is_learned_far_more_accurately() -> No
     posterior = learn_posterior(rough(system), known, np.zeros(len(known), dtype=np.intp), settings=SETTINGS)
     assert posterior is not None
     assert posterior.covariances.without_model
-    assert isinstance(posterior.model, models.Linear)
+    assert isinstance(posterior.covariances.model, models.Linear)
     x, u = rng.uniform(-1.5, 1.5, (100, 2)), rng.uniform(-0.8, 0.8, (100, 1))
     errors = posterior.mean.step(x[None], u[None])[0] - system(x, u)
     assert np.abs(errors).max() < 1e-3  # the waves of the model are 0.03
@@ -185,8 +185,8 @@ def test_a_smooth_model_is_that_of_the_posterior() -> None:
     posterior = learn_posterior(model, known, np.zeros(len(known), dtype=np.intp), settings=SETTINGS)
     assert posterior is not None
     assert not posterior.covariances.without_model
-    assert posterior.model is model
-    assert posterior.settings == SETTINGS
+    assert posterior.covariances.model is model
+    assert posterior.covariances.settings == SETTINGS
 
 
 def test_numbers_that_are_too_large_for_a_linear_model_keep_the_model() -> None:
@@ -197,4 +197,4 @@ def test_numbers_that_are_too_large_for_a_linear_model_keep_the_model() -> None:
     model, sources = rough(system), np.zeros(len(known), dtype=np.intp)
     with np.errstate(all="ignore"):
         posterior = learn_posterior(model, huge, sources, np.random.default_rng(1), SETTINGS)
-    assert posterior is None or posterior.model is model
+    assert posterior is None or posterior.covariances.model is model

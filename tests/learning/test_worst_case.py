@@ -92,7 +92,9 @@ def remembering() -> Remembering:
 
 def maxima(search: WorstCaseSearch, posterior: DynamicsPosterior, known: Array, rng: np.random.Generator) -> WorstCase:
     (of_pool,) = search.planner.distances(posterior.mean, search.plans, len(search.pool))
-    return search.maxima(posterior, search.on_mean(posterior, of_pool, known, rng), known, rng, posterior.functions)
+    return search.maxima(
+        posterior, search.on_mean(posterior, of_pool, known, rng), known, rng, posterior.functions_for(1)
+    )
 
 
 def grid(dimension: int) -> Array:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Mapping
 from dataclasses import replace as replaced
 from pathlib import Path
@@ -11,6 +12,7 @@ import numpy as np
 
 from ctxval._util.arrays import Array
 from ctxval._util.checked import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, Seconds, checked
+from ctxval._util.describe import describe
 from ctxval._util.progress import progress_shown, stage
 from ctxval.campaign import display
 from ctxval.campaign.choices import Choice, Execution, OpenTrial
@@ -19,7 +21,7 @@ from ctxval.campaign.envelope import EnvelopeSearch
 from ctxval.campaign.execution import ExecutionLoop
 from ctxval.campaign.executors import Executor, worker_pool
 from ctxval.campaign.history import executed_trials
-from ctxval.campaign.identity import description_of, identify, search_of
+from ctxval.campaign.identity import identify, search_of
 from ctxval.campaign.interval_search import IntervalSearch, with_next_task
 from ctxval.campaign.plot import overview
 from ctxval.campaign.storage.other_stores import provenance_of_store
@@ -86,7 +88,13 @@ class Campaign:
         self.name = name
         trials = store if isinstance(store, Store) else Store(store)
         self.search: Search = search_of(trials) if search is None else search
-        description = description_of(validation, self.search, self.seed, name)
+        described = {
+            "name": name,
+            "seed": self.seed,
+            "search": describe(self.search),
+            "validation": validation.describe(),
+        }
+        description: dict[str, Any] = json.loads(json.dumps(described))
         identify(trials, validation, description, accept_change, remeasure)
         self.recorder = TrialRecorder(validation, self.search, trials, self.seed, description)
         if remeasure:
@@ -143,7 +151,9 @@ class Campaign:
 
     def start_offset(self, trial: Trial) -> StartOffset | None:
         """Return how far an execution started from the initial state of its task; None if it was not recorded."""
-        return self.recorder.start_offset(trial)
+        executed = self.store.trajectories([trial.number], "system").get(trial.number)
+        point = self.validation.space.point(trial.parameters)
+        return None if executed is None else start_offset(self.validation, point, executed)
 
     # Running
 
@@ -314,15 +324,15 @@ class Campaign:
         if because is not None and (parameters is None or not because.strip()):
             raise InputError('because needs the parameters of an earlier task and a reason, such as "fuse replaced".')
         # An operator's time is worth a prediction: it is stored, and the execution tests it.
-        predicts = self.recorder.search.uses_prediction
-        with progress_shown(progress), self.store.sole_writer(wait), self.recorder.predicting(predicts):
-            self.refresh()
+        recorder, predicts = self.recorder, self.recorder.search.uses_prediction
+        with progress_shown(progress), recorder.store.sole_writer(wait), recorder.predicting(predicts):
+            recorder.refresh()
             if parameters is None:
-                return self.recorder.open(Choice(self.recorder.draw(), "iid") if draw else Choice())
-            space = self.validation.space
+                return recorder.open(Choice(recorder.draw(), "iid") if draw else Choice())
+            space = recorder.validation.space
             point = space.point(parameters)
             choice = Choice(space.to_unit(point), "manual", because, parameters=space.describe_point(point))
-            return self.recorder.open(choice)
+            return recorder.open(choice)
 
     @checked
     def ask_for_verdict(
@@ -386,10 +396,10 @@ class Campaign:
             ExecutionError: if the trajectory is not a complete execution of the task; the trial stays open.
             DistanceError: if the distance function gives no usable number; the execution is stored.
         """
-        self.refresh()
+        recorder, ended = self.recorder, replace is not None
+        recorder.refresh()
         if replace is not None and not replace.strip():
             raise InputError('replace needs a reason, such as "wrong file".')
-        recorder, ended = self.recorder, replace is not None
         trial = recorder.trial(opened.number if isinstance(opened, OpenTrial) else opened, ended=ended)
         if isinstance(opened, OpenTrial) and not np.array_equal(opened.trial.unit_point, trial.unit_point):
             raise InputError(f"the open trial {opened.number} belongs to another campaign.")
@@ -398,7 +408,7 @@ class Campaign:
             trial = recorder.trial(trial.number, ended=ended)
             if trajectory is not None:
                 plan = opened.plan if isinstance(opened, OpenTrial) else recorder.plan(trial)
-                execution = execution.measured(self.validation, plan, start_tolerance)
+                execution = execution.measured(recorder.validation, plan, start_tolerance)
             return recorder.close(trial, execution, replacing=replace)
 
     @checked
@@ -453,15 +463,15 @@ class Campaign:
     @property
     def provenance(self) -> Provenance:
         """What a certificate needs besides the trials: the task space, the search, changes, and what M predicts."""
-        validation, trials = self.validation, self.trials
+        recorder, validation, trials = self.recorder, self.recorder.validation, self.recorder.trials
         offsets = [
             (start_offset(validation, validation.space.point(trial.parameters), executed), trial.number)
-            for trial, executed in executed_trials(self.store, trials)
+            for trial, executed in executed_trials(recorder.store, trials)
         ]
         return replaced(
-            provenance_of_store(self.store),
+            provenance_of_store(recorder.store),
             space=validation.space,
-            learned=LearnedFromTrials(validation, trials, self.recorder.dynamics),
+            learned=LearnedFromTrials(validation, trials, recorder.dynamics),
             start=max(((offset.size, f"{offset.text} (trial {number})") for offset, number in offsets), default=None),
             units=validation.labels.units,
         )
@@ -503,10 +513,10 @@ class Campaign:
         Raises:
             CertificateError: if an option of the certificate is not valid.
         """
-        options = CertificateOptions.or_automatic(certificate, confidence, resolution)
-        self.state_threshold(threshold)
+        options, recorder = CertificateOptions.or_automatic(certificate, confidence, resolution), self.recorder
+        recorder.store.state_threshold(float(threshold))
         with progress_shown(progress), stage("certifying"):
-            return with_next_task(judge(self.trials, threshold, options, self.provenance), self.recorder, options)
+            return with_next_task(judge(recorder.trials, threshold, options, self.provenance), recorder, options)
 
     @checked
     def certify(

@@ -30,7 +30,7 @@ from ctxval.core.trial import REDEFINED, Trial
 from ctxval.core.validation import Validation
 from ctxval.errors import CertificateError
 from ctxval.learning import DynamicsStudy, ExecutionPrediction, LearnedDynamics
-from ctxval.learning.closed_loops import LoopPlanner
+from ctxval.learning.coverage import untried_corner
 from ctxval.learning.prediction import Executed
 from ctxval.learning.tolerance import LEVELS
 from ctxval.learning.worst_case import WorstCase, is_kinked
@@ -61,6 +61,7 @@ class CampaignDynamics:
             to one experiment.
         elsewhere: returns recordings of the same system that belong to no trial of this campaign. They teach the
             dynamics, and they are no executions of this model's controllers.
+        study: learns the dynamics.
         failure: the exception because of which the last :meth:`evidence` was None, in words; None if there was none.
     """
 
@@ -69,7 +70,7 @@ class CampaignDynamics:
         identity = [redefined, description.get("validation"), *validation.physical]
         text = json.dumps(identity, sort_keys=True)
         self.experiment = hashlib.sha256(text.encode()).hexdigest()[:16]
-        self._study = DynamicsStudy(validation, seed)
+        self.study = DynamicsStudy(validation, seed)
         self._store = store
         self.elsewhere: Callable[[], Sequence[Trajectory]] = tuple
         self.failure: str | None = None
@@ -77,24 +78,15 @@ class CampaignDynamics:
 
     def use_quantile(self, quantile: float) -> None:
         """State the share of the executions of a task that distances are about, if the system is noisy."""
-        if quantile != self._study.quantile:
-            self._study = self._study.anew(quantile)
+        if quantile != self.study.quantile:
+            self.study = self.study.anew(quantile)
             self._learned = {}
-
-    @property
-    def planner(self) -> LoopPlanner:
-        """Designs controllers and runs closed loops."""
-        return self._study.planner
 
     def learned(self, trials: Sequence[Trial], *, alone: bool = False) -> LearnedDynamics | None:
         """Return what the completed trials, and unless ``alone`` other recordings teach; None if it is nothing."""
-        return self._learned_from(executed_trials(self._store, trials), () if alone else self.elsewhere())
-
-    def _learned_from(
-        self, executed: Sequence[tuple[Trial, Trajectory]], others: Sequence[Trajectory]
-    ) -> LearnedDynamics | None:
-        if not self._study.is_current:
-            self._study, self._learned = self._study.anew(), {}
+        executed, others = executed_trials(self._store, trials), () if alone else self.elsewhere()
+        if not self.study.is_current:
+            self.study, self._learned = self.study.anew(), {}
         # The other recordings are kept with what they taught, so that their identities stay theirs. A result may be
         # replaced, and then has another distance.
         key = (*((trial.number, trial.distance) for trial, _ in executed), *map(id, others))
@@ -103,7 +95,7 @@ class CampaignDynamics:
                 del self._learned[next(iter(self._learned))]
             learned, failure = None, None
             try:
-                learned = self._study.learn([(trial.unit_point, trajectory) for trial, trajectory in executed], others)
+                learned = self.study.learn([(trial.unit_point, trajectory) for trial, trajectory in executed], others)
             except Exception as error:  # users' parts
                 failure = reason_of(error)
             self._learned[key] = others, learned, failure
@@ -112,7 +104,7 @@ class CampaignDynamics:
 
     def regular(self, trials: Sequence[Trial]) -> LearnedDynamics | None:
         """Return what the regular transitions of the completed trials teach; None if there are no irregular ones."""
-        return self._study.regular([(trial.unit_point, known) for trial, known in executed_trials(self._store, trials)])
+        return self.study.regular([(trial.unit_point, known) for trial, known in executed_trials(self._store, trials)])
 
     def prediction(self, trials: Sequence[Trial], *, pending: bool = False) -> Prediction | None:
         """Return the distance predicted from the executed trajectories, for a search; None if there is none.
@@ -121,9 +113,9 @@ class CampaignDynamics:
         still seen from what was executed.
         """
         trajectories = executed_trials(self._store, trials)
-        learned = self._learned_from(trajectories, self.elsewhere())
+        learned = self.learned(trials)
         executed = [(trial.unit_point, trajectory) for trial, trajectory in trajectories]
-        predicted = self._study.prediction_of(learned, executed)
+        predicted = self.study.prediction_of(learned, executed)
         if predicted is None:
             return None
         prediction = for_known_values(predicted, trials, [trial for trial, _ in trajectories])
@@ -133,7 +125,7 @@ class CampaignDynamics:
 
         def after() -> Prediction:
             as_if = None if learned is None else self._as_if(learned, executed, waiting)
-            return (None if as_if is None else self._study.prediction_of(as_if, executed)) or prediction
+            return (None if as_if is None else self.study.prediction_of(as_if, executed)) or prediction
 
         def fallback() -> Prediction | None:
             other = None if otherwise is None else otherwise()
@@ -144,7 +136,7 @@ class CampaignDynamics:
     def _as_if(self, learned: LearnedDynamics, executed: Executed, waiting: Array) -> LearnedDynamics | None:
         """Return what is learned as if tasks ``(k, d)`` had been executed as predicted; None if it cannot be said."""
         try:
-            return self._study.as_if_executed(learned, executed, learned.trajectories(waiting), self.elsewhere())
+            return self.study.as_if_executed(learned, executed, learned.trajectories(waiting), self.elsewhere())
         except Exception:  # users' parts
             return None
 
@@ -166,7 +158,7 @@ class CampaignDynamics:
         It has a few draws, and none but the posterior mean after fewer executions than a bound needs. With ``pending``
         as in :meth:`prediction`, it helps to choose a task and decides nothing.
         """
-        with stage("searching the learned dynamics", self._study.search.screening_loops, "closed loops"):
+        with stage("searching the learned dynamics", self.study.search.screening_loops, "closed loops"):
             learned = self.learned(trials)
             few = learned is not None and len(learned.executed) < FEWEST
             if learned is not None and pending:
@@ -188,7 +180,7 @@ class CampaignDynamics:
         if kept is not None:
             return kept
         digest, draws = self._store.digest(), draws_for(confidence)
-        with stage("searching the learned dynamics", self._study.search.expected_loops(draws), "closed loops"):
+        with stage("searching the learned dynamics", self.study.search.expected_loops(draws), "closed loops"):
             learned = self.learned(trials)
             try:
                 evidence = None if learned is None else self._whole(learned, trials, draws, confidence)
@@ -206,8 +198,8 @@ class CampaignDynamics:
 
     def _key(self, trials: Sequence[Trial], confidence: float) -> str:
         text = json.dumps([(trial.number, trial.state, trial.distance, trial.note) for trial in trials])
-        physical = "".join(f"{name} " for name in self._study.given.physical)
-        return f"evidence {confidence} {self._study.quantile} {physical}{hashlib.sha256(text.encode()).hexdigest()}"
+        physical = "".join(f"{name} " for name in self.study.given.physical)
+        return f"evidence {confidence} {self.study.quantile} {physical}{hashlib.sha256(text.encode()).hexdigest()}"
 
     def _whole(
         self, learned: LearnedDynamics, trials: Sequence[Trial], draws: int, confidence: float
@@ -216,7 +208,7 @@ class CampaignDynamics:
         evidence = replace(
             evidence,
             noise=learned.drawn_from.noise,
-            groups=len(evidence.maxima) // learned.drawn_from.groups,
+            groups=learned.drawn_from.functions_for(draws),
             without_model=learned.posterior.covariances.without_model,
         )
         best = largest_distance(trials)
@@ -226,8 +218,17 @@ class CampaignDynamics:
         if doubt_of(replace(evidence, tests=0), best, bound):  # how many tests a verdict needs is not known here
             return evidence
         # Many closed loops, which only matter to a bound that nothing else withdraws.
-        evidence = _with_jumps(evidence, learned, bound)
-        evidence = replace(evidence, pocket=learned.pocket())
+        jump = learned.study.search.largest_jump(learned.drawn_from)
+        evidence = replace(evidence, jump=jump, pocket=learned.pocket())
+        # The maxima of a distance with kinks lie on ridges, which deeper searches climb higher.
+        if is_kinked(learned.study.given.distance) or (evidence.dense and jumps(evidence, bound)):
+            values, points = learned.deeper
+            low, high = values.min(), values.max()
+            evidence = replace(evidence, disagreement=float(1 - low / high) if high > 0 else 0.0)
+            if high > evidence.highest:
+                elites = np.concatenate([points[values.argmax()][None], evidence.elites])
+                missed = float(high / evidence.highest)
+                evidence = replace(evidence, missed=missed, highest=float(high), elites=elites)
         if learned.noisy is not None:
             return evidence  # a push is compared with residuals of state and input, which do not hold here
         push, rates = learned.push_response, []
@@ -238,7 +239,7 @@ class CampaignDynamics:
         return replace(evidence, pushed=PushedDistances(residuals, LEVELS, push.everywhere, push.away))
 
     def _evidence(self, learned: LearnedDynamics, trials: Sequence[Trial], worst: WorstCase) -> DynamicsEvidence:
-        names, untried, noisy = self._study.validation.space.names, learned.untried_parameter, learned.noisy
+        names, untried, noisy = self.study.validation.space.names, learned.untried_parameter, learned.noisy
         actuator, predictions = learned.study.actuator, list(self.checked(trials))
         # Drawn tests come with the distances of their tasks on what is learned by now.
         drawn = [k for k, test in enumerate(predictions) if test.origin in DRAWN and test.stored and not test.is_noisy]
@@ -259,9 +260,9 @@ class CampaignDynamics:
             learned.coverage,
             unplanned=worst.unplanned,
             untried=None if untried is None else UntriedParameter(names[untried[0]], *untried[1:]),
-            corner=learned.untried_corner,
+            corner=untried_corner(learned.executed, self.study.validation.space, learned.coverage.task),
             sharpness=worst.sharpness,
-            dense=worst.points.shape[1] <= DENSE and self._study.planner.batched,
+            dense=worst.points.shape[1] <= DENSE and self.study.planner.batched,
             quantile=noisy.quantile if noisy is not None and noisy.is_noisy else None,
             lags=0 if noisy is None else noisy.fit.history.structure.lags,
             actuator=None if actuator is None else (actuator.delay, actuator.lag),
@@ -353,20 +354,3 @@ class LearnedFromTrials:
         """Return independent draws of tasks, points of the unit cube ``(count, d)``."""
         # This random stream is none of those of trials.
         return self.validation.space.unit_draws(count, np.random.default_rng([seed, 0x7461]))
-
-
-def _with_jumps(evidence: DynamicsEvidence, learned: LearnedDynamics, bound: float) -> DynamicsEvidence:
-    """Return evidence with the largest jump between tasks; if there are jumps, with what deeper searches have found.
-
-    The maxima of a distance with kinks lie on ridges, which deeper searches climb higher.
-    """
-    evidence = replace(evidence, jump=learned.largest_jump)
-    if not (is_kinked(learned.study.given.distance) or (evidence.dense and jumps(evidence, bound))):
-        return evidence
-    values, points = learned.deeper
-    low, high = values.min(), values.max()
-    evidence = replace(evidence, disagreement=float(1 - low / high) if high > 0 else 0.0)
-    if high <= evidence.highest:
-        return evidence
-    elites = np.concatenate([points[values.argmax()][None], evidence.elites])
-    return replace(evidence, missed=float(high / evidence.highest), highest=float(high), elites=elites)

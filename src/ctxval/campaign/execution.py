@@ -87,11 +87,11 @@ class ExecutionLoop:
                     if interrupts.asked:
                         raise KeyboardInterrupt
             finally:
-                recorder.abandon_executions()
+                recorder.executing.clear()  # trials that are still open become interrupted ones
 
     def _next(self) -> Choice | Trial | None:
         """Return an interrupted trial, or the choice of a new one; None if there is nothing to execute at present."""
-        if self.budget is not None and self.recorder.executions + self.recorder.executing >= self.budget:
+        if self.budget is not None and self.recorder.executions + len(self.recorder.executing) >= self.budget:
             return None
         return self.recorder.interrupted or self.rule()
 

@@ -30,22 +30,21 @@ class GoalsOfModel:
         if self._warned or not plan.task.has_goal:
             return
         self._plans = [*self._plans[:19], plan]  # which show the range of the states
-        sentence = self._sentence() if len(self._plans) >= 3 else None
-        if sentence is not None:
-            self._warned = True
-            warnings.warn(sentence, GoalWarning, stacklevel=2)
-
-    def _sentence(self) -> str | None:
-        on_model = [plan.model_trajectory for plan in self._plans]
-        misses = goal_misses(self._validation, on_model, [plan.task.goal for plan in self._plans])
+        on_model = [each.model_trajectory for each in self._plans]
+        if len(on_model) < 3:
+            return
+        misses = goal_misses(self._validation, on_model, [each.task.goal for each in self._plans])
         if misses is None or not misses.missed.any():
-            return None
+            return
         row, column = misses.worst
         names = labels_of(self._validation.names(on_model[0].states.shape[-1], on_model[0].inputs.shape[-1])[0])
         where = self._validation.space.describe_point(self._plans[row].parameters.points)
         miss = f"{misses.misses[row, column]:.3g} in {names[int(misses.states[column])]}"
-        return (
+        self._warned = True
+        warnings.warn(
             f"the model itself does not complete its tasks: in {misses.missed.sum()} of {len(self._plans)} it ends "
             f"more than {100 * MISSED:g} % of the range of a state from its goal, by {miss} for the task {where}. "
-            "A validation against such a model says little: see `ctxval check --aspect1`."
+            "A validation against such a model says little: see `ctxval check --aspect1`.",
+            GoalWarning,
+            stacklevel=2,
         )

@@ -23,12 +23,6 @@ _QUESTION = ("name", "seed", "search", "validation.space")
 """Parts of the description that must not differ, whatever reason the user gives."""
 
 
-def description_of(validation: Validation, search: Search, seed: int, name: str) -> dict[str, Any]:
-    """Return the description that identifies an experiment in a store, in the form that JSON returns."""
-    described = {"name": name, "seed": seed, "search": describe(search), "validation": validation.describe()}
-    return dict(json.loads(json.dumps(described)))
-
-
 def search_of(store: Store) -> Search:
     """Return the search of a store, made from its description; the default search for a new store."""
     described = store.description().get("search")

@@ -137,8 +137,13 @@ class IntervalSearch:
                 if certificate.covers(self.limit, self.options.volume):
                     return None
             return Choice(self.recorder.draw(), "iid", planned_draws=0)
-        if (test := self._next_test()) is not None:
-            return test
+        trials, dynamics = self.recorder.trials, self.recorder.dynamics
+        # The next test, if the last one held and more are missing: nothing needs to be searched for that.
+        ended = all(trial.state == "completed" for trial in trials)
+        if self.tests and self.predicts and ended and trials and trials[-1].origin in DRAWN:
+            predictions = dynamics.checked(trials)
+            if predictions and held(predictions[-1], self.best) and missing_tests(predictions, self.tests):
+                return self.test()
         evidence = self._evidence()
         if evidence is not None and (task := self._beside_a_failed_test(evidence)) is not None:
             return Choice.tested(task)
@@ -149,7 +154,7 @@ class IntervalSearch:
         # The whole evidence may decide if nothing that a few draws show leaves the verdict open.
         bound, enough = self._bound(evidence), len(self._ended) >= FEWEST
         if enough and raised(evidence, bound) <= self.limit and doubt_of(evidence, self.best, bound) is None:
-            whole = self.recorder.dynamics.evidence(self.recorder.trials, self.options.confidence, keep=self.keeps)
+            whole = dynamics.evidence(trials, self.options.confidence, keep=self.keeps)
             if whole is None:
                 return self._by_distance()
             evidence = replace(whole, tests=self.tests)
@@ -157,9 +162,9 @@ class IntervalSearch:
                 if certify_dynamics(Sample.of(self._ended), evidence, self.options.confidence).covers(self.limit):
                     return None
         if isinstance(kind, Automatic) and evidence.quantile is None and self._suite is None:
-            known = self._points(self.recorder.trials)
+            known = self._points(trials)
             # Executions, besides tests, after which `auto` uses the posterior bound if the dynamics decide nothing.
-            chosen = sum(trial.origin not in DRAWN for trial in self.recorder.trials)
+            chosen = sum(trial.origin not in DRAWN for trial in trials)
             patient = chosen < 16 or self._lacks_tests_alone(evidence)
             # In few dimensions, executions soon cover the tasks, and the posterior bound of the distance may decide.
             if not patient or covering(known, kind.posterior.resolution, 0) is not None:
@@ -200,17 +205,6 @@ class IntervalSearch:
         chances = [0.0 if noise is None else noise.chance_of_more(self.limit) for noise in noises]
         likeliest = int(np.argmax(chances))
         return Choice.tested(tasks[likeliest]) if chances[likeliest] > 1 - quantile else None
-
-    def _next_test(self) -> Choice | None:
-        """Return the next test if the last one held and more are missing: nothing needs to be searched for that."""
-        trials = self.recorder.trials
-        if not self.tests or not self.predicts or any(trial.state != "completed" for trial in trials):
-            return None
-        if not trials or trials[-1].origin not in DRAWN:
-            return None
-        predictions = self.recorder.dynamics.checked(trials)
-        passed = predictions and held(predictions[-1], self.best)
-        return self.test() if passed and missing_tests(predictions, self.tests) else None
 
     def _beside_a_failed_test(self, evidence: DynamicsEvidence) -> Array | None:
         """Return a task where a test that failed may be worst; None if there is no such test, or all are executed.
@@ -255,7 +249,7 @@ class IntervalSearch:
         if self._lacks_tests_alone(evidence):
             return self.test()
         learned = self.recorder.dynamics.learned(trials)
-        steady = Steadiness(self.recorder.dynamics.planner, None if learned is None else learned.expected)
+        steady = Steadiness(self.recorder.dynamics.study.planner, None if learned is None else learned.expected)
         point = next_task(evidence, self._points(self._ended), best, limit, confidence, steady, self._near)
         waiting = waiting_points(trials)
         if len(waiting) and (point is None or np.abs(waiting - point).max(axis=1).min() <= NEAR):

@@ -71,8 +71,19 @@ class Steadiness:
                 return False
             rounded = space.rounded(point)
             beside = np.where(rounded > 0.5, rounded - 1e-9, rounded + 1e-9)
-            with stage("testing a task", unit="designs"):
-                self._tested[key] = self._alike(np.stack([point, rounded, beside]))
+            points = np.stack([point, rounded, beside])
+            self._tested[key] = True
+            # The user's own parts may fail here; this is reported when the task is planned.
+            with stage("testing a task", unit="designs"), suppress(Exception, SystemExit):
+                if self.expected is None:
+                    shares = self._pushed_loops(points)
+                else:
+                    values = self.expected(points)
+                    shares = values[:, None] / max(values[np.isfinite(values)].max(initial=0.0), 1e-300)
+                # The tasks have the same distance, or none of them a known one.
+                known = np.isfinite(shares).all(axis=1)
+                alike = known.all() and (np.ptp(shares, axis=0) <= 0.05).all()
+                self._tested[key] = not known.any() or bool(alike)
         return self._tested[key]
 
     def moved(self, point: Array, rng: np.random.Generator) -> Array:
@@ -83,19 +94,6 @@ class Steadiness:
         if steady is None:
             self._tested[point.tobytes()] = True  # it is executed, and so not rejected
         return point if steady is None else steady
-
-    def _alike(self, points: Array) -> bool:
-        """Return whether tasks ``(m, d)`` have the same distance, or none of them a known one."""
-        try:
-            if self.expected is None:
-                shares = self._pushed_loops(points)
-            else:
-                values = self.expected(points)
-                shares = values[:, None] / max(values[np.isfinite(values)].max(initial=0.0), 1e-300)
-        except (Exception, SystemExit):  # the user's own parts; their failure is reported when the task is planned
-            return True
-        known = np.isfinite(shares).all(axis=1)
-        return not known.any() or bool(known.all() and (np.ptp(shares, axis=0) <= 0.05).all())
 
     def _pushed_loops(self, points: Array) -> Array:
         """Return the states of M, disturbed by 1 % of their ranges in each step, as shares of these ranges.
@@ -129,27 +127,25 @@ class Proposals:
 
         The point of an earlier trial stays, and independent draws are only rounded.
         """
-        search, steady = self._search, Steadiness(self._dynamics.planner)
+        search, steady = self._search, Steadiness(self._dynamics.study.planner)
         with stage("choosing a task", unit="designs") if search.uses_prediction else nullcontext():
             if search.uses_prediction:
                 prediction = self._dynamics.prediction(trials, pending=True)
                 if prediction is not None:
                     expected = prediction.expected
-                    steady = Steadiness(self._dynamics.planner, lambda points: expected(points)[0])
+                    steady = Steadiness(self._dynamics.study.planner, lambda points: expected(points)[0])
                     costs = partial(costs_of, prediction, self._validation, trials)
                     left = remaining_tasks(self._validation, trials)
                     prediction = replace(prediction, costs=costs, steady=steady, candidates=left)
                 search.use_prediction(prediction)
-            point, note = self._asked(), _plain_note(search.note())
+            point, note = self._asked()
             repeats = self._validation.space.members is None
             if repeats and any(point.tobytes() == trial.unit_point.tobytes() for trial in trials):
                 return point, note
-            if not search.iid:
-                point = self._steady(point, trials, steady)
-            rounded = self._allowed(point, trials)
+            point, note = self._final(point, trials, None if search.iid else steady, note, rejected)
             if isinstance(search, SequentialSearch):
-                search.amend(rounded)
-            return rounded, _with_rejected(note, rejected + steady.rejected)
+                search.amend(point)
+            return point, note
 
     def spread(self, trials: Sequence[Trial]) -> Array | None:
         """Return a task far from all that are being executed, a point ``(d,)``, if nothing at all is known yet.
@@ -174,12 +170,11 @@ class Proposals:
         assert choice.unit_point is not None
         if choice.parameters is not None or choice.origin == "iid":
             return choice.unit_point, choice.note
-        steady, point, rejected = Steadiness(self._dynamics.planner), choice.unit_point, choice.rejected
-        if rejected is None:
-            point, rejected = self._steady(point, trials, steady), steady.rejected
-        return self._allowed(point, trials), _with_rejected(choice.note, rejected)
+        steady = Steadiness(self._dynamics.study.planner) if choice.rejected is None else None
+        return self._final(choice.unit_point, trials, steady, choice.note, choice.rejected or 0)
 
-    def _asked(self) -> Array:
+    def _asked(self) -> tuple[Array, dict[str, Any] | None]:
+        """Return the point ``(d,)`` that the search proposes, and its note, which is stored as JSON."""
         asked, dimension = self._search.ask(1), self._validation.space.dimension
         point: Array = np.empty(0)
         with suppress(TypeError, ValueError):
@@ -190,34 +185,37 @@ class Proposals:
                 f"a search must return points of the unit cube, shape (1, {dimension}), "
                 f"got {shortened(repr(asked), 200)}."
             )
-        return np.asarray(point[0])
+        note, reserved = self._search.note(), (PREDICTION, CONVERGED, UNSTEADY)
+        if isinstance(note, dict) and set(reserved) & set(note):
+            raise InputError(f"the note of a search must not have the keys {enumerated(reserved, 10)}.")
+        with suppress(TypeError, ValueError):
+            if note is None or (isinstance(note, dict) and json.dumps(note, allow_nan=False)):
+                return np.asarray(point[0]), note
+        raise InputError(f"the note of a search must be a dictionary of plain values for JSON, got {note!r}.")
 
-    def _allowed(self, point: Array, trials: Sequence[Trial]) -> Array:
-        """Return the task to execute for a point ``(d,)``: the point, rounded, or the nearest task left of a suite."""
+    def _final(
+        self,
+        point: Array,
+        trials: Sequence[Trial],
+        steady: Steadiness | None,
+        note: dict[str, Any] | None,
+        rejected: int,
+    ) -> tuple[Array, dict[str, Any] | None]:
+        """Return the task to execute for a point ``(d,)``, and its note with the number of tasks that were rejected.
+
+        It is a steady task, if that is tested, and rounded; of a suite, the nearest task that is left.
+        """
         remaining = remaining_tasks(self._validation, trials)
+        if steady is not None:
+            # On M itself, no distance depends on how a controller would react to errors of M; a suite has no others.
+            if remaining is None and not self._validation.is_on_model and not steady(point):
+                point = steady.moved(point, np.random.default_rng([len(trials), _MOVED]))
+            rejected += steady.rejected
         if remaining is None:
-            return self._validation.space.rounded(point)
-        return np.asarray(remaining[np.linalg.norm(remaining - point, axis=1).argmin()])
-
-    def _steady(self, point: Array, trials: Sequence[Trial], steady: Steadiness) -> Array:
-        if self._validation.is_on_model or self._validation.space.members is not None:
-            return point  # no distance depends on how a controller would react to errors of M; a suite has no others
-        return point if steady(point) else steady.moved(point, np.random.default_rng([len(trials), _MOVED]))
-
-
-def _with_rejected(note: dict[str, Any] | None, rejected: int) -> dict[str, Any] | None:
-    return {**(note or {}), UNSTEADY: rejected} if rejected else note
-
-
-def _plain_note(note: Any) -> dict[str, Any] | None:
-    """Return a search's note, which is stored as JSON."""
-    reserved = (PREDICTION, CONVERGED, UNSTEADY)
-    if isinstance(note, dict) and set(reserved) & set(note):
-        raise InputError(f"the note of a search must not have the keys {enumerated(reserved, 10)}.")
-    with suppress(TypeError, ValueError):
-        if note is None or (isinstance(note, dict) and json.dumps(note, allow_nan=False)):
-            return note
-    raise InputError(f"the note of a search must be a dictionary of plain values for JSON, got {note!r}.")
+            point = self._validation.space.rounded(point)
+        else:
+            point = np.asarray(remaining[np.linalg.norm(remaining - point, axis=1).argmin()])
+        return point, {**(note or {}), UNSTEADY: rejected} if rejected else note
 
 
 class IndependentDraws:
@@ -230,10 +228,6 @@ class IndependentDraws:
 
     def __init__(self, store: Store, validation: Validation, seed: int) -> None:
         self._store, self._validation, self._seed = store, validation, seed
-
-    def search_seed(self) -> int:
-        """Return the seed of a search that depends on the model, because of independent draws or a refined model."""
-        return int(np.random.SeedSequence([self._seed, self.of_model()]).generate_state(1)[0])
 
     def point(self, trials: Sequence[Trial]) -> Array:
         """Return the next draw from the distribution of tasks, a point of the unit cube ``(d,)``."""

@@ -24,7 +24,7 @@ from ctxval.campaign.storage.store import Store
 from ctxval.certificates import PLANNED
 from ctxval.core.controller import converged_of
 from ctxval.core.distance import Distance
-from ctxval.core.plan import Plan, StartOffset, start_offset, try_distance
+from ctxval.core.plan import Plan, try_distance
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import CONVERGED, Origin, Trial
 from ctxval.core.validation import Validation
@@ -39,10 +39,11 @@ class TrialRecorder:
     Attributes:
         validation: the map p -> d(p), which :meth:`remeasure` replaces.
         store: the store of the trials, after a check that it belongs to this experiment.
-        description: the description of the experiment from :func:`ctxval.campaign.identity.description_of`.
+        description: what identifies the experiment in a store, in the form that JSON returns.
         search: with the optional methods of :class:`ctxval.searches.BaseSearch`.
         draws: chooses the points of an audit.
         dynamics: what the trajectories teach of the dynamics.
+        executing: the numbers of the trials that this process is executing.
         predicts: whether executions are predicted, and the predictions stored, before they are made.
     """
 
@@ -58,7 +59,7 @@ class TrialRecorder:
         self._proposals = Proposals(validation, self.search, self.dynamics)
         self._seed = seed
         self._distance_tried = False
-        self._executing: set[int] = set()
+        self.executing: set[int] = set()
         self.replay()
 
     # Present state
@@ -74,15 +75,10 @@ class TrialRecorder:
         return sum(trial.executed for trial in self._trials)
 
     @property
-    def executing(self) -> int:
-        """The number of trials that this process is executing."""
-        return len(self._executing)
-
-    @property
     def interrupted(self) -> Trial | None:
         """The first trial whose execution was interrupted."""
         begun = (trial for trial in self._trials if trial.state == "open" and trial.attempts)
-        return next((trial for trial in begun if trial.number not in self._executing), None)
+        return next((trial for trial in begun if trial.number not in self.executing), None)
 
     @property
     def has_tasks(self) -> bool:
@@ -105,12 +101,6 @@ class TrialRecorder:
         """Return the plan of a trial, as :meth:`ctxval.Validation.plan` makes it."""
         return self.validation.plan(self.validation.space.point(trial.parameters))
 
-    def start_offset(self, trial: Trial) -> StartOffset | None:
-        """Return how far an execution started from the initial state of its task; None if it was not recorded."""
-        executed = self.store.trajectories([trial.number], "system").get(trial.number)
-        point = self.validation.space.point(trial.parameters)
-        return None if executed is None else start_offset(self.validation, point, executed)
-
     def draw(self) -> Array:
         """Return the next independent draw of a task, a point of the unit cube ``(d,)``."""
         if self.validation.space.members is not None:
@@ -125,8 +115,9 @@ class TrialRecorder:
             self._trials = self.store.trials()
             self._changes = self.store.signature()[2]
         # A refined model has learned from the tasks of the model before: the same initial tasks would not test it.
-        of_model = self.search.iid or isinstance(self.validation.model, Refined)
-        seed = self.draws.search_seed() if of_model else self._seed
+        seed = self._seed
+        if self.search.iid or isinstance(self.validation.model, Refined):
+            seed = int(np.random.SeedSequence([seed, self.draws.of_model()]).generate_state(1)[0])
         self.search.reset(self.validation.space.dimension, seed)
         history = history_of(self._trials)
         if history:
@@ -186,7 +177,7 @@ class TrialRecorder:
         begun = replace(opened.trial, attempts=opened.trial.attempts + 1)
         self.store.begin_attempt(begun, changes=self._changes)
         self._trials[begun.number] = begun
-        self._executing.add(begun.number)
+        self.executing.add(begun.number)
         return OpenTrial(begun, opened.plan)
 
     def open_all(self, choices: Iterable[Choice], attempts: int) -> list[OpenTrial]:
@@ -195,7 +186,7 @@ class TrialRecorder:
         Each choice is made when the trials before it are known. If a task cannot be planned, the trials end before it;
         if it is the first one, the error is raised.
         """
-        opened, executing, unplanned = list[OpenTrial](), set(self._executing), False
+        opened, executing, unplanned = list[OpenTrial](), set(self.executing), False
         try:
             for choice in choices:
                 trial = self._next_trial(choice, attempts)
@@ -217,14 +208,14 @@ class TrialRecorder:
                 opened.append(OpenTrial(trial, plan))
                 self._trials.append(trial)
                 if attempts:
-                    self._executing.add(trial.number)
+                    self.executing.add(trial.number)
             if opened and not opened[0].number and self.store.path is not None:
                 self.draws.of_model()  # by which other stores of the same model are found
             new = [(each.trial, each.plan.model_trajectory, None) for each in opened]
             self.store.add(new, changes=self._changes)
         except BaseException:
             # After every error, the search must know exactly the stored trials.
-            self._executing = executing
+            self.executing = executing
             self.replay()
             raise
         if unplanned:
@@ -306,14 +297,10 @@ class TrialRecorder:
 
     def _closed(self, ended: Sequence[Trial]) -> None:
         for trial in ended:
-            self._executing.discard(trial.number)
+            self.executing.discard(trial.number)
             self._trials[trial.number] = trial
             if trial.distance is not None:
                 self._tell_search([trial])
-
-    def abandon_executions(self) -> None:
-        """End the executions of this process; the trials that are still open become interrupted ones."""
-        self._executing.clear()
 
     def add(self, executions: Sequence[tuple[Plan, Execution]], wait: float = 0.0) -> list[Trial | None]:
         """Store earlier executions in one transaction; return their trials, None if one is already in the store."""
@@ -360,7 +347,7 @@ class TrialRecorder:
         refusal = InputError(
             f"trial {trial.number} is being executed: its result cannot be recorded before the execution has ended."
         )
-        if trial.number in self._executing:
+        if trial.number in self.executing:
             raise refusal
         if not trial.attempts:
             yield  # a person opened it, and no process executes it

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,7 +14,7 @@ from ctxval.certificates.expiry import EXCEEDED, FEWEST, Statistic, WatchedChann
 from ctxval.core.trajectory import COMPLETE, Trajectory
 from ctxval.core.trial import Trial
 from ctxval.errors import CertificateError, InputError
-from ctxval.learning.run_statistics import DISTANCE, RunStatistic, RunStatistics, names
+from ctxval.learning.run_statistics import DISTANCE, RunStatistics, names
 
 if TYPE_CHECKING:
     from ctxval.campaign.campaign import Campaign
@@ -66,12 +66,25 @@ class Watch:
             raise CertificateError("the executions in the store cannot be predicted from each other.")
         self._states = list(names(learned.study, len(learned.posterior.data.sizes)))
         named = {name: [each[name] for each in known if name in each] for name in max(known, key=len)}
-        channels = [
-            _channel(name, runs, self._statistics.has_noise) for name, runs in named.items() if len(runs) >= FEWEST
-        ]
+        channels = []
+        for name, runs in named.items():
+            if len(runs) >= FEWEST:
+                freedom = float(np.median([each.freedom for each in runs])) if self._statistics.has_noise else None
+                informations = [each.information for each in runs if each.information is not None]
+                information = np.sum(informations, axis=0) if informations else None
+                channels.append(WatchedChannel(name, tuple(each.value for each in runs), freedom, information))
         self.state = WatchState(threshold, false_alarms, tuple(channels))
         if state is not None:
-            if not _is_same_watch(state, self.state):
+            begun = self.state
+            settings = len(state.channels), state.threshold, state.false_alarms
+            # It follows from the same beginning, up to the rounding of another processor.
+            same = settings == (len(channels), begun.threshold, begun.false_alarms) and all(
+                known.name == channel.name
+                and len(known.certified) == len(channel.certified)
+                and np.allclose(known.certified, channel.certified, rtol=1e-4)
+                for known, channel in zip(state.channels, channels, strict=True)
+            )
+            if not same:
                 raise InputError("the state belongs to a watch of another campaign, threshold or rate of false alarms.")
             self.state = state
 
@@ -158,22 +171,3 @@ class Watch:
 
     def __repr__(self) -> str:
         return f"Watch({self.state.sentence})"
-
-
-def _channel(name: str, certified: Sequence[RunStatistic], has_noise: bool) -> WatchedChannel:
-    """Return the channel of a statistic before the first later run."""
-    freedom = float(np.median([each.freedom for each in certified])) if has_noise else None
-    known = [each.information for each in certified if each.information is not None]
-    information = np.sum(known, axis=0) if known else None
-    return WatchedChannel(name, tuple(each.value for each in certified), freedom, information)
-
-
-def _is_same_watch(state: WatchState, begun: WatchState) -> bool:
-    """Return whether a state follows from the beginning of a watch, up to the rounding of another processor."""
-    settings = len(state.channels), state.threshold, state.false_alarms
-    return settings == (len(begun.channels), begun.threshold, begun.false_alarms) and all(
-        known.name == channel.name
-        and len(known.certified) == len(channel.certified)
-        and np.allclose(known.certified, channel.certified, rtol=1e-4)
-        for known, channel in zip(state.channels, begun.channels, strict=True)
-    )

@@ -79,17 +79,27 @@ class Automatic(CertificateKind):
         if sample.suite is not None:
             return by_dynamics or certified(WholeSuite(), sample, threshold, confidence)
         try:
-            by_distance = self._tested(certified(self.posterior, sample, threshold, confidence), sample)
+            certificate, expected = certified(self.posterior, sample, threshold, confidence)
         except CertificateError:
             if by_dynamics is None:
                 raise
             return by_dynamics
-        if by_dynamics is None or _decides(by_distance[0], threshold):
-            return by_distance
+        # Tests at drawn tasks may be missing for it, too.
+        origins = [origin for origin in sample.origins if self.tests and origin in DRAWN]
+        shown = shown_by_tests(origins, sample.points.shape[1], certificate.confidence, uniform=sample.is_uniform)
+        doubt, missing = certificate.doubt, self.missing_tests(sample)
+        if doubt is None and missing:
+            doubt = (
+                f"at least {missing} more {'task' if missing == 1 else 'tasks'} drawn over the whole task space must "
+                "be executed (`ctxval run` executes them; --tests 0 leaves them out)"
+            )
+        details = {**certificate.details, "tests": {**shown, "largest_error": None}}
+        certificate = replace(certificate, details=details, doubt=doubt)
+        if by_dynamics is None or _decides(certificate, threshold):
+            return certificate, expected
         supported = threshold is not None and supported_by(by_dynamics[0], threshold)
-        if _is_sound(by_dynamics[0]) or supported:
+        if _decides(by_dynamics[0], None) or supported:
             return by_dynamics
-        certificate, expected = by_distance
         suspect = by_dynamics[0].details["suspect"]
         return replace(certificate, details={**certificate.details, "suspect": suspect}), expected
 
@@ -98,24 +108,9 @@ class Automatic(CertificateKind):
         drawn = [origin in DRAWN for origin in sample.origins]
         return max(self.tests - int((np.isfinite(sample.distances) & drawn).sum()), 0)
 
-    def _tested(self, outcome: _Outcome, sample: Sample) -> _Outcome:
-        (certificate, expected), dimension = outcome, sample.points.shape[1]
-        origins = [origin for origin in sample.origins if self.tests and origin in DRAWN]
-        shown = shown_by_tests(origins, dimension, certificate.confidence, uniform=sample.is_uniform)
-        doubt, missing = certificate.doubt, self.missing_tests(sample)
-        if doubt is None and missing:
-            doubt = (
-                f"at least {missing} more {'task' if missing == 1 else 'tasks'} drawn over the whole task space must "
-                "be executed (`ctxval run` executes them; --tests 0 leaves them out)"
-            )
-        tests = {"tests": {**shown, "largest_error": None}}
-        return replace(certificate, details={**certificate.details, **tests}, doubt=doubt), expected
-
 
 def _decides(certificate: Certificate, threshold: float | None) -> bool:
-    return _is_sound(certificate) if threshold is None else certificate.covers(threshold)
-
-
-def _is_sound(certificate: Certificate) -> bool:
-    """Return whether a certificate is not withdrawn, and no prediction failed that raises its bound."""
+    """Return whether a certificate keeps a threshold; without one, whether no failed prediction raises its bound."""
+    if threshold is not None:
+        return certificate.covers(threshold)
     return certificate.doubt is None and certificate.details.get("raised_from") is None

@@ -205,10 +205,6 @@ class KindRegistry(Registry[CertificateKind]):
         """Return the kind of a certificate; the base class :class:`CertificateKind` if the kind is not known."""
         return self.find(certificate.kind) if certificate.kind in self else CertificateKind
 
-    def with_option(self, option: str) -> tuple[str, ...]:
-        """Return the names of the built-in and registered kinds that have an option."""
-        return tuple(name for name in self.built_in if option in self.find(name).options())
-
 
 def _required(kind: Any) -> type[CertificateKind]:
     if isinstance(kind, type) and issubclass(kind, CertificateKind) and isinstance(getattr(kind, "name", None), str):
@@ -233,7 +229,7 @@ def require_use(kind: str, given: Iterable[str]) -> None:
     """Refuse options that a kind would ignore: a user who gives one expects it to have an effect."""
     options = KINDS.find(kind).options()
     for option in given:
-        kinds = " or ".join(KINDS.with_option(option))
+        kinds = " or ".join(name for name in KINDS.built_in if option in KINDS.find(name).options())
         if option not in options and not kinds:
             raise UnknownNameError.among(f"option of the certificate {kind!r}", option, options)
         if option not in options:

@@ -123,19 +123,6 @@ def raised(evidence: DynamicsEvidence, bound: float) -> float:
     return bound if worst is None else bound + worst.error / ACCURATE
 
 
-def e_value(evidence: DynamicsEvidence) -> float:
-    """Return the evidence of the last predictions against the learned noise, a product of e-values; 1 without noise.
-
-    Each prediction has p-values of the distance and of statistics of the trajectory. The mean of ``p^-1/2 / 2`` over
-    them is an e-value (Vovk and Wang 2021), so it is large with a small probability if the predictions are right.
-    """
-    product = 1.0
-    for prediction in [each for each in evidence.predictions if each.is_noisy][-EVIDENCE_OF:]:
-        p = np.array([prediction.chance_of_more(prediction.distance), *prediction.p_values])
-        product *= float((0.5 / np.sqrt(p)).mean())
-    return product
-
-
 def jumps(evidence: DynamicsEvidence, bound: float) -> bool:
     """Return whether the distance is no smooth function of the task, so that a search may miss the largest one."""
     return evidence.sharpness > SHARP or evidence.jump > JUMP * bound
@@ -212,7 +199,14 @@ def unlearned(evidence: DynamicsEvidence, bound: float) -> Iterator[str]:
         yield sentences.FEW_PREDICTIONS.format(checked=checked, needed=PREDICTIONS)
     if evidence.quantile is None and evidence.noise > NOISE:
         yield sentences.NOISY.format(percent=100 * evidence.noise, most=100 * NOISE)
-    if (against := e_value(evidence)) > EVIDENCE:
+    # Each prediction of a noisy system has p-values of the distance and of statistics of the trajectory. The mean of
+    # p^-1/2 / 2 over them is an e-value (Vovk and Wang 2021), and so is the product: if predictions are right, it is
+    # large with a small probability only.
+    against = 1.0
+    for prediction in [each for each in evidence.predictions if each.is_noisy][-EVIDENCE_OF:]:
+        p = np.array([prediction.chance_of_more(prediction.distance), *prediction.p_values])
+        against *= float((0.5 / np.sqrt(p)).mean())
+    if against > EVIDENCE:
         yield sentences.NOISE_CONTRADICTED.format(against=against, most=EVIDENCE)
     if evidence.left_out > LEFT_OUT:
         yield sentences.LEFT_OUT.format(percent=100 * evidence.left_out, most=100 * LEFT_OUT)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ctxval._util.arrays import Array, single_threaded
+from ctxval._util.arrays import single_threaded
 from ctxval.certificates.maxima import Maxima
 from ctxval.certificates.sample import Sample
 from ctxval.certificates.sentences.verdicts import outlook
@@ -76,7 +76,13 @@ def _future(
     candidates = np.concatenate([highest, rng.random((400, sample.points.shape[1]))])
     warp = conditioned.warp  # from here on everything is on the process's scale
     best, limit = float(warp.forward(sample.best)), float(warp.forward(threshold))
-    mean, covariance = _joint(conditioned, sample.points, candidates)
+    hyperparameters = conditioned.hyperparameters
+    k = hyperparameters.kernel(candidates, sample.points)
+    weights = conditioned.factor.solve(k.T)
+    mean = conditioned.mean + weights.T @ (conditioned.y - conditioned.mean)
+    missing = 1 - weights.sum(axis=0)  # the mean of the prior is uncertain, too
+    covariance = hyperparameters.kernel(candidates, candidates) - k @ weights
+    covariance = conditioned.scale2 * (covariance + conditioned.mean_variance * np.outer(missing, missing))
     L = np.linalg.cholesky(covariance + _JITTER * conditioned.scale2 * np.eye(len(candidates)))
     truth = mean + L @ rng.normal(size=len(candidates))
     tops = (mean[:, None] + L @ rng.normal(size=(len(candidates), 256))).max(axis=0)
@@ -103,13 +109,3 @@ def _future(
         best = max(best, float(truth[row]))
         bound = max(float((mean + width * deviation).max()), best)
     return np.inf, False
-
-
-def _joint(conditioned: Conditioned, X: Array, Z: Array) -> tuple[Array, Array]:
-    hyperparameters = conditioned.hyperparameters
-    k = hyperparameters.kernel(Z, X)
-    weights = conditioned.factor.solve(k.T)
-    mean = conditioned.mean + weights.T @ (conditioned.y - conditioned.mean)
-    missing = 1 - weights.sum(axis=0)  # the mean of the prior is uncertain, too
-    covariance = hyperparameters.kernel(Z, Z) - k @ weights + conditioned.mean_variance * np.outer(missing, missing)
-    return mean, conditioned.scale2 * covariance

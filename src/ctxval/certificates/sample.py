@@ -93,7 +93,13 @@ class Sample(ShortRepr):
         """
         if not trials:
             raise CertificateError("nothing was executed yet, so nothing can be certified.")
-        made_good = _made_good(trials)
+        made_good = list[MadeGood]()
+        for trial in trials:
+            if trial.state == "failed" and trial.origin != "iid":
+                later = [success for success in executions_of(trial, trials) if success.number > trial.number]
+                by = next((success for success in later if success.because), later[0] if later else None)
+                if by is not None:
+                    made_good.append(MadeGood(trial.number, by.number, by.because))
         # A distance that was told alone under another definition does not matter if the task was executed again.
         alone = [trial for trial in trials if trial.failure == TOLD_ALONE and trial.origin != "iid"]
         left_out = {failure.trial for failure in made_good} | {t.number for t in alone if executions_of(t, trials)}
@@ -113,7 +119,7 @@ class Sample(ShortRepr):
             [trial.state for trial in counted],
             [trial.number for trial in counted],
             [each if isinstance(each, int) else None for each in planned],
-            made_good,
+            tuple(made_good),
             learned,
         )
 
@@ -253,14 +259,3 @@ def executions_of(trial: Trial, trials: Sequence[Trial]) -> list[Trial]:
     """Return the trials with a distance that executed the task of a trial; scaling rounds their unit-cube points."""
     known = [other for other in trials if other.distance is not None]
     return [other for other in known if np.abs(other.unit_point - trial.unit_point).max() <= SAME]
-
-
-def _made_good(trials: Sequence[Trial]) -> tuple[MadeGood, ...]:
-    made_good = []
-    for trial in trials:
-        if trial.state == "failed" and trial.origin != "iid":
-            later = [success for success in executions_of(trial, trials) if success.number > trial.number]
-            by = next((success for success in later if success.because), later[0] if later else None)
-            if by is not None:
-                made_good.append(MadeGood(trial.number, by.number, by.because))
-    return tuple(made_good)

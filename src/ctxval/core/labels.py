@@ -30,10 +30,12 @@ class Labels(ShortRepr):
 
     def names(self, system: object, states: int, inputs: int) -> tuple[dict[str, str], dict[str, str]]:
         """Return the names of n states and m inputs with units: these labels, the system's, or ``x0, ..., u0, ...``."""
-        return (
-            _named(self.states, names_of(system, "states"), "x", states),
-            _named(self.inputs, names_of(system, "inputs"), "u", inputs),
-        )
+        named = list[dict[str, str]]()
+        for labels, kind, letter, count in ((self.states, "states", "x", states), (self.inputs, "inputs", "u", inputs)):
+            known = (dict(map(parted, labels)), names_of(system, kind))
+            usual = {f"{letter}{i}": "" for i in range(count)}
+            named.append(next((names for names in known if len(names) == count), usual))
+        return named[0], named[1]
 
 
 def require_names(states: Iterable[str], inputs: Iterable[str]) -> None:
@@ -63,10 +65,3 @@ def names_of(system: object, kind: str) -> dict[str, str]:
     if isinstance(names, Mapping):
         return {str(name): str(unit) for name, unit in names.items()}
     return dict.fromkeys(map(str, names), "") if isinstance(names, list | tuple) else {}
-
-
-def _named(labels: tuple[str, ...], of_system: dict[str, str], letter: str, count: int) -> dict[str, str]:
-    for names in (dict(map(parted, labels)), of_system):
-        if len(names) == count:
-            return names
-    return {f"{letter}{i}": "" for i in range(count)}

@@ -39,7 +39,7 @@ class Parameters:
     def __getattr__(self, name: str) -> Any:
         if name.startswith("__"):
             raise AttributeError(name)
-        return self[name]
+        return self._space.values_of(name, self.points)
 
     def __getitem__(self, name: str) -> Any:
         return self._space.values_of(name, self.points)
@@ -85,8 +85,14 @@ class TaskSpace:
             lows.append(np.atleast_1d(low))
             highs.append(np.atleast_1d(high))
         self.names: tuple[str, ...] = tuple(names)
+        self.dimension = len(names)
+        """The number of scalar parameters; the paper writes it as the cardinality of P."""
         self.low: Array = np.concatenate(lows)
         self.high: Array = np.concatenate(highs)
+        self._scalar_units = [shortened(self.units[name]) for name, low in zip(bounds, lows, strict=True) for _ in low]
+        labels = zip(names, self._scalar_units, strict=True)
+        self.labels = tuple(f"{name} [{unit}]" if unit else name for name, unit in labels)
+        """An axis label for each scalar parameter: its name and its unit."""
         # Digits after the point of tasks that are chosen, 1e-9 of the range, and of those that are recognised.
         largest = np.maximum(np.abs(self.low), np.abs(self.high))
         magnitude, extent = np.ceil(np.log10(np.maximum([largest, self.high - self.low], 1e-300)))
@@ -95,20 +101,6 @@ class TaskSpace:
         self._chosen, self._decimals = 10.0 ** np.clip([chosen, np.maximum(chosen, 12 - magnitude)], 0, 22)
         self.distribution: TaskDistribution | None = None
         """The distribution of tasks; None if it is uniform."""
-
-    @property
-    def dimension(self) -> int:
-        """The number of scalar parameters; the paper writes it as the cardinality of P."""
-        return len(self.names)
-
-    @property
-    def labels(self) -> tuple[str, ...]:
-        """An axis label for each scalar parameter: its name and its unit."""
-        units = zip(self.names, self._scalar_units(), strict=True)
-        return tuple(f"{name} [{unit}]" if unit else name for name, unit in units)
-
-    def _scalar_units(self) -> list[str]:
-        return [shortened(self.units[name]) for name, at in self._columns.items() for _ in np.atleast_1d(self.low[at])]
 
     def __repr__(self) -> str:
         bounds = {name: (self.low[at], self.high[at]) for name, at in self._columns.items()}
@@ -120,7 +112,7 @@ class TaskSpace:
         distribution = {} if self.distribution is None else {DISTRIBUTION: self.distribution.describe()}
         return distribution | {
             name: [float(low), float(high), *([unit] if unit else [])]
-            for name, low, high, unit in zip(self.names, self.low, self.high, self._scalar_units(), strict=True)
+            for name, low, high, unit in zip(self.names, self.low, self.high, self._scalar_units, strict=True)
         }
 
     def columns(self, name: str) -> int | slice:

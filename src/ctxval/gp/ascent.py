@@ -30,17 +30,10 @@ class Evaluations:
     """
 
     def __init__(self, function: Values, low: Array, high: Array, budget: int, *, strict: bool = True) -> None:
-        self.strict = strict
-        self.low, self.high = low, high
-        self.budget = budget
-        self._function = function
+        self.low, self.high, self.dimension = low, high, len(low)
+        self.budget, self.strict, self._function = budget, strict, function
         self._points: list[Array] = [np.empty((0, len(low)))]
         self._values: list[Array] = [np.empty(0)]
-
-    @property
-    def dimension(self) -> int:
-        """The number of coordinates of a point."""
-        return len(self.low)
 
     @property
     def left(self) -> int:
@@ -93,11 +86,8 @@ class Evaluations:
             return
         scale = max(float(np.abs(self.best_first()[1][0])), 1e-300)
         calls = max(2, budget // (len(starts) * (self.dimension + 1)))
-
-        def sloped(points: Array) -> tuple[Array, Array]:
-            return self._slopes(np.clip(points, self.low, self.high))
-
-        climb(sloped, starts, self.low, self.high, scale=scale, iterations=calls, evaluations=calls)
+        box = self.low, self.high
+        climb(lambda Z: self._slopes(np.clip(Z, *box)), starts, *box, scale=scale, iterations=calls, evaluations=calls)
 
     def search_lines(self, starts: Array, rounds: int) -> None:
         """Search along lines from all starts ``(s, d)`` at once, several times.
@@ -106,9 +96,15 @@ class Evaluations:
         functions have their maxima. Some steps move only the coordinates that promise most.
         """
         points, row = starts, np.arange(len(starts))
+        counts = np.maximum(1, (np.array(_COORDINATES) * self.dimension).astype(int))
         for _ in range(rounds):
             here, slopes = self._slopes(points)
-            moved = self._along(points, slopes)
+            ways = np.where(slopes > 0, self.high, self.low) - points
+            rank = np.argsort(np.argsort(-np.abs(slopes * ways), axis=1, kind="stable"), axis=1)
+            few = np.where(rank[:, None] < counts[:, None], ways[:, None], 0.0)
+            steepest = slopes / np.maximum(np.abs(slopes).max(axis=1, keepdims=True), 1e-300) * (self.high - self.low)
+            moves = [_SHARES[:, None] * ways[:, None], _LENGTHS[:, None] * steepest[:, None], few]
+            moved = np.clip(points[:, None] + np.concatenate(moves, axis=1), self.low, self.high)  # (s, q, d)
             values = self.evaluate(moved.reshape(-1, self.dimension)).reshape(moved.shape[:2])
             best = values.argmax(axis=1)
             better = values[row, best] > here
@@ -116,19 +112,7 @@ class Evaluations:
             if not better.any():
                 return
 
-    def _along(self, points: Array, slopes: Array) -> Array:
-        """Return points on the lines from each point, shape ``(s, q, d)``."""
-        ways = np.where(slopes > 0, self.high, self.low) - points
-        order = np.argsort(-np.abs(slopes * ways), axis=1, kind="stable")
-        rank = np.argsort(order, axis=1)
-        counts = np.maximum(1, (np.array(_COORDINATES) * self.dimension).astype(int))
-        few = np.where(rank[:, None] < counts[:, None], ways[:, None], 0.0)
-        steepest = slopes / np.maximum(np.abs(slopes).max(axis=1, keepdims=True), 1e-300) * (self.high - self.low)
-        moves = [_SHARES[:, None] * ways[:, None], _LENGTHS[:, None] * steepest[:, None], few]
-        return np.asarray(np.clip(points[:, None] + np.concatenate(moves, axis=1), self.low, self.high))
-
     def _slopes(self, points: Array) -> tuple[Array, Array]:
-
         n, d = points.shape
         steps = np.where(points + 1e-4 <= self.high, 1e-4, -1e-4)  # inward if a bound is near
         moved = points[:, None, :] + np.eye(d) * steps[:, None, :]
@@ -198,10 +182,17 @@ def ascend(
 def _search_few(exact: Evaluations, starts: Array, rng: np.random.Generator) -> None:
     """Sample ever closer to the best points: cheaper than slopes in few dimensions, and insensitive to kinks."""
     d, low, high = exact.dimension, exact.low, exact.high
-    pool = _pool(d, min(_POOL * d, exact.budget // 3))
+    # A pool that fills the unit cube evenly and reaches its faces: a Kronecker sequence of generalised golden ratios
+    # (Roberts 2018, "The unreasonable effectiveness of quasirandom sequences").
+    size, ratio = min(_POOL * d, exact.budget // 3), 2.0
+    for _ in range(30):
+        ratio = (1 + ratio) ** (1 / (d + 1))
+    pool = (0.5 + np.arange(1, size + 1)[:, None] * ratio ** -np.arange(1.0, d + 1)) % 1
+    margin = 0.5 / size ** (1 / d)
+    pool = np.clip((1 + 2 * margin) * pool - margin, 0, 1)
     exact.evaluate(starts)
     exact.evaluate_inside(pool)
-    best, gap = _best(exact, _ZOOMED), len(pool) ** (-1 / d)
+    best, gap = _best(exact, _ZOOMED), size ** (-1 / d)
     for _ in range(2 * d - 1):
         corners = moves_to_bounds(best[:_MOVED], low, high).reshape(-1, d)
         count = min(_SAMPLES * d, exact.left - len(best) - len(corners))
@@ -269,17 +260,3 @@ def _best(done: Evaluations, count: int, share: float = 0.1) -> Array:
     finite = done.finite()
     reach = share * float(np.linalg.norm(done.high - done.low))
     return finite[separated_rows(finite, reach, count)]
-
-
-def _pool(dimension: int, count: int) -> Array:
-    """Return points ``(count, d)`` that fill the unit cube evenly and reach its faces.
-
-    A Kronecker sequence of generalised golden ratios (Roberts 2018, "The unreasonable effectiveness of quasirandom
-    sequences").
-    """
-    ratio = 2.0
-    for _ in range(30):
-        ratio = (1 + ratio) ** (1 / (dimension + 1))
-    points = (0.5 + np.arange(1, count + 1)[:, None] * ratio ** -np.arange(1.0, dimension + 1)) % 1
-    margin = 0.5 / count ** (1 / dimension)
-    return np.asarray(np.clip((1 + 2 * margin) * points - margin, 0, 1))

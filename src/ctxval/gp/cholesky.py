@@ -51,13 +51,8 @@ class CholeskyFactor:
         """``L^-1``, shape ``(n, n)``."""
         return self.whiten(np.eye(len(self.L)))
 
-    @functools.cached_property
-    def precisions(self) -> Array:
-        """The diagonal of ``K^-1``, shape ``(n,)``: inverse variances of each observation given all others."""
-        return np.asarray((self.inverse_factor**2).sum(axis=0))
-
     def precisions_of(self, rows: Rows) -> Array:
-        """Return some entries of the diagonal of ``K^-1``, which takes less time than all of them."""
+        """Return entries of the diagonal of ``K^-1``: inverse variances of observations given all others, ``(k,)``."""
         units = np.zeros((len(self.L), len(rows)), order="F")
         units[rows, np.arange(len(rows))] = 1.0
         return np.asarray((self.whiten(units) ** 2).sum(axis=0))
@@ -94,22 +89,15 @@ def pivoted_rows(kernel: Covariance, theta: Array, X: Array, count: int, least: 
     The choice ends if no remaining variance is larger than ``least``.
     """
     towards = kernel.towards(theta, X)
-    return pivoted_cholesky(kernel.diagonal(theta, X), lambda row: towards(X[row : row + 1])[0], count, least).rows
-
-
-@dataclass(frozen=True, eq=False)
-class PivotedCholesky:
-    """A part of a positive semidefinite matrix of which each row has the largest variance given the rows before it."""
-
-    rows: Rows  # (k,)
-    L: Array  # the Cholesky factor of the matrix of these rows (k, k)
-    left: Array  # the variances of all n rows given these (n,)
+    return pivoted_cholesky(kernel.diagonal(theta, X), lambda row: towards(X[row : row + 1])[0], count, least)[0]
 
 
 def pivoted_cholesky(
     variances: Array, covariances: Callable[[int], Array], count: int, least: float
-) -> PivotedCholesky:
-    """Return the Cholesky factor of those rows of a covariance matrix that represent all of it.
+) -> tuple[Rows, Array, Array]:
+    """Return those rows ``(k,)`` of a covariance matrix that represent all of it, and their Cholesky factor ``(k, k)``.
+
+    The third array has the variances of all n rows given these ``(n,)``.
 
     The matrix has the diagonal ``variances`` ``(n,)``, and ``covariances`` returns one of its rows in an array that may
     be overwritten; count and least are as in :func:`pivoted_rows`.
@@ -128,4 +116,4 @@ def pivoted_cholesky(
         left[pivot] = 0.0
         chosen.append(pivot)
     rows = np.array(chosen, dtype=np.intp)
-    return PivotedCholesky(rows, np.tril(columns[: len(rows)][:, rows].T), np.maximum(left, 0.0))
+    return rows, np.tril(columns[: len(rows)][:, rows].T), np.maximum(left, 0.0)

@@ -33,11 +33,6 @@ class GlobalMaximum:
     values: Array  # their values (m,); minus infinity if the function was not finite there
     elites: Array  # good points that are apart from each other, the best first (e, d); none if no value is finite
 
-    @property
-    def evaluations(self) -> int:
-        """The number of points at which the function was evaluated."""
-        return len(self.values)
-
 
 def search_globally(
     function: Values, dimension: int, starts: Array, rng: np.random.Generator, *, evaluations: int = 9000
@@ -55,7 +50,17 @@ def search_globally(
     climbs = min(12, budget // (8 * (dimension + 1)))  # each with 8 slopes at least
     if climbs > 0:
         done.climb(_apart(done.finite(), 0.2)[:climbs], budget)
-    _refine(done, rng)
+    # Moves to bounds, and ever smaller random moves around the best points.
+    if not len(done.finite()):
+        done.evaluate(done.samples(done.left, rng))
+    else:
+        sizes = _batches(done.left, evaluations, 12)
+        for batch, size in enumerate(sizes):
+            done.move_to_bounds(rng)
+            best = done.best_first()[0][:100]
+            near = best[np.argsort(np.linalg.norm(best - best[0], axis=1), kind="stable")[: 2 * dimension + 2]]
+            step = 0.02 * (1e-5 / 0.02) ** (batch / max(1, len(sizes) - 1))
+            done.evaluate(_offspring(best[:4], near, step, min(size, done.left), rng))
     return GlobalMaximum(*done.best_first(), _apart(done.finite(), _REACHES[-1]))
 
 
@@ -73,10 +78,6 @@ def _apart(points: Array, reach: float) -> Array:
     return points[separated_rows(points, reach * float(np.sqrt(points.shape[1])), 30)]
 
 
-def _geometric(ends: tuple[float, float], share: float) -> float:
-    return float(ends[0] * (ends[1] / ends[0]) ** share)
-
-
 # Evolution
 
 
@@ -92,25 +93,24 @@ def _evolve(done: Evaluations, rng: np.random.Generator) -> None:
         if not len(finite):
             done.evaluate(done.samples(size, rng))
             continue
-        reach, step = _geometric(_REACHES, share), _geometric(_STEPS, share)
+        reach, step = (first * (last / first) ** share for first, last in (_REACHES, _STEPS))
         everywhere, heights = done.in_order()
         rows, seen = np.concatenate([prominent, np.arange(seen, len(everywhere))]), len(everywhere)
-        prominent = rows[np.argsort(-_prominences(everywhere, _compressed(heights), rows), kind="stable")[:200]]
+        prominent = rows[np.argsort(-_prominences(everywhere, heights, rows), kind="stable")[:200]]
         first = _offspring(_apart(finite, reach), finite[:100], step, size - size // 2, rng)
         second = _offspring(_apart(everywhere[prominent], 0.02), finite[:100], step, size // 2, rng)
         done.evaluate(np.concatenate([first, second]))
 
 
-def _compressed(values: Array) -> Array:
-    """Return values on a scale that is linear near the median and logarithmic far from it; failures are lowest."""
-    finite = values[np.isfinite(values)]
+def _prominences(points: Array, heights: Array, rows: Rows) -> Array:
+    """Return by how much some rows exceed a local linear fit, without themselves, to their neighbours.
+
+    The scale is linear near the median of the heights and logarithmic far from it; failures are lowest.
+    """
+    finite = heights[np.isfinite(heights)]
     low, middle, high = np.quantile(finite, [0.25, 0.5, 0.75])
     spread = (high - low) or float(finite.std()) or 1.0
-    return np.asarray(np.arcsinh((np.maximum(values, finite.min()) - middle) / spread))
-
-
-def _prominences(points: Array, values: Array, rows: Rows) -> Array:
-    """Return by how much the values at some rows exceed a local linear fit, without themselves, to their neighbours."""
+    values = np.arcsinh((np.maximum(heights, finite.min()) - middle) / spread)
     d = points.shape[1]
     count = min(3 * d + 4, len(points))
     distances, neighbours = KDTree(points).query(points[rows], count)
@@ -133,8 +133,11 @@ def _offspring(parents: Array, pool: Array, step: float, count: int, rng: np.ran
     children = [
         all_of + _normal(all_of.shape, step, rng),
         few_of + _normal(few_of.shape, max(step, _STEPS[0] / 3), rng) * _few(few_of.shape, rng),
-        differential + _differences(pool, differential.shape, rng),
     ]
+    # Shares of differences between two points of the pool, in a random part of the coordinates.
+    first, second = rng.integers(len(pool), size=(2, len(differential)))
+    factors = rng.uniform(0.2, 1.0, size=(len(differential), 1))
+    children.append(differential + factors * (pool[first] - pool[second]) * (rng.random(differential.shape) < 0.7))
     moved = bound + _normal(bound.shape, step, rng) * _few(bound.shape, rng)
     children.append(np.where(_few(bound.shape, rng) > 0, rng.integers(2, size=bound.shape), moved))
     return np.clip(np.concatenate(children), 0, 1)
@@ -151,27 +154,3 @@ def _few(shape: tuple[int, ...], rng: np.random.Generator) -> Array:
     chosen = rng.random(shape) < 1 / shape[1]
     chosen[np.arange(shape[0]), rng.integers(shape[1], size=shape[0])] = True
     return chosen.astype(np.float64)
-
-
-def _differences(pool: Array, shape: tuple[int, ...], rng: np.random.Generator) -> Array:
-    """Return shares of differences between two points of a pool, in a random part of the coordinates."""
-    first, second = rng.integers(len(pool), size=(2, shape[0]))
-    factor = rng.uniform(0.2, 1.0, size=(shape[0], 1))
-    return np.asarray(factor * (pool[first] - pool[second]) * (rng.random(shape) < 0.7))
-
-
-# Refinement
-
-
-def _refine(done: Evaluations, rng: np.random.Generator) -> None:
-    """Try moves to bounds and ever smaller random moves around the best points."""
-    if not len(done.finite()):
-        done.evaluate(done.samples(done.left, rng))
-        return
-    sizes = _batches(done.left, done.budget, 12)
-    for batch, size in enumerate(sizes):
-        done.move_to_bounds(rng)
-        best = done.best_first()[0][:100]
-        near = best[np.argsort(np.linalg.norm(best - best[0], axis=1), kind="stable")[: 2 * done.dimension + 2]]
-        step = _geometric((0.02, 1e-5), batch / max(1, len(sizes) - 1))
-        done.evaluate(_offspring(best[:4], near, step, min(size, done.left), rng))

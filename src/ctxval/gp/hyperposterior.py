@@ -14,6 +14,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.distance import cdist
 
 from ctxval._util.arrays import Array, ArrayLike
 from ctxval._util.boxes import climb, farthest_rows, polish
@@ -71,13 +72,6 @@ class Prior:
     equally likely. None excludes the logarithm."""
     spread_share: float = 0.5  # share of the data from which hyperparameters are drawn a second time
 
-    def warps(self, y: Array) -> tuple[Warp, ...]:
-        """Return the scales that values ``(n,)`` may have."""
-        if self.offset is None or y.min() < 0:
-            return (Warp(),)
-        mean = float(y.mean())
-        return (Warp(unit=mean), Warp(self.offset * mean))
-
     def centre(self, dimension: int) -> float:
         """Return the mean of each length-scale's logarithm."""
         return float(np.log(self.length_scale) + 0.5 * np.log(dimension))
@@ -99,20 +93,7 @@ class Hyperparameters(ShortRepr):
 
     def kernel(self, X: Array, Z: Array) -> Array:
         """Return the correlations ``(n, m)`` of g between points ``(n, d)`` and ``(m, d)``."""
-        return Matern(self.nu, ard=True)(self._theta, X, Z)
-
-    def kernel_pull(self, X: Array, Z: Array, weights: Array) -> Array:
-        """Return ``sum_j weights_ij dk(x_i, z_j)/dx_i``, shape ``(n, d)``."""
-        return Matern(self.nu, ard=True).weighted_input_gradient(self._theta, X, Z, weights)
-
-    def as_rough_as(self, other: Hyperparameters) -> Hyperparameters:
-        """Return these hyperparameters with a smoothness and a mean length-scale that are at most those of another."""
-        shrink = min(0.0, float((other.log_scales - self.log_scales).mean()))
-        return Hyperparameters(min(self.nu, other.nu), self.log_scales + shrink, self.log_noise)
-
-    @property
-    def _theta(self) -> Array:
-        return np.concatenate([[0.0], self.log_scales])
+        return Matern(self.nu, ard=True)(np.concatenate([[0.0], self.log_scales]), X, Z)
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,7 +145,10 @@ def draw_hyperparameters(
         gaps[first] = -np.inf
         rows = np.sort([first, *farthest_rows(X, gaps, apart - 1)])
         rougher = _chain(X[rows], y[rows], prior, count, rng)
-        drawn = [(draw.as_rough_as(other), warp) for (draw, warp), (other, _) in zip(drawn, rougher, strict=True)]
+        for k, ((draw, warp), (other, _)) in enumerate(zip(drawn, rougher, strict=True)):
+            shrink = min(0.0, float((other.log_scales - draw.log_scales).mean()))
+            as_rough = Hyperparameters(min(draw.nu, other.nu), draw.log_scales + shrink, draw.log_noise)
+            drawn[k] = as_rough, warp
     return [condition(draw, X, y, warp) for draw, warp in drawn]
 
 
@@ -172,7 +156,9 @@ def _chain(
     X: Array, y: Array, prior: Prior, count: int, rng: np.random.Generator
 ) -> list[tuple[Hyperparameters, Warp]]:
     """Return draws of a Markov chain over (nu, log length-scales, log noise), two sweeps apart."""
-    d, warps, (low, high) = X.shape[1], prior.warps(y), np.log(prior.noise)
+    d, (low, high), warps = X.shape[1], np.log(prior.noise), [Warp()]
+    if prior.offset is not None and y.min() >= 0:
+        warps = [Warp(unit=float(y.mean())), Warp(prior.offset * float(y.mean()))]
     choices = [(nu, warp) for nu in prior.smoothness for warp in warps]
     choice, state = choices[0], np.append(np.full(d, prior.centre(d)), 0.5 * (low + high))
     # All length-scales together, each length-scale, and the noise.
@@ -246,20 +232,16 @@ class Paths:
     means: Array  # mu of each path (s,)
     scales: Array  # sigma of each path (s,)
 
-    def __len__(self) -> int:
-        return len(self.means)
+    def __call__(self, Z: Array, precision: type = np.float64) -> Array:
+        """Return the values of all paths at the same points ``(m, d)``, shape ``(m, s)``.
 
-    def __call__(self, Z: Array) -> Array:
-        """Return the values of all paths at the same points ``(m, d)``, shape ``(m, s)``."""
-        waves = _waves(Z, self.frequencies) @ self.amplitudes
-        return np.asarray(self.means + self.scales * (waves + self._correlations(Z) @ self.corrections))
-
-    def roughly(self, Z: Array) -> Array:
-        """Return the same values with waves in single precision: ten times as fast, and enough to choose candidates."""
-        single = np.float32
-        waves = _waves(Z.astype(single), self.frequencies.astype(single)) @ self.amplitudes.astype(single)
+        With waves in single precision they are ten times as fast, and good enough to choose candidates.
+        """
+        parts: list[Array] = [part.astype(precision, copy=False) for part in (Z, self.frequencies, self.amplitudes)]
+        waves = _waves(*parts[:2]) @ parts[2]
         # The corrections are sums of large terms that cancel, so they need double precision.
-        return np.asarray(self.means + self.scales * (waves + self._correlations(Z) @ self.corrections))
+        correlations = self.conditioned.hyperparameters.kernel(Z, self.X)
+        return np.asarray(self.means + self.scales * (waves + correlations @ self.corrections))
 
     def own(self, Z: Array) -> Array:
         """Return the values of each path at its own points ``(s, q, d)``, shape ``(s, q)``."""
@@ -270,7 +252,8 @@ class Paths:
         s, q, d = Z.shape
         flat = Z.reshape(-1, d)
         waves = _waves(flat, self.frequencies).reshape(s, q, -1)
-        correlations = self._correlations(flat).reshape(s, q, -1)
+        known = self.conditioned.hyperparameters
+        correlations = known.kernel(flat, self.X).reshape(s, q, -1)
         values = np.einsum("sqf,fs->sq", waves, self.amplitudes) + np.einsum(
             "sqn,ns->sq", correlations, self.corrections
         )
@@ -282,12 +265,12 @@ class Paths:
         )
         slopes = turned @ self.frequencies
         weights = np.repeat(self.corrections.T, q, axis=0)
-        slopes += self.conditioned.hyperparameters.kernel_pull(flat, self.X, weights).reshape(s, q, d)
+        lengths = np.exp(known.log_scales)
+        _, falls = Matern(known.nu).profile_and_slope(cdist(flat / lengths, self.X / lengths))
+        pulls = weights * falls
+        slopes += ((pulls @ self.X - pulls.sum(axis=1)[:, None] * flat) / lengths**2).reshape(s, q, d)
         scales = self.scales[:, None]
         return self.means[:, None] + scales * values, scales[..., None] * slopes
-
-    def _correlations(self, Z: Array) -> Array:
-        return self.conditioned.hyperparameters.kernel(Z, self.X)
 
 
 def _waves(Z: Array, frequencies: Array) -> Array:
@@ -324,7 +307,7 @@ def maxima(paths: Paths, known: Array, rng: np.random.Generator) -> tuple[Array,
     near = np.clip(near + rng.normal(size=near.shape) * rng.choice([0.003, 0.03], (len(near), 1)), 0.0, 1.0)
     corners = rng.integers(0, 2, (min(2**d, 256), d)).astype(np.float64)
     candidates = np.concatenate([known, near, corners, rng.random((min(2048, 512 * d), d))])
-    values, groups = paths.roughly(candidates), 4 if d <= 2 else 4 * (1 + d)
+    values, groups = paths(candidates, np.float32), 4 if d <= 2 else 4 * (1 + d)
     best_of = [candidates[group::groups][values[group::groups].argmax(axis=0)] for group in range(groups)]
     starts = np.stack(best_of, axis=1)  # (s, groups, d)
     if d > 2:
@@ -333,7 +316,7 @@ def maxima(paths: Paths, known: Array, rng: np.random.Generator) -> tuple[Array,
         starts = np.take_along_axis(climbed, highest[..., None], axis=1)
     points = np.concatenate([starts, _climb(paths, starts, 30 if d <= 2 else 80)], axis=1)
     heights = paths.own(points)
-    best, rows = np.argmax(heights, axis=1), np.arange(len(paths))
+    best, rows = np.argmax(heights, axis=1), np.arange(len(paths.means))
     tops, where = heights[rows, best], points[rows, best]
     if d > 2:
         where, tops = polish(paths.own, where, tops, (np.zeros(d), np.ones(d)), d, 1e-9 * paths.scales)

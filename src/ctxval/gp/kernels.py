@@ -109,12 +109,6 @@ class Matern(Kernel):
         slope = np.exp(theta[0]) * self.profile_and_slope(cdist(Y, V))[1]
         return np.asarray(-slope[:, :, None] * (Y[:, None, :] - V[None, :, :]) / scales)
 
-    def weighted_input_gradient(self, theta: Array, X: Array, Z: Array, weights: Array) -> Array:
-        """Return ``sum_j weights_ij dk(x_i, z_j)/dx_i``, shape ``(n, d)``, without the ``(n, m, d)`` of its terms."""
-        scales = np.exp(theta[1:])
-        pulls = np.exp(theta[0]) * weights * self.profile_and_slope(cdist(X / scales, Z / scales))[1]
-        return np.asarray((pulls @ Z - pulls.sum(axis=1)[:, None] * X) / scales**2)
-
     def diagonal_input_gradient(self, theta: Array, X: Array) -> Array:
         return np.zeros_like(X)
 

@@ -65,7 +65,8 @@ class GaussianProcess:
 
     def left_out(self) -> tuple[Array, Array]:
         """Return mean and variance ``(n,)`` of each observation given all others (Rasmussen and Williams, eq. 5.12)."""
-        return self.y - self.alpha / self.factor.precisions, 1 / self.factor.precisions
+        precisions = (self.factor.inverse_factor**2).sum(axis=0)  # the diagonal of (K + noise I)^-1
+        return self.y - self.alpha / precisions, 1 / precisions
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,7 +7,7 @@ from ctxval.learning.dynamics_posterior import DynamicsPosterior, PosteriorSetti
 from ctxval.learning.dynamics_study import DynamicsStudy
 from ctxval.learning.execution_prediction import ExecutionPrediction, PredictionScore
 from ctxval.learning.learned_dynamics import LearnedDynamics
-from ctxval.learning.prediction import predict_composed, predict_distance
+from ctxval.learning.prediction import predict_composed
 from ctxval.learning.replays import Replay, replay_executed
 
 __all__ = [
@@ -21,6 +21,5 @@ __all__ = [
     "Replay",
     "learn_posterior",
     "predict_composed",
-    "predict_distance",
     "replay_executed",
 ]

@@ -11,7 +11,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from ctxval._util.arrays import Array, Mask, Rows
+from ctxval._util.arrays import Array, Rows
 from ctxval._util.boxes import moves_to_bounds
 from ctxval._util.progress import advance
 from ctxval.core.controller import Controller, ControllerWithMemory, started
@@ -132,7 +132,26 @@ class LoopPlanner:
 
     def run(self, draws: Together, planned: Sequence[PlannedTasks]) -> list[Loops]:
         """Return the closed loops of all draws on the same tasks."""
-        return [self._run(draws, plan) for plan in planned]
+        if isinstance(draws, NoisyDraws):
+            of_run, replicates = np.divmod(np.arange(len(draws) * draws.replicates), draws.replicates)
+            of_draws = (np.broadcast_to(of_run[:, None], (len(of_run), len(plan.rows))) for plan in planned)
+            return [self._noisy_loops(draws, *pair, replicates) for pair in zip(planned, of_draws, strict=True)]
+        S, runs = len(draws), []
+
+        def of_one_task(x: Array, u: Array) -> Array:
+            return np.asarray(draws.step(x[:, None], u[:, None])[:, 0])
+
+        for plan in planned:
+            task = plan.task
+            if self._takes_draws_together(plan, S):
+                start = np.repeat(task.initial_state[None], S, axis=0)
+                step: Step = draws.step if task.batch_shape else of_one_task
+                together = rollout(step, plan.controller, task.starting_at(start))
+                loops = [Trajectory(together.times, together.states[s], together.inputs[s]) for s in range(S)]
+            else:
+                loops = [rollout(DrawnModel(draws[s]).step, plan.controller, task) for s in range(S)]
+            runs.append(self._stacked(plan, loops))
+        return runs
 
     def distances(self, draws: Together, planned: Sequence[PlannedTasks], tasks: int) -> Array:
         """Return the distances ``(S, q)`` of all draws on the same q tasks; NaN for a task without a finite plan."""
@@ -150,11 +169,21 @@ class LoopPlanner:
                 of_draw = np.broadcast_to(plan.rows // q, (R, len(plan.rows)))
                 distances[:, plan.rows] = self._noisy_loops(draws, plan, of_draw, np.arange(R)).distances
             else:
-                alone = not plan.task.batch_shape
-                step = draws.model_of(int(plan.rows[0]) // q).step if alone else _own_step(draws, q, plan.rows)
-                distances[0, plan.rows] = self.compared(plan, rollout(step, plan.controller, plan.task))
+                first, last = int(plan.rows[0]) // q, int(plan.rows[-1]) // q + 1
+                needed, here = draws[np.arange(first, last)], plan.rows - first * q
+
+                def step(x: Array, u: Array, needed: DynamicsDraws = needed, here: Rows = here) -> Array:
+                    # A flat batch has some rows of all tasks of these draws.
+                    whole = [np.zeros((len(needed) * q, part.shape[-1])) for part in (x, u)]
+                    whole[0][here], whole[1][here] = x, u
+                    after = needed.step(*(part.reshape(len(needed), q, -1) for part in whole))
+                    return np.asarray(after.reshape(-1, x.shape[-1])[here])
+
+                of_tasks = step if plan.task.batch_shape else draws.model_of(first).step
+                distances[0, plan.rows] = self.compared(plan, rollout(of_tasks, plan.controller, plan.task))
             advance(R * len(plan.rows))
-        return _of_draws(draws, distances.reshape(R, S, q).swapaxes(0, 1).reshape(S * R, q))
+        of_loops = distances.reshape(R, S, q).swapaxes(0, 1).reshape(S * R, q)
+        return draws.reduced(of_loops) if isinstance(draws, NoisyDraws) else of_loops
 
     def _noisy_loops(self, draws: NoisyDraws, planned: PlannedTasks, of_draw: Rows, replicates: Rows) -> Loops:
         """Return closed loops of draws ``(L, q)`` with a sequence of noise for each row, ``(L,)``."""
@@ -181,25 +210,6 @@ class LoopPlanner:
             inputs.reshape(*shape, *inputs.shape[-2:]),
         )
 
-    def _run(self, draws: Together, planned: PlannedTasks) -> Loops:
-        task, S = planned.task, len(draws)
-        if isinstance(draws, NoisyDraws):
-            of_run, replicates = np.divmod(np.arange(S * draws.replicates), draws.replicates)
-            of_draw = np.broadcast_to(of_run[:, None], (len(of_run), len(planned.rows)))
-            return self._noisy_loops(draws, planned, of_draw, replicates)
-        if self._takes_draws_together(planned, S):
-            start = np.repeat(task.initial_state[None], S, axis=0)
-
-            def of_one_task(x: Array, u: Array) -> Array:
-                return np.asarray(draws.step(x[:, None], u[:, None])[:, 0])
-
-            step: Step = draws.step if task.batch_shape else of_one_task
-            together = rollout(step, planned.controller, task.starting_at(start))
-            loops = [Trajectory(together.times, together.states[s], together.inputs[s]) for s in range(S)]
-        else:
-            loops = [rollout(DrawnModel(draws[s]).step, planned.controller, task) for s in range(S)]
-        return self._stacked(planned, loops)
-
     def _takes_draws_together(self, planned: PlannedTasks, draws: int) -> bool:
         """Return whether controllers take draws as another first axis; if not, one loop is run after the other."""
         if draws > 1 and self._together is None:
@@ -219,10 +229,12 @@ class LoopPlanner:
 
     def compared(self, planned: PlannedTasks, loops: Trajectory) -> Array:
         """Return the distances ``(q,)`` of loops; infinity if a loop diverges, NaN if that of M does."""
-        promised, known = planned.promised.finite, planned.promised.finite & loops.finite
-        model, system = (_without_divergence(run, known) for run in (planned.promised, loops))
-        distances = np.where(known, self.measured(planned.task, model, system), np.inf)
-        return np.where(promised, distances, np.nan).reshape(len(planned.rows))
+        known, runs = planned.promised.finite & loops.finite, [planned.promised, loops]
+        if not known.all():  # a distance need not take what is not finite
+            kept = known[..., None, None]
+            runs = [Trajectory(r.times, np.where(kept, r.states, 0.0), np.where(kept, r.inputs, 0.0)) for r in runs]
+        distances = np.where(known, self.measured(planned.task, *runs), np.inf)
+        return np.where(planned.promised.finite, distances, np.nan).reshape(len(planned.rows))
 
     def measured(self, task: Task, model: Trajectory, system: Trajectory) -> Array:
         """Return the distance of each task, ``(...)``, one by one if the distance does not take a batch.
@@ -268,13 +280,9 @@ def distances_of(draws: Together, loops: Sequence[Loops], planned: Sequence[Plan
     """Return the distances ``(S, q)`` of closed loops of S draws on planned tasks; NaN for a task without a plan."""
     distances = np.full((len(draws), tasks), np.nan)
     for plan, of_batch in zip(planned, loops, strict=True):
-        distances[:, plan.rows] = _of_draws(draws, of_batch.distances)
+        each = of_batch.distances
+        distances[:, plan.rows] = draws.reduced(each) if isinstance(draws, NoisyDraws) else each
     return distances
-
-
-def _of_draws(draws: Together, distances: Array) -> Array:
-    """Return the distances ``(S, q)`` of draws from those of their loops."""
-    return draws.reduced(distances) if isinstance(draws, NoisyDraws) else distances
 
 
 def loop_pairs(planner: LoopPlanner, posterior: DynamicsPosterior, tasks: Array) -> Array:
@@ -311,27 +319,3 @@ def unseen_parameters(planner: LoopPlanner, some: Array) -> tuple[int, ...]:
             if low is not None and high is not None and low.shape == high.shape:
                 effects[j] = max(effects[j], float(np.nanmax(np.abs(high - low) / size)))
     return tuple(np.flatnonzero(effects < 0.02).tolist())
-
-
-def _own_step(draws: DynamicsDraws, tasks: int, rows: Rows) -> Step:
-    """Return the step of draws on tasks of their own: a flat batch has some rows of all their ``S q`` tasks."""
-    first, last = int(rows[0]) // tasks, int(rows[-1]) // tasks + 1
-    needed, here = draws[np.arange(first, last)], rows - first * tasks
-
-    def of_all_tasks(part: Array) -> Array:
-        whole = np.zeros(((last - first) * tasks, part.shape[-1]))
-        whole[here] = part
-        return whole.reshape(last - first, tasks, part.shape[-1])
-
-    def step(x: Array, u: Array) -> Array:
-        return np.asarray(needed.step(of_all_tasks(x), of_all_tasks(u)).reshape(-1, x.shape[-1])[here])
-
-    return step
-
-
-def _without_divergence(loops: Trajectory, finite: Mask) -> Trajectory:
-    """Return trajectories with zeros instead of those that are not finite, which a distance need not take."""
-    if finite.all():
-        return loops
-    kept = finite[..., None, None]
-    return Trajectory(loops.times, np.where(kept, loops.states, 0.0), np.where(kept, loops.inputs, 0.0))

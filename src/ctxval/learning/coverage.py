@@ -22,6 +22,7 @@ from ctxval.learning.dynamics_posterior import DynamicsPosterior
 
 MOST_COORDINATES = 6
 """Largest number of state-input coordinates for which pairs of coordinates are compared."""
+_MOSTLY = [1e-3, 1 - 1e-3]  # quantiles of what is visited that are its range
 _FARTHEST = 1e3  # standardised coordinates are limited to this magnitude
 
 
@@ -37,13 +38,16 @@ def coverage(
     States and inputs have these labels.
     """
     visited, rows = _visited(posterior, loops), np.concatenate([tasks.rows for tasks in planned])
-    width = _widths(visited)
+    width = np.maximum(np.ptp(np.quantile(visited, _MOSTLY, axis=(0, 1)), axis=0), 1e-9)
     recorded, scaled = posterior.data.pairs / width, visited / width
     beyond = _beyond(recorded, scaled)
     # Gaps between the records are looked for in a part of the tasks and of the steps.
     compared = _some(len(scaled), 256)
     some = scaled[compared][:, _some(scaled.shape[1], 40)]
-    gaps = np.stack([_nearest(recorded[:, i], some[..., i]) for i in range(len(width))], axis=-1)
+    gaps = np.empty(some.shape)  # to the nearest recorded number
+    for i, ordered in enumerate(np.sort(recorded, axis=0).T):
+        above = np.clip(np.searchsorted(ordered, some[..., i]), 1, len(ordered) - 1)
+        gaps[..., i] = np.minimum(np.abs(some[..., i] - ordered[above]), np.abs(some[..., i] - ordered[above - 1]))
     pairs, couples = None, list(map(list, combinations(range(len(width)), 2)))
     if len(width) <= MOST_COORDINATES:
         trees = [(cKDTree(recorded[:, two]), two) for two in couples]
@@ -79,15 +83,11 @@ def beyond_records(
     Each array has a number for each task, in the order of the loops. With ``executed_only``, the data that M was made
     from are no records.
     """
-    width = _widths(_visited(posterior, of_pool))
+    ends = np.quantile(_visited(posterior, of_pool), _MOSTLY, axis=(0, 1))
+    width = np.maximum(np.ptp(ends, axis=0), 1e-9)
     pairs = posterior.data.pairs[posterior.data.sources >= 0] if executed_only else posterior.data.pairs
     recorded = pairs / width
     return [_beyond(recorded, _visited(posterior, [each]) / width).max(axis=(1, 2)) for each in loops]
-
-
-def _widths(visited: Array) -> Array:
-    low, high = np.quantile(visited, [1e-3, 1 - 1e-3], axis=(0, 1))
-    return np.asarray(np.maximum(high - low, 1e-9))
 
 
 def _beyond(recorded: Array, visited: Array) -> Array:
@@ -109,13 +109,6 @@ def _some(count: int, most: int) -> Rows:
     return np.unique(np.linspace(0, count - 1, min(count, most)).astype(np.intp))
 
 
-def _nearest(recorded: Array, visited: Array) -> Array:
-    """Return the distance of each visited number ``(N,)`` to the nearest recorded one."""
-    ordered = np.sort(recorded)
-    above = np.clip(np.searchsorted(ordered, visited), 1, len(ordered) - 1)
-    return np.minimum(np.abs(visited - ordered[above]), np.abs(visited - ordered[above - 1]))
-
-
 # Pockets
 
 
@@ -130,7 +123,7 @@ def largest_pocket(visited: Array, executed: Sequence[Trajectory], labels: Seque
         executed: the executed trajectories.
         labels: the label of each state, with its unit if that is known.
     """
-    low, high = np.quantile(visited, [1e-3, 1 - 1e-3], axis=0)
+    low, high = np.quantile(visited, _MOSTLY, axis=0)
     usual = visited[((visited >= low) & (visited <= high)).all(axis=1)]
     if not executed or not len(usual):
         return None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 
@@ -33,35 +34,28 @@ class DynamicsDraws(ShortRepr):
         rows = np.atleast_1d(np.asarray(rows, dtype=np.intp))
         if len(rows) == len(self):
             return self
-        chosen = [(each, rows[(rows >= first) & (rows < last)] - first) for each, first, last in self._groups()]
-        return replace(self, expansions=tuple(each[some] for each, some in chosen if len(some)))
+        firsts = np.cumsum([0, *(len(each.weights) for each in self.expansions)])
+        chosen = [rows[(rows >= first) & (rows < last)] - first for first, last in pairwise(firsts)]
+        kept = tuple(each[some] for each, some in zip(self.expansions, chosen, strict=True) if len(some))
+        return replace(self, expansions=kept)
 
     def step(self, x: Array, u: Array) -> Array:
         """Return the next states, shapes ``(S, q, n), (S, q, m) -> (S, q, n)``."""
         with np.errstate(all="ignore"):
             z = bounded(self.data.standardised(x, u))
-            values = [expansion(z[first:last]) for expansion, first, last in self._groups()]
-            learned = values[0] if len(values) == 1 else np.concatenate(values)
+            parts = np.split(z, np.cumsum([len(each.weights) for each in self.expansions[:-1]], dtype=int))
+            learned = np.concatenate([each(part) for each, part in zip(self.expansions, parts, strict=True)])
             if self.limit is not None:
                 learned = np.minimum(np.maximum(learned, -self.limit), self.limit)
             residuals = np.zeros_like(x)
             residuals[:, :, self.data.learned] = learned
             return self.model.step(x, u[..., : self.data.inputs]) + residuals * self.data.units
 
-    def _groups(self) -> list[tuple[KernelExpansion, int, int]]:
-        """Return the expansions with the rows of their first draw and of the one after their last."""
-        ends = np.cumsum([len(expansion.weights) for expansion in self.expansions]).tolist()
-        return list(zip(self.expansions, [0, *ends], ends, strict=False))
-
     def model_of(self, index: int) -> DrawnModel:
         """Return one draw as a model."""
         if not 0 <= index < len(self):
             raise IndexError(f"there are {len(self)} draws.")
         return DrawnModel(self[index])
-
-    def alone(self, x: Array, u: Array) -> Array:
-        """Return the next states ``(..., n)`` of the only one of some draws."""
-        return DrawnModel(self).step(x, u)
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,18 +76,18 @@ class DisturbedDynamics(ShortRepr):
 
     def step(self, x: Array, u: Array) -> Array:
         """Return the next states, shapes ``(S, q, n), (S, q, m) -> (S, q, n)``."""
-        return np.asarray(self.mean.alone(x, u) + self.added(self.ways, x))
+        return np.asarray(DrawnModel(self.mean).step(x, u) + self.added(self.ways, x))
 
 
-class DrawnModel:
+@dataclass(frozen=True, eq=False)
+class DrawnModel(ShortRepr):
     """The model ``M + r_s`` of the only one of some draws."""
 
-    def __init__(self, draws: DynamicsDraws | DisturbedDynamics) -> None:
-        self._draws = draws
+    draws: DynamicsDraws | DisturbedDynamics
 
     def step(self, x: Array, u: Array) -> Array:
         """Return the next state; shapes ``(..., n), (..., m) -> (..., n)``."""
-        return np.asarray(self._draws.step(rows_of(x)[None], rows_of(u)[None]).reshape(x.shape))
+        return np.asarray(self.draws.step(rows_of(x)[None], rows_of(u)[None]).reshape(x.shape))
 
 
 def bounded(z: Array) -> Array:

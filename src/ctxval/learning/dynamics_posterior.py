@@ -21,7 +21,7 @@ from ctxval._util.representation import ShortRepr
 from ctxval.core.model import Model
 from ctxval.core.trajectory import Transitions
 from ctxval.errors import InputError
-from ctxval.gp.cholesky import pivoted_rows
+from ctxval.gp.cholesky import factorise, pivoted_rows, tenfold
 from ctxval.learning.draws import DynamicsDraws, bounded
 from ctxval.learning.hyperparameters import (
     FAMILIES,
@@ -30,7 +30,7 @@ from ctxval.learning.hyperparameters import (
     ResidualHyperparameters,
     learning_rows,
 )
-from ctxval.learning.kernel_expansion import Component, KernelExpansion, draw_functions, joined, weights_without
+from ctxval.learning.kernel_expansion import Component, KernelExpansion, draw_functions, joined
 from ctxval.learning.residual_data import ResidualData, residual_data, smoother_than
 
 _PIVOT = 0.1  # variance, as a share of the noise, below which a transition adds nothing to those chosen before it
@@ -80,25 +80,9 @@ class DynamicsPosterior(ShortRepr):
     covariances: LearnedCovariances
     data: ResidualData
 
-    @property
-    def model(self) -> Model:
-        """The model to which residuals are added."""
-        return self.covariances.model
-
-    @property
-    def settings(self) -> PosteriorSettings:
-        """Numbers on which accuracy and cost depend."""
-        return self.covariances.settings
-
-    @property
-    def groups(self) -> int:
-        """The number of draws of the hyperparameters."""
-        return len(self.components)
-
-    @property
-    def functions(self) -> int:
-        """The usual number of functions that are drawn for each of them."""
-        return self.settings.functions
+    def functions_for(self, draws: int) -> int:
+        """Return the number of functions for each draw of the hyperparameters that gives at least so many draws."""
+        return max(self.covariances.settings.functions, -(-draws // len(self.components)))
 
     @functools.cached_property
     def most_probable(self) -> Component:
@@ -132,11 +116,9 @@ class DynamicsPosterior(ShortRepr):
 
         They represent the others for the most probable hyperparameters, and are the same for all hyperparameters.
         """
-        most = self._rescaled(self.covariances.posterior.mode)
+        most, count = self._rescaled(self.covariances.posterior.mode), self.covariances.settings.centres
         with single_threaded():
-            return pivoted_rows(
-                most.kernel, most.theta, self.data.pairs, self.settings.centres, least=_PIVOT * most.noise
-            )
+            return pivoted_rows(most.kernel, most.theta, self.data.pairs, count, least=_PIVOT * most.noise)
 
     def _component(self, drawn: ResidualHyperparameters, rng: np.random.Generator) -> Component:
         with single_threaded():
@@ -189,7 +171,11 @@ class DynamicsPosterior(ShortRepr):
         return most.mean
 
     def means_without(self, left_out: Sequence[Collection[int]]) -> DynamicsDraws:
-        """Return one mean for each set of executions that are left out, as draws; the hyperparameters do not change."""
+        """Return one mean for each set of executions that are left out, as draws; the hyperparameters do not change.
+
+        Leaving out a block of data changes the weights of the others by a linear map, as leaving out one observation
+        does (Rasmussen and Williams 2006, Sec. 5.4.2). Weights that rounding errors have spoilt are computed directly.
+        """
         most, unused = self.most_probable.hyperparameters, np.setdiff1d(np.arange(len(self.data.pairs)), self.rows)
         some = unused[np.linspace(0, max(0, len(unused) - 1), min(600, len(unused))).astype(int)]
         with single_threaded():
@@ -198,8 +184,20 @@ class DynamicsPosterior(ShortRepr):
             spare = pivoted_rows(most.kernel, most.theta, self.data.pairs[some], 100, least=least)
             rows = np.concatenate([self.rows, some[spare]])
             Z, Y = self._known(rows)
-            gone = np.array([np.isin(self.data.sources[rows], list(without)) for without in left_out])
-            weights = weights_without(most.kernel(most.theta, Z, Z), most.noise, Y, gone)
+            covariance = most.kernel(most.theta, Z, Z)
+            factor = factorise(covariance, tenfold(most.noise))
+            added = float((factor.L[-1] ** 2).sum() - covariance[-1, -1])
+            inverse, known = factor.inverse(), factor.solve(Y)
+            weights = np.repeat(known[None], len(left_out), axis=0)
+            for remaining, without in zip(weights, left_out, strict=True):
+                is_gone = np.isin(self.data.sources[rows], list(without))
+                gone, kept = np.flatnonzero(is_gone), np.flatnonzero(~is_gone)
+                remaining -= inverse[:, gone] @ np.linalg.solve(inverse[np.ix_(gone, gone)], known[gone])
+                remaining[gone] = 0.0
+                misfit = covariance[kept] @ remaining + added * remaining[kept] - Y[kept]
+                if not np.abs(misfit).max(initial=0.0) < 1e-6:
+                    again = factorise(covariance[np.ix_(kept, kept)], tenfold(most.noise))
+                    remaining[kept] = again.solve(Y[kept])
         return self._limited(KernelExpansion.of(most, Z, weights))
 
     @property
@@ -208,7 +206,7 @@ class DynamicsPosterior(ShortRepr):
         return np.asarray(5.0 * np.abs(self.data.outputs).max(axis=0))
 
     def _limited(self, mean: KernelExpansion) -> DynamicsDraws:
-        return DynamicsDraws(self.model, self.data, (mean,), limit=self.limit[self.data.learned])
+        return DynamicsDraws(self.covariances.model, self.data, (mean,), limit=self.limit[self.data.learned])
 
     def unfamiliarity(self, states: Array, inputs: Array) -> Array:
         """Return the standard deviation of r along trajectories, as a share of a typical step, ``(q,)``.
@@ -219,7 +217,7 @@ class DynamicsPosterior(ShortRepr):
         horizon, data, most = inputs.shape[1], self.data, self.most_probable
         at = np.linspace(0, horizon - 1, min(12, horizon)).astype(int)
         Z = bounded(data.standardised(states[:, at], inputs[:, at]))
-        variance = most.variance(Z.reshape(-1, Z.shape[-1])).reshape(Z.shape[:2]).mean(axis=1)
+        variance = most.whitened(Z.reshape(-1, Z.shape[-1]))[1].reshape(Z.shape[:2]).mean(axis=1)
         sizes = (data.sizes / data.steps)[data.learned] ** 2 * most.squares / len(most.centres)
         return np.asarray(np.sqrt(variance * sizes.mean()))
 
@@ -239,7 +237,8 @@ class DynamicsPosterior(ShortRepr):
             functions: number of functions for each draw of the hyperparameters; that of the settings if None.
             hyperparameters: number of draws of the hyperparameters that are used; all if None.
         """
-        count = self.settings.functions if functions is None else functions
+        model, settings = self.covariances.model, self.covariances.settings
+        count = settings.functions if functions is None else functions
         with single_threaded():
             if hyperparameters is None:
                 components = self.components
@@ -248,9 +247,9 @@ class DynamicsPosterior(ShortRepr):
                 components = self._components(np.unique(rows).tolist())
             # Adjacent components of the same hyperparameters share their pivots and are evaluated together.
             groups = [list(group) for _, group in groupby(components, lambda component: id(component.factor))]
-            drawn = [draw_functions(group, relevant, count, self.settings.pivots, rng) for group in groups]
+            drawn = [draw_functions(group, relevant, count, settings.pivots, rng) for group in groups]
         expansions, left_out = zip(*drawn, strict=True)
-        return DynamicsDraws(self.model, self.data, joined(expansions), max(left_out))
+        return DynamicsDraws(model, self.data, joined(expansions), max(left_out))
 
     @property
     def deviations(self) -> Array:

@@ -27,7 +27,7 @@ from ctxval.learning.histories import Record
 from ctxval.learning.learned_dynamics import LearnedDynamics
 from ctxval.learning.noise_study import NoiseStudy
 from ctxval.learning.noisy_draws import NoisyPosterior
-from ctxval.learning.prediction import ErrorVectors, Executed, predict_composed, predict_distance
+from ctxval.learning.prediction import ErrorVectors, Executed, PredictedDistance, predict_composed
 from ctxval.learning.recorded import data_near, digest, recorded_transitions, scheduled
 from ctxval.learning.regular import split_transitions
 from ctxval.learning.worst_case import WorstCaseSearch, WorstCaseSettings
@@ -121,7 +121,7 @@ class DynamicsStudy(ShortRepr):
         """
         if self._parts is None:
             self._parts = self._state_of_parts()
-        extended, logged = self._executions(executed), () if self.extended.needs_tasks else logged
+        extended, logged = self.extended.executions(executed), () if self.extended.needs_tasks else logged
         if extended is None:
             return None
         learned = self._learn(extended, logged, with_data=True)
@@ -156,7 +156,7 @@ class DynamicsStudy(ShortRepr):
 
     def regular(self, executed: Executed) -> LearnedDynamics | None:
         """Return what the regular transitions of executions teach; None if there are no irregular ones."""
-        extended, model = self._executions(executed), before_refinement(self.validation.model)
+        extended, model = self.extended.executions(executed), before_refinement(self.validation.model)
         for with_data in (True, False):
             recorded = self._recorded(extended, (), with_data) if extended else None
             if recorded is None or self._loops is None or not extended:
@@ -172,10 +172,17 @@ class DynamicsStudy(ShortRepr):
         recorded = self._recorded(executed, logged, with_data)
         if recorded is None:
             return None
-        # If nothing could be learned when it was scheduled, it is learned now.
+        # Hyperparameters are learned as scheduled, or now if nothing could be learned then; the latest ones are kept.
         for count in dict.fromkeys((scheduled(len(executed)), len(executed))):
-            known = recorded if count == len(executed) else None
-            covariances = self._learned_covariances(executed[:count], logged, known, with_data)
+            key = digest([*(trajectory for _, trajectory in executed[:count]), *logged]) + bytes([with_data])
+            if key not in self._covariances:
+                some = recorded if count == len(executed) else self._recorded(executed[:count], logged, with_data)
+                if some is None or self._loops is None:
+                    continue
+                model, seed = before_refinement(self.validation.model), (self.seed, count, 0)
+                settings = PosteriorSettings.for_horizon(self._loops.horizon)
+                self._covariances[key] = learn_covariances(model, *some, seed, settings)
+            covariances = self._covariances[key]
             if covariances is not None:
                 return self._conditioned(covariances, recorded, executed, with_data)
         return None
@@ -190,18 +197,10 @@ class DynamicsStudy(ShortRepr):
         """
         if learned.study is not self:
             return learned.study.as_if_executed(learned, executed, pending, logged)
-        together = [*(self._executions(executed) or ()), *pending]
+        together = [*(self.extended.executions(executed) or ()), *pending]
         logged = () if self.extended.needs_tasks else logged
         recorded = self._recorded(together, logged, learned.with_data)
         return self._conditioned(learned.posterior.covariances, recorded, together, learned.with_data)
-
-    def _executions(self, executed: Executed) -> Executed | None:
-        """Return executions as closed loops of the extended validation; None if states of M cannot be estimated."""
-        return self.extended.executions(executed, scheduled(len(executed)))
-
-    def recorded(self, trajectory: Trajectory) -> Trajectory:
-        """Return a closed loop as the system records it."""
-        return self.extended.recorded(trajectory)
 
     def _conditioned(
         self,
@@ -255,26 +254,8 @@ class DynamicsStudy(ShortRepr):
             point: the task of the later one, ``(d,)``.
             trajectory: what the system recorded.
         """
-        extended = self._executions([*executed, (point, trajectory)])
+        extended = self.extended.executions([*executed, (point, trajectory)])
         return None if extended is None else extended[-1][1]
-
-    def _learned_covariances(
-        self,
-        executed: Executed,
-        logged: Sequence[Trajectory],
-        recorded: tuple[Transitions, Rows] | None,
-        with_data: bool,
-    ) -> LearnedCovariances | None:
-        """Return the covariances learned from some executions, whose transitions may be known; the latest are kept."""
-        key = digest([*(trajectory for _, trajectory in executed), *logged]) + bytes([with_data])
-        if key not in self._covariances:
-            recorded = self._recorded(executed, logged, with_data) if recorded is None else recorded
-            if recorded is None or self._loops is None:
-                return None
-            model, seed = before_refinement(self.validation.model), (self.seed, len(executed), 0)
-            settings = PosteriorSettings.for_horizon(self._loops.horizon)
-            self._covariances[key] = learn_covariances(model, *recorded, seed, settings)
-        return self._covariances[key]
 
     @functools.cached_property
     def _data(self) -> Transitions | None:
@@ -332,7 +313,7 @@ class DynamicsStudy(ShortRepr):
             before, self._actuators[key] = self._found_actuator(executed[: some - 1]), None
             if before is None:
                 if learned is None or some < len(executed):
-                    extended = self._executions(executed[:some])
+                    extended = self.extended.executions(executed[:some])
                     learned = None if extended is None else self._learn(extended, (), with_data=True)
                 # Left-out error below which nobody asks whether inputs act late.
                 if learned is None or not learned.left_out_error > 0.02:
@@ -358,7 +339,7 @@ class DynamicsStudy(ShortRepr):
         return name, least, 0.0 if without_it is None else without_it.left_out_error
 
     def _learned_alone(self, executed: Executed) -> LearnedDynamics | None:
-        extended = self._executions(executed)
+        extended = self.extended.executions(executed)
         return None if extended is None else self._learn(extended, (), with_data=False)
 
     def suspected_parameter(self, learned: LearnedDynamics) -> tuple[str, float] | None:
@@ -369,7 +350,7 @@ class DynamicsStudy(ShortRepr):
         """
         if len(learned.executed) < _FEWEST_TOLD or not learned.left_out_error > _WELL:
             return None
-        plain = [(point, self.recorded(trajectory)) for point, trajectory in learned.executions]
+        plain = [(point, self.extended.recorded(trajectory)) for point, trajectory in learned.executions]
         name, with_it, without_it = self._most_telling(plain)
         return None if name is None or with_it > without_it / 2 else (name, without_it / max(with_it, 1e-300))
 
@@ -390,8 +371,15 @@ class DynamicsStudy(ShortRepr):
                 return self._predict_vectors(executed)
             loops, seconds = self._timed_loops
             in_parallel = loops is not None and not loops.batch_shape and seconds > _SLOW
-            prediction = predict_distance(learned.study.planner, learned.posterior, learned.executed, in_parallel)
-            return replace(prediction, otherwise=lambda: self._predict_vectors(executed))
+            planner, posterior = learned.study.planner, learned.posterior
+            exact = PredictedDistance(planner, posterior, learned.executed, in_parallel, posterior.mean)
+            # If few centres do not suffice, both predictions are one, so that no task is predicted twice.
+            few = posterior.rough_mean
+            rough = exact if few is posterior.mean else replace(exact, mean=few)
+            count = 2000 if planner.batched else 150
+            return Prediction(
+                exact, exact.left_out, count, rough=rough, otherwise=lambda: self._predict_vectors(executed)
+            )
 
     def _predict_vectors(self, executed: Executed) -> Prediction | None:
         """Return the prediction from the vectors of which distances are composed; None if they are not known."""

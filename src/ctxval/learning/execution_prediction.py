@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
 from typing import Any, Self
 
@@ -73,10 +74,7 @@ class ExecutionPrediction(ShortRepr):
 
     def to_json(self) -> dict[str, Any]:
         """Return all attributes, ready for JSON: infinity is None."""
-        rows = {name: [list(row) for row in getattr(self, name)] for name in ("states", "deviations")}
-        values = {**asdict(self), "quantiles": _without_infinity(self.quantiles), "steps": list(self.steps), **rows}
-        if self.noise is not None:
-            values["noise"]["distances"] = _without_infinity(self.noise.distances)
+        values: dict[str, Any] = json.loads(json.dumps(asdict(self)), parse_constant=lambda _: None)
         return values
 
     @classmethod
@@ -85,21 +83,26 @@ class ExecutionPrediction(ShortRepr):
         try:
             prediction = cls(
                 int(values["learned_from"]),
-                _with_infinity(values["quantiles"]),
+                tuple(np.inf if value is None else float(value) for value in values["quantiles"]),
                 float(values["deviation"]),
                 tuple(int(step) for step in values["steps"]),
                 _rows(values["states"]),
                 _rows(values["deviations"]),
                 float(values["diverged"]),
-                _noise(values.get("noise")),
             )
+            if (noise := values.get("noise")) is not None:
+                distances = tuple(np.inf if value is None else float(value) for value in noise["distances"])
+                (roughness,) = _rows([noise["roughness"]])
+                noise = NoisePrediction(int(noise["runs"]), distances, roughness, _rows(noise["statistics"]))
+                if {len(row) for row in (distances, *noise.statistics)} != {len(LEVELS)} or len(noise.statistics) != 3:
+                    return None
         except (KeyError, TypeError, ValueError, OverflowError):
             return None
         widths = {len(row) for row in (*prediction.states, *prediction.deviations)}
         lengths = {len(prediction.steps), len(prediction.states), len(prediction.deviations)}
         ordered = all(low <= high for low, high in pairwise(prediction.quantiles))
         consistent = len(prediction.quantiles) == len(_QUANTILES) and ordered and len(lengths) == len(widths) == 1
-        return prediction if consistent else None
+        return replace(prediction, noise=noise) if consistent else None
 
     def score(self, executed: Trajectory, distance: float) -> PredictionScore | None:
         """Return how an execution agrees with the prediction; None if they do not fit together."""
@@ -188,26 +191,8 @@ def predict_execution(
     )
 
 
-def _noise(values: Mapping[str, Any] | None) -> NoisePrediction | None:
-    if values is None:
-        return None
-    (roughness,), distances = _rows([values["roughness"]]), _with_infinity(values["distances"])
-    noise = NoisePrediction(int(values["runs"]), distances, roughness, _rows(values["statistics"]))
-    if {len(row) for row in (noise.distances, *noise.statistics)} != {len(LEVELS)} or len(noise.statistics) != 3:
-        raise ValueError("other numbers of quantiles")
-    return noise
-
-
 def _rows(listed: Iterable[Iterable[Any]]) -> tuple[tuple[float, ...], ...]:
     return tuple(tuple(float(value) for value in row) for row in listed)
-
-
-def _without_infinity(values: Iterable[float]) -> list[float | None]:
-    return [None if np.isinf(value) else value for value in values]
-
-
-def _with_infinity(values: Iterable[Any]) -> tuple[float, ...]:
-    return tuple(np.inf if value is None else float(value) for value in values)
 
 
 def _rounded(values: ArrayLike) -> tuple[float, ...]:

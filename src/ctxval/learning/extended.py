@@ -30,7 +30,7 @@ from ctxval.core.validation import Validation
 from ctxval.learning.actuators import ActuatedController, Actuator
 from ctxval.learning.histories import Record
 from ctxval.learning.prediction import Executed
-from ctxval.learning.recorded import closed_loops_on_model
+from ctxval.learning.recorded import closed_loops_on_model, scheduled
 from ctxval.learning.state_estimates import StateEstimates
 
 
@@ -70,6 +70,8 @@ class ExtendedValidation:
         self._acting = WeakKeyDictionary[Trajectory, Trajectory]()
         of_names = (np.arange(given.space.dimension)[given.space.columns(name)] for name in given.physical)
         self._columns = np.hstack([np.empty(0, dtype=np.intp), *of_names])
+        self.needs_tasks = bool(given.physical) or given.outputs is not None or actuator is not None
+        """Whether only executions of tasks can be learned from: other recordings tell no parameters and no start."""
         self.validation = self._extended() if self.needs_tasks else given
 
     def _extended(self) -> Validation:
@@ -109,11 +111,6 @@ class ExtendedValidation:
                 labels = replace(labels, states=(*labels_of(states), *more))
         return labels
 
-    @property
-    def needs_tasks(self) -> bool:
-        """Whether only executions of tasks can be learned from: other recordings tell no parameters and no start."""
-        return bool(self.given.physical) or self.given.outputs is not None or self.actuator is not None
-
     @functools.cached_property
     def loops(self) -> Trajectory | None:
         """Closed loops on M; None if no task can be planned."""
@@ -128,12 +125,18 @@ class ExtendedValidation:
         pairs = pairs[np.isfinite(pairs).all(axis=1)]
         return np.asarray(pairs[:: max(1, len(pairs) // 600)])
 
-    def executions(self, executed: Executed, some: int) -> Executed | None:
+    def executions(self, executed: Executed, some: int | None = None) -> Executed | None:
         """Return executions as closed loops of the other validation; None if states of M cannot be estimated.
 
-        Estimates are learned from the first ``some`` of them.
+        Estimates are learned from the first ``some`` of them, by default as many as are scheduled.
         """
-        acting = [(point, self._actuated(trajectory)) for point, trajectory in executed]
+        some = scheduled(len(executed)) if some is None else some
+        acting = list(executed)
+        if self.actuator is not None:  # with the inputs that act alone, the same object each time
+            for _, trajectory in executed:
+                if trajectory not in self._acting:
+                    self._acting[trajectory] = replace(trajectory, inputs=self.actuator.acting(trajectory.inputs))
+            acting = [(point, self._acting[trajectory]) for point, trajectory in executed]
         if self.given.outputs is not None:
             states = None if self.estimates is None else self.estimates.of(acting, some)
             if states is None:
@@ -149,14 +152,6 @@ class ExtendedValidation:
                 trajectory = replace(trajectory, inputs=np.concatenate([trajectory.inputs, commanded], axis=-1))
             together.append((point, trajectory))
         return together
-
-    def _actuated(self, trajectory: Trajectory) -> Trajectory:
-        """Return an execution with the inputs that act alone, the same object each time."""
-        if self.actuator is None:
-            return trajectory
-        if trajectory not in self._acting:
-            self._acting[trajectory] = replace(trajectory, inputs=self.actuator.acting(trajectory.inputs))
-        return self._acting[trajectory]
 
     def of(self, given: Validation) -> ExtendedValidation:
         """Return the same with other physical parameters; the states of M along executions are the same."""

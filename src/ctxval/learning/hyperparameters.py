@@ -19,7 +19,7 @@ from scipy.special import gammaln, logsumexp
 from ctxval._util.arrays import Array, Rows
 from ctxval.errors import InputError
 from ctxval.gp.cholesky import CholeskyFactor, factorise, pivoted_rows
-from ctxval.gp.kernels import Bounds, Covariance, Linear, Matern, Towards
+from ctxval.gp.kernels import Covariance, Linear, Matern, Towards
 from ctxval.gp.regression import most_likely
 
 FAMILIES = ((2.5, 0.0), (2.5, 1.0), (1.5, 0.0))
@@ -52,10 +52,15 @@ class ResidualKernel(Covariance):
     growth: float  # factor of the product of the inputs; 0 for a stationary Matern part
     inputs: int  # the number m of inputs of the system, which are the last columns
 
-    def bounds(self, dimension: int) -> Bounds:
-        """Return the bounds of theta; no column is irrelevant beyond 100 standard deviations of the data."""
-        scales = (float(np.log(0.05)), float(np.log(100.0)))
-        return [*[scales] * dimension, *_LINEAR_KERNEL.bounds(dimension)]
+    def box(self, dimension: int) -> tuple[Array, Array]:
+        """Return the bounds of (theta, log noise); no column is irrelevant beyond 100 standard deviations."""
+        low, high = np.log([*[(0.05, 100.0)] * dimension, *[_LINEAR_KERNEL.variance] * 2, NOISE]).T
+        return low, high
+
+    def within(self, parameters: Array) -> tuple[Array, float]:
+        """Return theta and the noise variance, within their bounds, for (theta, log noise)."""
+        within = np.clip(parameters, *self.box(len(parameters) - 3))
+        return within[:-1], float(np.exp(within[-1]))
 
     def towards(self, theta: Array, Z: Array) -> Towards:
         """Return the covariances with points ``(m, k)`` as a function of other points."""
@@ -71,7 +76,7 @@ class ResidualKernel(Covariance):
 
     def diagonal(self, theta: Array, X: Array) -> Array:
         """Return the variances k(z, z), shape ``(n,)``."""
-        grown = 1 + self.growth * (self._inputs(X) ** 2).sum(axis=1)
+        grown = 1 + self.growth * (X[:, X.shape[1] - self.inputs :] ** 2).sum(axis=1)
         return np.asarray(grown + _LINEAR_KERNEL.diagonal(theta[-2:], X))
 
     def with_gradient(self, theta: Array, Z: Array) -> tuple[Array, Callable[[Array], Array]]:
@@ -95,15 +100,12 @@ class ResidualKernel(Covariance):
     def _grow(self, covariances: Array, X: Array, Z: Array) -> Array:
         """Multiply covariances ``(n, m)`` by the growth with the inputs, and return them."""
         if self.growth:
-            factors = self._inputs(X) @ self._inputs(Z).T
+            first = Z.shape[1] - self.inputs  # a system may have none
+            factors = X[:, first:] @ Z[:, first:].T
             factors *= self.growth
             factors += 1
             covariances *= factors
         return covariances
-
-    def _inputs(self, Z: Array) -> Array:
-        """Return the columns of the inputs; a system may have none."""
-        return Z[:, Z.shape[1] - self.inputs :]
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,54 +130,38 @@ class Mode:
     @functools.cached_property
     def scale(self) -> Array:
         """A root ``(D, D)`` of the inverse of the curvature of the log posterior, by differences of its gradient."""
-
-        def slopes(parameters: Array) -> Array:
-            try:
-                return log_posterior(self.kernel, parameters, self.Z, self.Y)[1]
-            except InputError:  # the covariance is not positive definite
-                return np.zeros_like(parameters)
-
-        low, high = _box(self.kernel, self.Z.shape[1])
+        low, high = self.kernel.box(self.Z.shape[1])
         curvature = np.empty((len(self.place), len(self.place)))
         for i, step in enumerate(np.eye(len(self.place)) * 0.05):
-            up, down = np.minimum(self.place + step, high), np.maximum(self.place - step, low)
-            curvature[i] = (slopes(down) - slopes(up)) / (up - down)[i]
+            ends, slopes = (np.minimum(self.place + step, high), np.maximum(self.place - step, low)), []
+            for end in ends:
+                try:
+                    slopes.append(log_posterior(self.kernel, end, self.Z, self.Y)[1])
+                except InputError:  # the covariance is not positive definite
+                    slopes.append(np.zeros_like(end))
+            curvature[i] = (slopes[1] - slopes[0]) / (ends[0] - ends[1])[i]
         values, vectors = np.linalg.eigh(0.5 * (curvature + curvature.T))
         # No direction is less certain than a standard deviation of 2 in the logarithm.
         return np.asarray(vectors / np.sqrt(np.maximum(values, 0.25)))
-
-    def log_posterior_or_none(self, parameters: Array) -> float:
-        """Return the log density of (theta, log noise); minus infinity if the covariance is not positive definite."""
-        try:
-            theta, noise = _within(self.kernel, parameters)
-            return _log_likelihood(self.kernel(theta, self.Z, self.Z), noise, self.Y)[0] + _log_prior(parameters)[0]
-        except InputError:
-            return -np.inf
-
-    def proposals(self, count: int, rng: np.random.Generator) -> Array:
-        """Return draws ``(count, D)`` of a t distribution around the mode."""
-        normal = rng.standard_normal((count, len(self.place)))
-        return self.place + normal / np.sqrt(rng.chisquare(_FREEDOM, (count, 1)) / _FREEDOM) @ self.scale.T
-
-    def log_density(self, draws: Array) -> Array:
-        """Return the logarithms of the density ``(count,)`` of this t distribution."""
-        D = len(self.place)
-        constant = gammaln((_FREEDOM + D) / 2) - gammaln(_FREEDOM / 2) - 0.5 * D * np.log(_FREEDOM * np.pi)
-        squares = (np.linalg.solve(self.scale, (draws - self.place).T) ** 2).sum(axis=0)
-        log_volume = np.linalg.slogdet(self.scale)[1]
-        return np.asarray(constant - log_volume - 0.5 * (_FREEDOM + D) * np.log1p(squares / _FREEDOM))
 
 
 @dataclass(frozen=True, eq=False)
 class HyperparameterPosterior:
     """The posterior of the hyperparameters, given standardised residuals."""
 
-    families: tuple[tuple[Mode, ...], ...]  # the modes of each family of covariances
+    # the modes of each family of covariances, the highest first: with little noise, with much, or one that is both
+    families: tuple[tuple[Mode, ...], ...]
 
     @classmethod
     def given(cls, Z: Array, Y: Array, inputs: int, families: Sequence[tuple[float, float]]) -> HyperparameterPosterior:
         """Return the posterior given standardised pairs ``(N, k)`` and residuals ``(N, n)``."""
-        return cls(tuple(_modes_of(ResidualKernel(nu, growth, inputs), Z, Y) for nu, growth in families))
+        modes = []
+        for nu, growth in families:
+            kernel = ResidualKernel(nu, growth, inputs)
+            (height, place), (lower, other) = ends = climbed(kernel, Z, Y)
+            relevant = height - lower < 12.0 and np.abs(place - other).max() > 0.5  # else negligible, or the same mode
+            modes.append(tuple(Mode(kernel, *end, Z, Y) for end in (ends if relevant else ends[:1])))
+        return cls(tuple(modes))
 
     @functools.cached_property
     def highest(self) -> Mode:
@@ -185,21 +171,37 @@ class HyperparameterPosterior:
     @functools.cached_property
     def mode(self) -> ResidualHyperparameters:
         """The most probable hyperparameters."""
-        return ResidualHyperparameters(self.highest.kernel, *_within(self.highest.kernel, self.highest.place))
+        return ResidualHyperparameters(self.highest.kernel, *self.highest.kernel.within(self.highest.place))
 
     def draw(self, count: int, rng: np.random.Generator) -> list[ResidualHyperparameters]:
         """Return ``count`` draws; hyperparameters that are drawn again are the same object, and follow each other."""
         places, weights = [], []
         for family in self.families:
-            drawn = np.concatenate([mode.proposals(48 // len(family), rng) for mode in family])
+            kernel, Z, Y, D = family[0].kernel, family[0].Z, family[0].Y, len(family[0].place)
+            proposals, heights, densities = [], [], []
+            for mode in family:  # draws of t distributions around the modes
+                normal = rng.standard_normal((48 // len(family), D))
+                deviations = normal / np.sqrt(rng.chisquare(_FREEDOM, (len(normal), 1)) / _FREEDOM)
+                proposals.append(mode.place + deviations @ mode.scale.T)
+            drawn = np.concatenate(proposals)
             # All modes of a family make one proposal distribution: the mixture of theirs in equal parts.
-            density = logsumexp([mode.log_density(drawn) for mode in family], axis=0) - np.log(len(family))
-            places += [(family[0].kernel, place) for place in drawn]
-            heights = [family[0].log_posterior_or_none(place) for place in drawn]
+            constant = gammaln((_FREEDOM + D) / 2) - gammaln(_FREEDOM / 2) - 0.5 * D * np.log(_FREEDOM * np.pi)
+            for mode in family:
+                squares = (np.linalg.solve(mode.scale, (drawn - mode.place).T) ** 2).sum(axis=0)
+                log_volume = np.linalg.slogdet(mode.scale)[1]
+                densities.append(constant - log_volume - 0.5 * (_FREEDOM + D) * np.log1p(squares / _FREEDOM))
+            density = logsumexp(densities, axis=0) - np.log(len(family))
+            for place in drawn:
+                theta, noise = kernel.within(place)
+                try:
+                    heights.append(_log_likelihood(kernel(theta, Z, Z), noise, Y)[0] + _log_prior(place)[0])
+                except InputError:  # the covariance is not positive definite
+                    heights.append(-np.inf)
+            places += [(kernel, place) for place in drawn]
             weights.append(np.array(heights) - density)
         chosen = _resampled(np.concatenate(weights), count, rng).tolist()
         # What follows from the same object is computed once.
-        draws = {row: ResidualHyperparameters(places[row][0], *_within(*places[row])) for row in chosen}
+        draws = {row: ResidualHyperparameters(places[row][0], *places[row][0].within(places[row][1])) for row in chosen}
         return [draws[row] for row in chosen]
 
 
@@ -207,12 +209,7 @@ def draw_prior(dimension: int, inputs: int, rng: np.random.Generator) -> Residua
     """Return hyperparameters from the prior, such as those of a system on which a posterior is tested."""
     nu, growth = FAMILIES[rng.integers(len(FAMILIES))]
     kernel, (centres, deviations) = ResidualKernel(nu, growth, inputs), _prior(dimension + 3)
-    return ResidualHyperparameters(kernel, *_within(kernel, centres + deviations * rng.standard_normal(dimension + 3)))
-
-
-def highest_log_posterior(Z: Array, Y: Array, inputs: int) -> float:
-    """Return the largest log density of the hyperparameters of the most usual family, up to a constant."""
-    return _climbed(ResidualKernel(*FAMILIES[0], inputs), Z, Y)[0][0]
+    return ResidualHyperparameters(kernel, *kernel.within(centres + deviations * rng.standard_normal(dimension + 3)))
 
 
 def learning_rows(Z: Array, inputs: int, count: int) -> Rows:
@@ -228,7 +225,7 @@ def log_posterior(kernel: ResidualKernel, parameters: Array, Z: Array, Y: Array)
     The likelihood is ``-n log det(K) / 2 - N / 2 sum_i log(y_i' K^-1 y_i)``, in which the amplitudes are integrated
     out. It does not change beyond the bounds of the hyperparameters, where only the prior does.
     """
-    theta, noise = _within(kernel, parameters)
+    theta, noise = kernel.within(parameters)
     K, gradient = kernel.with_gradient(theta, Z)
     value, factor, scaled = _log_likelihood(K, noise, Y)
     W = scaled @ scaled.T
@@ -260,23 +257,10 @@ def _prior(count: int) -> tuple[Array, Array]:
     return np.log(medians), deviations
 
 
-def _box(kernel: ResidualKernel, dimension: int) -> tuple[Array, Array]:
-    """Return lower and upper bounds of (theta, log noise)."""
-    low, high = np.array([*kernel.bounds(dimension), np.log(NOISE)]).T
-    return low, high
-
-
-def _modes_of(kernel: ResidualKernel, Z: Array, Y: Array) -> tuple[Mode, ...]:
-    """Return the modes of a family, the highest first: one with little noise, one with much, or one that is both."""
-    (height, place), (lower, other) = climbed = _climbed(kernel, Z, Y)
-    relevant = height - lower < 12.0 and np.abs(place - other).max() > 0.5  # else negligible, or the same mode
-    return tuple(Mode(kernel, *end, Z, Y) for end in (climbed if relevant else climbed[:1]))
-
-
-def _climbed(kernel: ResidualKernel, Z: Array, Y: Array) -> list[tuple[float, Array]]:
+def climbed(kernel: ResidualKernel, Z: Array, Y: Array) -> list[tuple[float, Array]]:
     """Return the log posterior and its place where climbs from little and from much noise end, the highest first."""
     density = functools.partial(log_posterior, kernel, Z=Z, Y=Y)
-    bounds = list(zip(*_box(kernel, Z.shape[1]), strict=True))
+    bounds = list(zip(*kernel.box(Z.shape[1]), strict=True))
     # The data can look like a rough function, or like a smooth one with noise.
     starts = [np.log([*[_LENGTH[0]] * Z.shape[1], 1.0, 1.0, noise]) for noise in (1e-5, 0.1)]
     modes = [most_likely(density, start[None], bounds, tolerance=1e-7) for start in starts]
@@ -290,9 +274,3 @@ def _resampled(log_weights: Array, count: int, rng: np.random.Generator) -> Rows
     edges = np.cumsum(weights) / weights.sum()
     places = (np.arange(count) + rng.random()) / count
     return np.asarray(np.minimum(np.searchsorted(edges, places), len(weights) - 1), dtype=np.intp)
-
-
-def _within(kernel: ResidualKernel, parameters: Array) -> tuple[Array, float]:
-    """Return theta and the noise variance, within their bounds."""
-    within = np.clip(parameters, *_box(kernel, len(parameters) - 3))
-    return within[:-1], float(np.exp(within[-1]))

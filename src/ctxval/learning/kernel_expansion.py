@@ -12,7 +12,7 @@ from itertools import groupby, product
 
 import numpy as np
 
-from ctxval._util.arrays import Array, Mask, Rows
+from ctxval._util.arrays import Array, Rows
 from ctxval.gp.cholesky import CholeskyFactor, factorise, pivoted_cholesky, tenfold
 from ctxval.learning.hyperparameters import ResidualHyperparameters, ResidualKernel
 
@@ -36,18 +36,27 @@ class KernelExpansion:
     def __call__(self, z: Array) -> Array:
         """Return the values ``(S, q, n)`` of each function at arguments of its own, ``(S, q, k)``."""
         (S, q, k), M = z.shape, self.centres.shape[1]
-        # The squared distance to a centre is linear in an argument, its squared entries and 1.
+        linear, squared, growth = self._factors
         extended = np.empty((S, q, 2 * k + 1))
         extended[..., :k] = z
         np.multiply(z, z, out=extended[..., k:-1])
         extended[..., -1] = 1.0
-        values = np.matmul(extended, self._linear)
-        # As many covariances as stay in the processor's cache are computed together.
+        values = np.matmul(extended, linear)
+        # As many covariances as stay in the processor's cache are computed together, (s, M, q).
         largest = max(1, 20_000 // M)
         together = max(1, largest // max(1, q))
         for s, j in product(range(0, S, together), range(0, q, largest)):
-            block, some = (slice(s, s + together), slice(j, j + largest)), slice(s, s + together)
-            covariances = self._matern(some, extended[block].swapaxes(1, 2))
+            some, block = slice(s, s + together), (slice(s, s + together), slice(j, j + largest))
+            arguments = extended[block].swapaxes(1, 2)
+            r2 = np.matmul(squared[some], arguments)
+            np.abs(r2, out=r2)  # rounding errors around zero
+            r = np.sqrt(r2)
+            polynomial = _polynomial(self.kernel.nu, r, r2)
+            np.negative(r, out=r)
+            covariances = np.exp(r, out=r)
+            covariances *= polynomial
+            if growth is not None:
+                covariances *= np.matmul(growth[some], arguments)
             values[block] += np.matmul(covariances.swapaxes(1, 2), self.weights[some])
         return np.asarray(values)
 
@@ -56,64 +65,43 @@ class KernelExpansion:
         return KernelExpansion(self.kernel, self.thetas[rows], self.centres[rows], self.weights[rows])
 
     @functools.cached_property
-    def _linear(self) -> Array:
-        """The factors of an extended argument in the linear part, shape ``(S, 2 k + 1, n)``."""
+    def _factors(self) -> tuple[Array, Array, Array | None]:
+        """What is linear in an argument, its squared entries and 1, as factors of these 2 k + 1 numbers.
+
+        These are the linear part ``(S, 2 k + 1, n)``, the squares of a Matern function's arguments ``(S, M, 2 k + 1)``,
+        and the growth with the inputs in the same shape; None if there is none.
+        """
+        centres, k, m = self.centres, self.centres.shape[2], self.kernel.inputs
         constant, slope = np.exp(self.thetas[:, -2:]).T[..., None, None]
-        slopes = slope * np.matmul(self.centres.swapaxes(1, 2), self.weights)
+        slopes = slope * np.matmul(centres.swapaxes(1, 2), self.weights)
         constants = constant * self.weights.sum(axis=1, keepdims=True)
-        return np.concatenate([slopes, np.zeros_like(slopes), constants], axis=1)
-
-    @functools.cached_property
-    def _squared(self) -> Array:
-        """The factors of an extended argument in the squares of a Matern function's arguments, ``(S, M, 2 k + 1)``."""
+        linear = np.concatenate([slopes, np.zeros_like(slopes), constants], axis=1)
         inverse = 2 * self.kernel.nu / np.exp(2 * self.thetas[:, None, :-2])
-        squares = (inverse * self.centres**2).sum(axis=2, keepdims=True)
-        shape = self.centres.shape
-        factors = [-2 * inverse * self.centres, np.broadcast_to(inverse, shape), squares]
+        constants = (inverse * centres**2).sum(axis=2, keepdims=True)
+        squared = np.concatenate([-2 * inverse * centres, np.broadcast_to(inverse, centres.shape), constants], axis=2)
         # In this order, products with few columns are several times as fast.
-        return np.concatenate(factors, axis=2).swapaxes(1, 2).copy().swapaxes(1, 2)
-
-    @functools.cached_property
-    def _growth(self) -> Array:
-        """The same in the growth with the inputs."""
-        factors = np.zeros_like(self._squared)
-        k, m = self.centres.shape[2], self.kernel.inputs
-        factors[..., k - m : k] = self.kernel.growth * self.centres[..., k - m :]
-        factors[..., -1] = 1.0
-        return factors
-
-    def _matern(self, some: slice, extended: Array) -> Array:
-        """Return the Matern part of the covariances ``(s, M, q)`` of some functions, of ``(s, 2 k + 1, q)``."""
-        r2 = np.matmul(self._squared[some], extended)
-        np.abs(r2, out=r2)  # rounding errors around zero
-        r = np.sqrt(r2)
-        polynomial = _polynomial(self.kernel.nu, r, r2)
-        np.negative(r, out=r)
-        decay = np.exp(r, out=r)
-        decay *= polynomial
-        if self.kernel.growth:
-            decay *= np.matmul(self._growth[some], extended)
-        return np.asarray(decay)
+        squared = squared.swapaxes(1, 2).copy().swapaxes(1, 2)
+        if not self.kernel.growth:
+            return linear, squared, None
+        growth = np.zeros_like(squared)
+        growth[..., k - m : k] = self.kernel.growth * centres[..., k - m :]
+        growth[..., -1] = 1.0
+        return linear, squared, growth
 
 
 def joined(expansions: Sequence[KernelExpansion]) -> tuple[KernelExpansion, ...]:
     """Return the same functions, those of one family that follow each other in one expansion."""
-    groups = [list(group) for _, group in groupby(expansions, lambda expansion: expansion.kernel)]
-    return tuple(group[0] if len(group) == 1 else _joined(group) for group in groups)
-
-
-def _joined(alike: Sequence[KernelExpansion]) -> KernelExpansion:
-    most = max(expansion.centres.shape[1] for expansion in alike)
-
-    def padded(values: Array) -> Array:
-        return np.pad(values, ((0, 0), (0, most - values.shape[1]), (0, 0)))
-
-    return KernelExpansion(
-        alike[0].kernel,
-        np.concatenate([expansion.thetas for expansion in alike]),
-        np.concatenate([padded(expansion.centres) for expansion in alike]),
-        np.concatenate([padded(expansion.weights) for expansion in alike]),
-    )
+    together = list[KernelExpansion]()
+    for kernel, group in groupby(expansions, lambda expansion: expansion.kernel):
+        alike = list(group)
+        most = max(expansion.centres.shape[1] for expansion in alike)
+        missing = [((0, 0), (0, most - expansion.centres.shape[1]), (0, 0)) for expansion in alike]
+        centres, weights = (
+            np.concatenate([np.pad(getattr(each, name), more) for each, more in zip(alike, missing, strict=True)])
+            for name in ("centres", "weights")
+        )
+        together.append(KernelExpansion(kernel, np.concatenate([each.thetas for each in alike]), centres, weights))
+    return tuple(together)
 
 
 def _polynomial(nu: float, r: Array, r2: Array) -> Array:
@@ -133,26 +121,6 @@ def _polynomial(nu: float, r: Array, r2: Array) -> Array:
     r2 += r
     r2 += 1
     return r2
-
-
-def weights_without(covariance: Array, noise: float, outputs: Array, gone: Mask) -> Array:
-    """Return the weights ``(k, M, n)`` of k processes, each without the data that are gone for it, ``(k, M)``.
-
-    Leaving out a block of data changes the weights of the others by a linear map, as leaving out one observation does
-    (Rasmussen and Williams 2006, Sec. 5.4.2). Weights that rounding errors have spoilt are computed directly.
-    """
-    factor = factorise(covariance, tenfold(noise))
-    added = float((factor.L[-1] ** 2).sum() - covariance[-1, -1])
-    inverse, known = factor.inverse(), factor.solve(outputs)
-    weights = np.repeat(known[None], len(gone), axis=0)
-    for remaining, without in zip(weights, gone, strict=True):
-        rows, kept = np.flatnonzero(without), np.flatnonzero(~without)
-        remaining -= inverse[:, rows] @ np.linalg.solve(inverse[np.ix_(rows, rows)], known[rows])
-        remaining[rows] = 0.0
-        misfit = covariance[kept] @ remaining + added * remaining[kept] - outputs[kept]
-        if not np.abs(misfit).max(initial=0.0) < 1e-6:
-            remaining[kept] = factorise(covariance[np.ix_(kept, kept)], tenfold(noise)).solve(outputs[kept])
-    return weights
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,11 +143,12 @@ class Component:
         factor = factorise(kernel(theta, Z, Z), tenfold(hyperparameters.noise))
         weights = factor.solve(Y)
         squares = (Y * weights).sum(axis=0)
-        return cls(hyperparameters, Z, factor, weights, squares, _amplitudes(squares, len(Z), rng))
+        return cls(hyperparameters, Z, factor, weights, squares, squares).again(rng)
 
     def again(self, rng: np.random.Generator) -> Component:
-        """Return the same process with other amplitudes."""
-        return replace(self, amplitudes=_amplitudes(self.squares, len(self.centres), rng))
+        """Return the same process with other amplitudes, drawn from their posterior."""
+        chi2 = rng.chisquare(len(self.centres), len(self.squares))
+        return replace(self, amplitudes=np.sqrt(self.squares / chi2))
 
     @property
     def mean(self) -> KernelExpansion:
@@ -191,39 +160,12 @@ class Component:
         """The standard deviation of the noise of each standardised residual, shape ``(n,)``."""
         return np.asarray(np.sqrt(self.hyperparameters.noise) * self.amplitudes)
 
-    def variance(self, Z: Array) -> Array:
-        """Return the posterior variance at pairs ``(N, k)``, relative to the amplitudes, shape ``(N,)``."""
-        return self._whitened(Z)[1]
-
-    def _whitened(self, Z: Array) -> tuple[Array, Array]:
+    def whitened(self, Z: Array) -> tuple[Array, Array]:
+        """Return ``L^-1 k(centres, Z)``, shape ``(M, N)``, and the posterior variance ``(N,)`` for unit amplitudes."""
         kernel, theta = self.hyperparameters.kernel, self.hyperparameters.theta
         # For many pairs, a product with the inverse factor is several times as fast as substitution.
         half = self.factor.whiten_many(kernel(theta, Z, self.centres).T)
         return half, np.maximum(kernel.diagonal(theta, Z) - (half**2).sum(axis=0), 0.0)
-
-    def pivots(self, relevant: Array, count: int) -> tuple[Rows, Array, float]:
-        """Return rows by pivoted Cholesky of the posterior covariance, its factor, and the share of variance left."""
-        kernel, theta = self.hyperparameters.kernel, self.hyperparameters.theta
-        half, left = self._whitened(relevant)
-        first = left.max(initial=0.0)
-        # Variances below the noise are drawn too: many noisy transitions determine a function better than one does.
-        rounding = 1e-13 * kernel.diagonal(theta, relevant).max(initial=0.0)
-        towards, few = kernel.towards(theta, relevant), len(relevant) <= 300
-        covariance = towards(relevant) - half.T @ half if few else None  # cheaper than one row after the other
-
-        def covariances(row: int) -> Array:
-            if covariance is not None:
-                return np.asarray(covariance[row])
-            return np.asarray(towards(relevant[row : row + 1])[0] - half[:, row] @ half)
-
-        chosen = pivoted_cholesky(left, covariances, count, least=max(1e-6 * first, rounding))
-        left_out = chosen.left.max() / first if first > rounding else 0.0
-        return chosen.rows, chosen.L, float(left_out)
-
-
-def _amplitudes(squares: Array, count: int, rng: np.random.Generator) -> Array:
-    """Return a draw of the amplitudes from their posterior, given ``count`` transitions."""
-    return np.asarray(np.sqrt(squares / rng.chisquare(count, len(squares))))
 
 
 def draw_functions(
@@ -237,16 +179,30 @@ def draw_functions(
         pivots: largest number of pivots.
     """
     first = alike[0]
-    chosen, L, left_out = first.pivots(relevant, pivots)
+    kernel, theta = first.hyperparameters.kernel, first.hyperparameters.theta
+    half, left = first.whitened(relevant)
+    largest = left.max(initial=0.0)
+    # Variances below the noise are drawn too: many noisy transitions determine a function better than one does.
+    rounding = 1e-13 * kernel.diagonal(theta, relevant).max(initial=0.0)
+    towards, few = kernel.towards(theta, relevant), len(relevant) <= 300
+    covariance = towards(relevant) - half.T @ half if few else None  # cheaper than one row after the other
+
+    def covariances(row: int) -> Array:
+        if covariance is not None:
+            return np.asarray(covariance[row])
+        return np.asarray(towards(relevant[row : row + 1])[0] - half[:, row] @ half)
+
+    chosen, L, left = pivoted_cholesky(left, covariances, pivots, least=max(1e-6 * largest, rounding))
+    left_out = float(left.max() / largest) if largest > rounding else 0.0
     if not len(chosen):
         weights = np.repeat(first.weights[None], count * len(alike), axis=0)
         return KernelExpansion.of(first.hyperparameters, first.centres, weights), left_out
-    kernel, theta = first.hyperparameters.kernel, first.hyperparameters.theta
-    shape = (count, len(chosen), first.weights.shape[1])
+    at = relevant[chosen]
+    shape = (count, len(at), first.weights.shape[1])
     normal = np.concatenate([rng.standard_normal(shape) * component.amplitudes for component in alike])
     # The values L xi at the pivots are interpolated by the posterior covariance L L', with weights L'^-1 xi.
     weights = np.linalg.solve(L.T, normal)
-    cross = first.factor.solve(kernel(theta, first.centres, relevant[chosen]))
+    cross = first.factor.solve(kernel(theta, first.centres, at))
     together = np.concatenate([first.weights - np.matmul(cross, weights), weights], axis=1)
-    centres = np.concatenate([first.centres, relevant[chosen]])
+    centres = np.concatenate([first.centres, at])
     return KernelExpansion.of(first.hyperparameters, centres, together), left_out

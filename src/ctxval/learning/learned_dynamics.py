@@ -11,11 +11,11 @@ import numpy as np
 
 from ctxval._util.arrays import Array, single_threaded
 from ctxval._util.representation import ShortRepr
-from ctxval.core.coverage import StateInputCoverage, StatePocket, UntriedCorner
+from ctxval.core.coverage import StateInputCoverage, StatePocket
 from ctxval.core.labels import labels_of
 from ctxval.core.trajectory import Trajectory
 from ctxval.learning.closed_loops import AnyDraws, distances_of, loop_pairs
-from ctxval.learning.coverage import beyond_records, coverage, largest_pocket, untried_corner
+from ctxval.learning.coverage import beyond_records, coverage, largest_pocket
 from ctxval.learning.dynamics_posterior import DynamicsPosterior
 from ctxval.learning.execution_prediction import ExecutionPrediction, predict_execution
 from ctxval.learning.noisy_draws import SETTLED, NoisyDraws, NoisyPosterior
@@ -97,11 +97,6 @@ class LearnedDynamics(ShortRepr):
         scale = np.sqrt((np.concatenate(of_model) ** 2).mean(axis=0))
         return float(np.sqrt(((np.concatenate(errors) / np.maximum(scale, 1e-300)) ** 2).mean()))
 
-    @property
-    def worst_case(self) -> WorstCase:
-        """The largest distance over all tasks, for each of the usual number of draws."""
-        return self.worst_case_of(1)
-
     @functools.cached_property
     def screened(self) -> WorstCase:
         """The largest distance over some tasks, for each of a few draws of the dynamics: a quick lower bound."""
@@ -128,7 +123,7 @@ class LearnedDynamics(ShortRepr):
         search, planner = self.study.search, self.study.planner
         with single_threaded():
             planned = planner.plan(points)
-            functions = self._functions(draws)
+            functions = self.drawn_from.functions_for(draws)
             key = functions, settled
             if key not in self._draws:
                 # Their pivots lie on the loops of all tasks.
@@ -152,23 +147,14 @@ class LearnedDynamics(ShortRepr):
                 crossed[plan.rows] = self.boundary.crossed(self.posterior, loop)
         return values, beyond, crossed
 
-    def _functions(self, draws: int) -> int:
-        """Return the number of functions for each draw of the hyperparameters that gives at least so many draws."""
-        return max(self.drawn_from.functions, -(-draws // self.drawn_from.groups))
-
     def worst_case_of(self, draws: int) -> WorstCase:
         """Return the largest distance over all tasks, for each of at least so many draws of the dynamics."""
-        functions = self._functions(draws)
+        functions = self.drawn_from.functions_for(draws)
         if functions not in self._worst_cases:
             search, known, rng = self.study.search, self.executed, self._rng(1)
             of_mean = search.on_mean(self.drawn_from, self._on_pool[0], known, rng)
             self._worst_cases[functions] = search.maxima(self.drawn_from, of_mean, known, rng, functions)
         return self._worst_cases[functions]
-
-    @functools.cached_property
-    def largest_jump(self) -> float:
-        """The largest jump of the distance on the posterior mean between nearly equal tasks."""
-        return self.study.search.largest_jump(self.drawn_from)
 
     @functools.cached_property
     def deeper(self) -> tuple[Array, Array]:
@@ -210,22 +196,25 @@ class LearnedDynamics(ShortRepr):
 
         The gap is a share of the parameter's range; None if there is no such parameter.
         """
-        members = self.study.validation.space.members
-        gaps = [
-            (j, *_widest_gap(self.executed[:, j], None if members is None else members[:, j]))
-            for j in self.study.unseen_parameters
-        ]
+        members, gaps = self.study.validation.space.members, list[tuple[int, float, float]]()
+        for j in self.study.unseen_parameters:
+            ordered = np.sort(self.executed[:, j])
+            if not len(ordered):
+                gaps.append((j, 1.0, 0.5))
+                continue
+            if members is not None:
+                places = members[:, j]
+                away = np.abs(places[:, None] - ordered).min(axis=1)
+            else:  # the ends of the range, and the middles between neighbours
+                places = np.concatenate([[0.0], 0.5 * (ordered[1:] + ordered[:-1]), [1.0]])
+                away = np.concatenate([[ordered[0]], 0.5 * np.diff(ordered), [1 - ordered[-1]]])
+            gaps.append((j, float(away.max()), float(places[away.argmax()])))
         if not gaps:
             return None
         j, gap, value = max(gaps, key=lambda each: each[1])
         task = self.coverage.task.copy()
         task[j] = value
         return j, gap, task
-
-    @property
-    def untried_corner(self) -> UntriedCorner | None:
-        """The corner of a position in space that is farthest from all executions; None if all were executed."""
-        return untried_corner(self.executed, self.study.validation.space, self.coverage.task)
 
     @property
     def coverage(self) -> StateInputCoverage:
@@ -254,21 +243,8 @@ class LearnedDynamics(ShortRepr):
                     return None
                 relevant = pairs[rng.permutation(len(pairs))[:300]]
             draws = self.drawn_from.draw(relevant, rng)
-            return predict_execution(planner, draws, point, len(self.executed), self.study.recorded, noisy=is_noisy)
+            recorded = self.study.extended.recorded
+            return predict_execution(planner, draws, point, len(self.executed), recorded, noisy=is_noisy)
 
     def _rng(self, purpose: int) -> np.random.Generator:
         return np.random.default_rng([self.study.seed, len(self.executed), purpose])
-
-
-def _widest_gap(values: Array, of: Array | None) -> tuple[float, float]:
-    """Return the largest distance from a number in [0, 1], or from one of a suite, to the nearest value; and it."""
-    ordered = np.sort(values)
-    if not len(ordered):
-        return 1.0, 0.5
-    if of is not None:
-        away = np.abs(of[:, None] - ordered).min(axis=1)
-        return float(away.max()), float(of[away.argmax()])
-    middles = 0.5 * (ordered[1:] + ordered[:-1])
-    places = np.concatenate([[0.0], middles, [1.0]])
-    gaps = np.concatenate([[ordered[0]], 0.5 * np.diff(ordered), [1 - ordered[-1]]])
-    return float(gaps.max()), float(places[gaps.argmax()])

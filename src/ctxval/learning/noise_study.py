@@ -17,7 +17,7 @@ from ctxval._util.arrays import Array, Mask, Rows, single_threaded
 from ctxval._util.latest import Latest
 from ctxval.core.model import Model
 from ctxval.errors import InputError
-from ctxval.learning.closed_loops import LoopPlanner, PlannedTasks
+from ctxval.learning.closed_loops import LoopPlanner, Together
 from ctxval.learning.draws import DisturbedDynamics
 from ctxval.learning.dynamics_posterior import DynamicsPosterior
 from ctxval.learning.extended import ExtendedValidation
@@ -63,7 +63,19 @@ class NoiseStudy:
             posterior: what the executions teach without noise.
             records: of these executions.
         """
-        if not self._is_needed(posterior, records):
+        # Executions do not follow from task, state and input if noise, or what is not recorded, acts.
+        is_needed = (
+            float((posterior.most_probable.noise**2).max()) > NOISY
+            or self._effect(posterior) > MATTERS
+            or self._effect(posterior, _scatter_of(records)) > MATTERS
+        )
+        if not is_needed and len(records) >= 3:
+            last = records[-1]
+            with contextlib.suppress(np.linalg.LinAlgError, InputError, ValueError), np.errstate(all="ignore"):
+                mean = posterior.means_without([[len(records) - 1]])
+                predicted: Array = mean.step(last.states[None, :-1], last.inputs[None])[0]
+                is_needed = predicted_by_history(posterior, records, self.extended.pairs, predicted)
+        if not is_needed:
             return None
         some = scheduled(len(records))
         key = digest(records[:some])
@@ -80,7 +92,7 @@ class NoiseStudy:
             return None
         noisy, _ = learned
         # If it changes distances by a negligible share of the largest one, it is left out.
-        return noisy if self._effect_of_noise(noisy) > MATTERS else replace(noisy, replicates=1)
+        return noisy if self._effect(noisy) > MATTERS else replace(noisy, replicates=1)
 
     def again(
         self, noisy: NoisyPosterior, records: Sequence[Record], posterior: DynamicsPosterior, others: Sequence[Record]
@@ -104,99 +116,61 @@ class NoiseStudy:
         data = posterior.data
         try:
             with single_threaded(), np.errstate(all="ignore"):
-                fit, chosen = fit_structures(posterior.model, records, self.extended.pairs, data.learned, chosen)
+                model, pairs = posterior.covariances.model, self.extended.pairs
+                fit, chosen = fit_structures(model, records, pairs, data.learned, chosen)
         except (np.linalg.LinAlgError, InputError, ValueError):  # numbers that are not finite
             return None
         horizon, seed = max(len(record.inputs) for record in records), (self.seed, len(records))
         return NoisyPosterior(fit, data, _scatter_of(records), horizon, replicates, self.quantile, seed), chosen
 
-    def _is_needed(self, posterior: DynamicsPosterior, records: Sequence[Record]) -> bool:
-        """Return whether executions do not follow from task, state and input: noise, or what is not recorded, acts."""
-        if float((posterior.most_probable.noise**2).max()) > NOISY:
-            return True
-        if self._effect_of_noise(posterior) > MATTERS or self._effect_of_starts(posterior, records) > MATTERS:
-            return True
-        if len(records) < 3:
-            return False
-        last = records[-1]
-        with contextlib.suppress(np.linalg.LinAlgError, InputError, ValueError), np.errstate(all="ignore"):
-            mean = posterior.means_without([[len(records) - 1]])
-            predicted: Array = mean.step(last.states[None, :-1], last.inputs[None])[0]
-            return predicted_by_history(posterior, records, self.extended.pairs, predicted)
-        return False
+    def _effect(self, posterior: DynamicsPosterior | NoisyPosterior, starts: Array | None = None) -> float:
+        """Return the largest standard deviation of the distance of a task, as a share of the largest distance.
 
-    def _effect_of_noise(self, posterior: DynamicsPosterior | NoisyPosterior) -> float:
-        """Return the largest standard deviation of the distance of a task over noise, as a share of the largest one.
-
-        Of some tasks, those with the largest distances count. Only finite distances do.
+        It is that over noise or, if they are given, over initial states with standard deviations ``(n,)`` around those
+        of the tasks. Of some tasks, those with the largest distances count. Only finite distances do.
         """
-        scatter = posterior.scatter if isinstance(posterior, NoisyPosterior) else np.zeros(1)
-        if not _matters(posterior.deviations, posterior) and not _matters(scatter, posterior):
+        causes, planner = [posterior.deviations] if starts is None else [starts], self.planner
+        if starts is None and isinstance(posterior, NoisyPosterior):
+            causes.append(posterior.scatter)
+        # Standard deviation, as a share of a state's, below which it is rounding.
+        rounding = 1e-5 * posterior.data.scale[: len(posterior.data.sizes)]
+        if not any((each > rounding).any() for each in causes):
             return 0.0
-        with single_threaded(), np.errstate(all="ignore"):
-            planned, count, largest = self._largest(posterior)
-            runs = np.full((_RUNS, count), np.nan)
-            noisy = posterior.mean if isinstance(posterior, NoisyPosterior) else _shaken(posterior)
-            for plan, loops in zip(planned, self.planner.run(noisy, planned), strict=True):
-                runs[: len(loops.distances), plan.rows] = loops.distances[:_RUNS]
-        return _share(runs, largest)
 
-    def _effect_of_starts(self, posterior: DynamicsPosterior, records: Sequence[Record]) -> float:
-        """Return the same over initial states that deviate from those of the tasks as those of the records do."""
-        scatter = _scatter_of(records)
-        if not _matters(scatter, posterior):
+        def noise(ways: Rows, x: Array) -> Array:
+            # The noise is a function of the states, so that a loop is the same each time.
+            seed = np.frombuffer(np.ascontiguousarray(x).tobytes()[-64:], dtype=np.uint32)
+            rng = np.random.default_rng([int(ways[0]), *seed.tolist()])
+            return posterior.deviations * rng.standard_normal(x.shape)
+
+        with single_threaded(), np.errstate(all="ignore"):
+            tasks = self.search.pool[:_TRIED]
+            distances = planner.distances(posterior.silent, planner.plan(tasks), len(tasks))[0]
+            distances = np.nan_to_num(distances, nan=-1.0, posinf=-1.0)
+            planned = planner.plan(tasks[np.argsort(-distances, kind="stable")[:_TASKS]])
+            runs = np.full((_RUNS, min(_TASKS, len(tasks))), np.nan)
+            if starts is None:
+                noisy: Together = posterior.mean
+                if isinstance(posterior, DynamicsPosterior):  # white noise as large as was learned, several times
+                    noisy = DisturbedDynamics(posterior.mean, np.arange(_RUNS), noise)
+                for plan, loops in zip(planned, planner.run(noisy, planned), strict=True):
+                    runs[: len(loops.distances), plan.rows] = loops.distances[:_RUNS]
+            else:
+                rng = np.random.default_rng(0)
+                for run in runs:
+                    initial = [plan.task.initial_state for plan in planned]
+                    moved = zip(planned, [x + starts * rng.standard_normal(x.shape) for x in initial], strict=True)
+                    tried = [replace(plan, task=plan.task.starting_at(x)) for plan, x in moved]
+                    run[:] = planner.distances(posterior.silent, tried, len(run))[0]
+        runs = runs[:, np.isfinite(runs).any(axis=0)]
+        if not runs.size or not distances.max() > 0:
             return 0.0
-        rng = np.random.default_rng(0)
-        with single_threaded(), np.errstate(all="ignore"):
-            planned, count, largest = self._largest(posterior)
-            runs = []
-            for _ in range(_RUNS):
-                starts = (plan.task.initial_state for plan in planned)
-                moved = [start + scatter * rng.standard_normal(start.shape) for start in starts]
-                tried = [replace(plan, task=plan.task.starting_at(x)) for plan, x in zip(planned, moved, strict=True)]
-                runs.append(self.planner.distances(posterior.silent, tried, count)[0])
-        return _share(np.stack(runs), largest)
-
-    def _largest(self, posterior: DynamicsPosterior | NoisyPosterior) -> tuple[list[PlannedTasks], int, float]:
-        """Return the plans of the tasks with the largest distances without noise, their number, and the largest one."""
-        tasks = self.search.pool[:_TRIED]
-        distances = self.planner.distances(posterior.silent, self.planner.plan(tasks), len(tasks))[0]
-        distances = np.nan_to_num(distances, nan=-1.0, posinf=-1.0)
-        chosen = tasks[np.argsort(-distances, kind="stable")[:_TASKS]]
-        return self.planner.plan(chosen), len(chosen), float(distances.max())
+        return float(np.nanmax(np.nanstd(np.where(np.isfinite(runs), runs, np.nan), axis=0)) / distances.max())
 
 
 def _scatter_of(records: Sequence[Record]) -> Array:
     """Return the standard deviations of first records from the initial states of their tasks, shape ``(n,)``."""
     return np.asarray(np.sqrt(np.mean([(record.states[0] - record.start) ** 2 for record in records], axis=0)))
-
-
-def _share(runs: Array, largest: float) -> float:
-    """Return the largest standard deviation over runs ``(R, q)`` of finite distances as a share of the largest one."""
-    runs = runs[:, np.isfinite(runs).any(axis=0)]
-    if not runs.size or not largest > 0:
-        return 0.0
-    finite = np.where(np.isfinite(runs), runs, np.nan)
-    return float(np.nanmax(np.nanstd(finite, axis=0)) / largest)
-
-
-def _matters(deviations: Array, posterior: DynamicsPosterior | NoisyPosterior) -> bool:
-    """Return whether standard deviations ``(n,)`` of states are more than rounding."""
-    # Standard deviation of noise, as a share of a state's, below which it is rounding.
-    return bool((deviations > 1e-5 * posterior.data.scale[: len(posterior.data.sizes)]).any())
-
-
-def _shaken(posterior: DynamicsPosterior) -> DisturbedDynamics:
-    """Return the posterior mean with white noise as large as was learned, several times."""
-    deviations = posterior.deviations
-
-    def noise(ways: Rows, x: Array) -> Array:
-        # The noise is a function of the states, so that a loop is the same each time.
-        seed = np.frombuffer(np.ascontiguousarray(x).tobytes()[-64:], dtype=np.uint32)
-        rng = np.random.default_rng([int(ways[0]), *seed.tolist()])
-        return deviations * rng.standard_normal(x.shape)
-
-    return DisturbedDynamics(posterior.mean, np.arange(_RUNS), noise)
 
 
 @dataclass(frozen=True, eq=False)
@@ -264,7 +238,7 @@ def predicted_by_history(
         return False
     shares = []
     for lags in (1, 2, 3):
-        history = History(posterior.model, Structure(lags), np.eye(len(live)))
+        history = History(posterior.covariances.model, Structure(lags), np.eye(len(live)))
         fit = fit_lagged(history, records[:-1], pairs, None, live, usual=True)
         with_history = share(history.along([last], fit.residual)[2])
         if with_history < min(_BETTER * without, _GOOD):

@@ -8,7 +8,6 @@ from __future__ import annotations
 import functools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar
 
 import numpy as np
 
@@ -20,6 +19,7 @@ from ctxval.learning.residual_data import ResidualData
 
 REPLICATES = 10  # sequences of noise of each draw in a search
 ROUGH = 3  # sequences of noise of the mean in a search of tasks, whose best ones are evaluated with all
+_GROUPS, _FUNCTIONS = 5, 4  # draws of the hyperparameters, and usual number of weights for each of them
 SETTLED = 80  # sequences of noise at the tasks that a search has found
 
 
@@ -151,10 +151,9 @@ class NoisyPosterior(ShortRepr):
     quantile: float
     seed: tuple[int, ...]
 
-    groups: ClassVar[int] = 5
-    """The number of draws of the hyperparameters."""
-    functions: ClassVar[int] = 4
-    """The usual number of weights that are drawn for each of them."""
+    def functions_for(self, draws: int) -> int:
+        """Return the number of weights for each draw of the hyperparameters that gives at least so many draws."""
+        return max(_FUNCTIONS, -(-draws // _GROUPS))
 
     @property
     def noise(self) -> float:
@@ -201,7 +200,7 @@ class NoisyPosterior(ShortRepr):
         hyperparameters: int | None = None,
     ) -> NoisyDraws:
         """Return draws; see :meth:`DynamicsPosterior.draw`. Nothing depends on ``relevant``."""
-        groups, each = self.groups, self.functions if functions is None else functions
+        groups, each = _GROUPS, _FUNCTIONS if functions is None else functions
         if hyperparameters is not None:
             groups, each = hyperparameters // 2, 2 * each  # a few for a screening
         return self._with_noise(self.fit.draw(groups, each, rng), rng)

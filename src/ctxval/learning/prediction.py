@@ -12,7 +12,7 @@ composed of predicted vectors.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -95,17 +95,6 @@ class PredictedDistance:
 def _nan_where_it_fails(function: Callable[[Rows], Array], count: int, values: int) -> Array:
     parts = [np.full((values, 1), np.nan) if part is None else part for _, part in halved(function, count)]
     return np.concatenate(parts, axis=1)
-
-
-def predict_distance(
-    planner: LoopPlanner, posterior: DynamicsPosterior, executed: Array, in_parallel: bool = False
-) -> Prediction:
-    """Return the prediction of d for a search; the arguments are those of :class:`PredictedDistance`."""
-    exact = PredictedDistance(planner, posterior, executed, in_parallel, posterior.mean)
-    # If few centres do not suffice, both predictions are one, so that no task is predicted twice.
-    rough_mean = posterior.rough_mean
-    rough = exact if rough_mean is posterior.mean else replace(exact, mean=rough_mean)
-    return Prediction(exact, exact.left_out, 2000 if planner.batched else 150, rough=rough)
 
 
 def executions_of(executed: Array, points: Iterable[Array]) -> list[list[int]]:

@@ -117,10 +117,10 @@ def _is_regular(posterior: DynamicsPosterior, transitions: Transitions, regular:
     learned = data.learned
     with single_threaded(), np.errstate(all="ignore"):
         pairs = data.standardised(transitions.x, transitions.u)
-        residuals = (transitions.x_next - posterior.model.step(transitions.x, transitions.u))[:, learned]
+        residuals = (transitions.x_next - posterior.covariances.model.step(transitions.x, transitions.u))[:, learned]
         errors = np.abs(residuals / data.sizes[learned] - most.mean(pairs[None])[0])
         sizes = np.sqrt(most.squares / len(most.centres))
-        doubts = np.sqrt(np.maximum(most.variance(pairs), 0.0))[:, None] * sizes
+        doubts = np.sqrt(np.maximum(most.whitened(pairs)[1], 0.0))[:, None] * sizes
     usual = 1.48 * np.median(errors[regular], axis=0)
     return np.asarray((errors <= _IRREGULAR * np.sqrt(doubts**2 + usual**2 + _SHARE**2)).all(axis=1))
 

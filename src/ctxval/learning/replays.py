@@ -75,4 +75,4 @@ def _replayed(study: DynamicsStudy, model: DrawnModel | None, point: Array) -> R
     except Exception:  # the same
         return nothing
     finite = bool(predicted.finite.all()) and np.isfinite(distance)
-    return Replay(plain, study.recorded(predicted), distance) if finite else nothing
+    return Replay(plain, study.extended.recorded(predicted), distance) if finite else nothing

@@ -14,7 +14,7 @@ import numpy as np
 from ctxval._util.arrays import Array, Mask, Rows
 from ctxval.core.model import Model
 from ctxval.core.trajectory import Transitions
-from ctxval.learning.hyperparameters import highest_log_posterior, learning_rows
+from ctxval.learning.hyperparameters import FAMILIES, ResidualKernel, climbed, learning_rows
 from ctxval.models.linear import Linear
 from ctxval.models.scaling import standard_deviations, standardised_pairs
 
@@ -34,22 +34,10 @@ class ResidualData:
     scale: Array
     sizes: Array  # root mean square of the residual of each state, (n,)
     steps: Array  # standard deviation of the change of each state in one step, (n,)
+    learned: Mask  # which states have a residual that is not negligible, (n,)
+    units: Array  # the unit of each standardised residual; 0 if it is negligible, (n,)
+    inputs: int  # the number m of inputs of the system
     transitions: Transitions
-
-    @property
-    def learned(self) -> Mask:
-        """Which states have a residual that is not negligible, shape ``(n,)``."""
-        return np.asarray(self.sizes > NEGLIGIBLE * self.steps)
-
-    @property
-    def inputs(self) -> int:
-        """The number m of inputs of the system."""
-        return len(self.shift) - len(self.sizes)
-
-    @property
-    def units(self) -> Array:
-        """The unit of each standardised residual, shape ``(n,)``; 0 if it is negligible."""
-        return np.where(self.learned, self.sizes, 0.0)
 
     def standardised(self, x: Array, u: Array) -> Array:
         """Return standardised pairs ``(..., n + m)`` of states and the first m inputs, which act."""
@@ -73,9 +61,18 @@ def residual_data(model: Model, transitions: Transitions, sources: Rows) -> Resi
     if not learned.any():
         return None
     shift, scale = pairs.mean(axis=0), standard_deviations(pairs)
-    outputs = residuals / np.where(learned, sizes, np.inf)
     return ResidualData(
-        (pairs - shift) / scale, outputs, sources[usable], shift, scale, sizes, typical, transitions[usable]
+        (pairs - shift) / scale,
+        residuals / np.where(learned, sizes, np.inf),
+        sources[usable],
+        shift,
+        scale,
+        sizes,
+        typical,
+        learned,
+        units=np.where(learned, sizes, 0.0),
+        inputs=transitions.u.shape[1],
+        transitions=transitions[usable],
     )
 
 
@@ -85,11 +82,15 @@ def smoother_than(data: ResidualData, count: int) -> tuple[Model, ResidualData] 
     The hyperparameters are learned from ``count`` transitions.
     """
     # With at least 10 transitions for each coefficient, the fit itself explains little.
-    if len(data.pairs) < 10 * (data.pairs.shape[1] + 1) or _is_linear(data):
+    if len(data.pairs) < 10 * (data.pairs.shape[1] + 1):
         return None
+    known = data.transitions
+    predicted = known.x_next - data.outputs * data.units
+    deviations = predicted - _fitted(known, predicted).step(known.x, known.u)
+    if (np.sqrt((deviations**2).mean(axis=0)) <= 1e-3 * data.sizes).all():
+        return None  # the model of these residuals is linear itself, as far as it matters for them
     rows = learning_rows(data.pairs, data.inputs, count)
     needed = _log_density(data, rows) + len(rows) * len(data.sizes)  # a gain of 1 for each recorded number
-    known = data.transitions
     # If S itself is linear, its linear model leaves no residual. The change of its state has the same prior.
     for linear in (_fitted(known, known.x_next), Identity()):
         other = residual_data(linear, known, data.sources)
@@ -109,16 +110,9 @@ class Identity:
 def _log_density(data: ResidualData, rows: Rows) -> float:
     """Return the log density of transitions in the units of the system, up to a constant that all models share."""
     sizes = np.maximum(data.sizes, NEGLIGIBLE * data.steps)
-    learned = highest_log_posterior(data.pairs[rows], data.outputs[rows][:, data.learned], data.inputs)
+    kernel = ResidualKernel(*FAMILIES[0], data.inputs)
+    learned, _ = climbed(kernel, data.pairs[rows], data.outputs[rows][:, data.learned])[0]
     return learned - len(rows) * float(np.log(sizes).sum())
-
-
-def _is_linear(data: ResidualData) -> bool:
-    """Return whether the model of these residuals is linear, as far as it matters for them."""
-    known = data.transitions
-    predicted = known.x_next - data.outputs * data.units
-    deviations = predicted - _fitted(known, predicted).step(known.x, known.u)
-    return bool((np.sqrt((deviations**2).mean(axis=0)) <= 1e-3 * data.sizes).all())
 
 
 def _fitted(known: Transitions, following: Array) -> Linear:

@@ -15,6 +15,7 @@ import numpy as np
 
 from ctxval._util.arrays import Array, single_threaded
 from ctxval.core.trajectory import Trajectory
+from ctxval.learning.draws import DrawnModel
 from ctxval.learning.dynamics_study import DynamicsStudy
 from ctxval.learning.histories import Record
 from ctxval.learning.learned_dynamics import LearnedDynamics
@@ -148,10 +149,11 @@ def _residuals(learned: LearnedDynamics, record: Record) -> tuple[Array, Array, 
     noisy, posterior = learned.noisy, learned.posterior
     if noisy is None:
         data, most = posterior.data, posterior.most_probable
-        residuals = record.states[1:] - posterior.mean.alone(record.states[:-1], record.inputs)
+        residuals = record.states[1:] - DrawnModel(posterior.mean).step(record.states[:-1], record.inputs)
         Z = data.standardised(record.states[:-1], record.inputs)
         doubt = np.zeros(len(data.sizes))
-        doubt[data.learned] = most.variance(Z).mean() * most.squares / len(most.centres) * data.sizes[data.learned] ** 2
+        variance = most.whitened(Z)[1].mean() * most.squares / len(most.centres)
+        doubt[data.learned] = variance * data.sizes[data.learned] ** 2
         return residuals, doubt, posterior.deviations**2, Z
     fit = noisy.fit
     Z, _, residuals = fit.history.along([record], fit.residual)

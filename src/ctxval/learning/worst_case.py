@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ctxval._util.arrays import Array, Mask, Rows, single_threaded
+from ctxval._util.arrays import Array, Mask, single_threaded
 from ctxval._util.boxes import latin_hypercube, moves_to_bounds, separated_rows
 from ctxval.gp.ascent import ascend
 from ctxval.gp.global_search import search_globally
@@ -83,12 +83,7 @@ class WorstCaseSearch:
         self.members = planner.validation.space.members
         if self.members is not None:  # nothing lies between tasks of a suite
             self.settings = replace(self.settings, pool=len(self.members), evaluations=len(self.members), rounds=0)
-        self._seed = seed
-
-    @property
-    def dimension(self) -> int:
-        """The dimension d of the task space."""
-        return self.planner.validation.space.dimension
+        self.dimension, self._seed = planner.validation.space.dimension, seed
 
     def expected_loops(self, draws: int) -> int:
         """Return about how many closed loops a search with so many draws runs, on M and on the draws."""
@@ -145,7 +140,7 @@ class WorstCaseSearch:
             of_rows = self.planner.distances(posterior.mean, planned, tasks.shape[0] * 3)[0].reshape(-1, 3)
             if is_kinked(self.planner.validation.distance):
                 of_rows = self._nearer(posterior, tasks, of_rows)
-        jumps = _bend(of_rows)
+        jumps = np.abs(of_rows[:, 1] - 0.5 * (of_rows[:, 0] + of_rows[:, 2]))
         return float(jumps[np.isfinite(jumps)].max(initial=0.0))
 
     def _nearer(self, posterior: AnyPosterior, tasks: Array, distances: Array) -> Array:
@@ -154,7 +149,8 @@ class WorstCaseSearch:
         Of each row, the half with the larger change is kept, which a jump is in.
         """
         # Rows of such tasks that are looked at more closely if the distance has kinks.
-        rows = np.argsort(-np.nan_to_num(_bend(distances), nan=0.0, posinf=0.0), kind="stable")[:64]
+        bends = np.abs(distances[:, 1] - 0.5 * (distances[:, 0] + distances[:, 2]))
+        rows = np.argsort(-np.nan_to_num(bends, nan=0.0, posinf=0.0), kind="stable")[:64]
         tasks, distances = tasks[rows], distances[rows]
         for _ in range(int(np.log2(_NEARER))):
             later = np.abs(distances[:, 2] - distances[:, 1]) > np.abs(distances[:, 1] - distances[:, 0])
@@ -210,7 +206,7 @@ class WorstCaseSearch:
             evaluations = max(len(starts) + 50, settings.evaluations - len(self.pool))
             maximum = search_globally(distance, self.dimension, starts, rng, evaluations=evaluations)
         elites = np.concatenate([maximum.points[:1], maximum.elites[: settings.elites]])
-        return self._of_mean(posterior, float(maximum.values[0]), elites, maximum.evaluations)
+        return self._of_mean(posterior, float(maximum.values[0]), elites, len(maximum.values))
 
     def _of_mean(self, posterior: AnyPosterior, highest: float, elites: Array, evaluations: int) -> WorstCase:
         if posterior.searched is not posterior.mean:
@@ -230,8 +226,14 @@ class WorstCaseSearch:
             tasks = self._shared_tasks(of_mean, known, self.settings.shared // 4, rng)
             draws = posterior.draw(self.relevant(posterior, tasks, rng), rng, 1, _SCREENED[0])
             values = self._distances(draws, tasks)
-        best = values.argmax(axis=1)
-        return self._worst_case(of_mean, draws, values.max(axis=1), tasks[best], values.size, 0.0)
+        maxima, points = values.max(axis=1), tasks[values.argmax(axis=1)]
+        return replace(
+            of_mean,
+            maxima=np.where(maxima >= _DIVERGED, np.inf, maxima),
+            points=points,
+            evaluations=of_mean.evaluations + values.size,
+            left_out=draws.left_out,
+        )
 
     def maxima(
         self, posterior: AnyPosterior, of_mean: WorstCase, known: Array, rng: np.random.Generator, functions: int
@@ -245,8 +247,25 @@ class WorstCaseSearch:
                 # The search has chosen tasks with few sequences of noise, which its own maxima exaggerate.
                 settled = draws.with_replicates(SETTLED, rng)
                 maxima = _finite(self.planner.own_distances(settled, points[:, None]))[:, 0]
-            sharpness = 0.0 if self.members is not None else self._sharpness(posterior.mean, of_mean.elites, rng)
-        return self._worst_case(of_mean, draws, maxima, points, loops, sharpness)
+            # The largest share that the distance of an elite loses at the median of the tasks next to it. If
+            # controllers jump from task to task, the largest distance is a needle that a search finds by chance. Kinks
+            # are no needles: they are flat between tasks that are nearer.
+            peaks = of_mean.elites[: 0 if self.members is not None else self.settings.peaks]
+            near = _NEARBY / _NEARER if is_kinked(self.planner.validation.distance) else _NEARBY
+            moves = rng.uniform(-near, near, (len(peaks), self.settings.nearby, self.dimension))
+            beside = np.concatenate([peaks[:, None], np.clip(peaks[:, None] + moves, 0, 1)], axis=1)
+            flat = self._distances(posterior.mean, beside.reshape(-1, self.dimension))[0]
+            distances = np.maximum(flat.reshape(beside.shape[:2]), 0.0)
+            peak, next_to_it = distances[:, 0], np.median(distances[:, 1:], axis=1)
+            lost = np.divide(peak - next_to_it, peak, out=np.zeros(len(peak)), where=peak > 0)
+        return replace(
+            of_mean,
+            maxima=np.where(maxima >= _DIVERGED, np.inf, maxima),
+            points=points,
+            evaluations=of_mean.evaluations + loops,
+            left_out=draws.left_out,
+            sharpness=float(max(lost.max(initial=0.0), 0.0)),
+        )
 
     def _shared_tasks(self, of_mean: WorstCase, known: Array, count: int, rng: np.random.Generator) -> Array:
         """Return the tasks that draws share: elites, known tasks and random ones; of a suite, those not known."""
@@ -261,18 +280,6 @@ class WorstCaseSearch:
         assert self.members is not None
         return np.asarray(~(self.members[:, None] == known).all(axis=2).any(axis=1))
 
-    def _worst_case(
-        self, of_mean: WorstCase, draws: AnyDraws, maxima: Array, points: Array, loops: int, sharpness: float
-    ) -> WorstCase:
-        return replace(
-            of_mean,
-            maxima=np.where(maxima >= _DIVERGED, np.inf, maxima),
-            points=points,
-            evaluations=of_mean.evaluations + loops,
-            left_out=draws.left_out,
-            sharpness=sharpness,
-        )
-
     def _distances(self, draws: AnyDraws, points: Array) -> Array:
         """Return the distances ``(S, q)`` of draws on points ``(q, d)``, as a search takes them."""
         return _finite(self.planner.distances(draws, self.planner.plan(points), len(points)))
@@ -280,22 +287,6 @@ class WorstCaseSearch:
     def _on_one(self, mean: AnyDraws) -> Callable[[Array], Array]:
         """Return the distances ``(q,)`` on one draw, such as the posterior mean, as a function of points."""
         return lambda points: np.asarray(self._distances(mean, points)[0])
-
-    def _sharpness(self, mean: AnyDraws, elites: Array, rng: np.random.Generator) -> float:
-        """Return the largest share that the distance of an elite loses at the median of the tasks next to it.
-
-        If controllers jump from task to task, the largest distance is a needle that a search finds by chance. Kinks are
-        no needles: they are flat between tasks that are nearer.
-        """
-        peaks = elites[: self.settings.peaks]
-        near = _NEARBY / _NEARER if is_kinked(self.planner.validation.distance) else _NEARBY
-        moves = rng.uniform(-near, near, (len(peaks), self.settings.nearby, self.dimension))
-        tasks = np.concatenate([peaks[:, None], np.clip(peaks[:, None] + moves, 0, 1)], axis=1)
-        flat = self._distances(mean, tasks.reshape(-1, self.dimension))[0]
-        distances = np.maximum(flat.reshape(tasks.shape[:2]), 0.0)
-        peak, next_to_it = distances[:, 0], np.median(distances[:, 1:], axis=1)
-        lost = np.divide(peak - next_to_it, peak, out=np.zeros(len(peak)), where=peak > 0)
-        return float(max(lost.max(initial=0.0), 0.0))
 
     def relevant(self, posterior: AnyPosterior, tasks: Array, rng: np.random.Generator) -> Array:
         """Return standardised pairs on the mean's closed loops, from which pivots are chosen; noisy draws have none."""
@@ -309,13 +300,17 @@ class WorstCaseSearch:
         values, loops = self._on_shared(draws, tasks)
         order = np.argsort(-values, axis=1, kind="stable")
         best, points = np.take_along_axis(values, order[:, :1], 1)[:, 0], tasks[order[:, 0]]
-        second, searched = _others(tasks, order), np.arange(len(draws))
+        # The best task of each draw that is not next to its best one; the second best if all are.
+        ordered = tasks[order]
+        apart = np.linalg.norm(ordered - ordered[:, :1], axis=2) > _APART * np.sqrt(self.dimension)
+        rows = np.where(apart.any(axis=1), apart.argmax(axis=1), min(1, len(tasks) - 1))
+        second, searched = ordered[np.arange(len(ordered)), rows], np.arange(len(draws))
         for round_, share in enumerate((0.1, 0.05, 0.02, 0.007)[: self.settings.rounds]):
             before = best.copy()
             if round_ == 2:
                 # Each draw tries the best tasks of all others.
-                ordered = points[np.argsort(-best, kind="stable")]
-                shown = ordered[separated_rows(ordered, 0.02 * np.sqrt(self.dimension), _SHOWN)]
+                best_first = points[np.argsort(-best, kind="stable")]
+                shown = best_first[separated_rows(best_first, 0.02 * np.sqrt(self.dimension), _SHOWN)]
                 distances = self._distances(draws, shown)
                 points, best = _better(points, best, np.broadcast_to(shown, (len(best), *shown.shape)), distances)
                 loops += distances.size
@@ -329,7 +324,10 @@ class WorstCaseSearch:
             random = np.clip(around + share * few * rng.normal(size=shape), 0, 1)
             moved = np.concatenate([to_bounds, random], axis=1)
             distances = _finite(self.planner.own_distances(some, moved))
-            together = _together(at, highest, moved, distances)[:, None]
+            # Each point after all moves to bounds that help; of two that help, the better one.
+            down, up = np.split(distances[:, : 2 * self.dimension], 2, axis=1)
+            helps = np.maximum(down, up) > highest[:, None]
+            together = np.where(helps, np.where(down > up, 0.0, 1.0), at)[:, None]
             known = np.concatenate([at[:, None], moved], axis=1)
             if (together == known).all(axis=2).any(axis=1).all():
                 last = np.full((len(at), 1), -np.inf)  # none of them is a new task
@@ -365,11 +363,6 @@ class WorstCaseSearch:
         return values, len(first) * len(tasks) + len(others) * len(chosen)
 
 
-def _bend(distances: Array) -> Array:
-    """Return how far the distances of tasks in rows ``(k, 3)`` are from the middle of those on both sides."""
-    return np.asarray(np.abs(distances[:, 1] - 0.5 * (distances[:, 0] + distances[:, 2])))
-
-
 def is_kinked(distance: object) -> bool:
     """Return whether a distance, or the user's distance in it, has kinks."""
     while distance is not None:
@@ -377,14 +370,6 @@ def is_kinked(distance: object) -> bool:
             return True
         distance = getattr(distance, "distance", None)
     return False
-
-
-def _others(tasks: Array, order: Rows) -> Array:
-    """Return, for each draw, its best task ``(d,)`` that is not next to its best one; the second best if all are."""
-    ordered = tasks[order]
-    apart = np.linalg.norm(ordered - ordered[:, :1], axis=2) > _APART * np.sqrt(tasks.shape[1])
-    at = np.where(apart.any(axis=1), apart.argmax(axis=1), min(1, len(tasks) - 1))
-    return np.asarray(ordered[np.arange(len(ordered)), at])
 
 
 def _finite(distances: Array) -> Array:
@@ -397,11 +382,3 @@ def _better(points: Array, best: Array, tried: Array, distances: Array) -> tuple
     row, at = np.arange(len(points)), distances.argmax(axis=1)
     better = distances[row, at] > best
     return np.where(better[:, None], tried[row, at], points), np.where(better, distances[row, at], best)
-
-
-def _together(points: Array, best: Array, moved: Array, distances: Array) -> Array:
-    """Return each point ``(d,)`` after all moves to bounds that help; of two that help, the better one."""
-    d = points.shape[1]
-    down, up = distances[:, :d], distances[:, d : 2 * d]
-    at_bounds = np.where(down > up, 0.0, 1.0)
-    return np.where(np.maximum(down, up) > best[:, None], at_bounds, points)

@@ -169,7 +169,12 @@ def export(recovered: Recovered, folder: Path) -> list[Path]:
     try:
         (folder / "trajectories").mkdir(parents=True, exist_ok=True)
         paths = [folder / "trials.csv", folder / "trials.json"]
-        rows = [_flat(trial) for trial in recovered.trials.values()]
+        rows, after = list[dict[str, Any]](), ("distance", "failure", "executed", "attempts", "seconds")
+        for trial in recovered.trials.values():
+            row: dict[str, Any] = {name: getattr(trial, name) for name in ("number", "origin", "state")}
+            for name, value in trial.parameters.items():
+                row |= {f"{name}[{i}]": v for i, v in enumerate(value)} if isinstance(value, list) else {name: value}
+            rows.append(row | {name: getattr(trial, name) for name in after})
         header = list(dict.fromkeys(name for row in rows for name in row))
         with written_whole(paths[0], text=True) as file:
             writer = csv.writer(file)
@@ -190,10 +195,3 @@ def export(recovered: Recovered, folder: Path) -> list[Path]:
 def _cell(value: Any) -> Any:
     """Return a value as a cell of CSV; texts are made harmless for spreadsheets and terminals."""
     return guarded(visible(value)) if isinstance(value, str) else value
-
-
-def _flat(trial: Trial) -> dict[str, Any]:
-    flat: dict[str, Any] = {name: getattr(trial, name) for name in ("number", "origin", "state")}
-    for name, value in trial.parameters.items():
-        flat |= {f"{name}[{i}]": v for i, v in enumerate(value)} if isinstance(value, list) else {name: value}
-    return flat | {name: getattr(trial, name) for name in ("distance", "failure", "executed", "attempts", "seconds")}

@@ -12,7 +12,7 @@ from typing import Any, Literal, NoReturn, get_args
 import numpy as np
 
 from ctxval.core.trajectory import Trajectory
-from ctxval.core.trial import Origin, State, StatedThreshold, Trial
+from ctxval.core.trial import Origin, State, Trial
 from ctxval.errors import InputError
 
 COLUMNS = "number, origin, state, unit_point, parameters, attempts, executed, distance, failure, seconds, note, because"
@@ -119,18 +119,6 @@ def read_pairs(rows: Iterable[tuple[Any, Any]]) -> dict[str, Any]:
             raise InputError(f"a key must be a text that occurs once, got {key!r}.")
         pairs[key] = read_json(value, finite=False)
     return pairs
-
-
-def read_thresholds(stated: Any) -> tuple[StatedThreshold, ...]:
-    """Return the thresholds of a JSON value."""
-    thresholds: list[StatedThreshold] = []
-    for each in stated if isinstance(stated, list) else [None]:
-        match each:
-            case {"threshold": float(threshold), "distances": int(known), "at": str(at)} if 0 < threshold < np.inf:
-                thresholds.append(StatedThreshold(threshold, known, at))
-            case _:
-                raise InputError(f"a stated threshold must have its value, a number and a time, got {each!r}.")
-    return tuple(thresholds)
 
 
 def read_trajectory(number: int, side: str, npz: Any, checksum: Any) -> Trajectory | None:

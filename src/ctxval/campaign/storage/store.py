@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import hashlib
 import json
+import math
 import os
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict
@@ -103,10 +104,18 @@ class Store(Database):
         Those that were stated for another definition of the distance are left out.
         """
         stated = self._pairs("experiment").get(_THRESHOLDS)
-        try:
-            return None if stated is None else rows.read_thresholds(stated)
-        except InputError as error:
-            raise self._damaged("its thresholds cannot be read") from error
+        if stated is None:
+            return None
+        thresholds = list[StatedThreshold]()
+        for each in stated if isinstance(stated, list) else [None]:
+            match each:
+                case {"threshold": float(threshold), "distances": int(known), "at": str(at)} if (
+                    0 < threshold < math.inf
+                ):
+                    thresholds.append(StatedThreshold(threshold, known, at))
+                case _:
+                    raise self._damaged("its thresholds cannot be read")
+        return tuple(thresholds)
 
     def state_threshold(self, threshold: float) -> None:
         """Record a threshold with the number of distances that are known; if it is recorded already, nothing changes.
@@ -211,7 +220,7 @@ class Store(Database):
         """Record one more attempt, which the trial counts, before the execution starts."""
         with self._transaction():
             self._require_unchanged(changes)
-            self._update_open(trial, "AND state = 'open'")
+            self._update(trial, "AND state = 'open'")
 
     def close_trial(self, trial: Trial, system_trajectory: Trajectory | None, *, changes: int | None = None) -> None:
         """Store the result of an open trial; of two results for one trial, the first is stored."""
@@ -222,7 +231,7 @@ class Store(Database):
         with self._transaction():
             self._require_unchanged(changes)
             for trial, system_trajectory in ended:
-                self._update_open(trial, f"AND state = 'open' AND attempts = {trial.attempts:d}", closed_at=now())
+                self._update(trial, f"AND state = 'open' AND attempts = {trial.attempts:d}", closed_at=now())
                 self._write_trajectory(trial.number, "system", system_trajectory)
 
     def replace_result(
@@ -239,16 +248,13 @@ class Store(Database):
             self._write_trajectory(after.number, "system", trajectory)
             self._insert_change(Change("replaced", why, {"before": {str(before.number): result}}))
 
-    def _update(self, trial: Trial, where: str = "", closed_at: str | None = None) -> bool:
-        """Store what an execution changes in a trial; return whether its row satisfies a further condition."""
+    def _update(self, trial: Trial, where: str = "", closed_at: str | None = None) -> None:
+        """Store what an execution changes in a trial, which must satisfy a further condition."""
         columns = ("attempts", "state", "distance", "failure", "executed", "seconds")
         row = dict(zip(COLUMNS.split(", "), row_of(trial), strict=True))
         values = (*(row[name] for name in columns), checksum_of(row_of(trial)), closed_at, trial.number)
         assignments = f"{' = ?, '.join(columns)} = ?, checksum = ?, closed_at = coalesce(?, closed_at)"
-        return self._execute(f"UPDATE trials SET {assignments} WHERE number = ? {where}", values).rowcount == 1
-
-    def _update_open(self, trial: Trial, where: str, closed_at: str | None = None) -> None:
-        if self._update(trial, where, closed_at):
+        if self._execute(f"UPDATE trials SET {assignments} WHERE number = ? {where}", values).rowcount == 1:
             return
         row = self._execute("SELECT state FROM trials WHERE number = ?", (trial.number,)).fetchone()
         state = "not open" if row is None else "being executed by another process" if row[0] == "open" else row[0]
@@ -321,38 +327,31 @@ class Store(Database):
         Those of the system are kept in memory, up to 512 MiB, so that they are read once. Their arrays are read-only.
         A damaged trajectory is a :class:`ForeignStoreError`.
         """
-        if side == "system":
-            self._forget_changed()
-            read = {number: self._of_system(number) for number in numbers}
-        else:
-            read = {number: self._read_trajectory(number, side)[1] for number in numbers}
-        return {number: trajectory for number, trajectory in read.items() if trajectory is not None}
-
-    def _forget_changed(self) -> None:
+        if side == "model":
+            known = {number: self._read_trajectory(number, side)[1] for number in numbers}
+            return {number: trajectory for number, trajectory in known.items() if trajectory is not None}
         with self.snapshot():
             version = self._execute("PRAGMA data_version").fetchone()[0]
-            if version == self._version:
-                return  # no other connection has changed the file
-            self._version = version
-            statement = "SELECT trial, checksum FROM trajectories WHERE side = 'system'"
-            stored = dict(self._execute(statement)) if self._kept else {}
-        for number in [number for number, (checksum, _) in self._kept.items() if stored.get(number) != checksum]:
-            self._forget(number)
-
-    def _forget(self, number: int) -> None:
-        self._memory += _size(self._kept.pop(number, (None, None))[1])
-
-    def _of_system(self, number: int) -> Trajectory | None:
-        if number not in self._kept:
-            checksum, trajectory = self._read_trajectory(number, "system")
-            if _size(trajectory) > self._memory:  # to drop an older one would not help: all are read in turn
-                return trajectory
+            if version != self._version:  # another connection has changed the file
+                self._version = version
+                statement = "SELECT trial, checksum FROM trajectories WHERE side = 'system'"
+                stored = dict(self._execute(statement)) if self._kept else {}
+                for number in [each for each, (checksum, _) in self._kept.items() if stored.get(each) != checksum]:
+                    self._memory += _size(self._kept.pop(number)[1])
+        executed = dict[int, Trajectory]()
+        for number in numbers:
+            if number not in self._kept:
+                checksum, trajectory = self._read_trajectory(number, side)
+                if _size(trajectory) <= self._memory:  # to drop an older one would not help: all are read in turn
+                    self._memory -= _size(trajectory)
+                    self._kept[number] = checksum, trajectory
+                    for array in () if trajectory is None else (trajectory.times, trajectory.states, trajectory.inputs):
+                        array.setflags(write=False)
+            else:
+                trajectory = self._kept[number][1]
             if trajectory is not None:
-                for array in (trajectory.times, trajectory.states, trajectory.inputs):
-                    array.setflags(write=False)
-            self._memory -= _size(trajectory)
-            self._kept[number] = checksum, trajectory
-        return self._kept[number][1]
+                executed[number] = trajectory
+        return executed
 
     def _read_trajectory(self, number: int, side: Side) -> tuple[int | None, Trajectory | None]:
         where = "FROM trajectories {} WHERE trial = ? AND side = ?"
@@ -368,7 +367,7 @@ class Store(Database):
 
     def _write_trajectory(self, number: int, side: Side, trajectory: Trajectory | None) -> None:
         if side == "system":
-            self._forget(number)
+            self._memory += _size(self._kept.pop(number, (None, None))[1])
         if trajectory is not None:
             npz = trajectory.to_npz()
             values = (number, side, npz, checksum_of((number, side, npz)))

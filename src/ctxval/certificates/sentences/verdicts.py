@@ -108,10 +108,11 @@ def validated(certificate: Certificate, tau: float, quantities: Quantities) -> s
         condition = f"probability under a Gaussian process{condition_on_dynamics(details)}"
     elif kind == "posterior":
         what = "expected distance" if details.get("stochastic") else "distance"
-        condition = (
-            f"probability under a Gaussian process, if the {what} is as smooth between the trials as at "
-            f"them{_unusual(details.get('resolution'), quantities)}"
-        )
+        condition = f"probability under a Gaussian process, if the {what} is as smooth between the trials as at them"
+        resolution = details.get("resolution")
+        if resolution is not None and resolution["diagonals"] != RESOLUTION:
+            diagonals = f"{resolution['diagonals']:g} diagonals; usual: {RESOLUTION:g}"
+            condition += f"{_gaps(resolution, quantities)} ({diagonals})"
     return (
         f"{untested}every task{quantities.ranges} stays at or below {limit}{which}: the {kind} bound is {upper}, with "
         f"{level} {condition}."
@@ -123,13 +124,6 @@ def _bound_and_limit(certificate: Certificate, tau: float, quantities: Quantitie
     if "±" not in upper:
         upper, limit = distinguishable(certificate.upper_bound, tau)
     return quantities.of(upper), quantities.of(limit)
-
-
-def _unusual(resolution: Mapping[str, float] | None, quantities: Quantities) -> str:
-    if resolution is None or resolution["diagonals"] == RESOLUTION:
-        return ""
-    diagonals = f"{resolution['diagonals']:g} diagonals; usual: {RESOLUTION:g}"
-    return f"{_gaps(resolution, quantities)} ({diagonals})"
 
 
 def _gaps(resolution: Mapping[str, float], quantities: Quantities) -> str:

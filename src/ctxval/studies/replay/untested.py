@@ -58,7 +58,7 @@ def predicted_tasks(
     if learned is None:
         return None
     with single_threaded():
-        worst, pool = learned.worst_case, study.search.pool
+        worst, pool = learned.worst_case_of(1), study.search.pool
         random = pool[np.random.default_rng([seed, 3]).permutation(len(pool))[:96]]
         together = np.concatenate([worst.elites[:24], worst.points, random])
         points = np.unique(together.round(6), axis=0)[:: max(1, -(-len(together) // 384))]
