@@ -45,9 +45,13 @@ On plants on which rules were chosen:
 """
 
 MISLEADING = """
-On carts that break an assumption, which were looked at during development:
+On carts that break an assumption; eight of them were looked at during development, dropouts and battery were not:
 
 {table}
+
+The two validations are false. In payload, the load lies in a tenth of the goals, 0.8 to 1.2 m, and no executed task had such
+a goal. In sticking, the wheels stop in nearly every task where the push is too weak, at 0.82 to 0.86 of d_q*, and the worst
+tasks lie in a small place.
 """
 
 
