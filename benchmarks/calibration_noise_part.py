@@ -49,9 +49,9 @@ On carts that break an assumption; eight of them were looked at during developme
 
 {table}
 
-The two validations are false. In payload, the load lies in a tenth of the goals, 0.8 to 1.2 m, and no executed task had such
-a goal. In sticking, the wheels stop in nearly every task where the push is too weak, at 0.82 to 0.86 of d_q*, and the worst
-tasks lie in a small place.
+The two validations are false. In payload, the load lies in a tenth of the goals, 0.8 to 1.2 m, and no executed task
+had such a goal. In sticking, the wheels stop in nearly every task where the push is too weak, at 0.82 to 0.86 of
+d_q*, and the worst tasks lie in a small place.
 """
 
 
