@@ -22,11 +22,15 @@ _BEFORE, _AFTER = ("number", "origin", "state"), ("distance", "seconds", "attemp
 
 def as_text(campaign: Campaign) -> str:
     """Return a campaign in five lines: the task space, the search, the number of trials, the worst task, the store."""
+    worst, at = campaign.worst, "no distance is known"
+    if worst is not None and worst.distance is not None:
+        where = named(worst.parameters, campaign.validation.space.units)
+        at = f"trial {worst.number} with distance {number(worst.distance)} at {where}"
     return lines(
         call(campaign, campaign.validation.space, name=campaign.name or None, seed=campaign.seed),
         f"search: {shown(campaign.search)}",
         f"trials: {_trials(campaign)}",
-        f"worst: {_worst(campaign)}",
+        f"worst: {at}",
         f"store: {shown(campaign.store)}",
     )
 
@@ -53,14 +57,6 @@ def _trials(campaign: Campaign) -> Shown:
     states = Counter(trial.state for trial in campaign.trials)
     counts = [counted(campaign.executions, "execution"), *(f"{count} {state}" for state, count in states.items())]
     return Shown(f"{len(campaign.trials)} ({', '.join(counts)})")
-
-
-def _worst(campaign: Campaign) -> str:
-    worst = campaign.worst
-    if worst is None or worst.distance is None:
-        return "no distance is known"
-    at = named(worst.parameters, campaign.validation.space.units)
-    return f"trial {worst.number} with distance {number(worst.distance)} at {at}"
 
 
 def to_dataframe(trials: Sequence[Trial], space: TaskSpace) -> DataFrame:

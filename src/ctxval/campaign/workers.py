@@ -52,23 +52,6 @@ def execute_task(system: System, controller: Controller, task: Task) -> Executio
     return Execution(trajectory, seconds=time.perf_counter() - started)
 
 
-def _executed_batch(system: System, plans: Sequence[Plan]) -> Trajectory | None:
-    """Return the trajectories of plans; None if they cannot be a batch, or if it is not known which of them failed."""
-    kinds = {(task.horizon, task.dt, task.has_goal, task.reference.shape) for task in (plan.task for plan in plans)}
-    if len(plans) == 1 or len(kinds) > 1:
-        return None
-    try:
-        tasks = [plan.task for plan in plans]
-        trajectory = system.execute(each_alone([plan.controller for plan in plans], tasks), Task.stacked(tasks))
-    except BaseException as error:
-        if raised_by_signal(error):
-            raise
-        return None
-    if not isinstance(trajectory, Trajectory) or trajectory.batch_shape != (len(plans),):
-        return None
-    return trajectory if trajectory.ended == COMPLETE or not trajectory.finite.all() else None
-
-
 def timed_out(timeout: float, seconds: float) -> Execution:
     """Return the result of an execution that took longer than the timeout."""
     return Execution(failed=f"the execution did not end within {timeout:g} s", seconds=seconds)
@@ -122,8 +105,19 @@ class SerialPool(WorkerPool):
 
     def wait(self) -> list[tuple[int, Execution]]:
         taken, self._next = self._next, []
-        started = time.perf_counter()
-        together = _executed_batch(self.system, [plan for _, plan in taken])
+        tasks, controllers = [plan.task for _, plan in taken], [plan.controller for _, plan in taken]
+        kinds = {(task.horizon, task.dt, task.has_goal, task.reference.shape) for task in tasks}
+        started, together = time.perf_counter(), None
+        if len(taken) > 1 and len(kinds) == 1:
+            try:
+                together = self.system.execute(each_alone(controllers, tasks), Task.stacked(tasks))
+            except BaseException as error:
+                if raised_by_signal(error):
+                    raise
+            if not isinstance(together, Trajectory) or together.batch_shape != (len(taken),):
+                together = None
+            elif together.ended != COMPLETE and together.finite.all():
+                together = None  # it is not known which of them failed
         seconds = (time.perf_counter() - started) / len(taken)
         ended = [
             (number, execute_task(self.system, plan.controller, plan.task))

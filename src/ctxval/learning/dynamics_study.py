@@ -26,7 +26,6 @@ from ctxval.learning.extended import ExtendedValidation
 from ctxval.learning.histories import Record
 from ctxval.learning.learned_dynamics import LearnedDynamics
 from ctxval.learning.noise_study import NoiseStudy
-from ctxval.learning.noisy_draws import NoisyPosterior
 from ctxval.learning.prediction import ErrorVectors, Executed, PredictedDistance, predict_composed
 from ctxval.learning.recorded import data_near, digest, recorded_transitions, scheduled
 from ctxval.learning.regular import split_transitions
@@ -221,15 +220,6 @@ class DynamicsStudy(ShortRepr):
     def noise(self) -> NoiseStudy:
         """Learns dynamics with noise."""
         return NoiseStudy(self.extended, self.planner, self.search, self.seed, self.quantile)
-
-    def noisy(self, learned: LearnedDynamics) -> NoisyPosterior | None:
-        """Return dynamics with noise and histories, learned from the executions.
-
-        It is None if the next state follows from state and input, or if they cannot be learned.
-        """
-        if self._loops is None or not len(learned.executed):
-            return None
-        return self.noise.learn(learned.posterior, self.extended.records(learned.executions))
 
     def without(self, learned: LearnedDynamics, k: int) -> LearnedDynamics | None:
         """Return what all executions but one teach, with the same hyperparameters and the same structure of noise.

@@ -52,9 +52,14 @@ class LearnedDynamics(ShortRepr):
 
     @functools.cached_property
     def noisy(self) -> NoisyPosterior | None:
-        """The dynamics with noise and histories, if the next state does not follow from state and input; else None."""
+        """The dynamics with noise and histories, learned from the executions.
+
+        It is None if the next state follows from state and input, or if they cannot be learned.
+        """
+        if not len(self.executed):
+            return None
         with single_threaded():
-            return self.study.noisy(self)
+            return self.study.noise.learn(self.posterior, self.study.extended.records(self.executions))
 
     def with_noisy(self, noisy: NoisyPosterior | None) -> LearnedDynamics:
         """Return the same with dynamics with noise that were learned otherwise, or without noise."""

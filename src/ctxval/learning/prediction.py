@@ -70,11 +70,9 @@ class PredictedDistance:
         """Return the distances predicted at executed points, each from the executions of other points, ``(k,)``."""
         points = self.executed[rows]
         without = self.posterior.means_without(executions_of(self.executed, points))
-
         with single_threaded():
-            distances = _nan_where_it_fails(
-                lambda some: self.planner.own_distances(without[some], points[some, None]).T, len(rows), 1
-            )[0]
+            parts = halved(lambda some: self.planner.own_distances(without[some], points[some, None])[:, 0], len(rows))
+        distances = np.concatenate([[np.nan] if part is None else part for _, part in parts])
         return np.where(np.isfinite(distances), distances, np.nan)
 
     def _predicted(self, points: Array) -> Array:
@@ -89,12 +87,8 @@ class PredictedDistance:
                 predicted[:, plan.rows] = loops.distances[0], doubt
             return predicted
 
-        return _nan_where_it_fails(lambda rows: closed_loops(points[rows]), len(points), 2)
-
-
-def _nan_where_it_fails(function: Callable[[Rows], Array], count: int, values: int) -> Array:
-    parts = [np.full((values, 1), np.nan) if part is None else part for _, part in halved(function, count)]
-    return np.concatenate(parts, axis=1)
+        parts = halved(lambda rows: closed_loops(points[rows]), len(points))
+        return np.concatenate([np.full((2, 1), np.nan) if part is None else part for _, part in parts], axis=1)
 
 
 def executions_of(executed: Array, points: Iterable[Array]) -> list[list[int]]:
