@@ -32,6 +32,7 @@ from ctxval.certificates.sentences.verdicts import undecided
 from ctxval.certificates.verdict import judge, judge_by
 from ctxval.errors import CertificateError
 from rig_evidence import COVERED, GOOD, gap, prediction
+from rig_thorough import more
 
 
 def trials(count: int = 4, largest: float = 0.8) -> list[Trial]:
@@ -182,7 +183,7 @@ def test_the_verdict_names_its_evidence() -> None:
 
 
 @pytest.mark.parametrize(("other", "validates"), [(0.0, True), (0.01, True), (0.2, False)])
-@pytest.mark.parametrize("kind", [Dynamics(tests=0), Automatic(tests=0)])
+@pytest.mark.parametrize("kind", [Dynamics(tests=0), *more(Automatic(tests=0))])
 def test_noise_that_nobody_declared_is_named(other: float, validates: bool, kind: CertificateKind) -> None:
     executed = trials()
     again = replace(executed[2], number=len(executed), distance=(executed[2].distance or 0.0) - other)

@@ -171,7 +171,7 @@ def test_nothing_is_suspected_if_state_and_input_explain_the_executions() -> Non
     assert study.suspected_parameter(learned) is None
 
 
-@pytest.mark.slow
+@pytest.mark.thorough  # one of test_actuators finds a parameter and a delay together
 def test_a_parameter_that_clearly_explains_the_executions_is_found() -> None:
     validation = loaded_cart(())
     executed = random_executions(validation, 8)

@@ -19,6 +19,7 @@ from ctxval.models import Linear
 from ctxval.report.replay_page import replay_page, write_replay_page
 from ctxval.studies.replay import PredictedTask, PredictedTasks, ReplayReport, replay
 from rig_logs import run
+from rig_thorough import more
 
 LARGEST = 300_000
 """Bytes of a page; it does not grow with the recordings."""
@@ -105,7 +106,7 @@ def test_a_page_is_written_where_it_is_asked_for_and_never_over_a_store(tmp_path
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("scheme", ["light", *more("dark")])
 def test_a_page_is_quiet_small_and_accessible(browser: Any, tmp_path: Path, scheme: Any) -> None:
     path = write_replay_page(with_tasks(report(12, 400)), tmp_path / "page.html", name="arm", units="m")
     assert path.stat().st_size < LARGEST

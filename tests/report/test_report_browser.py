@@ -14,6 +14,7 @@ from browser import accessibility_findings
 from ctxval import Campaign, Store, cases, searches
 from ctxval.certificates import CertificateOptions
 from ctxval.report import ReportContext, context_of_campaign, context_of_store, write_page
+from rig_thorough import more
 
 LARGEST = 1_500_000
 """Bytes of a report."""
@@ -92,9 +93,7 @@ class Opened:
         return accessibility_findings(self.page)
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[pytest.mark.thorough] * (name in ("arm", "plane"))) for name in sorted(REPORTS)]
-)
+@pytest.mark.parametrize("name", ["pendulum", "hostile", *more("by hand", "many parameters", "arm", "plane")])
 def test_a_report_is_quiet_small_and_accessible(name: str, browser: Any, tmp_path: Path) -> None:
     path = write_page(REPORTS[name](tmp_path), tmp_path / "report.html")
     assert path.stat().st_size < LARGEST

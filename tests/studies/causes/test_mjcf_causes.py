@@ -43,9 +43,11 @@ def report(true: str) -> CauseReport:
 @pytest.mark.parametrize(
     ("true", "line", "says"),
     [
-        (mjcf('frictionloss="0.2"'), '<joint name="hinge" frictionloss="0.2"/>', "Hinge sticks (0.2 N m)"),
         (mjcf(mass=0.7), "<inertial ", "Link has a mass of 0.7 kg and not of 0.5 kg"),
-        *more((mjcf('armature="0.03"'), '<joint name="hinge" armature="0.03"/>', "more inertia of the rotor")),
+        *more(
+            (mjcf('frictionloss="0.2"'), '<joint name="hinge" frictionloss="0.2"/>', "Hinge sticks (0.2 N m)"),
+            (mjcf('armature="0.03"'), '<joint name="hinge" armature="0.03"/>', "more inertia of the rotor"),
+        ),
     ],
 )
 def test_the_attribute_that_differs_is_found(true: str, line: str, says: str) -> None:
