@@ -514,7 +514,7 @@ class Campaign:
             CertificateError: if an option of the certificate is not valid.
         """
         options, recorder = CertificateOptions.or_automatic(certificate, confidence, resolution), self.recorder
-        recorder.store.state_threshold(float(threshold))
+        self.state_threshold(threshold)
         with progress_shown(progress), stage("certifying"):
             return with_next_task(judge(recorder.trials, threshold, options, self.provenance), recorder, options)
 

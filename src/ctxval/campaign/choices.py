@@ -117,10 +117,9 @@ class Execution:
 
     def ended(self, trial: Trial, *, executed: bool = True) -> Trial:
         """Return a trial in the final state that this measured execution gives it."""
-        failure = self.unusable if self.failed is None else text_of(self.failed)
         state: State = "failed" if self.failed is not None else "unmeasured" if self.distance is None else "completed"
         return replace(
-            trial, state=state, executed=executed, distance=self.distance, failure=failure, seconds=self.seconds
+            trial, state=state, executed=executed, distance=self.distance, failure=self._failure, seconds=self.seconds
         )
 
     def is_that_of(self, trial: Trial) -> bool:
@@ -130,5 +129,8 @@ class Execution:
         else:
             # A distance that another type of processor has computed differs in its last digits.
             same = bool(np.isclose(trial.distance, self.distance, rtol=1e-9, atol=0))
-        failure = self.unusable if self.failed is None else text_of(self.failed)
-        return same and trial.failure == failure and trial.state != "open"
+        return same and trial.failure == self._failure and trial.state != "open"
+
+    @property
+    def _failure(self) -> str | None:
+        return self.unusable if self.failed is None else text_of(self.failed)

@@ -38,13 +38,6 @@ def executed_trials(store: Store, trials: Sequence[Trial]) -> list[tuple[Trial, 
     return [(trial, executed[trial.number]) for trial in completed if trial.number in executed]
 
 
-def failed_trials(store: Store, trials: Sequence[Trial]) -> list[tuple[Trial, Trajectory]]:
-    """Return the failed trials that have a recording, with the steps before their failures."""
-    failed = [trial for trial in trials if trial.state == "failed"]
-    recorded = store.trajectories([trial.number for trial in failed], "system")
-    return [(trial, recorded[trial.number]) for trial in failed if trial.number in recorded]
-
-
 def largest_distance(trials: Sequence[Trial]) -> float:
     """Return the largest distance of trials; 0 if none is known."""
     return max((trial.distance or 0.0 for trial in trials), default=0.0)

@@ -6,17 +6,19 @@ from dataclasses import replace
 
 import numpy as np
 
+from ctxval._util.texts import reason_of
 from ctxval.core.controller import Controller, started
 from ctxval.core.model import Step
 from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory
-from ctxval.errors import ShapeError
+from ctxval.errors import CtxvalError, ShapeError
 
 
-def rollout(step: Step, controller: Controller, task: Task) -> Trajectory:
+def rollout(step: Step, controller: Controller, task: Task, *, partial: bool = False) -> Trajectory:
     """Run a controller in closed loop with ``x_next = step(x, u)`` over the task's horizon.
 
-    A loop that diverges continues with NaN and infinity; it does not stop the other loops of its batch.
+    A loop that diverges continues with NaN and infinity; it does not stop the other loops of its batch. If it may be
+    ``partial``, an exception of the user's parts after the first step ends the trajectory before it.
     """
     with np.errstate(all="ignore"):
         x = np.array(task.initial_state)
@@ -27,19 +29,27 @@ def rollout(step: Step, controller: Controller, task: Task) -> Trajectory:
         states = np.empty((task.horizon + 1, *x.shape))
         inputs = np.empty((task.horizon, *u.shape))
         states[0], of_states, of_inputs = x, x.shape, u.shape
-        for t in range(task.horizon):
-            if t:
-                u = pi(t, x)
-            # An attribute is looked at first, because other checks take as long as a small step.
-            if getattr(u, "shape", None) != of_inputs and np.shape(u) != of_inputs:
-                wanted = f"inputs of shape {of_inputs} at every step"
-                raise ShapeError(f"the controller must return {wanted}, got {np.shape(u)}.")
-            inputs[t] = u
-            x = step(x, inputs[t])
-            if getattr(x, "shape", None) != of_states and np.shape(x) != of_states:
-                wanted = f"from states of shape {of_states} must return the same shape"
-                raise ShapeError(f"a step {wanted}, got {np.shape(x)}.")
-            states[t + 1] = x
+        try:
+            for t in range(task.horizon):
+                if t:
+                    u = pi(t, x)
+                # An attribute is looked at first, because other checks take as long as a small step.
+                if getattr(u, "shape", None) != of_inputs and np.shape(u) != of_inputs:
+                    wanted = f"inputs of shape {of_inputs} at every step"
+                    raise ShapeError(f"the controller must return {wanted}, got {np.shape(u)}.")
+                inputs[t] = u
+                x = step(x, inputs[t])
+                if getattr(x, "shape", None) != of_states and np.shape(x) != of_states:
+                    wanted = f"from states of shape {of_states} must return the same shape"
+                    raise ShapeError(f"a step {wanted}, got {np.shape(x)}.")
+                states[t + 1] = x
+        except CtxvalError:
+            raise
+        except Exception as error:
+            if not (partial and t):
+                raise
+            known = np.moveaxis(states[: t + 1], 0, -2), np.moveaxis(inputs[:t], 0, -2)
+            return Trajectory(task.times[: t + 1], *known, reason_of(error))
     trajectory = Trajectory(task.times, np.moveaxis(states, 0, -2), np.moveaxis(inputs, 0, -2))
     if trajectory.finite.all():
         return trajectory

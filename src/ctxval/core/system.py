@@ -12,13 +12,12 @@ import numpy as np
 from ctxval._util.arrays import Array, rows_of
 from ctxval._util.registry import part
 from ctxval._util.representation import ShortRepr
-from ctxval._util.texts import reason_of
 from ctxval.core.controller import Controller, ControllerWithMemory
 from ctxval.core.model import Model, Step, as_model, central_differences
 from ctxval.core.rollout import rollout
 from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory
-from ctxval.errors import CtxvalError, InputError, ShapeError
+from ctxval.errors import InputError, ShapeError
 
 OutputsLike = Callable[[Array], Array] | Sequence[int]
 """A function ``h(x) -> y`` of states ``(..., n)`` to outputs ``(..., p)``, or the indices of the states to record."""
@@ -153,25 +152,7 @@ class Simulated(ShortRepr):
 
         If a step of one task raises an exception, the trajectory ends before it.
         """
-        if task.batch_shape:
-            return rollout(self.model.step, controller, task)
-        states, inputs = [task.initial_state], list[Array]()
-
-        def step(x: Array, u: Array) -> Array:
-            reached = self.model.step(x, u)
-            states.append(np.array(reached))
-            inputs.append(u)
-            return reached
-
-        try:
-            return rollout(step, controller, task)
-        except CtxvalError:
-            raise
-        except Exception as error:  # the user's step or controller
-            if not inputs:
-                raise
-            recorded = np.array(states), np.array(inputs)
-            return Trajectory(task.times[: len(states)], *recorded, reason_of(error))
+        return rollout(self.model.step, controller, task, partial=not task.batch_shape)
 
 
 @part(functions={"outputs": "x -> y", "start": "x -> first state"}, parts={"system": "system"})

@@ -209,9 +209,8 @@ def _clean(idle: dict[int, list[_Process]], unpacked: str, owner: int) -> None:
 
 def _unpacked(path: Path) -> tuple[Any, str]:
     fmpy = require_extra("fmpy", "fmu", "FMUs need")
-    with reworded(
-        f"{path} cannot be read as an FMU", Exception
-    ):  # of many kinds: no file, not a zip, not XML, not valid by the schema
+    # Errors of many kinds: no file, not a zip, not XML, not valid by the schema.
+    with reworded(f"{path} cannot be read as an FMU", Exception):
         require_regular_file(path)
         description = fmpy.read_model_description(str(path))
     if description.coSimulation is None or not description.fmiVersion.startswith(("2", "3")):

@@ -10,7 +10,7 @@ import numpy as np
 from ctxval._util.arrays import single_threaded
 from ctxval._util.progress import advance, stage
 from ctxval.campaign.campaign import Campaign
-from ctxval.campaign.history import executed_trials, failed_trials
+from ctxval.campaign.history import executed_trials
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import Trial
 from ctxval.core.validation import Validation
@@ -72,9 +72,11 @@ def find_causes(campaign: Campaign, *, most: int = 2) -> CauseReport:
 def _usable(campaign: Campaign) -> list[tuple[Trial, Trajectory]]:
     """Return the failed trials with what was recorded until they left the surroundings of what M promised."""
     usable = []
-    for trial, run in failed_trials(campaign.store, campaign.trials):
-        promised = campaign.recorder.plan(trial).model_trajectory.states
-        far = np.abs(run.states - promised[0]) > _AWAY * np.ptp(promised, axis=0).clip(1e-12)
+    for trial in campaign.failed:
+        promised, run = campaign.trajectories(trial)
+        if promised is None or run is None:
+            continue
+        far = np.abs(run.states - promised.states[0]) > _AWAY * np.ptp(promised.states, axis=0).clip(1e-12)
         near = np.flatnonzero(far.any(axis=1))
         steps = min([run.horizon, *(near[:1] - 1)])
         if steps >= _STEPS:

@@ -66,32 +66,23 @@ class Separating(ShortRepr):
 
 @dataclass(frozen=True, eq=False)
 class CauseReport(ShortRepr):
-    """Why a model fails.
-
-    Attributes:
-        explained: the most probable causes, and others that the executions do not tell from them; empty if no cause
-            predicts held-out executions better than M.
-        named: whether the first of these is the cause. Otherwise the answer is none of these, and ``explained`` is what
-            comes nearest.
-        tried: the number of causes in the dictionary.
-        executions, before: the number of executions that were learned from, and their largest distance from M.
-        failed: how many of them failed, of which only the steps before are known.
-        began_elsewhere: whether M predicts the executions from where they began, and not from where their tasks begin.
-        separating: the task that tells causes apart which these executions do not.
-        ranked: the most probable causes alone, the best one first.
-    """
+    """Why a model fails."""
 
     plant: Plant
+    #: the most probable causes, and others that the executions do not tell from them; empty if no cause predicts
+    #: held-out executions better than M
     explained: tuple[Explained, ...]
+    #: whether the first of these is the cause; otherwise the answer is none of these, and they are what comes nearest
     named: bool
-    tried: int
-    executions: int
-    before: float
-    failed: int = 0
+    tried: int  #: the number of causes in the dictionary
+    executions: int  #: the number of executions that were learned from
+    before: float  #: their largest distance from M
+    failed: int = 0  #: how many of them failed, of which only the steps before are known
     units: str = ""
+    #: whether M predicts the executions from where they began, and not from where their tasks begin
     began_elsewhere: bool = False
-    separating: Separating | None = None
-    ranked: tuple[Explanation, ...] = ()
+    separating: Separating | None = None  #: the task that tells causes apart which these executions do not
+    ranked: tuple[Explanation, ...] = ()  #: the most probable causes alone, the best one first
 
     @property
     def causes(self) -> tuple[Cause, ...]:
