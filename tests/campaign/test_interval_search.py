@@ -32,6 +32,7 @@ from ctxval.certificates.prediction_tests import DRAWN, TESTS
 from ctxval.errors import InputError
 from ctxval.learning import dynamics_study
 from ctxval.learning.dynamics_posterior import condition
+from ctxval.testing import FaultyRig
 
 
 def facts(campaign: Campaign) -> list[tuple[object, ...]]:
@@ -60,6 +61,31 @@ def test_a_linear_system_is_validated_in_few_executions_by_a_bound_that_is_true(
     assert campaign.worst is not None
     assert low == campaign.worst.distance
     assert high == verdict.certificate.upper_bound  # the store keeps the evidence of the end
+
+
+@pytest.mark.slow
+@pytest.mark.in_full
+# a task that the search chose, and a test
+@pytest.mark.parametrize("failing", [2, pytest.param(6, marks=pytest.mark.thorough)])
+def test_a_failure_stops_no_search_and_is_decided_by_one_repetition(failing: int) -> None:
+    validation, largest = linear()
+    threshold = 1.25 * largest
+    validation = validation.with_parts(system=FaultyRig(validation.system, {failing: "raise"}))
+    campaign = Campaign(validation).run(30, threshold)
+    alone = campaign.executions
+    (failed,) = campaign.failed
+    verdict = campaign.verdict(threshold)
+    assert (verdict.answer, failed.number) == ("undecided", failing)
+    assert "1 of" in verdict.reason
+    assert alone <= 16
+    # The failed task is not executed again without a reason.
+    others = np.array([trial.unit_point for trial in campaign.completed])
+    assert np.abs(others - failed.unit_point).max(axis=1).min() > 1e-6
+    opened = campaign.ask(failed.parameters, because="the cable is mended")
+    campaign.tell(opened, validation.execute(opened.plan))
+    campaign.run(30, threshold)
+    assert campaign.verdict(threshold).answer == "validated"
+    assert campaign.executions <= alone + 2
 
 
 @pytest.mark.slow

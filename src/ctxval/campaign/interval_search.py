@@ -250,7 +250,10 @@ class IntervalSearch:
             return self.test()
         learned = self.recorder.dynamics.learned(trials)
         steady = Steadiness(self.recorder.dynamics.study.planner, None if learned is None else learned.expected)
-        point = next_task(evidence, self._points(self._ended), best, limit, confidence, steady, self._near)
+        # Failed ones count twice: without a reason, they are not repeated, although a start may jump next to them.
+        failed = [trial for trial in trials if trial.state == "failed"]
+        known = self._points([*self._ended, *failed])
+        point = next_task(evidence, known, best, limit, confidence, steady, self._near)
         waiting = waiting_points(trials)
         if len(waiting) and (point is None or np.abs(waiting - point).max(axis=1).min() <= NEAR):
             # It is being executed already. Another worker prepares for the results that are expected.
@@ -259,7 +262,8 @@ class IntervalSearch:
                 best = max(best, float(expected[np.isfinite(expected)].max(initial=0.0)))
                 limit = (1 + self.within) * best if self.threshold is None else limit
             after = self.recorder.dynamics.screening(trials, pending=True) or evidence
-            point = next_task(after, self._points(trials), best, limit, confidence, steady, self._near)
+            known = self._points([*trials, *failed])
+            point = next_task(after, known, best, limit, confidence, steady, self._near)
         return Choice(point, "covering", planned_draws=0, rejected=steady.rejected)
 
     # What is known
@@ -267,7 +271,7 @@ class IntervalSearch:
     def _evidence(self) -> DynamicsEvidence | None:
         """Return what the store keeps, or what a few posterior samples say; None if the certificate uses neither."""
         trials, dynamics = self.recorder.trials, self.recorder.dynamics
-        if not self.predicts or any(trial.state == "failed" for trial in trials):
+        if not self.predicts:
             return None
         evidence = dynamics.kept_evidence(trials, self.options.confidence) or dynamics.screening(trials)
         return None if evidence is None else replace(evidence, tests=self.tests)

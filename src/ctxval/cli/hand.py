@@ -82,9 +82,10 @@ def ask(
         if asked is None:
             verdict = campaign.verdict(limit, certificate=certificate)
             print_verdict(verdict)
+            opened_trials = sum(each.state == "open" for each in campaign.trials)
             if verdict.answer == "undecided" and not campaign.recorder.has_tasks:
                 out.say("each task of the suite is executed or open: --set task=NAME opens one of them again.")
-            elif verdict.answer == "undecided":
+            elif verdict.answer == "undecided" and campaign.executions + opened_trials >= total:
                 more = "--budget plans more executions, and --explore opens a trial without a verdict"
                 out.say(f"the budget is spent: {more}.")
             decided = {"verdict": verdict.answer, "reason": verdict.reason, "threshold": limit, "store": str(path)}

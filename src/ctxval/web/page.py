@@ -125,6 +125,8 @@ class Page:
             return None
         if state.snapshot.executions >= budget:
             return f"The budget of {counted(budget, 'execution')} is spent."
+        if state.verdict is not None and state.verdict.answer == "undecided":
+            return "No other execution would decide the verdict; its reason says what is missing."
         return "The verdict is reached. No further execution is needed for it."
 
     def ended(self, number: int) -> str | None:
