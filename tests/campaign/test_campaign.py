@@ -157,6 +157,29 @@ def test_a_failure_is_told_with_what_was_recorded_before(validation: Validation)
         campaign.tell(opened, Trajectory(whole.times, whole.states + 9.0, whole.inputs), failed="it was stopped")
 
 
+def test_an_emergency_stop_falsifies_if_the_steps_before_it_exceed_the_threshold(tmp_path: Path) -> None:
+    validation = make_validation(distance=distances.MaximumDeviation())
+    campaign = Campaign(validation, store=tmp_path / "a.sqlite")
+    opened = campaign.ask()
+    whole = validation.execute(opened.plan)
+    states = whole.states.copy()
+    states[5:, 0] += 3.0
+    stopped = campaign.tell(opened, Trajectory(whole.times, states, whole.inputs).first(8), failed="emergency stop")
+    gap = np.linalg.norm(states[:9] - opened.plan.model_trajectory.states[:9], axis=1).max()
+    assert stopped.least == pytest.approx(gap, rel=1e-12)
+    assert campaign.verdict(0.9 * gap).answer == "falsified"
+    assert campaign.verdict(1.1 * gap).answer == "undecided"
+    assert Campaign(validation, store=tmp_path / "a.sqlite").trials[0].least == stopped.least
+    assert campaign.run(10, 0.9 * gap).executions == 1
+    # Nothing is known of a final state, and with the deviation again the same as before.
+    campaign.remeasure(distances.FinalState())
+    assert campaign.verdict(0.9 * gap).answer == "undecided"
+    campaign.remeasure(distances.MaximumDeviation())
+    assert campaign.trials[0].least == stopped.least
+    campaign.tell(campaign.ask(opened.trial.parameters, because="the stop was mended"), whole)
+    assert campaign.verdict(0.9 * gap).answer != "falsified"
+
+
 def test_failures_do_not_change_what_a_resumed_campaign_chooses(validation: Validation, tmp_path: Path) -> None:
     def campaign(store: Path | None, done: int) -> Campaign:
         faults = {k - done: "raise" for k in (1, 6) if k >= done}

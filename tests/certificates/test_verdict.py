@@ -25,7 +25,7 @@ from ctxval.certificates.covering import resolved_volume
 from ctxval.certificates.sentences.withdrawals import REFINED
 from ctxval.certificates.stopping import StoppingRule
 from ctxval.certificates.verdict import counterexample, judge, judge_by
-from ctxval.core.trial import Origin, State, StatedThreshold, designs_sentence
+from ctxval.core.trial import AT_LEAST, Origin, State, StatedThreshold, designs_sentence
 from ctxval.errors import InputError
 
 pytestmark = pytest.mark.usefixtures("few_draws")
@@ -51,6 +51,22 @@ def certificate(upper: float, doubt: str | None = None, volume: float = 0.0) -> 
 
 
 # Counterexamples
+
+
+def test_the_steps_before_a_failure_falsify_until_a_success_makes_it_good() -> None:
+    stopped = replace(trial(8, 0.35, None), note={AT_LEAST: 0.7}, failure="emergency stop")
+    low = [replace(each, distance=0.1) for each in trials()]
+    verdict = judge([*low, stopped], 0.5)
+    assert (verdict.answer, verdict.witness) == ("falsified", stopped)
+    assert "trial 8 failed (emergency stop), but its distance is at least 0.7" in verdict.reason
+    assert "--again 8 --because" in verdict.reason
+    assert judge([*low, stopped], 0.8).answer == "undecided"
+    assert judge([*low, stopped, replace(trial(9, 0.35, 0.1), because="fuse replaced")], 0.5).answer != "falsified"
+    # A whole execution is the better counterexample.
+    whole = counterexample([*low, stopped, trial(9, 0.9, 0.6)], 0.5)
+    assert whole is not None
+    assert whole.witness is not None
+    assert whole.witness.number == 9
 
 
 def test_an_executed_distance_above_the_threshold_falsifies() -> None:

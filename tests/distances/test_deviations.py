@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -156,6 +157,19 @@ def test_a_distance_of_trajectories_is_a_metric(
     assert d(a, b) == d(b, a)
     rounding = 1e-12 if getattr(distance, "angles", ()) or isinstance(distance, AtCrossing) else 0
     assert d(a, c) <= (d(a, b) + d(b, c)) * (1 + 1e-12) + rounding * (1 + np.abs([a, b, c]).max())
+
+
+@pytest.mark.parametrize("distance", [each for each in METRICS if getattr(each, "monotone", False)])
+@given(states=STATES, others=STATES)
+@settings(max_examples=15, deadline=None)
+def test_no_further_deviation_makes_a_monotone_distance_smaller(
+    distance: Distance, states: np.ndarray, others: np.ndarray
+) -> None:
+    values = [
+        float(distance(trajectory(others), trajectory(np.concatenate([states[:k], others[k:]])), task()))
+        for k in range(1, HORIZON + 2)
+    ]
+    assert all(after >= before * (1 - 1e-12) for before, after in pairwise(values))
 
 
 def test_the_goal_error_depends_on_the_system_alone() -> None:

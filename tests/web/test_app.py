@@ -341,6 +341,9 @@ def test_a_campaign_by_hand_by_forms_alone(tmp_path: Path) -> None:
         found = zipfile.ZipFile(io.BytesIO(server.request("GET", "/trials/3/files.zip", Cookie=page.cookie).content))
         files = [f"trial-3/{name}" for name in ("controller.json", "controller.npz", "model.csv", "task.json")]
         assert sorted(found.namelist()) == files
+        before = b"\n".join(recording.splitlines()[:9])  # a header and eight samples
+        assert upload(server, 4, page, before, reason="it hit the stop").status == 303
+        wait_for(server, "it hit the stop", page)
         status, said = server.stop()
     assert (status, "stopped. All executions are stored" in said) == (130, True)
     stored = trials(tmp_path)
@@ -349,7 +352,7 @@ def test_a_campaign_by_hand_by_forms_alone(tmp_path: Path) -> None:
         ("failed", "acquisition"),
         ("completed", "manual"),
         ("open", "manual"),
-        ("open", "iid"),
+        ("failed", "iid"),
     ]
     assert stored[2].because == "motor <replaced>"
     assert stored[3].parameters == {"goal": 1.5}

@@ -274,7 +274,7 @@ def test_the_keyboard_reaches_everything_in_order(browser: Any, folder: Path, ad
     assert reached == [
         *("To the next task", "Choose another task", "Other ways to choose a task"),
         *("task.json", "controller.json", "controller.npz", "model.csv", "all files (zip)"),
-        *("file", "If the recording does not match", "Check and store the recording"),
+        *("file", "If the execution was stopped, or the recording does not match", "Check and store the recording"),
         "It failed, or there is no recording",
     ]
     one.page.keyboard.press("Enter")

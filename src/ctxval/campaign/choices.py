@@ -11,9 +11,9 @@ import numpy as np
 from ctxval._util.arrays import Array
 from ctxval._util.representation import call, fields_of, lines, shown
 from ctxval._util.texts import text_of
-from ctxval.core.plan import Plan, recorded_before_failure
+from ctxval.core.plan import Plan, least_distance, recorded_before_failure
 from ctxval.core.trajectory import Trajectory
-from ctxval.core.trial import Origin, State, Trial
+from ctxval.core.trial import AT_LEAST, Origin, State, Trial
 from ctxval.core.validation import Validation
 from ctxval.errors import InputError
 
@@ -78,6 +78,7 @@ class Execution:
             the failure; None if there is none.
         distance: d(p); None if it is not known.
         failed: the reason why there is no result: the system failed, or the execution took too long.
+        at_least: what the distance of a failed execution is at least; None if nothing is known.
         unusable: the reason why the distance function gave no usable number.
         lost: the reason why the worker was lost, which is not a failure of the system.
         seconds: the duration, if it is known.
@@ -86,6 +87,7 @@ class Execution:
     trajectory: Trajectory | None = None
     distance: float | None = None
     failed: str | None = None
+    at_least: float | None = None
     unusable: str | None = None
     lost: str | None = None
     seconds: float | None = None
@@ -99,17 +101,27 @@ class Execution:
             raise InputError(f"the distance must be a finite number >= 0, got {distance!r}.")
         return cls(trajectory, None if distance is None else float(distance), failed)
 
+    @classmethod
+    def before_failure(
+        cls, validation: Validation, plan: Plan, trajectory: object, failed: str, start_tolerance: float | None = None
+    ) -> Execution:
+        """Return a failed execution with the steps before the failure, if there are any, and their distance."""
+        tolerance = validation.start_tolerance if start_tolerance is None else start_tolerance
+        recorded, least = recorded_before_failure(plan, trajectory, tolerance), None
+        if recorded is not None:
+            least = least_distance(validation, plan.parameters.points, plan.model_trajectory, recorded)
+        return cls(recorded, failed=failed, at_least=least)
+
     def measured(self, validation: Validation, plan: Plan, start_tolerance: float | None = None) -> Execution:
         """Return the execution with its distance, after the checks of :meth:`Validation.accept`.
 
         Of one that failed, the steps before the failure remain.
         """
         if self.failed is not None and self.trajectory is not None:
-            tolerance = validation.start_tolerance if start_tolerance is None else start_tolerance
-            recorded = recorded_before_failure(plan, self.trajectory, tolerance)
-            if recorded is None:
+            ended = self.before_failure(validation, plan, self.trajectory, self.failed, start_tolerance)
+            if ended.trajectory is None:
                 raise InputError("the recording of the failed execution has no step of this task.")
-            return replace(self, trajectory=recorded)
+            return replace(ended, seconds=self.seconds)
         if self.failed is not None or self.distance is not None:
             return self
         measurement = validation.accept(plan, self.trajectory, start_tolerance)
@@ -118,9 +130,11 @@ class Execution:
     def ended(self, trial: Trial, *, executed: bool = True) -> Trial:
         """Return a trial in the final state that this measured execution gives it."""
         state: State = "failed" if self.failed is not None else "unmeasured" if self.distance is None else "completed"
-        return replace(
-            trial, state=state, executed=executed, distance=self.distance, failure=self._failure, seconds=self.seconds
-        )
+        note = {key: value for key, value in (trial.note or {}).items() if key != AT_LEAST}
+        if self.at_least is not None:
+            note[AT_LEAST] = self.at_least
+        ended = replace(trial, state=state, executed=executed, distance=self.distance, failure=self._failure)
+        return replace(ended, seconds=self.seconds, note=note or trial.note)
 
     def is_that_of(self, trial: Trial) -> bool:
         """Return whether a trial of the same task has stored this execution already."""

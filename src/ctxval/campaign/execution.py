@@ -6,6 +6,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
+from dataclasses import replace
 
 from ctxval._util.cores import Interrupts, exits_as_exceptions
 from ctxval._util.progress import advance, is_heard, stage
@@ -13,7 +14,7 @@ from ctxval._util.representation import named
 from ctxval.campaign.choices import Choice, Execution, OpenTrial
 from ctxval.campaign.trials import TrialRecorder
 from ctxval.campaign.workers import AHEAD, SerialPool, WorkerPool
-from ctxval.core.plan import recorded_before_failure, start_offset
+from ctxval.core.plan import start_offset
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import CONVERGED, Trial
 from ctxval.errors import CtxvalError, ExecutionError, InputError, StoreError
@@ -173,9 +174,8 @@ class ExecutionLoop:
         try:
             execution = execution.measured(self.recorder.validation, opened.plan)
         except (ExecutionError, InputError) as error:
-            validation = self.recorder.validation
-            recorded = recorded_before_failure(opened.plan, execution.trajectory, validation.start_tolerance)
-            execution = Execution(recorded, failed=str(error), seconds=execution.seconds)
+            failed = Execution.before_failure(self.recorder.validation, opened.plan, execution.trajectory, str(error))
+            execution = replace(failed, seconds=execution.seconds)
         if execution.failed is not None:
             self.failures[opened.number] += 1
             if self.failures[opened.number] <= self.retry_failures:
@@ -194,6 +194,8 @@ def _result(recorder: TrialRecorder, ended: Trial, executed: Trajectory | None) 
         parts.append(f"predicted {predicted.median:.4g}" + (f" ± {predicted.deviation:.1g}" if visible else ""))
     if ended.distance is None:
         parts.append(f"failed: {ended.failure}")
+        if ended.least:
+            parts.append(f"at least {ended.least:.4g} {validation.labels.units}".rstrip())
     else:
         parts.append(f"executed {ended.distance:.4g} {validation.labels.units}".rstrip())
     if ended.seconds is not None and ended.seconds >= 1:

@@ -13,8 +13,9 @@ from ctxval._util.describe import describe, differences
 from ctxval._util.progress import advance, stage
 from ctxval._util.texts import text_of
 from ctxval.campaign.storage.store import Store
+from ctxval.core.plan import least_distance
 from ctxval.core.trajectory import Trajectory
-from ctxval.core.trial import REDEFINED, TOLD_ALONE, Change, Trial
+from ctxval.core.trial import AT_LEAST, REDEFINED, TOLD_ALONE, Change, Trial
 from ctxval.core.validation import Validation
 from ctxval.errors import CtxvalError, DistanceError, InputError, StoreMismatchError
 from ctxval.searches import DEFAULT, REGISTRY, Repeated, Search, by_name
@@ -190,7 +191,7 @@ def _equal(before: Any, after: Any) -> bool:
 
 
 def remeasure(store: Store, validation: Validation, description: dict[str, Any]) -> list[Trial]:
-    """Recompute the distance of every stored execution; return the trials that changed."""
+    """Recompute the distance of every stored execution; return the trials whose distance changed."""
     with store.sole_writer():
         while True:
             with store.snapshot():
@@ -210,23 +211,25 @@ def remeasure(store: Store, validation: Validation, description: dict[str, Any])
             change = Change("remeasured", REDEFINED if redefined else "asked for", {"before": outcomes})
             # Another process may have recorded a result meanwhile; the distances are then computed again.
             if not (changed or redefined) or store.remeasure(trials, description, change, seen):
-                return trials
+                return [trial for trial in trials if trial.state != "failed"]
 
 
 def _measured(trial: Trial) -> dict[str, Any]:
     """Return the fields of a trial that a new measurement can change."""
-    return {"state": trial.state, "distance": trial.distance, "failure": trial.failure}
+    of_failed = {AT_LEAST: trial.least} if trial.state == "failed" else {}
+    return {"state": trial.state, "distance": trial.distance, "failure": trial.failure, **of_failed}
 
 
 def _measured_again(store: Store, validation: Validation, trial: Trial) -> Trial:
     advance()
-    if trial.state in ("open", "failed"):
-        return trial
     model, system = store.trajectory(trial.number, "model"), store.trajectory(trial.number, "system")
-    if model is None or system is None:
+    if trial.state == "open" or model is None or system is None:
         return trial
+    point = validation.space.point(trial.parameters)
+    if trial.state == "failed":
+        return replace(trial, note={**(trial.note or {}), AT_LEAST: least_distance(validation, point, model, system)})
     try:
-        distance = validation.remeasure(validation.space.point(trial.parameters), model, system)
+        distance = validation.remeasure(point, model, system)
     except DistanceError as error:
         if trial.distance is not None:
             sentence = f"the distance of trial {trial.number} cannot be computed again, and nothing is changed: {error}"

@@ -16,6 +16,7 @@ from ctxval.certificates.bounds import NO_UNITS, Quantities
 from ctxval.certificates.forecast import Forecast
 from ctxval.certificates.options import CONFIDENCE, CertificateOptions, require_confidence, require_volume
 from ctxval.certificates.provenance import Provenance
+from ctxval.certificates.sample import executions_of
 from ctxval.certificates.sentences import verdicts as sentences
 from ctxval.core.quantiles import QUANTILE
 from ctxval.core.trial import Trial, designs_sentence
@@ -99,16 +100,20 @@ def counterexample(
 ) -> Verdict | None:
     """Return the verdict "falsified" by the largest distance above the threshold; None if no distance is above it.
 
+    Of a failed execution, the distance of the steps before the failure counts, but less than that of whole executions.
+
     With noise, a single one does not suffice (:mod:`ctxval.certificates.bets`), except in a suite, executed once.
     """
     once = quantities.space is not None and quantities.space.members is not None
     tau, bets = float(threshold), None if once else bets_against(trials, float(threshold), quantile)
     if bets is not None and not bets.falsify(confidence):
         return None
-    above = [trial for trial in trials if trial.distance is not None and trial.distance > tau]
+    # A failure that a later success made good may have been a fault, which is no property of the system.
+    good = [t for t in trials if t.distance is None and any(s.number > t.number for s in executions_of(t, trials))]
+    above = [trial for trial in trials if trial.least > tau and trial not in good]
     if not above:
         return None
-    worst = max(above, key=lambda trial: trial.distance or 0.0)
+    worst = max(above, key=lambda trial: (trial.distance is not None, trial.least))
     return Verdict("falsified", tau, sentences.falsified(worst, trials, tau, quantities, bets), worst)
 
 

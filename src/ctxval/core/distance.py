@@ -18,7 +18,11 @@ class Distance(Protocol):
     """A distance d between the closed-loop trajectories of the model and of the system."""
 
     def __call__(self, model_trajectory: Trajectory, system_trajectory: Trajectory, task: Task) -> Array:
-        """Return d >= 0, shape ``(...)`` over the batch."""
+        """Return d >= 0, shape ``(...)`` over the batch.
+
+        If no further deviation of S from M makes it smaller, as of a maximum over time, the attribute ``monotone =
+        True`` says so: the steps before a failure then tell what the distance is at least.
+        """
 
 
 @runtime_checkable

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +15,7 @@ from ctxval.core.controller import Controller, started
 from ctxval.core.space import Parameters
 from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory, require_times
-from ctxval.errors import InputError, ShapeError
+from ctxval.errors import DistanceError, InputError, ShapeError
 
 if TYPE_CHECKING:
     from ctxval.core.validation import Validation
@@ -91,6 +92,21 @@ def recorded_before_failure(plan: Plan, trajectory: object, start_tolerance: flo
     except InputError:
         return None  # it is a recording of another task
     return recorded
+
+
+def least_distance(validation: Validation, point: ArrayLike, model: Trajectory, recorded: Trajectory) -> float | None:
+    """Return what the distance of an execution is at least that failed after some steps; None if nothing is known.
+
+    It is the distance if S had followed M from there on. Numbers that diverge are cut off where it is not finite.
+    """
+    if not getattr(validation.distance, "monotone", False):
+        return None
+    for steps in range(recorded.horizon, 0, -1):
+        states = np.concatenate([recorded.states[: steps + 1], model.states[steps + 1 :]])
+        inputs = np.concatenate([recorded.inputs[:steps], model.inputs[steps:]])
+        with suppress(DistanceError), np.errstate(all="ignore"):
+            return validation.remeasure(point, model, Trajectory(model.times, states, inputs))
+    return None
 
 
 def gives_inputs(plan: Plan, trajectory: Trajectory, tolerance: float) -> bool:

@@ -26,6 +26,9 @@ CONVERGED = "converged"
 UNSTEADY = "unsteady"
 """Key in the note of a trial: the number of tasks that were not executed because their controllers jump."""
 
+AT_LEAST = "at_least"
+"""Key in the note of a failed trial: the distance that the steps before the failure have already."""
+
 TOLD_ALONE = "its distance was told without a trajectory, and the distance has changed since: execute the task again."
 """The failure of a trial that was reported without a trajectory, so that a new distance cannot be computed."""
 
@@ -65,6 +68,12 @@ class Trial:
     def told(self) -> bool:
         """Whether a person has told the result of the execution."""
         return self.executed and self.state != "open" and not self.attempts
+
+    @property
+    def least(self) -> float:
+        """What d(p) is at least: the distance, or that of the steps before a failure; 0 if neither is known."""
+        known = (self.note or {}).get(AT_LEAST) if self.distance is None else self.distance
+        return float(known) if isinstance(known, int | float) else 0.0
 
     def __repr__(self) -> str:
         ended = {"distance": self.distance, "seconds": self.seconds, "attempts": self.attempts}

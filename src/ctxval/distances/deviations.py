@@ -147,6 +147,8 @@ class AtTimes(ErrorNorm):
         times: seconds after the start of the task; each is rounded to the nearest step.
     """
 
+    monotone: ClassVar[bool] = True
+
     norm: Norm = 2
     times: Sequence[float] = ()
 
@@ -175,6 +177,8 @@ class MaximumDeviation(StateNorm):
     :class:`StateNorm` has the attributes; the norm is that over the states at one time.
     """
 
+    monotone: ClassVar[bool] = True
+
     norm: Norm = 2
 
     def __call__(self, model_trajectory: Trajectory, system_trajectory: Trajectory, task: Task) -> Array:
@@ -188,6 +192,8 @@ class MeanDeviation(StateNorm):
 
     :class:`StateNorm` has the attributes; the norm is that over the states at one time.
     """
+
+    monotone: ClassVar[bool] = True
 
     norm: Norm = 2
 
@@ -208,6 +214,8 @@ class RelativeDeviation(StateNorm):
         least: smallest range that a gap is divided by, for each compared state in its unit; a state at rest would
             otherwise have an unbounded relative error.
     """
+
+    monotone: ClassVar[bool] = True
 
     norm: Norm = np.inf
     least: Sequence[float] = ()
@@ -238,6 +246,8 @@ class WholeTrajectory(StateNorm):
         norm, components, weights, scales, angles: as in :class:`StateNorm`.
         per_step: whether the norm is divided by the horizon H.
     """
+
+    monotone: ClassVar[bool] = True
 
     norm: Norm = np.inf
     per_step: bool = False

@@ -62,7 +62,10 @@ def result(kind: str, fields: Fields, recording: Path | None) -> SuppliedResult:
     tolerance = _number(fields, "tolerance", "the start tolerance") if fields.get("tolerance", "").strip() else None
     require("the start tolerance", NonNegativeFloat | None, tolerance)
     resample = "resample" in fields
-    return SuppliedResult(recording, resample=resample, start_tolerance=tolerance, replace=replace, uploaded=True)
+    failed = fields.get("reason", "").strip() or None
+    return SuppliedResult(
+        recording, failed=failed, resample=resample, start_tolerance=tolerance, replace=replace, uploaded=True
+    )
 
 
 def _number(fields: Fields, field: str, name: str) -> float:

@@ -250,7 +250,7 @@ class Store(Database):
 
     def _update(self, trial: Trial, where: str = "", closed_at: str | None = None) -> None:
         """Store what an execution changes in a trial, which must satisfy a further condition."""
-        columns = ("attempts", "state", "distance", "failure", "executed", "seconds")
+        columns = ("attempts", "state", "distance", "failure", "executed", "seconds", "note")
         row = dict(zip(COLUMNS.split(", "), row_of(trial), strict=True))
         values = (*(row[name] for name in columns), checksum_of(row_of(trial)), closed_at, trial.number)
         assignments = f"{' = ?, '.join(columns)} = ?, checksum = ?, closed_at = coalesce(?, closed_at)"

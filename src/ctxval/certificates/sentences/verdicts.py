@@ -38,7 +38,14 @@ def falsified(
     worst: Trial, trials: Sequence[Trial], tau: float, quantities: Quantities, bets: Bets | None = None
 ) -> str:
     """Return which executed task exceeds a threshold, and how often an execution of the same task reproduced it."""
-    distance, limit = distinguishable(worst.distance or 0.0, tau)
+    distance, limit = distinguishable(worst.least, tau)
+    if worst.distance is None:
+        return (
+            f"trial {worst.number} failed ({quoted(worst.failure or '')}), but its distance is at least "
+            f"{quantities.of(distance)} by the steps before the failure, which exceeds {quantities.of(limit)}, in the "
+            f"task {quantities.task(worst)}; if a fault caused this that is mended by now, execute the task again and "
+            f'say what it was (ctxval ask STORE --again {worst.number} --because "...").'
+        )
     again = [(trial.distance or 0.0) > tau for trial in executions_of(worst, trials) if trial is not worst]
     reproduced = ", executed once" if not again else ""
     if any(again):
