@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import sqlite3
 import subprocess
 import sys
 import time
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -39,6 +41,15 @@ def content(store: Path) -> list[tuple[object, ...]]:
     return rows
 
 
+def completed(store: Path) -> int:
+    """The number of completed trials, read as another process sees them."""
+    try:
+        with closing(sqlite3.connect(f"file:{store}?mode=ro", uri=True)) as reader:
+            return int(reader.execute("SELECT count(*) FROM trials WHERE state = 'completed'").fetchone()[0])
+    except sqlite3.OperationalError:  # it is not made yet
+        return 0
+
+
 def resumed(store: Path) -> tuple[list[tuple[object, ...]], list[tuple[object, ...]]]:
     """Resume a campaign that was killed; return what was completed before, and everything afterwards."""
     before = [row for row in content(store) if row[2] == "completed"]
@@ -60,7 +71,11 @@ def test_a_killed_campaign_resumes_bit_for_bit(tmp_path: Path, request: pytest.F
     for number in range(kills):
         store = tmp_path / f"{number}.sqlite"
         process = start(store)
-        time.sleep(rng.uniform(0, duration))
+        # At any moment from the first step to the last one, also if another load slows the process down.
+        first = int(rng.integers(0, BUDGET - 2))
+        while process.poll() is None and completed(store) < first:
+            time.sleep(0.001)
+        time.sleep(rng.uniform(0, duration / BUDGET))
         process.kill()
         process.wait()
         before, after = resumed(store)
