@@ -26,6 +26,7 @@ quick: .venv/.test  ## everything that takes less than half a second, on all cor
 	$(BIN)/python -m pytest -q -m "not slow" --numprocesses auto --dist worksteal
 
 thorough: .venv/.test  ## `make test` with more seeds, sizes and examples; takes about an hour
+	$(BIN)/python $(PIP) 'ray>=2.40'  # 240 MB
 	$(BIN)/python -m pytest --thorough --numprocesses auto --dist worksteal
 
 check: .venv/.test

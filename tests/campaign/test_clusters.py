@@ -15,6 +15,7 @@ import pytest
 from conftest import make_validation
 from ctxval import Campaign, Store, Trial, searches
 from ctxval.errors import CampaignError, InputError, StoreAccessError
+from rig_thorough import more
 from test_how_to import DOCS, blocks
 
 # The simulator of the page; its first execution sends its own process a signal.
@@ -75,7 +76,9 @@ def trials_of_recipe(folder: Path, recipe: str, struck_by: signal.Signals) -> li
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("recipe", "package"), [("slurm", "submitit"), ("ray", "ray"), ("dask", "distributed")])
+@pytest.mark.parametrize(
+    ("recipe", "package"), [("dask", "distributed"), *more(("slurm", "submitit"), ("ray", "ray"))]
+)
 def test_nothing_is_lost_if_a_worker_is_killed(tmp_path: Path, recipe: str, package: str) -> None:
     require(package)
     trials = trials_of_recipe(tmp_path, recipe, signal.SIGKILL)

@@ -45,6 +45,7 @@ def executions_of(validation: object) -> list[tuple[np.ndarray, object]]:
     return [(validation.space.to_unit(point), validation.outcome(point).system_trajectory) for point in POINTS]
 
 
+@pytest.mark.thorough  # a campaign that decides with outputs alone needs these predictions, too
 def test_executions_with_outputs_predict_as_well_as_with_states() -> None:
     errors = {}
     for name, validation in {"outputs": swing_validation(), "states": swing_validation(outputs=None)}.items():
