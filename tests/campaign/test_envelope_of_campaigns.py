@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,10 @@ import pytest
 
 from conftest import make_validation, make_validation_without_inputs
 from ctxval import Campaign, Store, Task, TaskSpace, Validation, certificates, controllers, distances, models, systems
+from ctxval.campaign.envelope import EnvelopeSearch
+from ctxval.campaign.interval_search import IntervalSearch
+from ctxval.certificates import CertificateOptions
+from ctxval.core.trial import AT_LEAST
 from ctxval.errors import InputError
 
 TAU, BUDGET = 0.3, 14
@@ -42,6 +47,34 @@ def test_it_finds_the_true_set_after_a_falsification_and_includes_nothing_else(w
     for trial in campaign.completed:
         known = envelope.trusted(trial.parameters)
         assert not (known and (trial.distance or 0) > tau)
+
+
+@pytest.mark.slow
+def test_a_failure_beyond_the_threshold_is_outside_or_contradicts_it(
+    whole: Campaign, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tau, space = threshold_of(whole.validation), whole.validation.space
+    tasks = space.iid(200, np.random.default_rng(4))
+    above = whole.validation.distances(tasks) > 1.5 * tau
+    trusted = whole.envelope(tau).trusted(tasks)
+
+    def with_failure(row: int, least: float) -> certificates.Envelope:
+        stopped = replace(
+            whole.trials[0], number=len(whole.trials), origin="manual", state="failed", distance=None,
+            unit_point=space.to_unit(tasks[row]), note={AT_LEAST: least},
+        )  # fmt: skip
+        monkeypatch.setattr(whole.recorder, "_trials", [*whole.trials, stopped])
+        envelope = EnvelopeSearch(IntervalSearch(whole.recorder, CertificateOptions(), BUDGET, tau)).envelope()
+        monkeypatch.undo()
+        return envelope
+
+    outside = with_failure(int(above.argmax()), 1.2 * tau)
+    assert outside.doubt is None
+    assert outside.trusted(tasks)[trusted].mean() > 0.95
+    assert "failed beyond the threshold, and the learned dynamics keep it" in str(
+        with_failure(int(trusted.argmax()), 1.2 * tau).doubt
+    )
+    assert "has no distance" in str(with_failure(int(above.argmax()), 0.8 * tau).doubt)
 
 
 @pytest.mark.slow

@@ -37,6 +37,7 @@ from ctxval.certificates.envelope import (
 )
 from ctxval.certificates.options import CertificateOptions
 from ctxval.certificates.prediction_tests import DRAWN
+from ctxval.certificates.sample import without_success
 from ctxval.core.trial import Trial
 from ctxval.errors import InputError
 from ctxval.learning import LearnedDynamics
@@ -65,18 +66,18 @@ class EnvelopeSearch:
         """Return the envelope that the executions give, or why there is none. The system is never executed."""
         space, trials = self._recorder.validation.space, self._ended()
         threshold, confidence = self._threshold, self._confidence
-        failed = [trial.number for trial in trials if trial.distance is None]
-        if failed:
-            why = f"trial {failed[0]} has no distance, so nothing is known of its task; execute it again"
+        unknown = next((trial for trial in without_success(trials) if trial.least <= threshold), None)
+        if unknown is not None:
+            why = f"trial {unknown.number} has no distance, so nothing is known of its task; execute it again"
             return withdrawn(space, threshold, confidence, why)
         with stage("computing the envelope", unit="closed loops"):
             known = self._known(trials)
             if known is None:
-                unknown = self._recorder.dynamics.failure or (
+                why = self._recorder.dynamics.failure or (
                     "no dynamics can be learned: there are no recorded trajectories, or M explains all of them, or no "
                     "controller can be designed"
                 )
-                return withdrawn(space, threshold, confidence, unknown)
+                return withdrawn(space, threshold, confidence, why)
             regular = self._regular(trials, known[1])
             if regular is None:
                 return self._of(*known, trials)
@@ -90,7 +91,10 @@ class EnvelopeSearch:
         """Return the envelope of what was learned, or why there is none."""
         space, units = self._recorder.validation.space, self._recorder.validation.labels.units
         threshold, confidence = self._threshold, self._confidence
-        executed = [(trial.unit_point, float(trial.distance or 0.0)) for trial in trials]
+        # A failed execution whose distance exceeds the threshold by the steps before is outside, too.
+        failed = without_success(trials)
+        known = [trial for trial in trials if trial.distance is not None or trial in failed]
+        executed = [(trial.unit_point, trial.least) for trial in known]
         # Further tasks check the interpolation between these; without batches, each costs a design of its own.
         checks = (256 if evidence.quantile is None else 64) if learned.study.planner.batched else 0
         at = partial(self._at, learned) if checks else None
@@ -99,6 +103,12 @@ class EnvelopeSearch:
                 evidence = self._left_out(learned, evidence)
             if (doubt := doubt_of_envelope(evidence, threshold)) is not None:
                 return withdrawn(space, threshold, confidence, doubt)
+            if failed:
+                predicted = learned.expected(np.array([trial.unit_point for trial in failed]))
+                for trial, distance in zip(failed, predicted.tolist(), strict=True):
+                    if distance <= threshold:
+                        doubt = f"trial {trial.number} failed beyond the threshold, and the learned dynamics keep it"
+                        return withdrawn(space, threshold, confidence, f"{doubt}; record more executions near its task")
             drawn, irregular = self._drawn(learned, evidence), learned.split.irregular if learned.split else 0
             return envelope_of(space, drawn, evidence, executed, threshold, confidence, at, checks, units, irregular)
         except Exception as error:  # users' parts, at states that no execution has reached
@@ -161,7 +171,9 @@ class EnvelopeSearch:
         budget is just enough for them: those that are predicted by better dynamics raise k less.
         """
         interval, recorder, trials = self._interval, self._recorder, self._ended()
-        if not interval.predicts or not recorder.has_tasks or any(trial.distance is None for trial in trials):
+        if not interval.predicts or not recorder.has_tasks:
+            return None
+        if any(trial.least <= self._threshold for trial in without_success(trials)):
             return None
         known = self._known(trials)
         if known is None:

@@ -255,6 +255,15 @@ def advice_to_remeasure(sample: Sample) -> str:
     )
 
 
+def without_success(trials: Sequence[Trial]) -> list[Trial]:
+    """Return the trials without a distance whose task was not executed with success later.
+
+    A failure that a later success made good may have been a fault, which is no property of the system.
+    """
+    unknown = (trial for trial in trials if trial.distance is None and trial.state != "open")
+    return [each for each in unknown if all(other.number < each.number for other in executions_of(each, trials))]
+
+
 def executions_of(trial: Trial, trials: Sequence[Trial]) -> list[Trial]:
     """Return the trials with a distance that executed the task of a trial; scaling rounds their unit-cube points."""
     known = [other for other in trials if other.distance is not None]

@@ -16,7 +16,7 @@ from ctxval.certificates.bounds import NO_UNITS, Quantities
 from ctxval.certificates.forecast import Forecast
 from ctxval.certificates.options import CONFIDENCE, CertificateOptions, require_confidence, require_volume
 from ctxval.certificates.provenance import Provenance
-from ctxval.certificates.sample import executions_of
+from ctxval.certificates.sample import without_success
 from ctxval.certificates.sentences import verdicts as sentences
 from ctxval.core.quantiles import QUANTILE
 from ctxval.core.trial import Trial, designs_sentence
@@ -108,9 +108,8 @@ def counterexample(
     tau, bets = float(threshold), None if once else bets_against(trials, float(threshold), quantile)
     if bets is not None and not bets.falsify(confidence):
         return None
-    # A failure that a later success made good may have been a fault, which is no property of the system.
-    good = [t for t in trials if t.distance is None and any(s.number > t.number for s in executions_of(t, trials))]
-    above = [trial for trial in trials if trial.least > tau and trial not in good]
+    failed = without_success(trials)
+    above = [each for each in trials if each.least > tau and (each.distance is not None or each in failed)]
     if not above:
         return None
     worst = max(above, key=lambda trial: (trial.distance is not None, trial.least))
