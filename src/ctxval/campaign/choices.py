@@ -20,25 +20,18 @@ from ctxval.errors import InputError
 
 @dataclass(frozen=True, eq=False)
 class Choice:
-    """The task of a new trial.
+    """The task of a new trial."""
 
-    Attributes:
-        unit_point: point of the unit cube, shape ``(d,)``; None if the search chooses it.
-        origin: the reason for this point; not used if the search chooses the point.
-        because: the change that was made to the system since the task was executed before.
-        planned_draws: the planned number of independent draws, which is stored with each draw; 0 if the results decide
-            the number, None if it is not known.
-        note: what is recorded about the choice, in types that JSON has.
-        rejected: the number of tasks that were tested and are not steady; None if this task is to be tested.
-        parameters: the task parameters as a person gave them; None if they are those of the point, rounded.
-    """
-
-    unit_point: Array | None = None
-    origin: Origin = "acquisition"
-    because: str | None = None
+    unit_point: Array | None = None  #: point of the unit cube, shape ``(d,)``; None if the search chooses it
+    origin: Origin = "acquisition"  #: the reason for this point; not used if the search chooses the point
+    because: str | None = None  #: the change that was made to the system since the task was executed before
+    #: the planned number of independent draws, which is stored with each draw; 0 if the results decide the number, None
+    #: if it is not known
     planned_draws: int | None = None
-    note: dict[str, Any] | None = None
+    note: dict[str, Any] | None = None  #: what is recorded about the choice, in types that JSON has
+    #: the number of tasks that were tested and are not steady; None if this task is to be tested
     rejected: int | None = None
+    #: the task parameters as a person gave them; None if they are those of the point, rounded
     parameters: Mapping[str, Any] | None = None
 
     @classmethod
@@ -49,15 +42,10 @@ class Choice:
 
 @dataclass(frozen=True, eq=False)
 class OpenTrial:
-    """A trial to be executed, with everything that an operator needs for the execution.
+    """A trial to be executed, with everything that an operator needs for the execution."""
 
-    Attributes:
-        trial: the stored trial.
-        plan: its task, its controller and the trajectory of the model.
-    """
-
-    trial: Trial
-    plan: Plan
+    trial: Trial  #: the stored trial
+    plan: Plan  #: its task, its controller and the trajectory of the model
 
     @property
     def number(self) -> int:
@@ -71,26 +59,17 @@ class OpenTrial:
 
 @dataclass(frozen=True, eq=False)
 class Execution:
-    """What an execution of S gave.
+    """What an execution of S gave."""
 
-    Attributes:
-        trajectory: the object that the system returned or a person recorded, of a failed execution the steps before
-            the failure; None if there is none.
-        distance: d(p); None if it is not known.
-        failed: the reason why there is no result: the system failed, or the execution took too long.
-        at_least: what the distance of a failed execution is at least; None if nothing is known.
-        unusable: the reason why the distance function gave no usable number.
-        lost: the reason why the worker was lost, which is not a failure of the system.
-        seconds: the duration, if it is known.
-    """
-
+    #: the object that the system returned or a person recorded, of a failed execution the steps before the failure;
+    #: None if there is none
     trajectory: Trajectory | None = None
-    distance: float | None = None
-    failed: str | None = None
-    at_least: float | None = None
-    unusable: str | None = None
-    lost: str | None = None
-    seconds: float | None = None
+    distance: float | None = None  #: d(p); None if it is not known
+    failed: str | None = None  #: the reason why there is no result: the system failed, or the execution took too long
+    at_least: float | None = None  #: what the distance of a failed execution is at least; None if nothing is known
+    unusable: str | None = None  #: the reason why the distance function gave no usable number
+    lost: str | None = None  #: the reason why the worker was lost, which is not a failure of the system
+    seconds: float | None = None  #: the duration, if it is known
 
     @classmethod
     def reported(cls, trajectory: Trajectory | None, distance: float | None, failed: str | None) -> Execution:

@@ -27,25 +27,15 @@ from ctxval.searches.trust_region import FAST
 
 @dataclass(frozen=True)
 class ThinkingCosts:
-    """What the choice of a task costs after a few executions of S; None if it cannot be estimated.
+    """What the choice of a task costs after a few executions of S; None if it cannot be estimated."""
 
-    Attributes:
-        design: seconds of the design of one controller.
-        closed_loop: seconds of one closed loop on the model.
-        choice: estimated seconds of the choice of a task that decides.
-        verdict: estimated seconds of the bound that decides.
-        suggestion: estimated seconds of one suggestion of the search ``auto``.
-        designs: number of designs of this suggestion.
-        fast: estimated seconds of one suggestion with the thinking ``"fast"``.
-    """
-
-    design: float
-    closed_loop: float
-    choice: float | None = None
-    verdict: float | None = None
-    suggestion: float | None = None
-    designs: int | None = None
-    fast: float | None = None
+    design: float  #: seconds of the design of one controller
+    closed_loop: float  #: seconds of one closed loop on the model
+    choice: float | None = None  #: estimated seconds of the choice of a task that decides
+    verdict: float | None = None  #: estimated seconds of the bound that decides
+    suggestion: float | None = None  #: estimated seconds of one suggestion of the search ``auto``
+    designs: int | None = None  #: number of designs of this suggestion
+    fast: float | None = None  #: estimated seconds of one suggestion with the thinking ``"fast"``
 
     @classmethod
     def measured(cls, validation: Validation, points: Sequence[Array]) -> ThinkingCosts:

@@ -318,17 +318,11 @@ class CampaignDynamics:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class LearnedFromTrials:
-    """The :class:`ctxval.certificates.LearnedDistance` of a campaign. The system is never executed.
+    """The :class:`ctxval.certificates.LearnedDistance` of a campaign. The system is never executed."""
 
-    Attributes:
-        validation: the map p -> d(p).
-        trials: all trials of the campaign.
-        study: what the trajectories teach of the dynamics.
-    """
-
-    validation: Validation
-    trials: Sequence[Trial]
-    study: CampaignDynamics
+    validation: Validation  #: the map p -> d(p)
+    trials: Sequence[Trial]  #: all trials of the campaign
+    study: CampaignDynamics  #: what the trajectories teach of the dynamics
     _predictions: dict[int, Prediction | None] = field(default_factory=dict, init=False)
 
     def expected(self, points: Array, before: int) -> Array:

@@ -56,23 +56,15 @@ _FAILING = 6  # of so many last predictions, at least half must hold
 
 @dataclass(frozen=True, eq=False)
 class IntervalSearch:
-    """Chooses the next task until the interval of d* decides.
+    """Chooses the next task until the interval of d* decides."""
 
-    Attributes:
-        recorder: the recorder of the trials.
-        options: the certificate that bounds d*: ``auto``, ``dynamics``, ``posterior`` or ``anytime``.
-        budget: the largest total number of executions.
-        threshold: tau, in the distance's units; None if there is none.
-        within: without a threshold, the share by which the bound may exceed the largest executed distance at the end.
-        keeps: whether the store keeps the evidence that may decide.
-    """
-
-    recorder: TrialRecorder
-    options: CertificateOptions
-    budget: int
-    threshold: float | None = None
+    recorder: TrialRecorder  #: the recorder of the trials
+    options: CertificateOptions  #: the certificate that bounds d*: ``auto``, ``dynamics``, ``posterior`` or ``anytime``
+    budget: int  #: the largest total number of executions
+    threshold: float | None = None  #: tau, in the distance's units; None if there is none
+    #: without a threshold, the share by which the bound may exceed the largest executed distance at the end
     within: float = WITHIN
-    keeps: bool = True
+    keeps: bool = True  #: whether the store keeps the evidence that may decide
 
     def __post_init__(self) -> None:
         require_decisive(self.options)

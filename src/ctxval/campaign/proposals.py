@@ -40,15 +40,11 @@ _DRAW, _HYPERCUBE = 0x6175, 0x6879  # those of independent draws, and of Latin h
 
 @dataclass(frozen=True, eq=False)
 class Steadiness:
-    """Tells for one choice which tasks may be executed, and counts the others.
+    """Tells for one choice which tasks may be executed, and counts the others."""
 
-    Attributes:
-        planner: designs controllers; S is never executed.
-        expected: points ``(m, d)`` -> predicted distances ``(m,)``; None if nothing is predicted: then the closed loops
-            of a slightly disturbed M are compared.
-    """
-
-    planner: LoopPlanner
+    planner: LoopPlanner  #: designs controllers; S is never executed
+    #: points ``(m, d)`` -> predicted distances ``(m,)``; None if nothing is predicted: then the closed loops of a
+    #: slightly disturbed M are compared
     expected: Callable[[Array], Array] | None = None
 
     _tested: dict[bytes, bool] = field(default_factory=dict, init=False)

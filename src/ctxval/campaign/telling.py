@@ -35,29 +35,18 @@ Names = Mapping[str, str]
 
 @dataclass(frozen=True)
 class SuppliedResult:
-    """The result of a trial, before it is checked: a recording, a distance, or why it failed.
+    """The result of a trial, before it is checked: a recording, a distance, or why it failed."""
 
-    Attributes:
-        recording: the file of the recorded trajectory: CSV, NPZ or a log of another kind.
-        distance: the distance, if there is no recording.
-        failed: the reason why there is no result; a recording has then the steps before the failure.
-        npz: whether the recording is an NPZ file; None if the suffix decides.
-        resample: interpolate the recording to the times of the task.
-        start_tolerance: replaces the start tolerance of the validation.
-        mapping: which fields of a log are states and inputs; None if the file has the names of the experiment.
-        replace: why this result replaces an earlier one of the trial; None if the trial is open.
-        uploaded: whether somebody sent the recording, who may not learn what a file contains.
-    """
-
-    recording: Path | None = None
-    distance: float | None = None
-    failed: str | None = None
-    npz: bool | None = None
-    resample: bool = False
-    start_tolerance: float | None = None
+    recording: Path | None = None  #: the file of the recorded trajectory: CSV, NPZ or a log of another kind
+    distance: float | None = None  #: the distance, if there is no recording
+    failed: str | None = None  #: the reason why there is no result; a recording has then the steps before the failure
+    npz: bool | None = None  #: whether the recording is an NPZ file; None if the suffix decides
+    resample: bool = False  #: interpolate the recording to the times of the task
+    start_tolerance: float | None = None  #: replaces the start tolerance of the validation
+    #: which fields of a log are states and inputs; None if the file has the names of the experiment
     mapping: LogMapping | None = None
-    replace: str | None = None
-    uploaded: bool = False
+    replace: str | None = None  #: why this result replaces an earlier one of the trial; None if the trial is open
+    uploaded: bool = False  #: whether somebody sent the recording, who may not learn what a file contains
 
     def read(self, experiment: Experiment, plan: Plan) -> Trajectory | None:
         """Return the recording; None if there is none."""

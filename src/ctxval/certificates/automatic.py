@@ -34,12 +34,6 @@ class Automatic(CertificateKind):
     For a suite of tasks, it is the bound from learned dynamics until all tasks were executed. The dynamics bound is
     tried only if the experiment is loaded and the resolution is the usual one. If neither keeps the threshold, the
     certificate is the one that is nearer to a decision.
-
-    Attributes:
-        resolution: as for the posterior bound.
-        tests: the number of executions at tasks drawn over the task space, which must be predicted beforehand if the
-            bound is from learned dynamics.
-        quantile: the share of the executions of each task that the bound is about, if they differ by noise.
     """
 
     name: ClassVar[str] = "auto"
@@ -47,8 +41,11 @@ class Automatic(CertificateKind):
     takes_suites: ClassVar[bool] = True
     sorts_draws: ClassVar[bool] = True  # its draws are tests, and count at any time
 
-    resolution: PositiveFloat = RESOLUTION
+    resolution: PositiveFloat = RESOLUTION  #: as for the posterior bound
+    #: the number of executions at tasks drawn over the task space, which must be predicted beforehand if the bound is
+    #: from learned dynamics
     tests: NonNegativeInt = TESTS
+    #: the share of the executions of each task that the bound is about, if they differ by noise
     quantile: Probability = QUANTILE
 
     @property

@@ -23,34 +23,22 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, repr=False)
 class Certificate:
-    """A statement about d* with its assumptions; ``str`` returns the text that the command line prints.
+    """A statement about d* with its assumptions; ``str`` returns the text that the command line prints."""
 
-    Attributes:
-        kind: the name of its :class:`CertificateKind`.
-        statement: the statement, in one sentence.
-        upper_bound: the bound h on the distance, in the distance's units.
-        confidence: the probability of the statement, over what ``assumptions`` say is random.
-        volume: the share of the task space that the statement leaves out; 0 if it covers all of it.
-        trials: the number n of trials that it is computed from.
-        assumptions: conditions under which the statement holds, one sentence each.
-        details: the numbers from which the statement is computed.
-        doubt: why the certificate is withdrawn, so that its statement must not be used; None if it is not.
-        error: standard error of ``upper_bound`` in the distance's units, if it is computed from random draws; else 0.
-        version: the version of ctxval that computed it.
-        distribution: the distribution of tasks as a text, which ``volume`` is a share of; None if it is uniform.
-    """
-
-    kind: str
-    statement: str
-    upper_bound: float
-    confidence: float
-    volume: float
-    trials: int
-    assumptions: tuple[str, ...]
-    details: dict[str, Any] = field(default_factory=dict)
+    kind: str  #: the name of its :class:`CertificateKind`
+    statement: str  #: the statement, in one sentence
+    upper_bound: float  #: the bound h on the distance, in the distance's units
+    confidence: float  #: the probability of the statement, over what ``assumptions`` say is random
+    volume: float  #: the share of the task space that the statement leaves out; 0 if it covers all of it
+    trials: int  #: the number n of trials that it is computed from
+    assumptions: tuple[str, ...]  #: conditions under which the statement holds, one sentence each
+    details: dict[str, Any] = field(default_factory=dict)  #: the numbers from which the statement is computed
+    #: why the certificate is withdrawn, so that its statement must not be used; None if it is not
     doubt: str | None = None
+    #: standard error of ``upper_bound`` in the distance's units, if it is computed from random draws; else 0
     error: float = 0.0
-    version: str = VERSION
+    version: str = VERSION  #: the version of ctxval that computed it
+    #: the distribution of tasks as a text, which ``volume`` is a share of; None if it is uniform
     distribution: str | None = None
 
     def covers(self, threshold: float, volume: float = 0.0) -> bool:

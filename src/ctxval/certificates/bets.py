@@ -26,18 +26,13 @@ _BOLDEST = 0.9  # largest predicted probability that is bet on; an execution tha
 
 @dataclass(frozen=True)
 class Bets:
-    """The bets of the trials of a noisy system against a threshold.
+    """The bets of the trials of a noisy system against a threshold."""
 
-    Attributes:
-        wealth: the mean of the product of all bets and that of the bets on repetitions.
-        above, executions: numbers of executions above the threshold, and of all.
-        quantile: the share q of the executions of each task that the threshold is said to bound.
-    """
-
-    wealth: float
+    wealth: float  #: the mean of the product of all bets and that of the bets on repetitions
+    #: above, executions: numbers of executions above the threshold, and of all
     above: int
     executions: int
-    quantile: float = QUANTILE
+    quantile: float = QUANTILE  #: the share q of the executions of each task that the threshold is said to bound
 
     def falsify(self, confidence: float) -> bool:
         """Return whether the threshold is falsified with a confidence."""

@@ -102,15 +102,10 @@ def distinguishable(value: float, tau: float) -> tuple[str, str]:
 
 @dataclass(frozen=True)
 class Quantities:
-    """What gives numbers their units, and tasks their names.
+    """What gives numbers their units, and tasks their names."""
 
-    Attributes:
-        units: the units of the distance.
-        space: the task space; None if it is not known.
-    """
-
-    units: str = ""
-    space: TaskSpace | None = None
+    units: str = ""  #: the units of the distance
+    space: TaskSpace | None = None  #: the task space; None if it is not known
 
     def of(self, text: str) -> str:
         """Return a distance as text with its units."""

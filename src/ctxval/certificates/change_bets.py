@@ -43,18 +43,13 @@ _WINDOW = 200  # latest runs at which a change may have begun; fewer starts make
 
 @dataclass(frozen=True, eq=False)
 class KnownStatistics:
-    """What is known of scaled chi-squares, in any number of cases ``(...)``.
+    """What is known of scaled chi-squares, in any number of cases ``(...)``."""
 
-    Attributes:
-        sums, logs: sums of the values and of their logarithms, shapes ``(...)``.
-        count: how many values these are.
-        freedom: the degrees of freedom that noise gives them; None if nothing is known beforehand.
-    """
-
+    #: sums, logs: sums of the values and of their logarithms, shapes ``(...)``
     sums: Array
     logs: Array
-    count: int
-    freedom: float | None
+    count: int  #: how many values these are
+    freedom: float | None  #: the degrees of freedom that noise gives them; None if nothing is known beforehand
 
     def _log_evidence(self) -> Array:
         a, K, k = 0.5 * _FREEDOMS, self.count, 0.0
@@ -78,16 +73,11 @@ class KnownStatistics:
 
 @dataclass(frozen=True, eq=False)
 class ScaleBets:
-    """The bets on each scale c and each start j of a change, and what they are made from.
+    """The bets on each scale c and each start j of a change, and what they are made from."""
 
-    Attributes:
-        products: logarithms of the products of the bets, shape ``(c, j)``.
-        base: what all runs show if nothing has changed.
-        same, changed: what they show if nothing has changed, and if it has, for each scale and start ``(c, j)``.
-    """
-
-    products: Array
-    base: KnownStatistics
+    products: Array  #: logarithms of the products of the bets, shape ``(c, j)``
+    base: KnownStatistics  #: what all runs show if nothing has changed
+    #: same, changed: what they show if nothing has changed, and if it has, for each scale and start ``(c, j)``
     same: KnownStatistics
     changed: KnownStatistics
 
@@ -130,20 +120,14 @@ def _appended(array: Array, value: float | Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class SlopeBets:
-    """The bets on changed coefficients, for each prior of the change and each start ``(p, j)``.
+    """The bets on changed coefficients, for each prior of the change and each start ``(p, j)``."""
 
-    Attributes:
-        products: logarithms of the products of the bets, shape ``(p, j)``.
-        gradients, informations: sums over the runs since each start, shapes ``(j, k)`` and ``(j, k, k)``.
-        priors: the inverse covariances if nothing has changed, and for each prior of a change, ``(1 + p, k, k)``.
-        scale: variance of the noise relative to what was learned.
-    """
-
-    products: Array
+    products: Array  #: logarithms of the products of the bets, shape ``(p, j)``
+    #: gradients, informations: sums over the runs since each start, shapes ``(j, k)`` and ``(j, k, k)``
     gradients: Array
     informations: Array
-    priors: Array
-    scale: float
+    priors: Array  #: the inverse covariances if nothing has changed, and for each prior of a change, ``(1 + p, k, k)``
+    scale: float  #: variance of the noise relative to what was learned
 
     @classmethod
     def before(cls, certified: Array, scale: float) -> SlopeBets:

@@ -37,17 +37,11 @@ _FEW = 4  # with fewer earlier tasks, all of them count as recent
 
 @dataclass(frozen=True, eq=False)
 class PairedDifferences:
-    """Differences of two distances at independent tasks, in the order of drawing.
+    """Differences of two distances at independent tasks, in the order of drawing."""
 
-    Attributes:
-        values: differences D_i, shape ``(N,)``.
-        predicted: what was predicted for each before its task was drawn, minus the mean of this prediction, or 0.
-        most: a number that no distance can exceed; None if none is known.
-    """
-
-    values: Array
-    predicted: Array
-    most: float | None = None
+    values: Array  #: differences D_i, shape ``(N,)``
+    predicted: Array  #: what was predicted for each before its task was drawn, minus the mean of this prediction, or 0
+    most: float | None = None  #: a number that no distance can exceed; None if none is known
 
     @property
     def corrected(self) -> Array:
@@ -76,24 +70,17 @@ class PairedDifferences:
 
 @dataclass(frozen=True)
 class MeanDifference:
-    """The expected difference of two distances, as far as the tasks so far tell.
+    """The expected difference of two distances, as far as the tasks so far tell."""
 
-    Attributes:
-        estimate: the estimate; None if there is no task.
-        low, high: the ends of the confidence sequence; infinite if nothing is known.
-        sign: 1 if the expected difference is above 0, -1 if it is below, 0 if this is not decided.
-        decided_after: the number of tasks after which the sign was decided; None if it is not.
-        tasks: the number of tasks.
-        variance_left: the variance of the later half of the corrected differences, as a share of that of the
-            differences; None if there are too few tasks.
-    """
-
-    estimate: float | None
+    estimate: float | None  #: the estimate; None if there is no task
+    #: low, high: the ends of the confidence sequence; infinite if nothing is known
     low: float
     high: float
-    sign: int
-    decided_after: int | None
-    tasks: int
+    sign: int  #: 1 if the expected difference is above 0, -1 if it is below, 0 if this is not decided
+    decided_after: int | None  #: the number of tasks after which the sign was decided; None if it is not
+    tasks: int  #: the number of tasks
+    #: the variance of the later half of the corrected differences, as a share of that of the differences; None if there
+    #: are too few tasks
     variance_left: float | None
 
 

@@ -16,18 +16,13 @@ LARGEST = 2.0  # multiple of the threshold up to which bounds are told apart
 
 @dataclass(frozen=True, eq=False)
 class DrawnDistances(ShortRepr):
-    """The distances of some tasks on draws of the learned dynamics.
+    """The distances of some tasks on draws of the learned dynamics."""
 
-    Attributes:
-        points: tasks, points of the unit cube ``(K, d)``.
-        draws: distances on S draws ``(S, K)``; infinity if the loop diverges, NaN if no controller can be designed.
-        beyond: how far the loop on the mean leaves the records, as a share of the visited range ``(K,)``.
-        crossed: how far it crosses the boundary of the regular part, from -1 to 1; None if there is no boundary.
-    """
-
-    points: Array
+    points: Array  #: tasks, points of the unit cube ``(K, d)``
+    #: distances on S draws ``(S, K)``; infinity if the loop diverges, NaN if no controller can be designed
     draws: Array
-    beyond: Array
+    beyond: Array  #: how far the loop on the mean leaves the records, as a share of the visited range ``(K,)``
+    #: how far it crosses the boundary of the regular part, from -1 to 1; None if there is no boundary
     crossed: Array | None = None
 
     @property

@@ -55,18 +55,15 @@ MOST_DRAWS = 400  # posterior samples of the dynamics, which limit the confidenc
 @part("dynamics")
 @dataclass(frozen=True, repr=False)
 class Dynamics(CertificateKind):
-    """Bound on d* from posterior draws of the residual dynamics, which are learned from the executed trajectories.
-
-    Attributes:
-        tests: the number of executions that must have been predicted beforehand at tasks drawn over the task space.
-        quantile: the share of the executions of each task that the bound is about, if they differ by noise.
-    """
+    """Bound on d* from posterior draws of the residual dynamics, which are learned from the executed trajectories."""
 
     name: ClassVar[str] = "dynamics"
     needs_model: ClassVar[bool] = True
     takes_suites: ClassVar[bool] = True
 
+    #: the number of executions that must have been predicted beforehand at tasks drawn over the task space
     tests: NonNegativeInt = TESTS
+    #: the share of the executions of each task that the bound is about, if they differ by noise
     quantile: Probability = QUANTILE
 
     def require_usable(self, confidence: float, executions: int) -> None:

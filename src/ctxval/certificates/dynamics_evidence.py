@@ -19,38 +19,25 @@ from ctxval.core.trial import Origin
 
 @dataclass(frozen=True)
 class CheckedPrediction(ShortRepr):
-    """A prediction from earlier executions only, compared with the execution.
+    """A prediction from earlier executions only, compared with the execution."""
 
-    Attributes:
-        trial: the number of the trial.
-        rank: share of the predicted distances that are below the executed one; NaN if nothing was predicted.
-        median: median of the predicted distances; infinity if nothing was predicted.
-        upper: 0.95 quantile of the predicted distances; infinity if more draws than that diverged.
-        distance: the executed distance.
-        z2: squared standardised error, the larger one of the trajectory and of the distance; NaN if it is not known.
-        stored: whether the prediction was stored before the execution; if not, it was computed afterwards.
-        new: whether the task differs from those that were executed before.
-        origin: the reason why the task was chosen.
-        point: the task, a point of the unit cube ``(d,)``.
-        quantiles: quantiles of the predicted distances at ``quantiles.LEVELS`` if the system is noisy; else empty.
-        runs: the number of predicted distances that these are of.
-        p_values: predicted probabilities of more than what statistics of the trajectory are; empty without noise.
-        explained: the distance of the task on what all executions teach together; None if it is not known.
-    """
-
-    trial: int
-    rank: float
-    median: float
-    upper: float
-    distance: float
+    trial: int  #: the number of the trial
+    rank: float  #: share of the predicted distances that are below the executed one; NaN if nothing was predicted
+    median: float  #: median of the predicted distances; infinity if nothing was predicted
+    upper: float  #: 0.95 quantile of the predicted distances; infinity if more draws than that diverged
+    distance: float  #: the executed distance
+    #: squared standardised error, the larger one of the trajectory and of the distance; NaN if it is not known
     z2: float = np.nan
-    stored: bool = True
-    new: bool = True
-    origin: Origin = "acquisition"
-    point: tuple[float, ...] = ()
+    stored: bool = True  #: whether the prediction was stored before the execution; if not, it was computed afterwards
+    new: bool = True  #: whether the task differs from those that were executed before
+    origin: Origin = "acquisition"  #: the reason why the task was chosen
+    point: tuple[float, ...] = ()  #: the task, a point of the unit cube ``(d,)``
+    #: quantiles of the predicted distances at ``quantiles.LEVELS`` if the system is noisy; else empty
     quantiles: tuple[float, ...] = ()
-    runs: int = 0
+    runs: int = 0  #: the number of predicted distances that these are of
+    #: predicted probabilities of more than what statistics of the trajectory are; empty without noise
     p_values: tuple[float, ...] = ()
+    #: the distance of the task on what all executions teach together; None if it is not known
     explained: float | None = None
 
     @property
@@ -85,32 +72,20 @@ class CheckedPrediction(ShortRepr):
 
 @dataclass(frozen=True, eq=False)
 class UntriedParameter(ShortRepr):
-    """A task parameter that hardly changes the closed loops of M.
+    """A task parameter that hardly changes the closed loops of M."""
 
-    Attributes:
-        name: its name.
-        gap: the largest distance of one of its values to the nearest executed one, as a share of its range.
-        task: a task in that gap, a point of the unit cube ``(d,)``.
-    """
-
-    name: str
-    gap: float
-    task: Array
+    name: str  #: its name
+    gap: float  #: the largest distance of one of its values to the nearest executed one, as a share of its range
+    task: Array  #: a task in that gap, a point of the unit cube ``(d,)``
 
 
 @dataclass(frozen=True)
 class Tolerance:
-    """The smallest push that brings a task above a threshold, in the state in which it takes least.
+    """The smallest push that brings a task above a threshold, in the state in which it takes least."""
 
-    Attributes:
-        state: the rate of change of the state, with its units, such as ``speed [m/s^2]``.
-        push: the size of the push; infinity if the largest one that was tried does not suffice.
-        residual: the largest residual that was recorded, in the same units.
-    """
-
-    state: str
-    push: float
-    residual: float
+    state: str  #: the rate of change of the state, with its units, such as ``speed [m/s^2]``
+    push: float  #: the size of the push; infinity if the largest one that was tried does not suffice
+    residual: float  #: the largest residual that was recorded, in the same units
 
     @property
     def ratio(self) -> float:
@@ -120,19 +95,13 @@ class Tolerance:
 
 @dataclass(frozen=True, eq=False)
 class PushedDistances(ShortRepr):
-    """The largest distances if something that no record shows pushes a state, on the posterior mean.
+    """The largest distances if something that no record shows pushes a state, on the posterior mean."""
 
-    Attributes:
-        residuals: the largest recorded residual of the rate of change of each pushed state, by its label.
-        levels: the sizes of the pushes as multiples of these residuals, ascending from 0, shape ``(L,)``.
-        everywhere: the largest distance for each state and size, shape ``(k, L)``.
-        away: the same if the push acts only where no record is near.
-    """
-
+    #: the largest recorded residual of the rate of change of each pushed state, by its label
     residuals: dict[str, float]
-    levels: Array
-    everywhere: Array
-    away: Array
+    levels: Array  #: the sizes of the pushes as multiples of these residuals, ascending from 0, shape ``(L,)``
+    everywhere: Array  #: the largest distance for each state and size, shape ``(k, L)``
+    away: Array  #: the same if the push acts only where no record is near
 
     def to_json(self) -> dict[str, Any]:
         """Return all attributes, ready for JSON: distances that are not finite are None."""
@@ -168,74 +137,51 @@ class PushedDistances(ShortRepr):
 
 @dataclass(frozen=True, eq=False)
 class DynamicsEvidence(ShortRepr):
-    """What draws of the learned dynamics say about the largest distance.
+    """What draws of the learned dynamics say about the largest distance."""
 
-    Attributes:
-        maxima: the largest distance over all tasks of each draw, shape ``(S,)``; infinity if its loop diverges.
-        points: where it lies, points of the unit cube ``(S, d)``.
-        highest: the largest distance on the posterior mean, and below it those of other tasks.
-        elites: tasks with large distances on the posterior mean, points ``(e, d)``, the largest first.
-        evaluations: number of closed loops on learned dynamics that were run to find the maxima.
-        executions: number of executions with a trajectory, from which the dynamics were learned.
-        left_out: share of the posterior variance that a draw leaves out between its pivots.
-        noise: learned variance of noise, as a share of the mean square of the residual.
-        predictions: predictions and executions, in the order of the trials.
-        coverage: how well the records cover the closed loops of the tasks.
-        groups: number of draws that share hyperparameters.
-        unplanned: share of the tasks for which no controller can be designed, or on which M diverges.
-        untried: a parameter that M's loops do not depend on; None if there is none.
-        without_model: whether the system was learned without M, because M is rougher than the system.
-        corner: the corner of a position that is farthest from executed tasks; None if no parameter is a position.
-        sharpness: largest share by which a large distance on the mean exceeds those of tasks that are nearly the same.
-        jump: largest jump of the distance on the mean between tasks that are nearly the same, at random tasks; 0 if it
-            was not computed, because the bound is withdrawn anyway.
-        dense: whether there are so few task parameters that deeper searches can find what lies between jumps.
-        missed: factor by which the largest distance on the mean is larger in two deeper searches; at least 1.
-        disagreement: share by which the smaller result of these searches is below the larger one.
-        tests: the number of tests that a bound needs; see :mod:`~ctxval.certificates.prediction_tests`.
-        pushed: the largest distances if something pushes the system; None if the bound is withdrawn anyway.
-        quantile: the share of the executions of a task whose distances are below the maxima; None if the system is not
-            noisy, so that all are alike.
-        lags: number of earlier records and inputs that the learned dynamics depend on.
-        actuator: the delay and the time constant, in steps, with which inputs act; None if they act at once.
-        pocket: the largest region that no execution has entered; None if it is not known.
-        physical: the task parameters that the learned dynamics depend on.
-        suspect: another one that they seem to depend on, and how many times less predictions of executions from the
-            others err with it; None if predictions hold, or if there is none.
-        without_data: whether the data that M was made from are left out, because they contradict the executions.
-        estimated: whether states of M are estimated from recorded outputs.
-    """
-
-    maxima: Array
-    points: Array
-    highest: float
-    elites: Array
-    evaluations: int
-    executions: int
-    left_out: float
-    noise: float
-    predictions: tuple[CheckedPrediction, ...]
-    coverage: StateInputCoverage
-    groups: int = 2
-    unplanned: float = 0.0
-    untried: UntriedParameter | None = None
+    maxima: Array  #: the largest distance over all tasks of each draw, shape ``(S,)``; infinity if its loop diverges
+    points: Array  #: where it lies, points of the unit cube ``(S, d)``
+    highest: float  #: the largest distance on the posterior mean, and below it those of other tasks
+    elites: Array  #: tasks with large distances on the posterior mean, points ``(e, d)``, the largest first
+    evaluations: int  #: number of closed loops on learned dynamics that were run to find the maxima
+    executions: int  #: number of executions with a trajectory, from which the dynamics were learned
+    left_out: float  #: share of the posterior variance that a draw leaves out between its pivots
+    noise: float  #: learned variance of noise, as a share of the mean square of the residual
+    predictions: tuple[CheckedPrediction, ...]  #: predictions and executions, in the order of the trials
+    coverage: StateInputCoverage  #: how well the records cover the closed loops of the tasks
+    groups: int = 2  #: number of draws that share hyperparameters
+    unplanned: float = 0.0  #: share of the tasks for which no controller can be designed, or on which M diverges
+    untried: UntriedParameter | None = None  #: a parameter that M's loops do not depend on; None if there is none
+    #: the corner of a position that is farthest from executed tasks; None if no parameter is a position
     corner: UntriedCorner | None = None
-    without_model: bool = False
+    without_model: bool = False  #: whether the system was learned without M, because M is rougher than the system
+    #: largest share by which a large distance on the mean exceeds those of tasks that are nearly the same
     sharpness: float = 0.0
+    #: largest jump of the distance on the mean between tasks that are nearly the same, at random tasks; 0 if it was not
+    #: computed, because the bound is withdrawn anyway
     jump: float = 0.0
+    #: whether there are so few task parameters that deeper searches can find what lies between jumps
     dense: bool = False
+    #: factor by which the largest distance on the mean is larger in two deeper searches; at least 1
     missed: float = 1.0
-    disagreement: float = 0.0
-    tests: int = TESTS
+    disagreement: float = 0.0  #: share by which the smaller result of these searches is below the larger one
+    tests: int = TESTS  #: the number of tests that a bound needs; see :mod:`~ctxval.certificates.prediction_tests`
+    #: the largest distances if something pushes the system; None if the bound is withdrawn anyway
     pushed: PushedDistances | None = None
+    #: the share of the executions of a task whose distances are below the maxima; None if the system is not noisy, so
+    #: that all are alike
     quantile: float | None = None
-    lags: int = 0
+    lags: int = 0  #: number of earlier records and inputs that the learned dynamics depend on
+    #: the delay and the time constant, in steps, with which inputs act; None if they act at once
     actuator: tuple[float, float] | None = None
-    pocket: StatePocket | None = None
-    physical: tuple[str, ...] = ()
+    pocket: StatePocket | None = None  #: the largest region that no execution has entered; None if it is not known
+    physical: tuple[str, ...] = ()  #: the task parameters that the learned dynamics depend on
+    #: another one that they seem to depend on, and how many times less predictions of executions from the others err
+    #: with it; None if predictions hold, or if there is none
     suspect: tuple[str, float] | None = None
+    #: whether the data that M was made from are left out, because they contradict the executions
     without_data: bool = False
-    estimated: bool = False
+    estimated: bool = False  #: whether states of M are estimated from recorded outputs
 
     def rank(self, confidence: float) -> int:
         """Return the row, in ascending order, of the maximum that d* stays below with this probability."""

@@ -64,51 +64,38 @@ _WORTH = 0.8  # share of the tasks predicted below the threshold that tests may 
 
 @dataclass(frozen=True, eq=False)
 class Envelope(ShortRepr):
-    """The set of tasks on which d stays below a threshold, with a confidence for all of them at once.
+    """The set of tasks on which d stays below a threshold, with a confidence for all of them at once."""
 
-    Attributes:
-        space: the task space.
-        threshold, confidence: tau and the confidence.
-        statement: what it says, in one sentence.
-        share: the share of the tasks that are trusted.
-        regions: the largest boxes and half-spaces inside it, the largest first; empty for a suite.
-        tasks: the names of the trusted tasks of a suite; None if the task space is no suite.
-        factor: k, by how many spreads the mean must stay below the threshold.
-        raised_by: the trial that raised k, by its excess over its prediction or because the draws miss its distance;
-            None if there is none.
-        margin: the median of what the interpolation adds next to evaluated tasks, as a share of the threshold.
-        evaluated: the number of tasks at which closed loops were run.
-        checks: the number of further tasks that checked the interpolation between these.
-        uncovered: the share of the tasks that are not trusted only because predicted runs leave the records.
-        executions, tests: numbers of executions, and of those that were predicted beforehand at drawn tasks.
-        quantile: the share of the executions of a task whose distances are below tau; None if the system is not noisy.
-        assumptions: what it assumes.
-        irregular: the number of recorded steps, such as contacts, that are no part of what is learned; a task is not
-            trusted if its run comes to states like theirs.
-        doubt: why it is withdrawn; then no task is trusted.
-        units: the units of the distance.
-    """
-
-    space: TaskSpace
+    space: TaskSpace  #: the task space
+    #: threshold, confidence: tau and the confidence
     threshold: float
     confidence: float
-    statement: str
-    share: float = 0.0
+    statement: str  #: what it says, in one sentence
+    share: float = 0.0  #: the share of the tasks that are trusted
+    #: the largest boxes and half-spaces inside it, the largest first; empty for a suite
     regions: tuple[Region, ...] = ()
+    #: the names of the trusted tasks of a suite; None if the task space is no suite
     tasks: tuple[str, ...] | None = None
-    factor: float | None = None
+    factor: float | None = None  #: k, by how many spreads the mean must stay below the threshold
+    #: the trial that raised k, by its excess over its prediction or because the draws miss its distance; None if there
+    #: is none
     raised_by: int | None = None
+    #: the median of what the interpolation adds next to evaluated tasks, as a share of the threshold
     margin: float = 0.0
-    evaluated: int = 0
-    checks: int = 0
-    uncovered: float = 0.0
+    evaluated: int = 0  #: the number of tasks at which closed loops were run
+    checks: int = 0  #: the number of further tasks that checked the interpolation between these
+    uncovered: float = 0.0  #: the share of the tasks that are not trusted only because predicted runs leave the records
+    #: executions, tests: numbers of executions, and of those that were predicted beforehand at drawn tasks
     executions: int = 0
     tests: int = 0
+    #: the share of the executions of a task whose distances are below tau; None if the system is not noisy
     quantile: float | None = None
-    assumptions: tuple[str, ...] = ()
+    assumptions: tuple[str, ...] = ()  #: what it assumes
+    #: the number of recorded steps, such as contacts, that are no part of what is learned; a task is not trusted if its
+    #: run comes to states like theirs
     irregular: int = 0
-    doubt: str | None = None
-    units: str = ""
+    doubt: str | None = None  #: why it is withdrawn; then no task is trusted
+    units: str = ""  #: the units of the distance
     _surfaces: Surfaces | None = None
     _bounds: Array | None = None
 

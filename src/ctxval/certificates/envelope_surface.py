@@ -44,19 +44,13 @@ def upper_at(points: Array, centres: Array, weights: Array, errors: Array) -> Ar
 
 @dataclass(frozen=True, eq=False)
 class Surfaces:
-    """Upper bounds of c numbers over the unit cube: interpolated, plus the largest local error.
+    """Upper bounds of c numbers over the unit cube: interpolated, plus the largest local error."""
 
-    Attributes:
-        centres: the tasks at which the numbers are known, shape ``(K, d)``.
-        weights: shape ``(K + 1 + d, c)``.
-        left_out: what each number would be if its task were left out, shape ``(K, c)``.
-        errors: by how much that is wrong, shape ``(K, c)``; the largest of the nearest is the local error. Its sign
-            does not count: what is too large at a task is too small between others.
-    """
-
-    centres: Array
-    weights: Array
-    left_out: Array
+    centres: Array  #: the tasks at which the numbers are known, shape ``(K, d)``
+    weights: Array  #: shape ``(K + 1 + d, c)``
+    left_out: Array  #: what each number would be if its task were left out, shape ``(K, c)``
+    #: by how much that is wrong, shape ``(K, c)``; the largest of the nearest is the local error. Its sign does not
+    #: count: what is too large at a task is too small between others.
     errors: Array
 
     @classmethod

@@ -28,16 +28,12 @@ _DIGITS = 3
 
 @dataclass(frozen=True)
 class Region:
-    """A box of tasks, or a half-space if it has one limit.
+    """A box of tasks, or a half-space if it has one limit."""
 
-    Attributes:
-        limits: the lower and the upper limit of parameters, or of a sum or a difference such as ``goal - start``, by
-            their labels; None if there is no limit on that side.
-        share: the share of the tasks that it holds.
-    """
-
+    #: the lower and the upper limit of parameters, or of a sum or a difference such as ``goal - start``, by their
+    #: labels; None if there is no limit on that side
     limits: dict[str, tuple[float | None, float | None]]
-    share: float
+    share: float  #: the share of the tasks that it holds
 
     @property
     def text(self) -> str:

@@ -32,36 +32,25 @@ FEWEST = 3
 
 @dataclass(frozen=True, eq=False)
 class Statistic:
-    """The statistic of one run in a channel.
+    """The statistic of one run in a channel."""
 
-    Attributes:
-        value: positive.
-        gradient, information: what the run says of coefficients w, whose likelihood is proportional to
-            ``exp(w' gradient - w' information w / 2)``, shapes ``(k,)`` and ``(k, k)``; None if there is no noise.
-    """
-
-    value: float
+    value: float  #: positive
+    #: gradient, information: what the run says of coefficients w, whose likelihood is proportional to ``exp(w' gradient
+    #: - w' information w / 2)``, shapes ``(k,)`` and ``(k, k)``; None if there is no noise
     gradient: Array | None = None
     information: Array | None = None
 
 
 @dataclass(frozen=True)
 class WatchedChannel(ShortRepr):
-    """One kind of statistics.
+    """One kind of statistics."""
 
-    Attributes:
-        name: what they are of, as the subject of a sentence in the plural.
-        certified: those of the certified runs, each predicted from the others; positive.
-        freedom: the degrees of freedom that noise gives them; None if there is no noise.
-        information: that of all certified runs on coefficients, shape ``(k, k)``; None if there is no noise.
-        later: those of later runs; None for a run that does not have it.
-    """
-
-    name: str
-    certified: tuple[float, ...]
-    freedom: float | None = None
+    name: str  #: what they are of, as the subject of a sentence in the plural
+    certified: tuple[float, ...]  #: those of the certified runs, each predicted from the others; positive
+    freedom: float | None = None  #: the degrees of freedom that noise gives them; None if there is no noise
+    #: that of all certified runs on coefficients, shape ``(k, k)``; None if there is no noise
     information: Array | None = field(default=None, compare=False)
-    later: tuple[Statistic | None, ...] = ()
+    later: tuple[Statistic | None, ...] = ()  #: those of later runs; None for a run that does not have it
     _scales: ScaleBets | None = field(default=None, compare=False)
     _slopes: SlopeBets | None = field(default=None, compare=False)
 
@@ -96,31 +85,20 @@ class WatchedChannel(ShortRepr):
 
 @dataclass(frozen=True)
 class WatchState(ShortRepr):
-    """What later runs say of a certificate: plain numbers, which can be stored as JSON.
+    """What later runs say of a certificate: plain numbers, which can be stored as JSON."""
 
-    Attributes:
-        threshold: tau.
-        false_alarms: largest rate of false alarms, such as one in 1,000 runs.
-        channels: the statistics.
-        runs: the names of the later runs.
-        distances: their distances; None if they are unknown.
-        evidence: the e-detector; the alarm is raised when it reaches ``1 / false_alarms``, and stays.
-        alarm: the run, counted from 1, at which the alarm was raised; None if the certificate still holds.
-        since: the run, counted from 1, from which on the change is likeliest to have acted.
-        cause: the name of the channel with the largest evidence, or ``EXCEEDED``.
-        ratio: how many times as large as those certified its statistics are since that run, or the distance as a
-            multiple of the threshold.
-    """
-
-    threshold: float
-    false_alarms: float
-    channels: tuple[WatchedChannel, ...]
-    runs: tuple[str, ...] = ()
-    distances: tuple[float | None, ...] = ()
-    evidence: float = 0.0
+    threshold: float  #: tau
+    false_alarms: float  #: largest rate of false alarms, such as one in 1,000 runs
+    channels: tuple[WatchedChannel, ...]  #: the statistics
+    runs: tuple[str, ...] = ()  #: the names of the later runs
+    distances: tuple[float | None, ...] = ()  #: their distances; None if they are unknown
+    evidence: float = 0.0  #: the e-detector; the alarm is raised when it reaches ``1 / false_alarms``, and stays
+    #: the run, counted from 1, at which the alarm was raised; None if the certificate still holds
     alarm: int | None = None
-    since: int | None = None
-    cause: str | None = None
+    since: int | None = None  #: the run, counted from 1, from which on the change is likeliest to have acted
+    cause: str | None = None  #: the name of the channel with the largest evidence, or ``EXCEEDED``
+    #: how many times as large as those certified its statistics are since that run, or the distance as a multiple of
+    #: the threshold
     ratio: float | None = None
 
     def after(self, run: str, statistics: Mapping[str, Statistic], distance: float | None = None) -> Self:

@@ -19,20 +19,14 @@ _JITTER = 1e-9  # added to variances, relative to the distance's, so that the co
 
 @dataclass(frozen=True)
 class Forecast:
-    """Forecast of further executions.
+    """Forecast of further executions."""
 
-    Attributes:
-        executions: number of executions after which half of the simulated futures are decided, or the fewest that can
-            decide; None if it exceeds ``HORIZON``.
-        validated: share of the futures, or of the posterior samples of the dynamics, that validate the threshold.
-        falsified: share of them in which a distance exceeds the threshold.
-        fewest: whether ``executions`` is the fewest that can decide.
-    """
-
+    #: number of executions after which half of the simulated futures are decided, or the fewest that can decide; None
+    #: if it exceeds ``HORIZON``
     executions: int | None
-    validated: float
-    falsified: float
-    fewest: bool = False
+    validated: float  #: share of the futures, or of the posterior samples of the dynamics, that validate the threshold
+    falsified: float  #: share of them in which a distance exceeds the threshold
+    fewest: bool = False  #: whether ``executions`` is the fewest that can decide
 
     def __str__(self) -> str:
         return outlook(self, HORIZON)

@@ -30,20 +30,13 @@ _MOST = 4  # chains for a bound near a threshold; one chain is usual
 
 @dataclass(frozen=True, eq=False)
 class Maxima(ShortRepr):
-    """Draws of d* from its posterior.
+    """Draws of d* from its posterior."""
 
-    Attributes:
-        draws: the draws in ascending order, shape ``(S,)``.
-        points: a maximiser of each draw's path, in the unit cube, shape ``(S, d)``.
-        conditioned: the processes under each draw of the hyperparameters.
-        owners: index into ``conditioned`` of each draw, shape ``(S,)``.
-        stochastic: whether two executions of one task may differ, so that d* is the largest expected distance.
-    """
-
-    draws: Array
-    points: Array
-    conditioned: list[Conditioned]
-    owners: Rows
+    draws: Array  #: the draws in ascending order, shape ``(S,)``
+    points: Array  #: a maximiser of each draw's path, in the unit cube, shape ``(S, d)``
+    conditioned: list[Conditioned]  #: the processes under each draw of the hyperparameters
+    owners: Rows  #: index into ``conditioned`` of each draw, shape ``(S,)``
+    #: whether two executions of one task may differ, so that d* is the largest expected distance
     stochastic: bool = False
 
     @checked

@@ -21,17 +21,11 @@ MOST_VOLUME = 0.5  # above it, a statement leaves out most of the task space
 @checked
 @dataclass(frozen=True)
 class CertificateOptions(ShortRepr):
-    """The certificate by which trials are judged, and the volume that it may leave out.
+    """The certificate by which trials are judged, and the volume that it may leave out."""
 
-    Attributes:
-        kind: the kind of certificate, with its own options.
-        confidence: confidence level of the certificate, at least 0.5.
-        volume: the share of the task space that may exceed the threshold, at most 0.5; if it is 0, only bounds on d*
-            validate.
-    """
-
-    kind: CertificateKind = field(default_factory=Automatic)
-    confidence: Probability = CONFIDENCE
+    kind: CertificateKind = field(default_factory=Automatic)  #: the kind of certificate, with its own options
+    confidence: Probability = CONFIDENCE  #: confidence level of the certificate, at least 0.5
+    #: the share of the task space that may exceed the threshold, at most 0.5; if it is 0, only bounds on d* validate
     volume: float = 0.0
 
     def __post_init__(self) -> None:

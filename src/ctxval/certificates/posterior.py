@@ -48,14 +48,12 @@ class Posterior(CertificateKind):
     """Bound on d* from the posterior of a Gaussian process of the distance.
 
     If two executions of one task differ, the bound is one on the largest expected distance.
-
-    Attributes:
-        resolution: largest distance from a task to its nearest trial, in diagonals of the task space; beyond it the
-            bound is withdrawn. With 1 it is never withdrawn for this reason.
     """
 
     name: ClassVar[str] = "posterior"
 
+    #: largest distance from a task to its nearest trial, in diagonals of the task space; beyond it the bound is
+    #: withdrawn. With 1 it is never withdrawn for this reason.
     resolution: PositiveFloat = RESOLUTION
 
     def certify(self, sample: Sample, confidence: float = 0.95) -> Certificate:
@@ -170,21 +168,13 @@ LEVEL = 0.01
 
 @dataclass(frozen=True)
 class Diagnosis(ShortRepr):
-    """How well the process predicts its own data.
+    """How well the process predicts its own data."""
 
-    Attributes:
-        surprise: the probability, under the process, that the largest error upward is at least as large.
-        trial: number of the trial with the largest error upward.
-        left_out: root mean square of the standardised leave-one-out errors; about 1 if the process fits the data.
-        farthest: largest distance from a task to its nearest trial, in diagonals of the task space.
-        doubt: why the bound is withdrawn, in one sentence; None if it is not.
-    """
-
-    surprise: float
-    trial: int
-    left_out: float
-    farthest: float
-    doubt: str | None
+    surprise: float  #: the probability, under the process, that the largest error upward is at least as large
+    trial: int  #: number of the trial with the largest error upward
+    left_out: float  #: root mean square of the standardised leave-one-out errors; about 1 if the process fits the data
+    farthest: float  #: largest distance from a task to its nearest trial, in diagonals of the task space
+    doubt: str | None  #: why the bound is withdrawn, in one sentence; None if it is not
 
     def to_json(self) -> dict[str, Any]:
         """Return the numbers, ready for JSON."""

@@ -35,28 +35,21 @@ class Neighbour(ShortRepr):
 
 @dataclass(frozen=True, eq=False)
 class Provenance(ShortRepr):
-    """Facts on a campaign, besides its trials, that concern a certificate.
+    """Facts on a campaign, besides its trials, that concern a certificate."""
 
-    Attributes:
-        space: the task space, to state lengths in its units; None if it is not known.
-        remarks: sentences that a certificate lists among its assumptions, such as what was changed on the system.
-        learned: what the experiment's model predicts, for kinds that need it; None if the experiment is not loaded.
-        distribution: the distribution of tasks as a text; None if it is uniform.
-        units: the units of the distance.
-        start: the largest offset of the start of an execution, as the distance measures it, and as a text; None if
-            executions were not recorded.
-        thresholds: the thresholds in the order in which they were first stated; None if nobody has recorded them.
-        beside: the other stores of the same experiment beside this one.
-    """
-
-    space: TaskSpace | None = None
+    space: TaskSpace | None = None  #: the task space, to state lengths in its units; None if it is not known
+    #: sentences that a certificate lists among its assumptions, such as what was changed on the system
     remarks: tuple[str, ...] = ()
+    #: what the experiment's model predicts, for kinds that need it; None if the experiment is not loaded
     learned: LearnedDistance | None = None
-    distribution: str | None = None
-    units: str = ""
+    distribution: str | None = None  #: the distribution of tasks as a text; None if it is uniform
+    units: str = ""  #: the units of the distance
+    #: the largest offset of the start of an execution, as the distance measures it, and as a text; None if executions
+    #: were not recorded
     start: tuple[float, str] | None = None
+    #: the thresholds in the order in which they were first stated; None if nobody has recorded them
     thresholds: tuple[StatedThreshold, ...] | None = None
-    beside: tuple[Neighbour, ...] = ()
+    beside: tuple[Neighbour, ...] = ()  #: the other stores of the same experiment beside this one
 
     @classmethod
     def of(

@@ -39,12 +39,7 @@ _OF_MAP = 0.05
 @part("region")
 @dataclass(frozen=True, repr=False)
 class Region(CertificateKind):
-    """Bound on the distance by a prediction and a margin, but for a share of the tasks; a map of where tau is kept.
-
-    Attributes:
-        discard: how many of the largest excesses are discarded; it must be chosen before the draws are known.
-        predictions: number M of tasks that are predicted to estimate the share of the tasks that keep the threshold.
-    """
+    """Bound on the distance by a prediction and a margin, but for a share of the tasks; a map of where tau is kept."""
 
     name: ClassVar[str] = "region"
     bounds_maximum: ClassVar[bool] = False
@@ -52,7 +47,9 @@ class Region(CertificateKind):
     needs_model: ClassVar[bool] = True
     sorts_draws: ClassVar[bool] = True
 
+    #: how many of the largest excesses are discarded; it must be chosen before the draws are known
     discard: NonNegativeInt = 0
+    #: number M of tasks that are predicted to estimate the share of the tasks that keep the threshold
     predictions: PositiveInt = 1000
 
     def certify(self, sample: Sample, confidence: float = 0.95) -> Certificate:

@@ -24,47 +24,31 @@ PLANNED = "draws"
 
 @dataclass(frozen=True)
 class MadeGood(ShortRepr):
-    """A failed trial whose task was executed with success later.
+    """A failed trial whose task was executed with success later."""
 
-    Attributes:
-        trial: number of the trial that failed.
-        by: number of the trial that succeeded.
-        because: what was changed on the system in between; None if nobody stated it.
-    """
-
-    trial: int
-    by: int
-    because: str | None
+    trial: int  #: number of the trial that failed
+    by: int  #: number of the trial that succeeded
+    because: str | None  #: what was changed on the system in between; None if nobody stated it
 
 
 @dataclass(frozen=True, eq=False)
 class Sample(ShortRepr):
-    """Executed trials as a certificate sees them: points, distances, and why each task was chosen.
+    """Executed trials as a certificate sees them: points, distances, and why each task was chosen."""
 
-    Attributes:
-        points: tasks as points of the unit cube, shape ``(n, d)``.
-        distances: their distances, shape ``(n,)``; NaN if the execution failed or could not be measured.
-        origins: why each task was chosen, n entries.
-        states: the state of each trial, n entries; none may be open.
-        numbers: numbers of the trials, for messages; 0, 1, ... by default.
-        planned: for each trial, the total number of independent draws that was planned when it was drawn; 0 if they
-            were to end with the verdict, None if that is not known.
-        made_good: failures that are left out, because their tasks were executed with success later.
-        learned: what the experiment's model predicts; None if the experiment is not loaded.
-        distribution: the distribution of tasks as a text; None if it is uniform.
-        suite: the tasks of a suite, points of the unit cube ``(N, d)``; None if tasks fill the box.
-    """
-
-    points: Array
-    distances: Array
-    origins: Sequence[Origin]
-    states: Sequence[State]
-    numbers: Sequence[int] = ()
+    points: Array  #: tasks as points of the unit cube, shape ``(n, d)``
+    distances: Array  #: their distances, shape ``(n,)``; NaN if the execution failed or could not be measured
+    origins: Sequence[Origin]  #: why each task was chosen, n entries
+    states: Sequence[State]  #: the state of each trial, n entries; none may be open
+    numbers: Sequence[int] = ()  #: numbers of the trials, for messages; 0, 1, ... by default.
+    #: for each trial, the total number of independent draws that was planned when it was drawn; 0 if they were to end
+    #: with the verdict, None if that is not known
     planned: Sequence[int | None] = ()
+    #: failures that are left out, because their tasks were executed with success later
     made_good: tuple[MadeGood, ...] = ()
+    #: what the experiment's model predicts; None if the experiment is not loaded
     learned: LearnedDistance | None = None
-    distribution: str | None = None
-    suite: Array | None = None
+    distribution: str | None = None  #: the distribution of tasks as a text; None if it is uniform
+    suite: Array | None = None  #: the tasks of a suite, points of the unit cube ``(N, d)``; None if tasks fill the box
 
     def __post_init__(self) -> None:
         if not len(self.numbers):

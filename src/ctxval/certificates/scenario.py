@@ -72,14 +72,11 @@ class Scenario(CertificateKind):
 @part("sampling-discarding")
 @dataclass(frozen=True, repr=False)
 class SamplingDiscarding(Scenario):
-    """The scenario bound after the largest distances are discarded (sampling and discarding, SD).
-
-    Attributes:
-        discard: how many of the largest distances are discarded, at least 1; it must be chosen before they are known.
-    """
+    """The scenario bound after the largest distances are discarded (sampling and discarding, SD)."""
 
     name: ClassVar[str] = "sampling-discarding"
 
+    #: how many of the largest distances are discarded, at least 1; it must be chosen before they are known
     discard: PositiveInt | None = None
 
     def _require_discard(self) -> int:

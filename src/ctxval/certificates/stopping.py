@@ -28,14 +28,11 @@ from ctxval.errors import CertificateError, InputError
 
 @dataclass(frozen=True, eq=False)
 class StoppingDecision(ShortRepr):
-    """Whether a campaign stops, and the next task that the rule asks for.
+    """Whether a campaign stops, and the next task that the rule asks for."""
 
-    Attributes:
-        decided: whether it stops: the verdict is reached, or will be reached if the open trials show nothing new.
-        next_point: the point of the unit cube ``(d,)`` to execute next; None if the search chooses the next task.
-    """
-
+    #: whether it stops: the verdict is reached, or will be reached if the open trials show nothing new
     decided: bool = False
+    #: the point of the unit cube ``(d,)`` to execute next; None if the search chooses the next task
     next_point: Array | None = None
 
 
@@ -47,17 +44,13 @@ that allows for the error of so few draws, in the probability that d* keeps the 
 @checked
 @dataclass(frozen=True)
 class StoppingRule(ShortRepr):
-    """The rule by which a campaign stops when its verdict on a threshold is reached.
+    """The rule by which a campaign stops when its verdict on a threshold is reached."""
 
-    Attributes:
-        threshold: tau, in the distance's units.
-        options: the certificate of the verdict; it must be the posterior bound.
-        confirmations: number of trials, where the largest draws of d* lie, after the bound first keeps the threshold;
-            it must still keep it after them. They mostly correct a bound that is too low.
-    """
-
-    threshold: PositiveFloat
+    threshold: PositiveFloat  #: tau, in the distance's units
+    #: the certificate of the verdict; it must be the posterior bound
     options: CertificateOptions = field(default_factory=CertificateOptions.posterior)
+    #: number of trials, where the largest draws of d* lie, after the bound first keeps the threshold; it must still
+    #: keep it after them. They mostly correct a bound that is too low.
     confirmations: NonNegativeInt = 2
 
     def __post_init__(self) -> None:

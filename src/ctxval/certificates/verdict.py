@@ -28,27 +28,20 @@ Answer = Literal["validated", "falsified", "undecided"]
 
 @dataclass(frozen=True, eq=False)
 class Verdict:
-    """The answer of the trials to the question whether d* <= tau.
+    """The answer of the trials to the question whether d* <= tau."""
 
-    Attributes:
-        answer: "falsified" if an executed distance exceeds tau, "validated" if a certificate keeps tau with its
-            confidence, else "undecided".
-        threshold: tau, in the distance's units.
-        reason: the reason for the answer, in one or two sentences.
-        witness: the executed trial with d(p) > tau of a falsification; else None.
-        certificate: the certificate that validates or does not suffice; None if there is none.
-        expected: a forecast of further executions; None if the answer is decided or nothing can be predicted.
-        rests_on: the evidence for a validation, its conditions, and what holds without them; else None.
-        next_task: the parameters of the task to execute next, if learned dynamics choose it to decide; else None.
-    """
-
+    #: "falsified" if an executed distance exceeds tau, "validated" if a certificate keeps tau with its confidence, else
+    #: "undecided"
     answer: Answer
-    threshold: float
-    reason: str
-    witness: Trial | None = None
-    certificate: Certificate | None = None
+    threshold: float  #: tau, in the distance's units
+    reason: str  #: the reason for the answer, in one or two sentences
+    witness: Trial | None = None  #: the executed trial with d(p) > tau of a falsification; else None
+    certificate: Certificate | None = None  #: the certificate that validates or does not suffice; None if there is none
+    #: a forecast of further executions; None if the answer is decided or nothing can be predicted
     expected: Forecast | None = None
+    #: the evidence for a validation, its conditions, and what holds without them; else None
     rests_on: str | None = None
+    #: the parameters of the task to execute next, if learned dynamics choose it to decide; else None
     next_task: Mapping[str, Any] | None = None
 
     @property
@@ -202,19 +195,12 @@ def require_suite(kind: CertificateKind) -> None:
 
 @dataclass(frozen=True, eq=False)
 class Assessment(ShortRepr):
-    """A certificate and a verdict of the same trials.
+    """A certificate and a verdict of the same trials."""
 
-    Attributes:
-        kind: the name of the certificate's kind.
-        certificate: the certificate; None if its theory refuses the trials.
-        verdict: the verdict; None if no threshold was given.
-        refusal: why there is no certificate; None if there is one.
-    """
-
-    kind: str
-    certificate: Certificate | None
-    verdict: Verdict | None = None
-    refusal: str | None = None
+    kind: str  #: the name of the certificate's kind
+    certificate: Certificate | None  #: the certificate; None if its theory refuses the trials
+    verdict: Verdict | None = None  #: the verdict; None if no threshold was given
+    refusal: str | None = None  #: why there is no certificate; None if there is one
 
     def to_json(self) -> dict[str, Any]:
         """Return the certificate, the verdict and the forecast as one flat table, ready for JSON."""

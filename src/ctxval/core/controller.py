@@ -138,13 +138,10 @@ def converged_of(controller: object, batch_shape: tuple[int, ...] = ()) -> Mask 
 
 @dataclass(frozen=True, eq=False, init=False)
 class Limits(ShortRepr):
-    """Limits of the inputs, ``low <= u <= high``.
+    """Limits of the inputs, ``low <= u <= high``."""
 
-    Attributes:
-        low, high: the lower and upper limits: a number for all inputs, or one for each input, shape ``(m,)``; infinite
-            if there is no limit.
-    """
-
+    #: low, high: the lower and upper limits: a number for all inputs, or one for each input, shape ``(m,)``; infinite
+    #: if there is no limit
     low: Array
     high: Array
 
@@ -216,20 +213,13 @@ def fed_back(K: Array, deviations: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class AffineFeedback(ShortRepr):
-    """Time-varying affine feedback ``u = v_t + K_t (x - x_t)``, clipped to its limits if it has any.
+    """Time-varying affine feedback ``u = v_t + K_t (x - x_t)``, clipped to its limits if it has any."""
 
-    Attributes:
-        gains: the gains K, shape ``(..., H, m, n)``, or ``(H, m, n)`` if all tasks of the batch share them.
-        inputs: the inputs v, shape ``(..., H, m)``.
-        states: the states x, shape ``(..., H, n)`` or with more times than H.
-        limits: the limits of the inputs, shared by all tasks of the batch; None if there are none.
-        converged: whether the design converged, booleans of shape ``(...)``; None if the design is not iterative.
-    """
-
-    gains: Array
-    inputs: Array
-    states: Array
-    limits: Limits | None = None
+    gains: Array  #: the gains K, shape ``(..., H, m, n)``, or ``(H, m, n)`` if all tasks of the batch share them
+    inputs: Array  #: the inputs v, shape ``(..., H, m)``
+    states: Array  #: the states x, shape ``(..., H, n)`` or with more times than H
+    limits: Limits | None = None  #: the limits of the inputs, shared by all tasks of the batch; None if there are none
+    #: whether the design converged, booleans of shape ``(...)``; None if the design is not iterative
     converged: Mask | None = None
 
     def __call__(self, t: int, x: Array) -> Array:

@@ -10,65 +10,41 @@ from ctxval._util.representation import ShortRepr
 
 @dataclass(frozen=True, eq=False)
 class StateInputGap(ShortRepr):
-    """A gap between the states and inputs that closed loops visit and those that are recorded.
+    """A gap between the states and inputs that closed loops visit and those that are recorded."""
 
-    Attributes:
-        size: its size, as a share of the visited range.
-        coordinates: its coordinates, such as ``angle [rad]``, or ``x[1]`` and ``u[0]`` if they have no names.
-        place: the visited state and input, by coordinate, in the units of the system.
-    """
-
-    size: float
+    size: float  #: its size, as a share of the visited range
+    #: its coordinates, such as ``angle [rad]``, or ``x[1]`` and ``u[0]`` if they have no names
     coordinates: tuple[str, ...]
-    place: dict[str, float]
+    place: dict[str, float]  #: the visited state and input, by coordinate, in the units of the system
 
 
 @dataclass(frozen=True, eq=False)
 class StateInputCoverage(ShortRepr):
-    """The largest gaps between the states and inputs that closed loops visit and those that are recorded.
+    """The largest gaps between the states and inputs that closed loops visit and those that are recorded."""
 
-    Attributes:
-        marginal: the largest gap in a single coordinate.
-        beyond: the largest excess over the largest record of a single coordinate, or below its smallest one.
-        pair: the largest gap in two coordinates together; None if there are too many coordinates to compare pairs.
-        resolution: the largest gap of each coordinate, in its unit.
-        task: the task whose closed loop leads farthest from the records, a point of the unit cube ``(d,)``.
-        tasks: the number of tasks that were compared.
-    """
-
-    marginal: StateInputGap
+    marginal: StateInputGap  #: the largest gap in a single coordinate
+    #: the largest excess over the largest record of a single coordinate, or below its smallest one
     beyond: StateInputGap
+    #: the largest gap in two coordinates together; None if there are too many coordinates to compare pairs
     pair: StateInputGap | None
-    resolution: dict[str, float]
-    task: Array
-    tasks: int
+    resolution: dict[str, float]  #: the largest gap of each coordinate, in its unit
+    task: Array  #: the task whose closed loop leads farthest from the records, a point of the unit cube ``(d,)``
+    tasks: int  #: the number of tasks that were compared
 
 
 @dataclass(frozen=True)
 class StatePocket:
-    """The largest region of two states that closed loops of tasks enter, and that no execution has entered.
+    """The largest region of two states that closed loops of tasks enter, and that no execution has entered."""
 
-    Attributes:
-        size: its radius, as a share of the visited ranges.
-        place: its centre, by the labels of the states, in their units.
-        within: its radius in each of the two states; they are equal if both are places.
-    """
-
-    size: float
-    place: dict[str, float]
-    within: dict[str, float]
+    size: float  #: its radius, as a share of the visited ranges
+    place: dict[str, float]  #: its centre, by the labels of the states, in their units
+    within: dict[str, float]  #: its radius in each of the two states; they are equal if both are places
 
 
 @dataclass(frozen=True, eq=False)
 class UntriedCorner(ShortRepr):
-    """The corner of two components of a position in space that is farthest from all executed tasks.
+    """The corner of two components of a position in space that is farthest from all executed tasks."""
 
-    Attributes:
-        place: the two components by their labels.
-        gap: the distance of the nearest executed task, of the farther component, as a share of its range.
-        task: a task there, a point of the unit cube ``(d,)``.
-    """
-
-    place: dict[str, float]
-    gap: float
-    task: Array
+    place: dict[str, float]  #: the two components by their labels
+    gap: float  #: the distance of the nearest executed task, of the farther component, as a share of its range
+    task: Array  #: a task there, a point of the unit cube ``(d,)``

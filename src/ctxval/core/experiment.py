@@ -24,22 +24,15 @@ class Experiment:
     """A validation with its defaults, as ``ctxval run`` runs it; it gets the names and units as its labels.
 
     A UnitsWarning says that the distance adds states of different units, and has neither weights nor scales.
-
-    Attributes:
-        name: a short name for files and displays.
-        budget: the default number of executions of S.
-        threshold: the default threshold tau; without a threshold there is no verdict.
-        truth: a function that finds d*, for simulated systems.
-        units: the units of the distance.
-        states, inputs: names of the states and inputs with their units; by default the labels of the validation.
     """
 
-    name: str
+    name: str  #: a short name for files and displays
     validation: Validation
-    budget: PositiveInt = 25
-    threshold: PositiveFloat | None = None
-    truth: Callable[[], Truth] | None = None
-    units: str = ""
+    budget: PositiveInt = 25  #: the default number of executions of S
+    threshold: PositiveFloat | None = None  #: the default threshold tau; without a threshold there is no verdict
+    truth: Callable[[], Truth] | None = None  #: a function that finds d*, for simulated systems
+    units: str = ""  #: the units of the distance
+    #: states, inputs: names of the states and inputs with their units; by default the labels of the validation
     states: tuple[str, ...] = ()
     inputs: tuple[str, ...] = ()
 

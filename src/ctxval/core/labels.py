@@ -14,16 +14,12 @@ from ctxval.errors import InputError
 @checked
 @dataclass(frozen=True)
 class Labels(ShortRepr):
-    """Names and units, which change nothing that is computed.
+    """Names and units, which change nothing that is computed."""
 
-    Attributes:
-        states, inputs: one label ``name [unit]`` for each state and each input; empty if they have no names.
-        units: the units of the distance.
-    """
-
+    #: states, inputs: one label ``name [unit]`` for each state and each input; empty if they have no names
     states: tuple[str, ...] = ()
     inputs: tuple[str, ...] = ()
-    units: str = ""
+    units: str = ""  #: the units of the distance
 
     def __post_init__(self) -> None:
         require_names(self.states, self.inputs)

@@ -71,19 +71,12 @@ class Transitions(ShortRepr):
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
-    """The times, states and inputs of a closed loop, for one task or a batch of tasks.
+    """The times, states and inputs of a closed loop, for one task or a batch of tasks."""
 
-    Attributes:
-        times: seconds, shape ``(H + 1,)``.
-        states: shape ``(..., H + 1, n)``.
-        inputs: shape ``(..., H, m)``.
-        ended: ``"complete"``, or the reason why the trajectory ended before its horizon.
-    """
-
-    times: Array
-    states: Array
-    inputs: Array
-    ended: str = COMPLETE
+    times: Array  #: seconds, shape ``(H + 1,)``
+    states: Array  #: shape ``(..., H + 1, n)``
+    inputs: Array  #: shape ``(..., H, m)``
+    ended: str = COMPLETE  #: ``"complete"``, or the reason why the trajectory ended before its horizon
 
     def __post_init__(self) -> None:
         for name in ("times", "states", "inputs"):

@@ -35,33 +35,21 @@ TOLD_ALONE = "its distance was told without a trajectory, and the distance has c
 
 @dataclass(frozen=True, eq=False)
 class Trial:
-    """One task p with all its results.
+    """One task p with all its results."""
 
-    Attributes:
-        number: number of the trial, from 0, in the order in which the search proposed them.
-        origin: the reason why p was chosen; covering: p was far from all other trials, or tests the bound.
-        unit_point: p in the unit cube, shape ``(d,)``.
-        parameters: p by name.
-        attempts: number of times that the execution was started.
-        executed: whether an execution of S ended, successfully or not; the budget counts these.
-        distance: d(p); None if the trial is not completed.
-        failure: the reason why the trial failed or its distance could not be measured.
-        seconds: duration of the execution, if known.
-        note: values for JSON that the search attached when it chose p; it gets them back when a campaign resumes.
-        because: what was changed on the system since an earlier trial of the same task that had another result.
-    """
-
-    number: int
-    origin: Origin
+    number: int  #: number of the trial, from 0, in the order in which the search proposed them
+    origin: Origin  #: the reason why p was chosen; covering: p was far from all other trials, or tests the bound
     state: State
-    unit_point: Array
-    parameters: dict[str, Point]
-    attempts: int = 0
-    executed: bool = False
-    distance: float | None = None
-    failure: str | None = None
-    seconds: float | None = None
+    unit_point: Array  #: p in the unit cube, shape ``(d,)``
+    parameters: dict[str, Point]  #: p by name
+    attempts: int = 0  #: number of times that the execution was started
+    executed: bool = False  #: whether an execution of S ended, successfully or not; the budget counts these
+    distance: float | None = None  #: d(p); None if the trial is not completed
+    failure: str | None = None  #: the reason why the trial failed or its distance could not be measured
+    seconds: float | None = None  #: duration of the execution, if known
+    #: values for JSON that the search attached when it chose p; it gets them back when a campaign resumes
     note: dict[str, Any] | None = None
+    #: what was changed on the system since an earlier trial of the same task that had another result
     because: str | None = None
 
     @property

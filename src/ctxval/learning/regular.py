@@ -42,18 +42,13 @@ _RIDGE = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class RegularTransitions:
-    """The recorded transitions, split.
+    """The recorded transitions, split."""
 
-    Attributes:
-        covariances: the posterior of the hyperparameters of the regular part.
-        transitions, sources: all of them, and the execution of each; -1 for data that the model was made from.
-        regular: which are regular, ``(N,)``.
-    """
-
-    covariances: LearnedCovariances
+    covariances: LearnedCovariances  #: the posterior of the hyperparameters of the regular part
+    #: transitions, sources: all of them, and the execution of each; -1 for data that the model was made from
     transitions: Transitions
     sources: Rows
-    regular: Mask
+    regular: Mask  #: which are regular, ``(N,)``
 
     @property
     def irregular(self) -> int:

@@ -36,19 +36,13 @@ _UNREADABLE = (sqlite3.Error, CtxvalError, ValueError, TypeError, OverflowError,
 
 @dataclass(eq=False)
 class Recovered:
-    """The readable parts of a store.
+    """The readable parts of a store."""
 
-    Attributes:
-        trials: the trials by number.
-        trajectories: the trajectories by the number of their trial and their side.
-        about: the tables experiment, settings and history.
-        damaged: a sentence for each part that could not be read.
-    """
-
-    trials: dict[int, Trial] = field(default_factory=dict)
+    trials: dict[int, Trial] = field(default_factory=dict)  #: the trials by number
+    #: the trajectories by the number of their trial and their side
     trajectories: dict[tuple[int, Side], Trajectory] = field(default_factory=dict)
-    about: dict[str, Any] = field(default_factory=dict)
-    damaged: list[str] = field(default_factory=list)
+    about: dict[str, Any] = field(default_factory=dict)  #: the tables experiment, settings and history
+    damaged: list[str] = field(default_factory=list)  #: a sentence for each part that could not be read
 
     def note(self, sentence: str) -> None:
         """Add a sentence on something that cannot be read."""

@@ -31,23 +31,19 @@ class Settings:
     """Every free parameter of the case, with the reason for its value.
 
     The paper gives none of them; it only says that A, B and K are random.
-
-    Attributes:
-        dt: s; the discretisation is exact, so dt only sets how long an input is held. 50 ms are short against the
-            closed loops' time constants, of which the shortest is typically 0.4 s.
-        horizon: steps; 1 s is half of the longest time constant, so that the final state depends both on the initial
-            state and on the goal.
-        decay: 1/s; both closed loops decay at least this fast. Draws that decay more slowly are shifted, ``A - s I``.
-            Rejecting them would take too long, because few random closed loops of 10 states are stable.
-        spread: 1/s; about the modulus of the largest eigenvalue of A and of B K, for any n.
-        tolerance: the threshold is this times the number of states; it is a quarter of the way from the centre of P to
-            its edge.
     """
 
+    #: s; the discretisation is exact, so dt only sets how long an input is held. 50 ms are short against the closed
+    #: loops' time constants, of which the shortest is typically 0.4 s.
     dt: float = 0.05
+    #: steps; 1 s is half of the longest time constant, so that the final state depends both on the initial state and on
+    #: the goal
     horizon: int = 20
+    #: 1/s; both closed loops decay at least this fast. Draws that decay more slowly are shifted, ``A - s I``. Rejecting
+    #: them would take too long, because few random closed loops of 10 states are stable.
     decay: float = 0.5
-    spread: float = 1.0
+    spread: float = 1.0  #: 1/s; about the modulus of the largest eigenvalue of A and of B K, for any n
+    #: the threshold is this times the number of states; it is a quarter of the way from the centre of P to its edge
     tolerance: float = 0.25
 
 
