@@ -13,7 +13,7 @@ from ctxval._util.representation import ShortRepr
 from ctxval.core.model import Model, linearize
 from ctxval.core.trajectory import Transitions
 from ctxval.errors import InputError, ShapeError
-from ctxval.models.scaling import standardised_pairs
+from ctxval.models.increments import standardised_pairs
 from ctxval.models.smooth_maps import SmoothMap, affine, kernel_sum, matern, total
 
 Linearised = Literal["corrected", "model"]  #: whose Jacobian controllers are designed with

@@ -15,7 +15,7 @@ from ctxval.core.model import central_differences, paired
 from ctxval.core.trajectory import Transitions
 from ctxval.errors import InputError, ShapeError
 from ctxval.models import smooth_maps as maps
-from ctxval.models.scaling import require_finite
+from ctxval.models.increments import require_finite
 from ctxval.models.smooth_maps import Kernel, Slope, Slopes, SmoothMap
 
 
