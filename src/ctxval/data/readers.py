@@ -8,7 +8,7 @@ from __future__ import annotations
 import gzip
 import json
 import zlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,7 @@ from ctxval._util.checked import PositiveFloat, require
 from ctxval._util.columns import CsvTable
 from ctxval._util.files import MOST_BYTES, Archive, read_bytes, read_json, require_regular_file
 from ctxval._util.refusals import require_extra, reworded
-from ctxval.data.log import Log, MemoryTable, Table, reading
+from ctxval.data.log import Log, MemoryTable, Table, leaves, reading
 from ctxval.data.matlab import read_mat
 from ctxval.data.messages import BagLog, McapLog
 from ctxval.errors import InputError
@@ -151,7 +151,8 @@ def read_json_records(path: Path) -> list[Log]:
                 raise InputError(f"{path} has more than {MOST_BYTES} bytes when it is decompressed.")
         content = json.loads(packed.decode("utf-8"))
     records = _records(path, content)
-    rows = [dict(_numbers("", record, 4)) for record in records]
+    numeric = (int, float, list, type(None))
+    rows = [{path: value for path, value in leaves(row, depth=4) if isinstance(value, numeric)} for row in records]
     columns = {name: _column([row.get(name) for row in rows]) for name in dict.fromkeys(k for row in rows for k in row)}
     kept = {name: column for name, column in columns.items() if column is not None}
     if not kept:
@@ -169,16 +170,6 @@ def _records(path: Path, content: Any) -> list[Mapping[str, Any]]:
             f'{path} must have one list of records, as [{{"t": 0.0, "x": 1.5}}, ...]; it has {len(tables)} such lists.'
         )
     return tables[0]
-
-
-def _numbers(before: str, record: Mapping[str, Any], depth: int) -> Iterator[tuple[str, Any]]:
-    for name, value in record.items():
-        path = f"{before}.{name}".removeprefix(".")
-        match value:
-            case {}:
-                yield from _numbers(path, value, depth - 1) if depth else ()
-            case int() | float() | [*_] | None:
-                yield path, value
 
 
 def _column(values: list[Any]) -> Array | None:
