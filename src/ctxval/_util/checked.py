@@ -157,8 +157,9 @@ def _missed_class(cls: type, arguments: tuple[Any, ...], value: Any) -> str:
     try:
         if isinstance(value, cls) and not unbound:
             return ""
-    except TypeError:  # a protocol that cannot be checked
-        return ""
+    except TypeError:  # a protocol that cannot be checked, which no plain value fulfils
+        if not required or not isinstance(value, str | int | float | list | dict):
+            return ""
     methods = [f"{name}({', '.join([*inspect.signature(method).parameters][1:])})" for name, method in required.items()]
     article = "an" if cls.__name__[0] in "AEIO" else "a"
     instance = ", an object and no class" if unbound else ""

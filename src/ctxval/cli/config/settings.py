@@ -21,7 +21,7 @@ from ctxval.certificates import KINDS, RESOLUTION, CertificateOptions, require_u
 from ctxval.certificates.options import CONFIDENCE, LEAST_CONFIDENCE, MOST_VOLUME, WITHIN
 from ctxval.certificates.prediction_tests import TESTS
 from ctxval.cli.config import parts
-from ctxval.cli.config.parts import argument, part, refusal_of, require_types
+from ctxval.cli.config.parts import argument, part, require_types
 from ctxval.cli.config.references import reference, require_function
 from ctxval.cli.config.signatures import code_named, signed
 from ctxval.core.experiment import Experiment
@@ -379,4 +379,11 @@ def sentence_of(source: str, error: ValidationError) -> str:
         return f"{source}{UnknownNameError.among('setting', str(first['loc'][-1]), Settings.model_fields)}"
     name, value = ".".join(map(str, first["loc"])), first["input"]
     shown = repr(value[:100]) if isinstance(value, str) else str(value)[:100]
-    return f"{source}{name}{refusal_of(first)}, got {shown}."
+    match first:
+        case {"type": "greater_than_equal", "ctx": {"ge": bound}}:
+            why = " must be a positive integer" if bound == 1 else f" must be at least {bound}"
+        case {"type": "greater_than", "ctx": {"gt": 0}}:
+            why = " must be a positive number"
+        case _:
+            why = f": {first['msg'].lower()}".replace(": input should", " must", 1)
+    return f"{source}{name}{why}, got {shown}."
