@@ -19,8 +19,7 @@ from ctxval import Campaign, Trial, report
 from ctxval.certificates import CertificateOptions, Region
 from ctxval.errors import InputError
 from ctxval.report import ReportContext, context_of_campaign, context_of_store, sections
-from ctxval.report.sections import appendix
-from ctxval.report.sections.repeat import command_of, identity, python_snippet
+from ctxval.report.sections.repeat import appendix, command_of, identity, python_snippet
 from ctxval.report.sections.trials import packed, recorded_lines
 from rig_thorough import more
 
@@ -273,7 +272,7 @@ def test_markdown_names_the_verdict_and_the_worst_tasks(swing: ReportContext) ->
 
 
 def test_the_appendix_covers_the_vocabulary_of_both_standards(swing: ReportContext) -> None:
-    entries = list(appendix.appendix(swing))
+    entries = list(appendix(swing))
     assert all(entry.content.strip() for entry in entries)
     for standard in ("NASA-STD-7009B", "ASME V&V 10", "ASME V&V 20"):
         assert any(standard in entry.standard for entry in entries)

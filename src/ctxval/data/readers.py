@@ -150,35 +150,26 @@ def read_json_records(path: Path) -> list[Log]:
             if len(packed) > MOST_BYTES:
                 raise InputError(f"{path} has more than {MOST_BYTES} bytes when it is decompressed.")
         content = json.loads(packed.decode("utf-8"))
-    records = _records(path, content)
-    numeric = (int, float, list, type(None))
-    rows = [{path: value for path, value in leaves(row, depth=4) if isinstance(value, numeric)} for row in records]
-    columns = {name: _column([row.get(name) for row in rows]) for name in dict.fromkeys(k for row in rows for k in row)}
-    kept = {name: column for name, column in columns.items() if column is not None}
-    if not kept:
-        raise InputError(f"{path} has no field with numbers in its records.")
-    around = content.items() if isinstance(content, Mapping) else ()
-    constant = {name: np.full(len(records), float(value)) for name, value in around if isinstance(value, int | float)}
-    return [MemoryTable(str(path), {**constant, **kept})]
-
-
-def _records(path: Path, content: Any) -> list[Mapping[str, Any]]:
-    lists = content.values() if isinstance(content, Mapping) else [content]
-    tables = [each for each in lists if each and type(each) is list and {type(row) for row in each} == {dict}]
+    around = content if isinstance(content, Mapping) else {"": content}
+    tables = [each for each in around.values() if each and type(each) is list and {*map(type, each)} == {dict}]
     if len(tables) != 1:
         raise InputError(
             f'{path} must have one list of records, as [{{"t": 0.0, "x": 1.5}}, ...]; it has {len(tables)} such lists.'
         )
-    return tables[0]
-
-
-def _column(values: list[Any]) -> Array | None:
-    """Return a field of all records, ``(N,)`` or ``(N, k)``; None if it does not hold numbers."""
-    width = next((len(value) for value in values if isinstance(value, list)), None)
-    missing = np.nan if width is None else [np.nan] * width
-    with suppress(TypeError, ValueError, OverflowError):
-        return np.array([missing if value is None else value for value in values], dtype=np.float64)
-    return None
+    numeric = (int, float, list, type(None))
+    rows = [{path: value for path, value in leaves(row, depth=4) if isinstance(value, numeric)} for row in tables[0]]
+    columns = dict[str, Array]()
+    for name in dict.fromkeys(name for row in rows for name in row):
+        values = [row.get(name) for row in rows]
+        width = next((len(value) for value in values if isinstance(value, list)), None)
+        missing = np.nan if width is None else [np.nan] * width
+        with suppress(TypeError, ValueError, OverflowError):  # it does not hold numbers
+            columns[name] = np.array([missing if value is None else value for value in values], dtype=np.float64)
+    if not columns:
+        raise InputError(f"{path} has no field with numbers in its records.")
+    beside = {name: value for name, value in around.items() if isinstance(value, int | float)}
+    constant = {name: np.full(len(rows), float(value)) for name, value in beside.items()}
+    return [MemoryTable(str(path), {**constant, **columns})]
 
 
 # Files and folders

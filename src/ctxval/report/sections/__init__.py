@@ -10,9 +10,8 @@ from typing import Protocol, runtime_checkable
 from ctxval._util.refusals import reworded
 from ctxval.errors import InputError
 from ctxval.report.context import ReportContext
-from ctxval.report.sections.appendix import for_the_file
 from ctxval.report.sections.distances import convergence, distances
-from ctxval.report.sections.repeat import repeat
+from ctxval.report.sections.repeat import for_the_file, repeat
 from ctxval.report.sections.trials import trials
 from ctxval.report.sections.verdict import basis, lights, verdict
 
