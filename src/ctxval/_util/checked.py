@@ -11,7 +11,7 @@ import inspect
 import reprlib
 import sys
 import types
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from typing import Annotated, Any, Literal, NamedTuple, TypeVar, Union, get_args, get_origin
 
 import numpy as np
@@ -87,6 +87,12 @@ def require(name: str, annotation: Any, value: Any) -> Any:
     if wanted:
         raise InputError(f"{name} must be {wanted}, got {_SHOWN.repr(value)}.")
     return value
+
+
+def require_known(kind: str, names: Iterable[str], known: Collection[str]) -> None:
+    for name in names:
+        if name not in known:
+            raise UnknownNameError.among(kind, name, known)
 
 
 def _resolved(function: Any, made: Any) -> Iterator[tuple[str, Any]]:

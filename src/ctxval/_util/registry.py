@@ -11,7 +11,7 @@ from contextlib import suppress
 from dataclasses import KW_ONLY, dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
-from ctxval._util.checked import checked
+from ctxval._util.checked import checked, require_known
 from ctxval._util.refusals import reworded
 from ctxval.errors import InputError, UnknownNameError
 
@@ -166,7 +166,6 @@ def has_method(cls: type, method: str | None) -> bool:
 def construct(what: str, build: Any, arguments: Mapping[str, Any], *first: Any) -> Any:
     with reworded(f"{what} cannot be made"):
         taken = inspect.signature(build).parameters
-        open_ended = any(parameter.kind is parameter.VAR_KEYWORD for parameter in taken.values())
-        for key in () if open_ended else [key for key in arguments if key not in taken]:
-            raise UnknownNameError.among(f"argument of {what}", key, taken)
+        if not any(parameter.kind is parameter.VAR_KEYWORD for parameter in taken.values()):
+            require_known(f"argument of {what}", arguments, taken)
         return build(*first, **arguments)

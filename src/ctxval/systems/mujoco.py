@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ctxval._util.arrays import Array, ArrayLike, Mask, Rows, as_finite, require_shape
-from ctxval._util.checked import PositiveInt
+from ctxval._util.checked import PositiveInt, require_known
 from ctxval._util.mjcf import compile_mjcf, warning_of
 from ctxval._util.registry import part
 from ctxval._util.representation import ShortRepr
@@ -18,7 +18,7 @@ from ctxval.core.controller import Controller
 from ctxval.core.rollout import rollout
 from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory
-from ctxval.errors import InputError, ShapeError, UnknownNameError
+from ctxval.errors import InputError, ShapeError
 
 
 @part(files=("mjcf",))
@@ -165,8 +165,6 @@ def _coordinates(model: Any, sites: Sequence[str], axes: str) -> tuple[Rows, ...
     if not axes or not set(axes) <= set("xyz"):
         raise InputError(f"axes must be letters of 'xyz', got {axes!r}.")
     known = [model.site(i).name for i in range(model.nsite)]
-    for site in sites:
-        if site not in known:
-            raise UnknownNameError.among("site", site, known)
+    require_known("site", sites, known)
     rows = np.array([known.index(site) for site in sites], dtype=np.intp)
     return np.ix_(rows, np.array(["xyz".index(axis) for axis in axes], dtype=np.intp))

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from ctxval import controllers, distances, models, systems
-from ctxval._util.checked import require
+from ctxval._util.checked import require, require_known
 from ctxval._util.files import Archive, read_bytes
 from ctxval._util.refusals import reworded
 from ctxval._util.registry import Declaration, Registry, construct, declaration_of
@@ -26,7 +26,7 @@ from ctxval.core.task_distribution import Normal
 from ctxval.core.trajectory import Transitions
 from ctxval.core.validation import Validation
 from ctxval.data import LogMapping, read_recordings
-from ctxval.errors import InputError, UnknownNameError
+from ctxval.errors import InputError
 from ctxval.models.saved import stored_transitions
 from ctxval.paper import cases
 
@@ -154,9 +154,7 @@ def task_function(given: str | Mapping[str, Any], space: TaskSpace, system: Any,
     """Return the map p -> task of an experiment file, from ``module:attr`` or from a table."""
     if isinstance(given, str):
         return require_function(f"the task {given}", reference(given, folder), "p -> Task")
-    for key in given:
-        if key not in TaskTable.__dataclass_fields__:
-            raise UnknownNameError.among("entry of [task]", key, TaskTable.__dataclass_fields__)
+    require_known("entry of [task]", given, TaskTable.__dataclass_fields__)
     table = {"goal": None, "dt": getattr(system, "dt", None), **given}
     missing = [key for key in ("initial_state", "horizon", "dt") if table.get(key) is None]
     if missing:
@@ -205,8 +203,7 @@ def with_distribution(
         kind = given.pop("type", None)
         if kind == "uniform":
             continue
-        if kind != "normal":
-            raise UnknownNameError.among(f"distribution of {name}", str(kind), ("normal", "uniform"))
+        require_known(f"distribution of {name}", [str(kind)], ("normal", "uniform"))
         if given.keys() <= {"mean", "deviation"} and len(given) < 2:
             raise InputError(f"the normal distribution of {name} needs a mean and a deviation, got {given!r}.")
         stated[name] = construct(f"the distribution of {name}", Normal, given)

@@ -13,6 +13,7 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 from pydantic_core import PydanticCustomError
 
+from ctxval._util.checked import require_known
 from ctxval._util.files import read_toml
 from ctxval.campaign.campaign import Campaign
 from ctxval.campaign.interval_search import is_decisive
@@ -70,9 +71,7 @@ class CertificateTable(BaseModel):
         fields, extra = type(self).model_fields, self.model_extra or {}
         changed = {name for name, field in fields.items() if name != "kind" and getattr(self, name) != field.default}
         try:
-            for name in extra:
-                if name not in (names := {*fields, *KINDS[self.kind].options()}):
-                    raise UnknownNameError.among("setting", name, names)
+            require_known("setting", extra, {*fields, *KINDS[self.kind].options()})
             require_use(self.kind, sorted({*changed, *extra}))
             require_types(f"certificate {self.kind!r}", KINDS[self.kind], extra)
         except (CertificateError, InputError) as error:
