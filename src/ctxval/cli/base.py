@@ -87,7 +87,6 @@ def command(name: str | None = None, /, *, with_json: bool = True, **words: Any)
 
 
 def _described(parameter: inspect.Parameter, command: str, words: Mapping[str, Any]) -> inspect.Parameter:
-    """Return a parameter of a command as typer takes it, with its text; words replace those in braces."""
     text = {**TEXTS["options"], **TEXTS.get(command, {})}[parameter.name]
     # The text itself names the kinds that most people need.
     kinds = (kind for kind in KINDS.built_in if kind not in ("auto", "posterior", "audit"))
@@ -110,7 +109,6 @@ def _described(parameter: inspect.Parameter, command: str, words: Mapping[str, A
 
 
 def _run(function: Callable[[], Any], as_json: bool, stated: set[str]) -> None:
-    """Run a command, print its result as JSON if that is asked for, and end with a sentence if it fails."""
     warnings.showwarning = _show_warning
     failure, status = None, 0
     out.quiet = notes.quiet = as_json
@@ -194,7 +192,6 @@ def worst_of(trial: Trial | None) -> dict[str, Any] | None:
 
 
 def failures_of(trials: Iterable[Trial]) -> list[dict[str, Any]]:
-    """Return the reasons why trials failed with the numbers of the trials, the most frequent reason first."""
     by_reason: dict[str, list[int]] = {}
     for trial in trials:
         if trial.state == "failed":
@@ -242,7 +239,6 @@ def print_columns(columns: Sequence[str], rows: Iterable[Sequence[str]], title: 
 
 
 def print_other_stores(others: list[str]) -> None:
-    """Name the other campaigns of the same experiment, if there are any."""
     if others:
         count = f"{len(others)} other store{'s' if len(others) > 1 else ''} of this experiment"
         sentence = f"the folder contains {count}: {', '.join(others)}."

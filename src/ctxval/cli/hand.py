@@ -244,5 +244,4 @@ def _served(opened: Opened, threshold: float | None, budget: int | None) -> Serv
 
 
 def web_server() -> Any:
-    """Return the module of the server, which needs the extra ``web``."""
     return require_extra("ctxval.web.server", "web", "the page needs")

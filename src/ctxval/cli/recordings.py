@@ -344,7 +344,6 @@ def collect(
 
 
 def numbers(text: str) -> list[int]:
-    """Return the numbers of steps in a text with commas between them."""
     parts = [part.strip() for part in text.split(",")]
     if not all(part.isdecimal() and int(part) > 0 for part in parts):
         raise InputError(f"--steps must be positive integers with commas between them, such as 1,10,50, got {text!r}.")
@@ -352,7 +351,6 @@ def numbers(text: str) -> list[int]:
 
 
 def print_breaks(recordings: Recordings) -> None:
-    """Print how logs were read, and where they were split."""
     for note in recordings.notes:
         out.say((note, "dim"))
     for split in recordings.breaks[:5]:

@@ -188,7 +188,6 @@ def run(
 
 @contextmanager
 def _workers(workers: int | None, dask: str | None) -> Iterator[dict[str, Any]]:
-    """Yield the arguments of :meth:`ctxval.Campaign.run` for local processes or for the workers of a Dask scheduler."""
     if dask is None:
         yield {"workers": workers}
         return
@@ -204,7 +203,6 @@ def _workers(workers: int | None, dask: str | None) -> Iterator[dict[str, Any]]:
 
 @contextmanager
 def _live_page(wanted: bool, served: ServedCampaign, settings: Settings) -> Iterator[LiveCampaign | None]:
-    """Serve the page of the campaign while the command runs, if it is wanted."""
     if not wanted:
         yield None
         return

@@ -263,7 +263,6 @@ def state_envelope(
 
 
 def print_envelope(envelope: Envelope) -> None:
-    """Print what an envelope says, in words and in numbers."""
     if envelope.doubt is None:
         out.say(("envelope", "bold"), f": {envelope.statement}", wrap=True)
     out.say(envelope.words, wrap=True)

@@ -71,7 +71,6 @@ def _print(result: Survey) -> None:
 
 
 def mapping_text(mapping: LogMapping, dt: float) -> str:
-    """Return a mapping as a TOML file to edit."""
     usual = vars(Field("x"))
 
     def text_of(field: Field) -> str:

@@ -52,7 +52,6 @@ class _FileOfMessages(TopicLog):
     def _decoded(
         self, channel: Any, topic: str, data: bytes, message: str, definition: Callable[[], Definition]
     ) -> Any:
-        """Return the content of a message, decoded by the definition of its channel."""
         if channel not in self._decoders:
             make, name, text = definition()
             with reworded(f"{self.source}: the definition of the messages of {topic}, {name}, cannot be read"):

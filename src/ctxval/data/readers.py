@@ -81,7 +81,6 @@ def read_parquet(path: Path, period: float | None = None) -> list[Log]:
 
 
 def _parquet_column(path: Path, file: Any, name: str) -> Array:
-    """Return a column, ``(N,)`` or ``(N, k)``."""
     compute = require_extra("pyarrow.compute", "logs", "Parquet files need")
     about = file.metadata
     groups = map(about.row_group, range(about.num_row_groups))

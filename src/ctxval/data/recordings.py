@@ -256,7 +256,6 @@ def _with_derivatives(recordings: Recordings, mapping: LogMapping) -> Recordings
 
 
 def _with_observer(recordings: Recordings, observer: Observer) -> Recordings:
-    """Return recordings with the states that a user's function estimates from them."""
     name = observer.reference or getattr(observer.function, "__name__", "")
     if observer.function is None:
         raise InputError(
@@ -316,7 +315,6 @@ def _with_lags(recordings: Recordings, lags: int) -> Recordings:
 
 
 def _long_enough(recordings: Recordings, records: int, what: str) -> tuple[list[Recording], tuple[Break, ...]]:
-    """Return the recordings with so many records, and the breaks with those that are left out."""
     kept, left = list[Recording](), list[Recording]()
     for run in recordings.runs:
         (kept if len(run.trajectory.states) >= max(records, 2) else left).append(run)

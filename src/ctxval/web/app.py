@@ -264,7 +264,6 @@ def task_request(fields: Fields, space: TaskSpace) -> TaskRequest:
 
 
 def result(kind: str, fields: Fields, recording: Path | None) -> SuppliedResult:
-    """Return what an operator reports of a trial, with the reason if it replaces an earlier result."""
     replace = fields.get("replace")
     if kind == "failure":
         reason = fields.get("reason", "").strip()

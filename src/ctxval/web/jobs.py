@@ -81,7 +81,6 @@ class ServedCampaign:
 
     @property
     def decides(self) -> bool:
-        """Whether executions can be chosen that decide the verdict."""
         with suppress(InputError):
             require_decisive(self.certificate)
             return self.threshold is not None

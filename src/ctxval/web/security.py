@@ -58,7 +58,6 @@ class Access:
         return self._token is not None and _same(self._token, token)
 
     def new_session(self) -> tuple[str, str]:
-        """Return the name and the cookie of a new session."""
         name = secrets.token_urlsafe(18)
         return name, f"{name}.{self._signed('session', name)}"
 

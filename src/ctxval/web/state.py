@@ -135,7 +135,6 @@ class PageState:
         self._loop.call_soon_threadsafe(self.end_events)
 
     def end_events(self) -> None:
-        """Let all listeners end, because the server stops."""
         self._closing = True
         self._notify()
 
