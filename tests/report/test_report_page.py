@@ -6,6 +6,7 @@ import base64
 import hashlib
 import json
 import re
+import sys
 from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,7 @@ from rig_pages import HOSTILE, hostile_store, pendulum, plane
 from ctxval import Campaign, Trial, report
 from ctxval.certificates import CertificateOptions, Region
 from ctxval.errors import InputError
-from ctxval.report import ReportContext, context_of_campaign, context_of_store, sections
+from ctxval.report import ReportContext, context_of_campaign, context_of_store
 from ctxval.report.sections.repeat import appendix, command_of, identity, python_snippet
 from ctxval.report.sections.trials import packed, recorded_lines
 from rig_thorough import more
@@ -226,11 +227,12 @@ def test_what_is_no_section_is_refused(swing: ReportContext) -> None:
 
 
 def test_installed_packages_add_sections(swing: ReportContext, monkeypatch: pytest.MonkeyPatch) -> None:
-    point = EntryPoint("weather", "test_report_page:Sunny", sections.GROUP)
-    monkeypatch.setattr(sections, "entry_points", lambda group: [point])
+    module = sys.modules[report.page.__module__]
+    point = EntryPoint("weather", "test_report_page:Sunny", "ctxval.report_sections")
+    monkeypatch.setattr(module, "entry_points", lambda group: [point])
     assert "sunshine" in report.page(swing)
-    broken = EntryPoint("broken", "no_such_module:Nothing", sections.GROUP)
-    monkeypatch.setattr(sections, "entry_points", lambda group: [broken])
+    broken = EntryPoint("broken", "no_such_module:Nothing", "ctxval.report_sections")
+    monkeypatch.setattr(module, "entry_points", lambda group: [broken])
     with pytest.raises(InputError, match="the section 'broken' cannot be loaded"):
         report.page(swing)
 
