@@ -83,7 +83,10 @@ class MuJoCo(ShortRepr):
         if not np.isclose(task.dt, self.dt, rtol=1e-9, atol=0):
             wanted = f"{self._model.opt.timestep:g} s x {self.substeps} = {self.dt:g} s"
             raise InputError(f"the task's dt must be the model's timestep times substeps, {wanted}, got {task.dt:g} s.")
+        from mujoco import mjtStage
+
         simulations, steps, failure = self._started(task), 0, ""
+        stage = int(mjtStage.mjSTAGE_POS if self.sites else mjtStage.mjSTAGE_NONE)  # whether sites are located
         ctrl, healthy = simulations.ctrl, np.ones(len(simulations.qpos), dtype=bool)
 
         def mark(failed: Mask, reason: str) -> None:
@@ -100,8 +103,9 @@ class MuJoCo(ShortRepr):
             steps += 1
             mark(np.asarray(~np.isfinite(inputs).all(axis=1)), "an input is not finite")
             ctrl[healthy] = inputs[healthy]
-            simulations.advance(self.substeps, healthy, locate=bool(self.sites))
-            warned: Mask = np.asarray(simulations.warnings > 0)
+            ids = None if healthy.all() else np.flatnonzero(healthy)
+            simulations.batch.step(ids, self.substeps, stage)
+            warned: Mask = np.asarray(simulations.batch.warning[:, :, 1] > 0)
             if warned.any():
                 mark(np.asarray(warned.any(axis=1)), f"MuJoCo warned of {warning_of(warned.any(axis=0))}")
             states = self._observed(simulations)
@@ -139,25 +143,16 @@ class _Batch:
     """Simulations of one model: qpos ``(N, nq)``, qvel ``(N, nv)``, ctrl ``(N, nu)``, sites ``(N, nsite, 3)``."""
 
     def __init__(self, model: Any, count: int, threads: int) -> None:
-        from mujoco import mjtStage
         from mujoco.batch import Batch
 
         self.batch = Batch(model, count, threads)
-        self.located, self.moved = int(mjtStage.mjSTAGE_POS), int(mjtStage.mjSTAGE_NONE)
         self.qpos, self.qvel, self.ctrl = (self.batch.bind(name) for name in ("qpos", "qvel", "ctrl"))
         self.site_positions: Array = self.batch.bind("site_xpos")
 
-    @property
-    def warnings(self) -> Rows:
-        counts: Rows = self.batch.warning[:, :, 1]
-        return counts
-
     def locate(self) -> None:
-        self.batch.forward(stage=self.located)
+        from mujoco import mjtStage
 
-    def advance(self, substeps: int, rows: Mask, *, locate: bool) -> None:
-        ids = None if rows.all() else np.flatnonzero(rows)
-        self.batch.step(ids, substeps, self.located if locate else self.moved)
+        self.batch.forward(stage=int(mjtStage.mjSTAGE_POS))
 
 
 def _coordinates(model: Any, sites: Sequence[str], axes: str) -> tuple[Rows, ...]:
