@@ -18,18 +18,8 @@ from ctxval.campaign.storage.recovery import export, recover
 from ctxval.campaign.storage.store import CAUSE, Store
 from ctxval.certificates import KINDS, CertificateOptions, assess
 from ctxval.certificates.envelope import Envelope
-from ctxval.cli.base import (
-    RUN,
-    command,
-    failures_of,
-    out,
-    print_failures,
-    print_other_stores,
-    print_table,
-    print_verdict,
-    status_of,
-    worst_of,
-)
+from ctxval.cli import base
+from ctxval.cli.base import command, out, print_table, print_verdict
 from ctxval.cli.config.settings import Settings
 from ctxval.cli.config.stored_settings import budget_of, limit_of, open_store, planned_settings, trusted_settings
 from ctxval.cli.options import Allowed, named_values, require_folder, require_outputs
@@ -43,7 +33,7 @@ def status(store: Path) -> Any:
     with opened.snapshot():
         description, trials, changes = opened.description(), opened.trials(), opened.history()
         thresholds = [asdict(stated) for stated in opened.thresholds() or ()]
-        kept = opened.computed(RUN)
+        kept = opened.computed(base.RUN)
     verdict = None
     match kept:
         case {"verdict": {"verdict": str(answer), "threshold": float(threshold), "reason": str(reason)}}:
@@ -56,10 +46,10 @@ def status(store: Path) -> Any:
         "seed": description.get("seed"),
         "executions": sum(trial.executed for trial in trials),
         "failed": sum(trial.state == "failed" for trial in trials),
-        "failures": failures_of(trials),
+        "failures": base.failures_of(trials),
         "unmeasured": [trial.number for trial in trials if trial.state == "unmeasured"],
         "open": [trial.number for trial in trials if trial.state == "open"],
-        "worst": worst_of(max(measured, key=lambda trial: trial.distance or 0, default=None)),
+        "worst": base.worst_of(max(measured, key=lambda trial: trial.distance or 0, default=None)),
         "verdict": verdict,
         "thresholds": thresholds,
         "changes": [asdict(change) for change in changes],
@@ -71,7 +61,7 @@ def status(store: Path) -> Any:
         out.say(f"{stated['at'][:19]} threshold {stated['threshold']:g}: stated after {known}")
     for change in report["changes"]:
         out.say(f"{change['at'][:19]} {change['what']}: {change['why']}")
-    print_failures(report["failures"])
+    base.print_failures(report["failures"])
     return report
 
 
@@ -101,7 +91,7 @@ def remeasure(store: Path, allowed: Allowed) -> Any:
         "measured": sum(trial.state == "completed" for trial in trials),
         "changed": [trial.number for trial in trials if trial.distance != before.get(trial.number)],
         "unmeasured": [trial.number for trial in campaign.unmeasured],
-        "worst": worst_of(campaign.worst),
+        "worst": base.worst_of(campaign.worst),
         "store": str(store),
     }
     if report["changed"]:
@@ -182,8 +172,8 @@ def certify_store(store: Path, asked: Asked, allowed: Allowed, audit: int | None
             f"asked for: `ctxval certify {shlex.quote(str(store))} --kind auto`.",
             wrap=True,
         )
-    print_other_stores(others)
-    return {**assessment.to_json(), "store": str(store), "other_stores": others}, status_of(verdict)
+    base.print_other_stores(others)
+    return {**assessment.to_json(), "store": str(store), "other_stores": others}, base.status_of(verdict)
 
 
 @command("report")
@@ -228,7 +218,7 @@ def write_report(
     out.say(", ".join(written.values()))
     if context.missing:
         out.say(f"without the experiment: {context.missing}", wrap=True)
-    return {**reports.to_json(context), "files": written}, status_of(context.verdict)
+    return {**reports.to_json(context), "files": written}, base.status_of(context.verdict)
 
 
 def page_path(store: Path) -> Path:
