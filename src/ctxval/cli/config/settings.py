@@ -10,7 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, Field, ValidationError, model_validator
 from pydantic_core import PydanticCustomError
 
 from ctxval._util.checked import require_known
@@ -44,13 +44,11 @@ from ctxval.studies.safety import judged_by
 Part = str | dict[str, Any]  #: ``module:attr``, or a table with a type and its arguments
 
 
-class CertificateTable(BaseModel):
+class CertificateTable(BaseModel, extra="allow"):
     """The table ``[certificate]``: the certificate for the verdict, chosen before the campaign is run.
 
     A kind of certificate from another package has its own options in the table.
     """
-
-    model_config = ConfigDict(extra="allow")
 
     kind: str = "auto"
     #: the share of the task space that may exceed the threshold
@@ -91,10 +89,8 @@ class CertificateTable(BaseModel):
         return CertificateOptions(chosen.of(merged), confidence, merged["volume"])
 
 
-class SearchTable(BaseModel):
+class SearchTable(BaseModel, extra="allow"):
     """The table ``[search]``: the name of a search, and its options."""
-
-    model_config = ConfigDict(extra="allow")
 
     name: str = DEFAULT_SEARCH
     repeats: int = Field(default=1, ge=1)
@@ -105,28 +101,24 @@ class SearchTable(BaseModel):
         return by_name(self.name, repeats=self.repeats, **options)
 
 
-class Aspect1Table(BaseModel):
+class Aspect1Table(BaseModel, extra="forbid"):
     """The table ``[aspect1]``, which ``ctxval check --aspect1`` reads; a campaign does not use it.
 
     The distance tells how far a trajectory is from completing its task; by default it is derived from that of the
     experiment. The threshold is in the units of the goal.
     """
 
-    model_config = ConfigDict(extra="forbid")
-
     distance: Part | None = None
     threshold: float | None = Field(default=None, gt=0, allow_inf_nan=False, strict=True)
     tasks: int = Field(default=TASKS, ge=2)
 
 
-class SpecTable(BaseModel):
+class SpecTable(BaseModel, extra="allow"):
     """The table ``[spec]``: what a closed loop shall do, which ``ctxval safe`` judges.
 
     Its other entries are the arguments of the specification. The margin is the robustness of M that shall suffice for a
     task to be safe; None to find it.
     """
-
-    model_config = ConfigDict(extra="allow")
 
     type: str = "ReachAvoid"
     margin: float | None = Field(default=None, gt=0, allow_inf_nan=False, strict=True)
@@ -139,13 +131,11 @@ class SpecTable(BaseModel):
 _WHOLE = ("space", "task", "system", "model", "synthesizer")
 
 
-class Settings(BaseModel):
+class Settings(BaseModel, extra="forbid"):
     """The content of an experiment file, overridden by the options of the command line.
 
     Either ``experiment`` names the experiment, or ``name`` to ``units`` describe it completely.
     """
-
-    model_config = ConfigDict(extra="forbid")
 
     experiment: str | None = None
     options: dict[str, Any] = Field(default_factory=dict)
