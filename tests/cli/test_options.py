@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ctxval.cli.options import named_values, parsed
+from ctxval.cli.base import named_values, parsed
 from ctxval.errors import InputError
 from rig_cli import calling
 

@@ -16,10 +16,9 @@ from ctxval.campaign.choices import Execution
 from ctxval.campaign.storage.other_stores import STORE_SUFFIXES
 from ctxval.campaign.storage.store import Store
 from ctxval.campaign.telling import SuppliedResult
-from ctxval.cli.base import command, out, print_verdict, status_of
+from ctxval.cli.base import Allowed, command, named_values, out, print_verdict, require_folder, status_of
 from ctxval.cli.config.settings import Settings
 from ctxval.cli.config.stored_settings import Opened, budget_of, limit_of, open_store, open_target, trusted_settings
-from ctxval.cli.options import Allowed, named_values, require_folder
 from ctxval.core.exchange import TASK_FORMAT
 from ctxval.core.plan import Plan
 from ctxval.core.trial import CONVERGED, Trial

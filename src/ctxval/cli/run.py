@@ -18,11 +18,10 @@ from ctxval.campaign.interval_search import IntervalSearch
 from ctxval.campaign.storage.other_stores import other_stores
 from ctxval.certificates.verdict import usable_bound
 from ctxval.cli import base
-from ctxval.cli.base import command, err, out, print_table
+from ctxval.cli.base import command, err, named_values, out, print_table
 from ctxval.cli.config.settings import Settings, read_settings
 from ctxval.cli.config.stored_settings import budget_of, limit_of
 from ctxval.cli.hand import web_server
-from ctxval.cli.options import named_values
 from ctxval.cli.stores import page_path, print_envelope
 from ctxval.core.trajectory import Transitions
 from ctxval.core.trial import designs_sentence

@@ -19,10 +19,9 @@ from ctxval.campaign.storage.store import CAUSE, Store
 from ctxval.certificates import KINDS, CertificateOptions, assess
 from ctxval.certificates.envelope import Envelope
 from ctxval.cli import base
-from ctxval.cli.base import command, out, print_table, print_verdict
+from ctxval.cli.base import Allowed, command, named_values, out, print_table
 from ctxval.cli.config.settings import Settings
 from ctxval.cli.config.stored_settings import budget_of, limit_of, open_store, planned_settings, trusted_settings
-from ctxval.cli.options import Allowed, named_values, require_folder, require_outputs
 from ctxval.core.labels import Labels, labels_of
 from ctxval.errors import CtxvalError, InputError, StoreAccessError, StoreError
 
@@ -71,7 +70,7 @@ def export_store(store: Path, out_: Path | None = None, force: bool = False) -> 
     if content.damaged and not content.trials and not content.trajectories:
         raise StoreAccessError(f"nothing can be read from {store}: it is not a store, or it is damaged completely.")
     target = store.with_suffix(".export") if out_ is None else out_
-    require_folder(target, ("trials.json", "trials.csv", "trajectories"), MADE_BY, force=force)
+    base.require_folder(target, ("trials.json", "trials.csv", "trajectories"), MADE_BY, force=force)
     export(content, target)
     for sentence in content.damaged[:20]:
         out.say(("cannot be read", "yellow"), f": {sentence}")
@@ -160,7 +159,7 @@ def certify_store(store: Path, asked: Asked, allowed: Allowed, audit: int | None
         assessment = assess(opened.trials(), options, limit, known)
     others, verdict = [str(other.path) for other in known.beside], assessment.verdict
     if verdict is not None:
-        print_verdict(verdict)
+        base.print_verdict(verdict)
     if assessment.certificate is None:
         out.say(f"no certificate: {assessment.refusal}", wrap=True)
     for row in [] if assessment.certificate is None else str(assessment.certificate).split("\n"):
@@ -189,7 +188,7 @@ def write_report(
     opened = Store.existing(store)
     target = page_path(store) if page is None else page
     outputs = {"--out .html": target, "--junit .xml": junit, "--markdown .md": markdown}
-    require_outputs(outputs, [store, allowed.experiment], force=force)
+    base.require_outputs(outputs, [store, allowed.experiment], force=force)
     require("threshold", PositiveFloat | None, asked.threshold)
     try:
         loaded = open_store(store, allowed)
@@ -237,7 +236,7 @@ def state_envelope(
     force: bool = False,
 ) -> Any:
     suffix = ".onnx" if out_ is not None and out_.suffix == ".onnx" else ".py"
-    require_outputs({f"--out {suffix}": out_}, [store, allowed.experiment], force=force)
+    base.require_outputs({f"--out {suffix}": out_}, [store, allowed.experiment], force=force)
     loaded = open_store(store, allowed)
     limit = limit_of(loaded.experiment, loaded.settings, threshold)
     if limit is None:

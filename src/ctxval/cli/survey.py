@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 
 from ctxval._util.files import write_text
-from ctxval.cli.base import command, out, print_columns
-from ctxval.cli.options import require_outputs
+from ctxval.cli.base import command, out, print_columns, require_outputs
 from ctxval.cli.recordings import Logs, error_cells, print_breaks
 from ctxval.data import Field, LogMapping, Observer
 from ctxval.models import write_model
