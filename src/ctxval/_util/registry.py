@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from ctxval._util.checked import checked, require_known
 from ctxval._util.refusals import reworded
+from ctxval._util.representation import ShortRepr
 from ctxval.errors import InputError, UnknownNameError
 
 if TYPE_CHECKING:  # importlib.metadata is slow to import, and is needed only for names that are not built in
@@ -26,7 +27,7 @@ Made = TypeVar("Made")
 class Declaration:
     """Declares a class, or a function that makes an object, as a part that is found by name; checks its arguments.
 
-    A part of this package is found once its package exports it in ``__all__``.
+    A part of this package is found once its package exports it in ``__all__``. Its objects show their attributes.
     """
 
     name: str = ""  # the name of the class by default
@@ -39,6 +40,9 @@ class Declaration:
 
     def __call__(self, made: Part) -> Part:
         made = checked(made)
+        shown: Any = made
+        if shown.__repr__ is object.__repr__:  # a class without one of its own
+            shown.__repr__ = ShortRepr.__repr__
         _declarations[made] = replace(self, name=self.name or made.__name__)
         return made
 

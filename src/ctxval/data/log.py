@@ -256,7 +256,7 @@ class TopicLog(Log):
         for topic in self.topics():
             with suppress(InputError):  # the topic has another encoding
                 first = next(iter(self.messages([topic])), None)
-                names += [] if first is None else [f"{topic}.{path}" for path in _leaves(first.content)]
+                names += [] if first is None else [f"{topic}.{path}" for path in _numeric_fields(first.content)]
         return tuple(names)
 
     def signals(self, fields: Sequence[str], clock: Clock) -> dict[str, Signal]:
@@ -376,7 +376,7 @@ def leaves(content: Mapping[str, Any], before: str = "", depth: int = 6) -> Iter
             yield from leaves(value, path, depth - 1)
 
 
-def _leaves(content: Any, before: str = "", depth: int = 6) -> Iterator[str]:
+def _numeric_fields(content: Any, before: str = "", depth: int = 6) -> Iterator[str]:
     parts: Iterable[tuple[str, Any]] = ()
     match content:
         case int() | float() | np.number():
@@ -391,4 +391,4 @@ def _leaves(content: Any, before: str = "", depth: int = 6) -> Iterator[str]:
             names = getattr(type(content), "__slots__", ())
             parts = ((f"{before}.{name}", getattr(content, name)) for name in names)
     for path, part in parts if depth else ():
-        yield from _leaves(part, path.removeprefix("."), depth - 1)
+        yield from _numeric_fields(part, path.removeprefix("."), depth - 1)

@@ -335,7 +335,7 @@ def _too_short(run: Recording, what: str, dt: float) -> Break:
 
 
 @part(files=("runs",))
-class Recorded(ShortRepr):
+class Recorded:
     """Recorded executions of named tasks, such as those of a :class:`ctxval.TaskSuite`, as the true system.
 
     The execution of a task is the recording with its name; the controller is not asked. So a campaign sees what it

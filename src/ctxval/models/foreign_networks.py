@@ -15,14 +15,13 @@ from ctxval._util.arrays import Array, rows_of
 from ctxval._util.onnx_network import OnnxNetwork
 from ctxval._util.refusals import require_extra, reworded
 from ctxval._util.registry import part
-from ctxval._util.representation import ShortRepr
 from ctxval.core.model import central_differences, paired
 from ctxval.core.trajectory import Transitions
 from ctxval.errors import InputError, ModelError, ShapeError
 
 
 @part(files=("source",))
-class Onnx(ShortRepr):
+class Onnx:
     """A network from an ONNX file as a model; any toolbox may have written the file, and nothing in it is run as code.
 
     The network takes the state and the input as two inputs in this order, or as one input with the state first. Its
@@ -59,7 +58,7 @@ class Onnx(ShortRepr):
 
 
 @part(runs_code=True)
-class Torch(ShortRepr):
+class Torch:
     """A torch module as a model, with the exact Jacobian of its automatic differentiation.
 
     The module maps a batch of states ``(N, n)`` and inputs ``(N, m)`` to ``(N, n)``. It is called with both if its

@@ -16,8 +16,6 @@ from ctxval.report.markup import bar, bullets, details, joined, number, paragrap
 from ctxval.report.page import framed, now
 from ctxval.studies.replay import PredictedTask, PredictedTasks, ReplayReport, StepError
 
-__all__ = ["replay_page", "write_replay_page"]
-
 _CHARTED = 12  # largest number of states and inputs with charts of their own
 
 

@@ -23,7 +23,6 @@ from ctxval._util.checked import Seconds, require_known
 from ctxval._util.files import require_regular_file
 from ctxval._util.refusals import require_extra, reworded
 from ctxval._util.registry import part
-from ctxval._util.representation import ShortRepr
 from ctxval.core.controller import Controller
 from ctxval.core.task import Task
 from ctxval.core.trajectory import COMPLETE, Trajectory
@@ -35,7 +34,7 @@ _PROGRAM = Path(__file__).with_name("fmu_process.py")
 
 
 @part(runs_code=True, files=("path",))
-class FMU(ShortRepr):
+class FMU:
     """An FMU for co-simulation, FMI 2 or 3, as the true system.
 
     Every execution has its own instance: parameters and the initial state are set as start values, inputs are held

@@ -12,7 +12,6 @@ from ctxval._util.arrays import Array, ArrayLike, as_floats
 from ctxval._util.checked import NonNegativeFloat, Seconds
 from ctxval._util.refusals import reworded
 from ctxval._util.registry import part
-from ctxval._util.representation import ShortRepr
 from ctxval.core.controller import Controller, Feedback, started
 from ctxval.core.labels import require_names
 from ctxval.core.model import Model, Step, as_model
@@ -41,7 +40,7 @@ def rk4(derivative: Derivative, dt: float) -> Callable[[Array, Array], Array]:
 
 
 @part(functions={"execute": "(controller, task) -> trajectory"})
-class Function(ShortRepr):
+class Function:
     """A plain function ``(controller, task) -> trajectory`` as the true system: a robot's own driver, a simulator.
 
     The function calls ``controller(t, x)`` for the inputs, once for each step in order if the controller has memory.
@@ -65,7 +64,7 @@ class Function(ShortRepr):
 
 
 @part()
-class Manual(ShortRepr):
+class Manual:
     """A system whose tasks people execute: get a task with ``campaign.ask()``, report it with ``campaign.tell()``.
 
     States and inputs are names of the components with their units, for files.
@@ -86,7 +85,7 @@ class Manual(ShortRepr):
 
 
 @part(functions={"step": "(x, u) -> x_next"})
-class Imperfect(ShortRepr):
+class Imperfect:
     """A step function or a model as the true system, whose records and actuators are imperfect.
 
     The controller acts on the records, as on a robot. Executions of one task differ if there is noise.

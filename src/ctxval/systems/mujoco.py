@@ -13,7 +13,6 @@ from ctxval._util.arrays import Array, ArrayLike, Mask, Rows, as_finite, require
 from ctxval._util.checked import PositiveInt, require_known
 from ctxval._util.mjcf import compile_mjcf, warning_of
 from ctxval._util.registry import part
-from ctxval._util.representation import ShortRepr
 from ctxval.core.controller import Controller
 from ctxval.core.rollout import rollout
 from ctxval.core.task import Task
@@ -22,7 +21,7 @@ from ctxval.errors import InputError, ShapeError
 
 
 @part(files=("mjcf",))
-class MuJoCo(ShortRepr):
+class MuJoCo:
     """An MJCF model as the true system, with feedback, for whole batches of closed loops at once.
 
     The state is ``(qpos, qvel)``, followed by the selected coordinates of each selected site. An execution starts from

@@ -25,7 +25,6 @@ from ctxval._util.checked import TimeLimit
 from ctxval._util.files import temporary_folder
 from ctxval._util.refusals import reworded
 from ctxval._util.registry import part
-from ctxval._util.representation import ShortRepr
 from ctxval.core.controller import Controller
 from ctxval.core.exchange import write_controller, write_task
 from ctxval.core.labels import require_names
@@ -116,7 +115,7 @@ def _end(supervisor: subprocess.Popen[bytes], child: int) -> None:
 
 
 @part(runs_code=True, folder="folder")
-class Subprocess(ShortRepr):
+class Subprocess:
     """A command that executes one task, as the true system.
 
     Every execution has a new folder with ``task.json`` and the controller as ``controller.json`` and
