@@ -189,23 +189,20 @@ class Settings(BaseModel, extra="forbid"):
                 where = "write it at the top of the file, or give --seed"
                 raise InputError(f"[options] must not contain the seed: {where}.")
             experiment = parts.named_experiment(self.experiment, self.seed, self.options, self.folder)
-        validation = given = experiment.validation
+        validation = experiment.validation
+        stated: dict[str, Any] = {"longest": self.longest, "physical": self.physical}
+        changed = {name: value for name, value in stated.items() if value is not None}
         if self.refined is not None:  # a model that was learned from executions of the given one
             path = (self.folder or Path()) / self.refined
-            refined = read_refined(path, given.model)
+            refined = read_refined(path, validation.model)
             if refined.data is None:
                 raise InputError(f"{path} lacks the recorded steps that the model was learned from.")
-            validation = validation.with_model(Refined(refined, refined.data, given.model))
+            changed["model"] = Refined(refined, refined.data, validation.model)
             experiment = replace(experiment, truth=None)
-        if self.longest is not None:
-            validation = validation.with_parts(longest=self.longest)
-        if self.physical is not None:
-            validation = validation.with_parts(physical=self.physical)
         if self.distribution is not None:
-            validation = validation.with_space(
-                parts.with_distribution(validation.space, self.distribution, self.folder)
-            )
-        experiment = experiment if validation is given else replace(experiment, validation=validation)
+            changed["space"] = parts.with_distribution(validation.space, self.distribution, self.folder)
+        if changed:
+            experiment = replace(experiment, validation=validation.with_parts(**changed))
         if self.judge == "distance":
             return experiment
         if self.spec is None:
