@@ -178,7 +178,8 @@ def require_types(what: str, function: Any, options: Mapping[str, Any]) -> dict[
     with suppress(NameError, TypeError):
         hints = get_type_hints(target, include_extras=True)
     given = {name: tuple(value) if isinstance(value, list) else value for name, value in options.items()}
-    return {name: require(f"{what}: {name}", hints.get(name, Any), value) for name, value in given.items()}
+    with reworded(what, InputError):
+        return {name: require(name, hints.get(name, Any), value) for name, value in given.items()}
 
 
 def with_distribution(
