@@ -19,7 +19,7 @@ from ctxval import Experiment, Task, TaskSpace, Validation, controllers, distanc
 from ctxval._util.arrays import Array
 from ctxval.core.labels import Labels
 from ctxval.systems import Simulated
-from ctxval.systems.integrate import rk4
+from ctxval.systems.functions import rk4
 
 DT, HORIZON = 0.1, 30
 TROLLEY, ROPE, GRAVITY, DRAG = 2.0, 1.0, 9.81, 0.6

@@ -34,7 +34,7 @@ from ctxval import (
 from ctxval._util.arrays import Array
 from ctxval._util.json_lines import JsonLines
 from ctxval.core.controller import Controller
-from ctxval.systems.integrate import Derivative
+from ctxval.systems.functions import Derivative
 from study_auto import Result, add_options, campaign, print_table, search_named, stored
 
 HORIZON, DT = 60, 0.05

@@ -34,7 +34,7 @@ from ctxval.core.rollout import rollout
 from ctxval.learning.closed_loops import LoopPlanner, loop_pairs
 from ctxval.learning.dynamics_posterior import PosteriorSettings, learn_posterior
 from ctxval.learning.hyperparameters import ResidualHyperparameters, draw_prior
-from ctxval.models.scaling import standard_deviations
+from ctxval.models.increments import standard_deviations
 
 KEY = ("design", "states", "seed")
 STORED = Path(__file__).parent / "results" / "posterior_ranks.jsonl"

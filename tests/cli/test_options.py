@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ctxval.cli.options import named_values, parsed
+from ctxval.cli.base import named_values, parsed
 from ctxval.errors import InputError
 from rig_cli import calling
 
@@ -81,7 +81,7 @@ def test_any_option_of_a_case_can_be_set(invoke: Any) -> None:
 def test_a_wrong_option_is_refused_with_the_nearest(invoke: Any, command: str) -> None:
     for option, sentence in (
         ("dims=2", "no option of the case 'linear' is called 'dims'; did you mean 'dim'?"),
-        ("dim=large", "case 'linear': dim must be a valid integer, got 'large'."),
+        ("dim=large", "case 'linear': dim must be an integer, got 'large'."),
     ):
         result = invoke(command, "linear", "--option", option)
         assert result.exit_code == 2

@@ -10,7 +10,7 @@ import pytest
 
 from ctxval import models, plot
 from ctxval._util.files import MADE_BY, write_text, written_whole
-from ctxval.cli.options import require_folder, require_outputs
+from ctxval.cli.base import require_folder, require_outputs
 from ctxval.core.trajectory import Transitions
 from ctxval.errors import InputError
 from ctxval.studies.fitting.model_file import write_model_file

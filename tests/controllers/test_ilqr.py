@@ -11,7 +11,7 @@ from ctxval.core.model import Function, Model, linearize
 from ctxval.core.rollout import rollout
 from ctxval.errors import DesignError, InputError, ModelError, ShapeError
 from ctxval.models import Linear
-from ctxval.systems.integrate import rk4
+from ctxval.systems.functions import rk4
 
 DT = 0.05
 

@@ -8,7 +8,7 @@ from ctxval.core.controller import AffineFeedback
 from ctxval.core.rollout import rollout
 from ctxval.errors import ShapeError
 from ctxval.models import Linear
-from ctxval.systems.integrate import rk4
+from ctxval.systems.functions import rk4
 
 
 def derivative(x: np.ndarray, u: np.ndarray) -> np.ndarray:

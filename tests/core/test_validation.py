@@ -21,7 +21,7 @@ from ctxval.errors import (
 )
 from ctxval.models import Linear
 from ctxval.systems import Simulated
-from ctxval.systems.integrate import rk4
+from ctxval.systems.functions import rk4
 
 DT, HORIZON = 0.05, 12
 SPACE = TaskSpace(goal=(-2, 2, "rad"), start=(-1, 1))

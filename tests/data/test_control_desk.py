@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from ctxval.data import Clock, Field, LogMapping, read_logs, read_recordings
-from ctxval.data.control_desk import ControlDeskLog, is_control_desk
+from ctxval.data.matlab import ControlDeskLog, is_control_desk
 from ctxval.errors import InputError
 from rig_logs import DT, run, write_control_desk
 

@@ -123,7 +123,7 @@ def test_a_chunk_that_is_much_larger_than_its_file_is_not_decompressed(kind: str
 def test_messages_are_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from rig_logs import write_mcap_json
 
-    monkeypatch.setattr("ctxval.data.topics._MOST_MEMORY", 10_000)
+    monkeypatch.setattr("ctxval.data.log._MOST_MEMORY", 10_000)
     write_mcap_json(tmp_path / "a.mcap", run(60))
     with pytest.raises(InputError, match=r"a\.mcap has too many numbers: 10000 bytes of memory may be used"):
         read_recordings([tmp_path / "a.mcap"], LogMapping.from_table({"states": ["/state.cart.position"]}))

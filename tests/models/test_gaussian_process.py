@@ -9,7 +9,7 @@ import pytest
 
 from ctxval import Task, Transitions, controllers, models, testing
 from ctxval.errors import InputError, ShapeError
-from ctxval.models import gaussian_process
+from ctxval.models import increments
 
 LENGTH_SCALES = np.array([1.2, 3.0, 2.0])
 
@@ -58,13 +58,13 @@ def test_the_likelihood_is_scikit_learns_and_its_gradient_is_right() -> None:
     scaling = models.IncrementScaling.of(data)
     Z, Y = scaling.inputs(data.x, data.u), scaling.targets(data)
     theta = np.log([2.0, 1e-2, *LENGTH_SCALES])
-    value, gradient = gaussian_process.log_likelihood(theta, Z, Y)
+    value, gradient = increments.log_likelihood(theta, Z, Y)
     kernel = ConstantKernel(2.0) * RBF(LENGTH_SCALES)
     oracle = GaussianProcessRegressor(kernel, alpha=1e-2, optimizer=None).fit(Z, Y)
     constant = -0.5 * Y.size * np.log(2 * np.pi)
     assert value + constant == pytest.approx(oracle.log_marginal_likelihood_value_, abs=1e-8)
     h = 1e-6
-    likelihood = lambda moved: gaussian_process.log_likelihood(moved, Z, Y)[0]  # noqa: E731
+    likelihood = lambda moved: increments.log_likelihood(moved, Z, Y)[0]  # noqa: E731
     numeric = [(likelihood(theta + h * e) - likelihood(theta - h * e)) / (2 * h) for e in np.eye(len(theta))]
     np.testing.assert_allclose(gradient, numeric, rtol=1e-5, atol=1e-5)
 
@@ -86,7 +86,7 @@ def test_the_fit_makes_its_data_more_likely_than_where_it_started(model: models.
     noise = 1e-6  # the data have none
     theta = np.log([found.variance, noise, *found.length_scales])
     start = np.log([1.0, 1e-3, 3.0, 3.0, 3.0])
-    likelihood = [gaussian_process.log_likelihood(point, model.centres, Y)[0] for point in (theta, start)]
+    likelihood = [increments.log_likelihood(point, model.centres, Y)[0] for point in (theta, start)]
     assert likelihood[0] > likelihood[1] + 100
 
 

@@ -13,7 +13,7 @@ from ctxval._util.arrays import Array
 from ctxval.certificates import CertificateOptions
 from ctxval.report import ReportContext, context_of_campaign
 from ctxval.report.distance_model import DistanceModel
-from ctxval.report.findings import Answer, Finding, asks, share_far_from_trials, smooth
+from ctxval.report.findings import Answer, Finding, Question, findings_of, share_far_from_trials, smooth
 from ctxval.report.insights import (
     bias,
     components,
@@ -26,6 +26,10 @@ from ctxval.report.insights import (
     weak_region,
     weak_states,
 )
+
+
+def found_by(question: Question, context: ReportContext) -> Finding | None:
+    return next(iter(findings_of(context, {"": question})), None)
 
 
 @pytest.fixture(scope="module")
@@ -62,7 +66,7 @@ def test_the_lights_of_a_campaign_with_a_failure(flat: ReportContext) -> None:
 def test_a_campaign_without_a_threshold_has_no_verdict() -> None:
     context = context_of_campaign(pendulum(executions=3))
     assert "Certificate" not in named(context.diagnostics)
-    assert weak_region(context) is None
+    assert found_by(weak_region, context) is None
 
 
 def test_an_empty_campaign_has_findings_too() -> None:
@@ -78,7 +82,7 @@ def test_the_share_far_from_trials_is_that_of_a_line() -> None:
 
 
 def test_where_m_is_weak_counts_executed_and_predicted_tasks(swing: ReportContext) -> None:
-    found = weak_region(swing)
+    found = found_by(weak_region, swing)
     assert found is not None
     assert found.light == "bad"
     assert found.numbers["executed_above"] == int((swing.distances > 0.2).sum())
@@ -92,7 +96,7 @@ def test_the_region_of_weak_tasks_is_described_by_its_parameters() -> None:
     # The distance is |goal - 1|, and the load does not matter.
     campaign = Campaign(distance_of_goal(space), search=searches.Random(), seed=0).run(30)
     context = context_of_campaign(campaign, threshold=0.8, certificate=CertificateOptions.posterior())
-    found = weak_region(context)
+    found = found_by(weak_region, context)
     assert found is not None
     model = context.distance_model
     assert model is not None
@@ -132,7 +136,7 @@ def test_the_distance_model_needs_two_distances() -> None:
 
 
 def test_inputs_at_the_limits_of_the_synthesizer_are_counted(flat: ReportContext) -> None:
-    found = saturation(flat)
+    found = found_by(saturation, flat)
     assert found is not None
     executed = np.concatenate([one.system.inputs for one in flat.recordings.values()])
     share = (np.abs(executed) >= 0.2 * (1 - 1e-6)).mean(axis=0).max()
@@ -147,7 +151,10 @@ def test_limits_that_nobody_states_are_seen_in_the_records() -> None:
     parts = ("space", "task", "system", "model", "distance")
     other = Validation(**{part: getattr(validation, part) for part in parts}, synthesizer=limited)
     context = context_of_campaign(Campaign(other, search=searches.Random(), seed=0).run(4))
-    found, known = saturation(replace(context, validation=None, missing="not loaded")), saturation(context)
+    found, known = (
+        found_by(saturation, replace(context, validation=None, missing="not loaded")),
+        found_by(saturation, context),
+    )
     assert found is not None
     assert known is not None
     assert not found.numbers["limits_known"]
@@ -156,7 +163,7 @@ def test_limits_that_nobody_states_are_seen_in_the_records() -> None:
 
 
 def test_the_corrected_model_explains_a_linear_residual(flat: ReportContext) -> None:
-    found = explained(flat)
+    found = found_by(explained, flat)
     assert found is not None
     assert found.light == "good"
     assert found.numbers["share_explained"] > 0.95
@@ -165,20 +172,20 @@ def test_the_corrected_model_explains_a_linear_residual(flat: ReportContext) -> 
 def test_without_the_experiment_two_questions_are_open(flat: ReportContext) -> None:
     data = replace(flat, validation=None, missing="not loaded")
     for question in (explained, goals):
-        found = question(data)
+        found = found_by(question, data)
         assert found is not None
         assert found.light == "unknown"
         assert "not loaded" in found.text
 
 
 def test_the_goals_of_m_are_those_of_weighted_states(swing: ReportContext) -> None:
-    found = goals(swing)
+    found = found_by(goals, swing)
     assert found is not None
     assert found.numbers["trials"] == len(swing.recordings)
 
 
 def test_the_state_that_errs_most_is_named_with_its_unit(swing: ReportContext) -> None:
-    found = components(swing)
+    found = found_by(components, swing)
     assert found is not None
     assert found.numbers["state"] in ("angle [rad]", "rate [rad/s]")
     assert sum(found.numbers["shares"].values()) == pytest.approx(1.0)
@@ -206,7 +213,7 @@ def test_a_planner_that_jumps_is_found() -> None:
         distance=distances.FinalState(),
     )
     campaign = Campaign(validation, search=searches.Random(), seed=0).run(40)
-    found = flips(context_of_campaign(campaign))
+    found = found_by(flips, context_of_campaign(campaign))
     assert found is not None
     assert found.light == "attention"
     assert found.numbers["flipped"] > 0
@@ -214,7 +221,7 @@ def test_a_planner_that_jumps_is_found() -> None:
 
 
 def test_designs_that_stop_early_are_counted(weak_motor: ReportContext) -> None:
-    found = converged(weak_motor)
+    found = found_by(converged, weak_motor)
     assert found is not None
     assert found.light == "attention"
     assert found.text == (
@@ -223,9 +230,9 @@ def test_designs_that_stop_early_are_counted(weak_motor: ReportContext) -> None:
 
 
 def test_the_bias_has_numbers_and_nothing_is_said_of_what_is_usual(swing: ReportContext) -> None:
-    assert unusual_motion(swing) is None
-    assert weak_states(swing) is None
-    found = bias(swing)
+    assert found_by(unusual_motion, swing) is None
+    assert found_by(weak_states, swing) is None
+    found = found_by(bias, swing)
     assert found is not None
     assert found.numbers
 
@@ -240,12 +247,10 @@ def test_every_finding_is_one_text_with_a_light_and_json(swing: ReportContext, f
 
 
 def test_a_question_that_fails_is_a_finding_that_is_not_known(swing: ReportContext) -> None:
-    @asks("odd")
     def failing(context: ReportContext) -> Answer:
         raise ValueError("odd data")
 
-    found = failing(swing)
-    assert found is not None
+    (found,) = findings_of(swing, {"odd": failing})
     assert (found.name, found.light) == ("odd", "unknown")
     assert "odd data" in found.text
 
@@ -256,8 +261,8 @@ def test_neither_smooth_nor_alike_is_good_if_designs_did_not_converge(
     assert weak_motor.designs is not None
     assert "did not converge at 4 of 4 executed tasks, among them the worst one" in weak_motor.designs
     monkeypatch.setattr(DistanceModel, "calibration", 1.0)
-    sure = smooth(replace(weak_motor, trials=tuple(replace(trial, note=None) for trial in weak_motor.trials)))
-    doubted = smooth(weak_motor)
+    sure = found_by(smooth, replace(weak_motor, trials=tuple(replace(trial, note=None) for trial in weak_motor.trials)))
+    doubted = found_by(smooth, weak_motor)
     assert sure is not None
     assert doubted is not None
     assert (sure.light, doubted.light) == ("good", "attention")

@@ -6,6 +6,7 @@ import base64
 import hashlib
 import json
 import re
+import sys
 from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import Any
@@ -18,9 +19,8 @@ from rig_pages import HOSTILE, hostile_store, pendulum, plane
 from ctxval import Campaign, Trial, report
 from ctxval.certificates import CertificateOptions, Region
 from ctxval.errors import InputError
-from ctxval.report import ReportContext, context_of_campaign, context_of_store, sections
-from ctxval.report.sections import appendix
-from ctxval.report.sections.repeat import command_of, identity, python_snippet
+from ctxval.report import ReportContext, context_of_campaign, context_of_store
+from ctxval.report.sections.repeat import appendix, command_of, identity, python_snippet
 from ctxval.report.sections.trials import packed, recorded_lines
 from rig_thorough import more
 
@@ -227,11 +227,12 @@ def test_what_is_no_section_is_refused(swing: ReportContext) -> None:
 
 
 def test_installed_packages_add_sections(swing: ReportContext, monkeypatch: pytest.MonkeyPatch) -> None:
-    point = EntryPoint("weather", "test_report_page:Sunny", sections.GROUP)
-    monkeypatch.setattr(sections, "entry_points", lambda group: [point])
+    module = sys.modules[report.page.__module__]
+    point = EntryPoint("weather", "test_report_page:Sunny", "ctxval.report_sections")
+    monkeypatch.setattr(module, "entry_points", lambda group: [point])
     assert "sunshine" in report.page(swing)
-    broken = EntryPoint("broken", "no_such_module:Nothing", sections.GROUP)
-    monkeypatch.setattr(sections, "entry_points", lambda group: [broken])
+    broken = EntryPoint("broken", "no_such_module:Nothing", "ctxval.report_sections")
+    monkeypatch.setattr(module, "entry_points", lambda group: [broken])
     with pytest.raises(InputError, match="the section 'broken' cannot be loaded"):
         report.page(swing)
 
@@ -273,7 +274,7 @@ def test_markdown_names_the_verdict_and_the_worst_tasks(swing: ReportContext) ->
 
 
 def test_the_appendix_covers_the_vocabulary_of_both_standards(swing: ReportContext) -> None:
-    entries = list(appendix.appendix(swing))
+    entries = list(appendix(swing))
     assert all(entry.content.strip() for entry in entries)
     for standard in ("NASA-STD-7009B", "ASME V&V 10", "ASME V&V 20"):
         assert any(standard in entry.standard for entry in entries)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from ctxval.systems.integrate import rk4
+from ctxval.systems.functions import rk4
 
 
 def pendulum(x: np.ndarray, u: np.ndarray) -> np.ndarray:

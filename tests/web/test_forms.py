@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from ctxval import TaskSpace, TaskSuite
 from ctxval.campaign.telling import SuppliedResult
 from ctxval.errors import InputError
-from ctxval.web.forms import recording_in, result, task_request
+from ctxval.web.app import recording_in, result, task_request
 from ctxval.web.jobs import TaskRequest
 
 SPACE = TaskSpace(goal=(-1.0, 1.0, "rad"), offset=([0, 0], [1, 2], "m"))

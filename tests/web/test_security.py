@@ -137,4 +137,4 @@ def test_no_cookie_and_no_token_is_too_odd(cookie: str, token: str) -> None:
 def test_secrets_are_random_and_not_shown() -> None:
     one, other = Access(None, 1), Access(None, 1)
     assert len({one.new_session(), one.new_session(), other.new_session()}) == 3
-    assert repr(Access(TOKEN, 1)) == "Access(needs_token=True)"
+    assert TOKEN not in repr(Access(TOKEN, 1))

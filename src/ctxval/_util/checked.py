@@ -11,7 +11,7 @@ import inspect
 import reprlib
 import sys
 import types
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from typing import Annotated, Any, Literal, NamedTuple, TypeVar, Union, get_args, get_origin
 
 import numpy as np
@@ -89,6 +89,12 @@ def require(name: str, annotation: Any, value: Any) -> Any:
     return value
 
 
+def require_known(kind: str, names: Iterable[str], known: Collection[str]) -> None:
+    for name in names:
+        if name not in known:
+            raise UnknownNameError.among(kind, name, known)
+
+
 def _resolved(function: Any, made: Any) -> Iterator[tuple[str, Any]]:
     """Yield the annotations of parameters; those of the fields of a dataclass are read where the field is defined."""
     variadic = {inspect.Parameter.VAR_KEYWORD, inspect.Parameter.VAR_POSITIONAL}
@@ -157,8 +163,9 @@ def _missed_class(cls: type, arguments: tuple[Any, ...], value: Any) -> str:
     try:
         if isinstance(value, cls) and not unbound:
             return ""
-    except TypeError:  # a protocol that cannot be checked
-        return ""
+    except TypeError:  # a protocol that cannot be checked, which no plain value fulfils
+        if not required or not isinstance(value, str | int | float | list | dict):
+            return ""
     methods = [f"{name}({', '.join([*inspect.signature(method).parameters][1:])})" for name, method in required.items()]
     article = "an" if cls.__name__[0] in "AEIO" else "a"
     instance = ", an object and no class" if unbound else ""

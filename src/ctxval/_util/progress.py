@@ -43,11 +43,11 @@ Listener = Callable[[Progress], None]  #: called with each report; it should ret
 @dataclass
 class _Stage:
     listener: Listener
-    name: str
-    expected: float | None
-    unit: str
-    done: float
-    depth: int
+    name: str = ""
+    expected: float | None = None
+    unit: str = ""
+    done: float = 0
+    depth: int = -1  # that of a listener, outside of all stages
 
     def report(self, note: str = "", *, ended: bool = False) -> None:
         # An estimate that was too small is none any more.
@@ -55,30 +55,29 @@ class _Stage:
         self.listener(Progress(self.name, self.done, expected, self.unit, note, self.depth, ended))
 
 
-_listener: ContextVar[Listener | None] = ContextVar("listener", default=None)
-_innermost: ContextVar[_Stage | None] = ContextVar("innermost", default=None)
+_innermost: ContextVar[_Stage | None] = ContextVar("innermost", default=None)  # None if nobody listens
 
 
 def is_heard() -> bool:
-    return _listener.get() is not None
+    return _innermost.get() is not None
 
 
 @contextmanager
 def listening(listener: Listener | None) -> Iterator[None]:
     """Send all reports within this context to a listener; None lets nobody listen."""
-    tokens = _listener.set(listener), _innermost.set(None)
+    token = _innermost.set(None if listener is None else _Stage(listener))
     try:
         yield
     finally:
-        _listener.reset(tokens[0])
-        _innermost.reset(tokens[1])
+        _innermost.reset(token)
 
 
 def also_listening(listener: Listener) -> AbstractContextManager[None]:
-    outer = _listener.get() or ignore
+    outer = _innermost.get()
 
     def both(progress: Progress) -> None:
-        outer(progress)
+        if outer is not None:
+            outer.listener(progress)
         listener(progress)
 
     return listening(both)
@@ -90,19 +89,17 @@ def ignore(_: Progress) -> None:
 
 def mute() -> None:
     """Let nobody listen from now on, as in a forked process, whose listener is that of its parent."""
-    _listener.set(None)
     _innermost.set(None)
 
 
 @contextmanager
 def stage(name: str, expected: float | None = None, unit: str = "", done: float = 0) -> Iterator[None]:
     """Report that long work begins, and its end."""
-    listener = _listener.get()
-    if listener is None:
+    outer = _innermost.get()
+    if outer is None:
         yield
         return
-    outer = _innermost.get()
-    begun = _Stage(listener, name, expected, unit, done, 0 if outer is None else outer.depth + 1)
+    begun = _Stage(outer.listener, name, expected, unit, done, outer.depth + 1)
     token = _innermost.set(begun)
     try:
         begun.report()
@@ -115,14 +112,14 @@ def stage(name: str, expected: float | None = None, unit: str = "", done: float 
 def advance(count: float = 1, note: str = "") -> None:
     """Report that so much more of the innermost stage is done."""
     current = _innermost.get()
-    if current is not None:
+    if current is not None and current.depth >= 0:
         current.done += count
         current.report(note)
 
 
 def expect(expected: float) -> None:
     current = _innermost.get()
-    if current is not None:
+    if current is not None and current.depth >= 0:
         current.expected = expected
         current.report()
 

@@ -11,8 +11,9 @@ from contextlib import suppress
 from dataclasses import KW_ONLY, dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
-from ctxval._util.checked import checked
+from ctxval._util.checked import checked, require_known
 from ctxval._util.refusals import reworded
+from ctxval._util.representation import ShortRepr
 from ctxval.errors import InputError, UnknownNameError
 
 if TYPE_CHECKING:  # importlib.metadata is slow to import, and is needed only for names that are not built in
@@ -26,7 +27,7 @@ Made = TypeVar("Made")
 class Declaration:
     """Declares a class, or a function that makes an object, as a part that is found by name; checks its arguments.
 
-    A part of this package is found once its package exports it in ``__all__``.
+    A part of this package is found once its package exports it in ``__all__``. Its objects show their attributes.
     """
 
     name: str = ""  # the name of the class by default
@@ -39,6 +40,9 @@ class Declaration:
 
     def __call__(self, made: Part) -> Part:
         made = checked(made)
+        shown: Any = made
+        if shown.__repr__ is object.__repr__:  # a class without one of its own
+            shown.__repr__ = ShortRepr.__repr__
         _declarations[made] = replace(self, name=self.name or made.__name__)
         return made
 
@@ -166,7 +170,6 @@ def has_method(cls: type, method: str | None) -> bool:
 def construct(what: str, build: Any, arguments: Mapping[str, Any], *first: Any) -> Any:
     with reworded(f"{what} cannot be made"):
         taken = inspect.signature(build).parameters
-        open_ended = any(parameter.kind is parameter.VAR_KEYWORD for parameter in taken.values())
-        for key in () if open_ended else [key for key in arguments if key not in taken]:
-            raise UnknownNameError.among(f"argument of {what}", key, taken)
+        if not any(parameter.kind is parameter.VAR_KEYWORD for parameter in taken.values()):
+            require_known(f"argument of {what}", arguments, taken)
         return build(*first, **arguments)

@@ -1,4 +1,4 @@
-"""What all commands share: options with their texts, errors in one sentence, exit statuses, and printing."""
+"""What all commands share: options with their texts, files that they write, errors, exit statuses, and printing."""
 
 from __future__ import annotations
 
@@ -7,17 +7,22 @@ import inspect
 import io
 import os
 import sys
+import tomllib
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext, redirect_stdout, suppress
+from dataclasses import dataclass
 from json import dumps  # code of users may replace what is in a module
+from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 import typer
 from rich.table import Table
 
 from ctxval._util.describe import describe
+from ctxval._util.files import make_folder_of, require_made_by_us
 from ctxval._util.progress import progress_shown
+from ctxval._util.refusals import reworded
 from ctxval._util.texts import reason_of, shortened
 from ctxval.campaign.goals_of_model import GoalWarning
 from ctxval.campaign.storage.disks import StoreWarning
@@ -87,7 +92,6 @@ def command(name: str | None = None, /, *, with_json: bool = True, **words: Any)
 
 
 def _described(parameter: inspect.Parameter, command: str, words: Mapping[str, Any]) -> inspect.Parameter:
-    """Return a parameter of a command as typer takes it, with its text; words replace those in braces."""
     text = {**TEXTS["options"], **TEXTS.get(command, {})}[parameter.name]
     # The text itself names the kinds that most people need.
     kinds = (kind for kind in KINDS.built_in if kind not in ("auto", "posterior", "audit"))
@@ -110,7 +114,6 @@ def _described(parameter: inspect.Parameter, command: str, words: Mapping[str, A
 
 
 def _run(function: Callable[[], Any], as_json: bool, stated: set[str]) -> None:
-    """Run a command, print its result as JSON if that is asked for, and end with a sentence if it fails."""
     warnings.showwarning = _show_warning
     failure, status = None, 0
     out.quiet = notes.quiet = as_json
@@ -185,6 +188,81 @@ def _show_warning(message: Warning | str, category: type[Warning], *place: Any, 
         err.say(warnings.formatwarning(message, category, *place[:2]).rstrip("\n"))
 
 
+# Values of options, and files that options name: never onto an input, and never onto the work of others
+
+
+@dataclass(frozen=True)
+class Allowed:
+    """What may be done with the experiment of a store: whose code may run, and why it may have changed."""
+
+    experiment: str | None = None
+    trust: bool = False
+    accept_change: str | None = None
+
+
+def named_values(given: Sequence[str] | None, flag: str = "--option", /, **named: Any) -> dict[str, Any]:
+    values = {name: value for name, value in named.items() if value is not None}
+    for text in given or ():
+        name, equals, value = text.partition("=")
+        name = name.strip()
+        if not (equals and name):
+            raise InputError(f"{flag} must be NAME=VALUE, such as {flag} dim=4, got {text!r}.")
+        if name in values:
+            raise InputError(f"the option {name} is given twice: as {values[name]!r} and as {value!r}.")
+        values[name] = parsed(value.strip())
+    return values
+
+
+def parsed(text: str) -> Any:
+    """Return the number, Boolean, list or quoted text that a TOML file would contain, or else the text itself."""
+    with suppress(tomllib.TOMLDecodeError, RecursionError):
+        match tomllib.loads(f"value = {text}"):
+            case {"value": str() | int() | float() | list() as value, **others} if not others:
+                return value
+    return text
+
+
+def require_outputs(outputs: Mapping[str, Path | None], inputs: Iterable[object], *, force: bool) -> None:
+    """Check the files that a command will write, before it does anything else."""
+    read = [Path(str(each)) for each in inputs if each is not None and "\0" not in str(each)]
+    named: dict[Path, str] = {}
+    for option, path in outputs.items():
+        if path is None:
+            continue
+        name, _, suffix = option.partition(" .")
+        suffix = suffix and f".{suffix}"
+        if suffix and path.suffix.lower() != suffix:
+            raise InputError(f"{name} must be a file that ends in {suffix}, got {str(path)!r}.")
+        make_folder_of(path)
+        with reworded(f"{path} cannot be written", OSError, RuntimeError, ValueError):
+            place, there = path.resolve(), path.exists()
+            is_input = there and any(each.exists() and each.samefile(path) for each in read)
+        if place in named:
+            raise InputError(f"{named[place]} and {name} must be different files, and both are {path}.")
+        named[place] = name
+        if path.is_dir():
+            raise InputError(f"{path} cannot be written: it is a folder.")
+        if is_input and not force:
+            raise InputError(f"{path} is read by this command: give another name, or --force to replace it.")
+        if path.is_symlink() and not force:
+            raise InputError(f"{path} is a link to another file: give another name, or --force to replace it.")
+        if not force:
+            require_made_by_us(path)
+
+
+def require_folder(folder: Path, names: Iterable[str], mark: str, *, force: bool) -> None:
+    """Check that files may be written into a folder: none of them is there, or the first one is ours."""
+    first, *others = names
+    there = [name for name in (first, *others) if (folder / name).exists()]
+    if there and not force:
+        if first not in there:
+            raise InputError(f"{folder / there[0]} is there already: give another folder, or --force to replace it.")
+        require_made_by_us(folder / first, mark.encode())
+
+
+# Printing
+
+
 def status_of(verdict: Verdict | None) -> int:
     return FALSIFIED if verdict is not None and verdict.answer == "falsified" else 0
 
@@ -194,7 +272,6 @@ def worst_of(trial: Trial | None) -> dict[str, Any] | None:
 
 
 def failures_of(trials: Iterable[Trial]) -> list[dict[str, Any]]:
-    """Return the reasons why trials failed with the numbers of the trials, the most frequent reason first."""
     by_reason: dict[str, list[int]] = {}
     for trial in trials:
         if trial.state == "failed":
@@ -242,7 +319,6 @@ def print_columns(columns: Sequence[str], rows: Iterable[Sequence[str]], title: 
 
 
 def print_other_stores(others: list[str]) -> None:
-    """Name the other campaigns of the same experiment, if there are any."""
     if others:
         count = f"{len(others)} other store{'s' if len(others) > 1 else ''} of this experiment"
         sentence = f"the folder contains {count}: {', '.join(others)}."

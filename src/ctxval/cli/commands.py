@@ -42,7 +42,6 @@ class Commands(TyperGroup):
                 self.commands[name] = command
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        """Return the command that the arguments name, loaded, and the other arguments."""
         if args[0] in MODULES:
             importlib.import_module(MODULES[args[0]])
             self.commands = typer.main.get_group(app).commands
@@ -59,7 +58,6 @@ class Commands(TyperGroup):
 
 @contextmanager
 def _harmless_errors() -> Iterator[None]:
-    """Escape control characters in the messages of errors about arguments."""
     try:
         yield
     except Exception as error:

@@ -11,23 +11,14 @@ from ctxval._util.checked import NonNegativeFloat, require
 from ctxval._util.progress import advance, stage
 from ctxval._util.refusals import require_extra
 from ctxval._util.texts import enumerated
-from ctxval.campaign.by_hand import (
-    TRIAL_FILES,
-    parameters_from,
-    parameters_of_trial,
-    read_runs,
-    result_sentence,
-    tell_result,
-    write_files,
-)
+from ctxval.campaign import by_hand
 from ctxval.campaign.choices import Execution
 from ctxval.campaign.storage.other_stores import STORE_SUFFIXES
 from ctxval.campaign.storage.store import Store
 from ctxval.campaign.telling import SuppliedResult
-from ctxval.cli.base import command, out, print_verdict, status_of
+from ctxval.cli.base import Allowed, command, named_values, out, print_verdict, require_folder, status_of
 from ctxval.cli.config.settings import Settings
 from ctxval.cli.config.stored_settings import Opened, budget_of, limit_of, open_store, open_target, trusted_settings
-from ctxval.cli.options import Allowed, named_values, require_folder
 from ctxval.core.exchange import TASK_FORMAT
 from ctxval.core.plan import Plan
 from ctxval.core.trial import CONVERGED, Trial
@@ -65,7 +56,7 @@ def ask(
     if because is not None and again is None:
         raise InputError("--because needs --again TRIAL: it states why the task is executed again.")
     if out_ is not None:
-        require_folder(out_, TRIAL_FILES, TASK_FORMAT, force=force)
+        require_folder(out_, by_hand.TRIAL_FILES, TASK_FORMAT, force=force)
     if Path(target).suffix in STORE_SUFFIXES and not Path(target).exists():
         raise InputError(f"there is no store at {target}; `ctxval ask FILE.toml --store {target}` creates one.")
     overrides = {"store": store, "search": search, "seed": seed, "options": named_values(option) or None}
@@ -92,14 +83,14 @@ def ask(
             return {"trial": None, "executions": campaign.executions, **decided}, status_of(verdict)
         waiting = asked
     else:
-        chosen = None if again is None else parameters_of_trial(campaign, again)
+        chosen = None if again is None else by_hand.parameters_of_trial(campaign, again)
         if parameters:
-            chosen = parameters_from(parameters, experiment.validation.space)
+            chosen = by_hand.parameters_from(parameters, experiment.validation.space)
         waiting = campaign.ask(chosen, draw=draw, because=because, wait=_WAIT)
     folder = path.with_suffix(".trials") / str(waiting.number) if out_ is None else out_
     if out_ is None:
-        require_folder(folder, TRIAL_FILES, TASK_FORMAT, force=force)
-    files = write_files(folder, experiment, waiting)
+        require_folder(folder, by_hand.TRIAL_FILES, TASK_FORMAT, force=force)
+    files = by_hand.write_files(folder, experiment, waiting)
     others = [each.number for each in campaign.trials if each.state == "open" and each.number != waiting.number]
     task = ", ".join(f"{name} = {value}" for name, value in waiting.trial.parameters.items())
     out.say(f"trial {waiting.number}: {task}")
@@ -152,8 +143,8 @@ def tell(
     opened = open_store(store, allowed)
     campaign, file, mapping = opened.campaign, trajectory or npz, opened.settings.log_mapping
     result = SuppliedResult(file, distance, failed, npz is not None, resample, start_tolerance, mapping, replace)
-    ended = tell_result(campaign, opened.experiment, trial, result)
-    out.say(result_sentence(ended, opened.experiment.units, campaign.start_offset(ended)))
+    ended = by_hand.tell_result(campaign, opened.experiment, trial, result)
+    out.say(by_hand.result_sentence(ended, opened.experiment.units, campaign.start_offset(ended)))
     return _ended(ended, campaign.executions, store)
 
 
@@ -170,9 +161,9 @@ def import_runs(
     opened = open_store(store, allowed)
     campaign, experiment, mapping = opened.campaign, opened.experiment, opened.settings.log_mapping
     space = experiment.validation.space
-    given = parameters_from(parameters, space) if parameters else None
+    given = by_hand.parameters_from(parameters, space) if parameters else None
     how = {"resample": resample, "start_tolerance": start_tolerance, "mapping": mapping}
-    runs = read_runs(files, given, space, **how)
+    runs = by_hand.read_runs(files, given, space, **how)
     checked = list[tuple[Plan, Execution]]()
     with stage("checking", len(runs), "runs"):
         for run in runs:  # all of them before any is stored
@@ -182,7 +173,7 @@ def import_runs(
     new = [trial for trial in ended if trial is not None]
     known = len(ended) - len(new)
     for trial in new[:10]:
-        out.say(result_sentence(trial, experiment.units, campaign.start_offset(trial)))
+        out.say(by_hand.result_sentence(trial, experiment.units, campaign.start_offset(trial)))
     if len(new) > 10:
         out.say(f"... and {len(new) - 10} other trials; --json lists them.")
     out.say(f"{len(new)} runs imported, {known} already in the store.")
@@ -245,5 +236,4 @@ def _served(opened: Opened, threshold: float | None, budget: int | None) -> Serv
 
 
 def web_server() -> Any:
-    """Return the module of the server, which needs the extra ``web``."""
     return require_extra("ctxval.web.server", "web", "the page needs")

@@ -10,11 +10,11 @@ from typing import Any, get_args
 from ctxval._util.refusals import reworded
 from ctxval._util.representation import task_text
 from ctxval._util.texts import shortened
-from ctxval.cli.base import CANNOT_GO_ON, FALSIFIED, command, err, notes, out, print_columns
+from ctxval.cli import base
+from ctxval.cli.base import command, err, named_values, notes, out, print_columns, require_outputs
 from ctxval.cli.config.parts import part
 from ctxval.cli.config.references import reference, require_function
 from ctxval.cli.config.settings import Settings, read_settings
-from ctxval.cli.options import named_values, parsed, require_outputs
 from ctxval.core.experiment import Experiment
 from ctxval.core.labels import labels_of, names_of
 from ctxval.core.model import Model, as_model
@@ -252,7 +252,7 @@ def fit_models(
     print_breaks(recordings)
     _print_fit(report)
     if not report.fitted:
-        return {**report.to_json(), "files": []}, CANNOT_GO_ON
+        return {**report.to_json(), "files": []}, base.CANNOT_GO_ON
     written, learned = list[str](), [model for model in report.fitted if model.kind != "given"]
     best = (learned or report.fitted)[0]
     if out_ is not None:
@@ -267,7 +267,7 @@ def fit_models(
         out.say(f"the {best.kind} model is in {' and '.join(written)}")
     if best.useless is not None:
         notes.say(("not good: ", "bold red"), f"{best.useless}.", wrap=True)
-    return {**report.to_json(), "files": written}, 0 if best.useless is None else FALSIFIED
+    return {**report.to_json(), "files": written}, 0 if best.useless is None else base.FALSIFIED
 
 
 def require_model_file(path: Path | None, inputs: Iterable[object], *, force: bool) -> None:
@@ -320,10 +320,10 @@ def collect(
 ) -> Any:
     settings = read_settings(target, {"options": named_values(option), "seed": seed})
     experiment = settings.load()
-    size = parsed(amplitude)
+    size = base.parsed(amplitude)
     if not isinstance(size, int | float | list):
         raise InputError(f"--amplitude must be a number or a list such as [1.0, 0.5], got {amplitude!r}.")
-    allowed = None if limits is None else parsed(limits)
+    allowed = None if limits is None else base.parsed(limits)
     excitation = Excitation(experiment.validation, kind, size, allowed, seed)  # type: ignore[arg-type]
     with reworded(f"{out_} cannot be made", OSError):
         out_.mkdir(parents=True, exist_ok=True)
@@ -340,11 +340,10 @@ def collect(
             recorded.append(str(paths[number]))
     out.say(f"{len(recorded)} executions recorded in {out_}, {known} were there before, {len(failed)} failed.")
     report = {"recorded": recorded, "known": known, "failed": failed, "folder": str(out_)}
-    return (report, CANNOT_GO_ON) if failed and not recorded and not known else report
+    return (report, base.CANNOT_GO_ON) if failed and not recorded and not known else report
 
 
 def numbers(text: str) -> list[int]:
-    """Return the numbers of steps in a text with commas between them."""
     parts = [part.strip() for part in text.split(",")]
     if not all(part.isdecimal() and int(part) > 0 for part in parts):
         raise InputError(f"--steps must be positive integers with commas between them, such as 1,10,50, got {text!r}.")
@@ -352,7 +351,6 @@ def numbers(text: str) -> list[int]:
 
 
 def print_breaks(recordings: Recordings) -> None:
-    """Print how logs were read, and where they were split."""
     for note in recordings.notes:
         out.say((note, "dim"))
     for split in recordings.breaks[:5]:

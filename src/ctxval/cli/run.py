@@ -17,25 +17,11 @@ from ctxval._util.texts import reason_of
 from ctxval.campaign.interval_search import IntervalSearch
 from ctxval.campaign.storage.other_stores import other_stores
 from ctxval.certificates.verdict import usable_bound
-from ctxval.cli.base import (
-    CANNOT_GO_ON,
-    ERROR,
-    RUN,
-    command,
-    err,
-    failures_of,
-    out,
-    print_failures,
-    print_other_stores,
-    print_table,
-    print_verdict,
-    status_of,
-    worst_of,
-)
+from ctxval.cli import base
+from ctxval.cli.base import command, err, named_values, out, print_table
 from ctxval.cli.config.settings import Settings, read_settings
 from ctxval.cli.config.stored_settings import budget_of, limit_of
 from ctxval.cli.hand import web_server
-from ctxval.cli.options import named_values
 from ctxval.cli.stores import page_path, print_envelope
 from ctxval.core.trajectory import Transitions
 from ctxval.core.trial import designs_sentence
@@ -129,9 +115,9 @@ def run(
             "budget": total,
             "executions": campaign.executions,
             "failed": len(campaign.failed),
-            "failures": failures_of(campaign.failed),
+            "failures": base.failures_of(campaign.failed),
             "controllers": designs_sentence(campaign.trials),
-            "worst": worst_of(campaign.worst),
+            "worst": base.worst_of(campaign.worst),
             "estimate": estimate,
             "interval": None if campaign.worst is None else [campaign.worst.distance, usable_bound(bound)],
             "units": units,
@@ -151,44 +137,43 @@ def run(
         if with_report:
             page = page_path(path)
             # An earlier run may have written the same report.
-            current = page.is_file() and campaign.store.computed(RUN) == {**result, "report": str(page)}
+            current = page.is_file() and campaign.store.computed(base.RUN) == {**result, "report": str(page)}
             try:
                 context = None if current else context_of_campaign(campaign, verdict, budget=total, envelope=trusted)
                 report["report"] = str(page if context is None else write_page(context, page))
             except Exception as error:  # it must not hide the verdict, for which executions were paid
                 err.say(f"no report: {reason_of(error)}")
                 report["report"] = None
-        campaign.store.keep_computed(RUN, {**result, "report": report.get("report")}, digest)
+        campaign.store.keep_computed(base.RUN, {**result, "report": report.get("report")}, digest)
         if shown is not None:
             shown.end(verdict, bound, report.get("report"))
     if verdict is not None:
-        print_verdict(verdict, units)
+        base.print_verdict(verdict, units)
     if trusted is not None:
         print_envelope(trusted)
     if verdict is None and bound is not None:
         print_table({"certificate": bound.doubt or bound.statement})
     elif verdict is None and report["controllers"]:  # a verdict says it
         out.say(f"{report['controllers']}.", wrap=True)
-    print_failures(report["failures"])
+    base.print_failures(report["failures"])
     failed = f", of which {report['failed']} failed" if report["failed"] else ""
     rows = {"executions": f"{report['executions']} of at most {total}{failed}"}
     shown_keys = ("worst", "truth", "error_percent", "store", "report")
     print_table(rows | {key: report[key] for key in shown_keys if key in report}, units)
     if verdict is not None:
-        print_other_stores(report["other_stores"])
+        base.print_other_stores(report["other_stores"])
     if campaign.failed and not campaign.completed:
         err.say(
-            ERROR,
+            base.ERROR,
             f"all {len(campaign.failed)} executions failed, so there is no distance. `ctxval why` looks for a "
             "cause in what was recorded before the failures.",
         )
-        return report, CANNOT_GO_ON
-    return report, status_of(verdict)
+        return report, base.CANNOT_GO_ON
+    return report, base.status_of(verdict)
 
 
 @contextmanager
 def _workers(workers: int | None, dask: str | None) -> Iterator[dict[str, Any]]:
-    """Yield the arguments of :meth:`ctxval.Campaign.run` for local processes or for the workers of a Dask scheduler."""
     if dask is None:
         yield {"workers": workers}
         return
@@ -204,7 +189,6 @@ def _workers(workers: int | None, dask: str | None) -> Iterator[dict[str, Any]]:
 
 @contextmanager
 def _live_page(wanted: bool, served: ServedCampaign, settings: Settings) -> Iterator[LiveCampaign | None]:
-    """Serve the page of the campaign while the command runs, if it is wanted."""
     if not wanted:
         yield None
         return

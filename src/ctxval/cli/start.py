@@ -13,11 +13,10 @@ from typing import Any
 from rich.progress import Progress, TextColumn
 
 from ctxval._util.files import write_text
-from ctxval.cli.base import BAD_INPUT, FALSIFIED, command, err, out, print_table
+from ctxval.cli.base import BAD_INPUT, FALSIFIED, command, err, named_values, out, print_table
 from ctxval.cli.config.check import aspect1_findings, check_experiment
 from ctxval.cli.config.parts import part, plain_options
 from ctxval.cli.config.settings import read_settings
-from ctxval.cli.options import named_values
 from ctxval.core.experiment import UnitsWarning
 from ctxval.errors import InputError
 from ctxval.paper import cases as known_cases

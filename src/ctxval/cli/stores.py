@@ -18,21 +18,10 @@ from ctxval.campaign.storage.recovery import export, recover
 from ctxval.campaign.storage.store import CAUSE, Store
 from ctxval.certificates import KINDS, CertificateOptions, assess
 from ctxval.certificates.envelope import Envelope
-from ctxval.cli.base import (
-    RUN,
-    command,
-    failures_of,
-    out,
-    print_failures,
-    print_other_stores,
-    print_table,
-    print_verdict,
-    status_of,
-    worst_of,
-)
+from ctxval.cli import base
+from ctxval.cli.base import Allowed, command, named_values, out, print_table
 from ctxval.cli.config.settings import Settings
 from ctxval.cli.config.stored_settings import budget_of, limit_of, open_store, planned_settings, trusted_settings
-from ctxval.cli.options import Allowed, named_values, require_folder, require_outputs
 from ctxval.core.labels import Labels, labels_of
 from ctxval.errors import CtxvalError, InputError, StoreAccessError, StoreError
 
@@ -43,7 +32,7 @@ def status(store: Path) -> Any:
     with opened.snapshot():
         description, trials, changes = opened.description(), opened.trials(), opened.history()
         thresholds = [asdict(stated) for stated in opened.thresholds() or ()]
-        kept = opened.computed(RUN)
+        kept = opened.computed(base.RUN)
     verdict = None
     match kept:
         case {"verdict": {"verdict": str(answer), "threshold": float(threshold), "reason": str(reason)}}:
@@ -56,10 +45,10 @@ def status(store: Path) -> Any:
         "seed": description.get("seed"),
         "executions": sum(trial.executed for trial in trials),
         "failed": sum(trial.state == "failed" for trial in trials),
-        "failures": failures_of(trials),
+        "failures": base.failures_of(trials),
         "unmeasured": [trial.number for trial in trials if trial.state == "unmeasured"],
         "open": [trial.number for trial in trials if trial.state == "open"],
-        "worst": worst_of(max(measured, key=lambda trial: trial.distance or 0, default=None)),
+        "worst": base.worst_of(max(measured, key=lambda trial: trial.distance or 0, default=None)),
         "verdict": verdict,
         "thresholds": thresholds,
         "changes": [asdict(change) for change in changes],
@@ -71,7 +60,7 @@ def status(store: Path) -> Any:
         out.say(f"{stated['at'][:19]} threshold {stated['threshold']:g}: stated after {known}")
     for change in report["changes"]:
         out.say(f"{change['at'][:19]} {change['what']}: {change['why']}")
-    print_failures(report["failures"])
+    base.print_failures(report["failures"])
     return report
 
 
@@ -81,7 +70,7 @@ def export_store(store: Path, out_: Path | None = None, force: bool = False) -> 
     if content.damaged and not content.trials and not content.trajectories:
         raise StoreAccessError(f"nothing can be read from {store}: it is not a store, or it is damaged completely.")
     target = store.with_suffix(".export") if out_ is None else out_
-    require_folder(target, ("trials.json", "trials.csv", "trajectories"), MADE_BY, force=force)
+    base.require_folder(target, ("trials.json", "trials.csv", "trajectories"), MADE_BY, force=force)
     export(content, target)
     for sentence in content.damaged[:20]:
         out.say(("cannot be read", "yellow"), f": {sentence}")
@@ -101,7 +90,7 @@ def remeasure(store: Path, allowed: Allowed) -> Any:
         "measured": sum(trial.state == "completed" for trial in trials),
         "changed": [trial.number for trial in trials if trial.distance != before.get(trial.number)],
         "unmeasured": [trial.number for trial in campaign.unmeasured],
-        "worst": worst_of(campaign.worst),
+        "worst": base.worst_of(campaign.worst),
         "store": str(store),
     }
     if report["changed"]:
@@ -170,7 +159,7 @@ def certify_store(store: Path, asked: Asked, allowed: Allowed, audit: int | None
         assessment = assess(opened.trials(), options, limit, known)
     others, verdict = [str(other.path) for other in known.beside], assessment.verdict
     if verdict is not None:
-        print_verdict(verdict)
+        base.print_verdict(verdict)
     if assessment.certificate is None:
         out.say(f"no certificate: {assessment.refusal}", wrap=True)
     for row in [] if assessment.certificate is None else str(assessment.certificate).split("\n"):
@@ -182,8 +171,8 @@ def certify_store(store: Path, asked: Asked, allowed: Allowed, audit: int | None
             f"asked for: `ctxval certify {shlex.quote(str(store))} --kind auto`.",
             wrap=True,
         )
-    print_other_stores(others)
-    return {**assessment.to_json(), "store": str(store), "other_stores": others}, status_of(verdict)
+    base.print_other_stores(others)
+    return {**assessment.to_json(), "store": str(store), "other_stores": others}, base.status_of(verdict)
 
 
 @command("report")
@@ -199,7 +188,7 @@ def write_report(
     opened = Store.existing(store)
     target = page_path(store) if page is None else page
     outputs = {"--out .html": target, "--junit .xml": junit, "--markdown .md": markdown}
-    require_outputs(outputs, [store, allowed.experiment], force=force)
+    base.require_outputs(outputs, [store, allowed.experiment], force=force)
     require("threshold", PositiveFloat | None, asked.threshold)
     try:
         loaded = open_store(store, allowed)
@@ -228,7 +217,7 @@ def write_report(
     out.say(", ".join(written.values()))
     if context.missing:
         out.say(f"without the experiment: {context.missing}", wrap=True)
-    return {**reports.to_json(context), "files": written}, status_of(context.verdict)
+    return {**reports.to_json(context), "files": written}, base.status_of(context.verdict)
 
 
 def page_path(store: Path) -> Path:
@@ -247,7 +236,7 @@ def state_envelope(
     force: bool = False,
 ) -> Any:
     suffix = ".onnx" if out_ is not None and out_.suffix == ".onnx" else ".py"
-    require_outputs({f"--out {suffix}": out_}, [store, allowed.experiment], force=force)
+    base.require_outputs({f"--out {suffix}": out_}, [store, allowed.experiment], force=force)
     loaded = open_store(store, allowed)
     limit = limit_of(loaded.experiment, loaded.settings, threshold)
     if limit is None:
@@ -263,7 +252,6 @@ def state_envelope(
 
 
 def print_envelope(envelope: Envelope) -> None:
-    """Print what an envelope says, in words and in numbers."""
     if envelope.doubt is None:
         out.say(("envelope", "bold"), f": {envelope.statement}", wrap=True)
     out.say(envelope.words, wrap=True)

@@ -14,11 +14,11 @@ from ctxval.campaign import plot
 from ctxval.campaign.campaign import Campaign
 from ctxval.certificates import CertificateOptions
 from ctxval.certificates.options import CONFIDENCE
-from ctxval.cli.base import FALSIFIED, command, err, failures_of, out, print_columns, print_failures
+from ctxval.cli import base
+from ctxval.cli.base import Allowed, command, err, named_values, out, print_columns, require_outputs
 from ctxval.cli.config.references import reference, require_function
 from ctxval.cli.config.settings import Settings, read_settings
 from ctxval.cli.config.stored_settings import budget_of, limit_of, open_target
-from ctxval.cli.options import Allowed, named_values, require_outputs
 from ctxval.cli.recordings import StepFunction, print_parameters, require_model_file
 from ctxval.core.validation import Validation
 from ctxval.errors import InputError
@@ -58,10 +58,10 @@ def compare(
         largest_possible=largest_possible,
         stochastic=stochastic,
     )
-    failures = {name: failures_of(campaign.failed) for name, campaign in campaigns.items()}
+    failures = {name: base.failures_of(campaign.failed) for name, campaign in campaigns.items()}
     _print_comparison(comparison)
     for value in failures.values():
-        print_failures(value)
+        base.print_failures(value)
     files = []
     if out_ is not None:
         files.append(str(write_text(out_, comparison.to_markdown())))
@@ -175,7 +175,7 @@ def refine_model(
     files = [] if out_ is None or not number else write_refined(out_, refinement, function.step)
     if files:
         out.say(f"the model of round {number} is in {' and '.join(files)}")
-    return {**refinement.to_dict(), "files": files}, FALSIFIED if refinement.answer == "falsified" else 0
+    return {**refinement.to_dict(), "files": files}, base.FALSIFIED if refinement.answer == "falsified" else 0
 
 
 def _method(name: str, fit: str | None, function: StepFunction) -> Method | None:

@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 
 from ctxval._util.files import write_text
-from ctxval.cli.base import command, out, print_columns
-from ctxval.cli.options import require_outputs
+from ctxval.cli.base import command, out, print_columns, require_outputs
 from ctxval.cli.recordings import Logs, error_cells, print_breaks
 from ctxval.data import Field, LogMapping, Observer
 from ctxval.models import write_model
@@ -71,7 +70,6 @@ def _print(result: Survey) -> None:
 
 
 def mapping_text(mapping: LogMapping, dt: float) -> str:
-    """Return a mapping as a TOML file to edit."""
     usual = vars(Field("x"))
 
     def text_of(field: Field) -> str:

@@ -15,9 +15,8 @@ from ctxval._util.representation import task_text
 from ctxval.campaign.by_hand import parameters_from, read_runs
 from ctxval.campaign.choices import Execution
 from ctxval.campaign.watching import FALSE_ALARMS
-from ctxval.cli.base import FALSIFIED, command, notes, out
+from ctxval.cli.base import FALSIFIED, Allowed, command, notes, out
 from ctxval.cli.config.stored_settings import Opened, limit_of, open_store
-from ctxval.cli.options import Allowed
 from ctxval.cli.recordings import Logs
 from ctxval.core.trajectory import Trajectory
 from ctxval.errors import ExecutionError, InputError

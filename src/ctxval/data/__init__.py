@@ -1,11 +1,10 @@
 """Recordings of a system: readers of logs, and their mapping to states and inputs at equal steps."""
 
-from ctxval.data.log import Clock, Log, MemoryTable, Signal, Table
+from ctxval.data.log import Clock, Log, MemoryTable, Message, Signal, Table, TopicLog
 from ctxval.data.mapping import Field, LogMapping, Observer
 from ctxval.data.readers import READERS, component_names, is_log, read_logs
 from ctxval.data.recordings import Recorded, Recording, Recordings, read_recordings, recordings_of
 from ctxval.data.sampling import Break, Channel
-from ctxval.data.topics import Message, TopicLog
 
 __all__ = [
     "READERS",

@@ -9,14 +9,14 @@ from pathlib import Path
 from typing import Any, Literal
 
 from ctxval._util.arrays import Array
-from ctxval._util.checked import FiniteFloat, NonNegativeInt, Seconds, checked, require
+from ctxval._util.checked import FiniteFloat, NonNegativeInt, Seconds, checked, require, require_known
 from ctxval._util.columns import column_of, conversion, named_unit
 from ctxval._util.files import read_toml
 from ctxval._util.refusals import reworded
 from ctxval._util.representation import ShortRepr
 from ctxval._util.texts import enumerated
 from ctxval.data.log import LISTED, Clock, Log
-from ctxval.errors import InputError, UnknownNameError
+from ctxval.errors import InputError
 
 Stamp = Literal["auto", "log", "publish", "header"]
 
@@ -168,7 +168,7 @@ class LogMapping(ShortRepr):
         A field is a path, or a table with the attributes of :class:`Field`. ``states`` and ``inputs`` may also be lists
         of paths.
         """
-        _require_known("entry of the mapping of recordings", table, [field.name for field in fields(LogMapping)])
+        require_known("entry of the mapping of recordings", table, [field.name for field in fields(LogMapping)])
         parts = dict[str, Any]()
         for kind in ("states", "inputs"):
             match table.get(kind, {}):
@@ -188,7 +188,7 @@ class LogMapping(ShortRepr):
             case {"observer": str(function)}:
                 parts["observer"] = Observer(None, {}, function)
             case {"observer": {"function": str(function)} as observer}:
-                _require_known("entry of the observer", observer, ["function", "states"])
+                require_known("entry of the observer", observer, ["function", "states"])
                 parts["observer"] = Observer(None, observer.get("states", {}), function)
             case {"observer": given}:
                 raise InputError(f"an observer must name a function module:attr, got {given!r}.")
@@ -235,12 +235,6 @@ def _usual(known: Sequence[str], vectors: Sequence[str], letter: str) -> dict[st
     return columns
 
 
-def _require_known(what: str, table: Mapping[str, Any], names: Sequence[str]) -> None:
-    for key in table:
-        if key not in names:
-            raise UnknownNameError.among(what, key, names)
-
-
 def _field(name: str, described: Any) -> Field:
     match described:
         case Field():
@@ -250,6 +244,6 @@ def _field(name: str, described: Any) -> Field:
     if not isinstance(described, Mapping):
         raise InputError(f"the field {name} must be a path or a table, got {described!r}.")
     table = {("path" if key == "field" else key): value for key, value in described.items()}
-    _require_known(f"entry of the field {name}", table, [field.name for field in fields(Field)])
+    require_known(f"entry of the field {name}", table, [field.name for field in fields(Field)])
     with reworded(f"the field {name}", InputError):
         return Field(**({} if "derivative_of" in table else {"path": name}) | table)

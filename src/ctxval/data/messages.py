@@ -25,8 +25,7 @@ from ctxval._util.arrays import Array
 from ctxval._util.files import open_regular
 from ctxval._util.refusals import require_extra, reworded
 from ctxval._util.texts import quoted, reason_of
-from ctxval.data.log import reading
-from ctxval.data.topics import Message, TopicLog
+from ctxval.data.log import Message, TopicLog, reading
 from ctxval.errors import InputError
 
 Decoder = Callable[[bytes], Any]  #: A function that decodes the bytes of one message
@@ -53,7 +52,6 @@ class _FileOfMessages(TopicLog):
     def _decoded(
         self, channel: Any, topic: str, data: bytes, message: str, definition: Callable[[], Definition]
     ) -> Any:
-        """Return the content of a message, decoded by the definition of its channel."""
         if channel not in self._decoders:
             make, name, text = definition()
             with reworded(f"{self.source}: the definition of the messages of {topic}, {name}, cannot be read"):

@@ -8,7 +8,7 @@ from __future__ import annotations
 import gzip
 import json
 import zlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,7 @@ from ctxval._util.checked import PositiveFloat, require
 from ctxval._util.columns import CsvTable
 from ctxval._util.files import MOST_BYTES, Archive, read_bytes, read_json, require_regular_file
 from ctxval._util.refusals import require_extra, reworded
-from ctxval.data.log import Log, MemoryTable, Table, reading
+from ctxval.data.log import Log, MemoryTable, Table, leaves, reading
 from ctxval.data.matlab import read_mat
 from ctxval.data.messages import BagLog, McapLog
 from ctxval.errors import InputError
@@ -81,7 +81,6 @@ def read_parquet(path: Path, period: float | None = None) -> list[Log]:
 
 
 def _parquet_column(path: Path, file: Any, name: str) -> Array:
-    """Return a column, ``(N,)`` or ``(N, k)``."""
     compute = require_extra("pyarrow.compute", "logs", "Parquet files need")
     about = file.metadata
     groups = map(about.row_group, range(about.num_row_groups))
@@ -150,44 +149,26 @@ def read_json_records(path: Path) -> list[Log]:
             if len(packed) > MOST_BYTES:
                 raise InputError(f"{path} has more than {MOST_BYTES} bytes when it is decompressed.")
         content = json.loads(packed.decode("utf-8"))
-    records = _records(path, content)
-    rows = [dict(_numbers("", record, 4)) for record in records]
-    columns = {name: _column([row.get(name) for row in rows]) for name in dict.fromkeys(k for row in rows for k in row)}
-    kept = {name: column for name, column in columns.items() if column is not None}
-    if not kept:
-        raise InputError(f"{path} has no field with numbers in its records.")
-    around = content.items() if isinstance(content, Mapping) else ()
-    constant = {name: np.full(len(records), float(value)) for name, value in around if isinstance(value, int | float)}
-    return [MemoryTable(str(path), {**constant, **kept})]
-
-
-def _records(path: Path, content: Any) -> list[Mapping[str, Any]]:
-    lists = content.values() if isinstance(content, Mapping) else [content]
-    tables = [each for each in lists if each and type(each) is list and {type(row) for row in each} == {dict}]
+    around = content if isinstance(content, Mapping) else {"": content}
+    tables = [each for each in around.values() if each and type(each) is list and {*map(type, each)} == {dict}]
     if len(tables) != 1:
         raise InputError(
             f'{path} must have one list of records, as [{{"t": 0.0, "x": 1.5}}, ...]; it has {len(tables)} such lists.'
         )
-    return tables[0]
-
-
-def _numbers(before: str, record: Mapping[str, Any], depth: int) -> Iterator[tuple[str, Any]]:
-    for name, value in record.items():
-        path = f"{before}.{name}".removeprefix(".")
-        match value:
-            case {}:
-                yield from _numbers(path, value, depth - 1) if depth else ()
-            case int() | float() | [*_] | None:
-                yield path, value
-
-
-def _column(values: list[Any]) -> Array | None:
-    """Return a field of all records, ``(N,)`` or ``(N, k)``; None if it does not hold numbers."""
-    width = next((len(value) for value in values if isinstance(value, list)), None)
-    missing = np.nan if width is None else [np.nan] * width
-    with suppress(TypeError, ValueError, OverflowError):
-        return np.array([missing if value is None else value for value in values], dtype=np.float64)
-    return None
+    numeric = (int, float, list, type(None))
+    rows = [{path: value for path, value in leaves(row, depth=4) if isinstance(value, numeric)} for row in tables[0]]
+    columns = dict[str, Array]()
+    for name in dict.fromkeys(name for row in rows for name in row):
+        values = [row.get(name) for row in rows]
+        width = next((len(value) for value in values if isinstance(value, list)), None)
+        missing = np.nan if width is None else [np.nan] * width
+        with suppress(TypeError, ValueError, OverflowError):  # it does not hold numbers
+            columns[name] = np.array([missing if value is None else value for value in values], dtype=np.float64)
+    if not columns:
+        raise InputError(f"{path} has no field with numbers in its records.")
+    beside = {name: value for name, value in around.items() if isinstance(value, int | float)}
+    constant = {name: np.full(len(rows), float(value)) for name, value in beside.items()}
+    return [MemoryTable(str(path), {**constant, **columns})]
 
 
 # Files and folders

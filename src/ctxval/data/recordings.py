@@ -9,17 +9,17 @@ from typing import Any
 
 import numpy as np
 
-from ctxval._util.arrays import Array, Rows
+from ctxval._util.arrays import Array, Mask, Rows
 from ctxval._util.columns import FAR, conversion, sentinels, time_column, unit_advice
+from ctxval._util.refusals import reworded
 from ctxval._util.registry import part
 from ctxval._util.representation import ShortRepr, call, counted
 from ctxval._util.texts import enumerated
 from ctxval.core.controller import Controller, started
 from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory, Transitions
-from ctxval.data.derived import with_derived
 from ctxval.data.log import Log, Signal, Table
-from ctxval.data.mapping import LogMapping
+from ctxval.data.mapping import LogMapping, Observer
 from ctxval.data.readers import component_names, logs_in, read_logs, task_of
 from ctxval.data.sampling import Break, Channel, sampled
 from ctxval.errors import ExecutionError, InputError
@@ -125,7 +125,10 @@ def recordings_of(
         {channel.name: channel.unit for channel in first if channel.of_input == of_input} for of_input in (False, True)
     )
     whole = Recordings(tuple(runs), tuple(breaks), dt, states, inputs, (*how, *dict.fromkeys(notes)))
-    return with_derived(whole, chosen)
+    whole = _with_derivatives(whole, chosen)
+    if isinstance(chosen.observer, Observer):
+        whole = _with_observer(whole, chosen.observer)
+    return _with_lags(whole, chosen.lags)
 
 
 def _channels(log: Log, mapping: LogMapping, names: Mapping[str, list[str]], notes: list[str]) -> list[Channel]:
@@ -211,8 +214,128 @@ def _period(log: Log, channel: Channel) -> float:
     return rounded if abs(rounded - period) * counts.sum() < 1e-3 * period else period
 
 
+# States that are not recorded but follow from records: derivatives, and records of earlier steps
+
+
+def _with_derivatives(recordings: Recordings, mapping: LogMapping) -> Recordings:
+    derived = {name: field for name, field in mapping.states.items() if field.derivative_of}
+    if not derived:
+        return recordings
+    from scipy.signal import savgol_filter  # imported here, because it is slow to load and seldom needed
+
+    known, dt = list(recordings.states), recordings.dt
+    for name, field in derived.items():
+        if field.derivative_of not in known:
+            raise InputError(
+                f"{name} is the derivative of {field.derivative_of!r}, which must be a recorded state with one "
+                f"component; these are {', '.join(known)}."
+            )
+    # Components of vectors have names of their own, and stay where their field is.
+    order = []
+    for name in mapping.states:
+        components = [label for label in known if label.startswith(name) and label[len(name) :].isdecimal()]
+        order += [name] if name in derived or name in known else components
+    window = max(field.window for field in derived.values())
+    kept, breaks = _long_enough(recordings, window, f"the {window} records of a derivative")
+    runs = []
+    for run in kept:
+        columns = dict(zip(known, run.trajectory.states.T, strict=True))
+        for name, field in derived.items():
+            columns[name] = savgol_filter(columns[field.derivative_of], field.window, 2, deriv=1, delta=dt)
+        runs.append(_from_step(0, run, np.stack([columns[label] for label in order], axis=-1), dt))
+    units, notes = dict(recordings.states), list(recordings.notes)
+    for name, field in derived.items():
+        base_unit = recordings.states[field.derivative_of]
+        units[name] = field.unit or (f"{base_unit}/s" if base_unit else "")
+        notes.append(
+            f"{name} is the derivative of {field.derivative_of}, that of a parabola through {field.window} records "
+            f"around each: it looks {field.window // 2 * dt:.3g} s ahead, so a controller would have it that much later"
+        )
+    named = {label: units[label] for label in order}
+    return replace(recordings, runs=tuple(runs), breaks=breaks, states=named, notes=tuple(notes))
+
+
+def _with_observer(recordings: Recordings, observer: Observer) -> Recordings:
+    name = observer.reference or getattr(observer.function, "__name__", "")
+    if observer.function is None:
+        raise InputError(
+            f"the observer {name} is not loaded: replay, fit and start do it; in Python, give the mapping the function."
+        )
+    runs: list[Recording] = []
+    breaks, widths = list(recordings.breaks), set[int]()
+    for run in recordings.runs:
+        y, u = run.trajectory.states, run.trajectory.inputs
+        with reworded(f"the observer {name} failed on {run.source}"):  # the user's function
+            x = np.asarray(observer.function(y.copy(), u.copy(), recordings.dt), dtype=np.float64)
+        if x.ndim != 2 or len(x) != len(y) or not x.shape[1]:
+            wanted = f"states of shape ({len(y)}, n)"
+            raise InputError(f"the observer {name} must return {wanted}, got {x.shape}.")
+        widths.add(x.shape[1])
+        finite: Mask = np.asarray(np.isfinite(x).all(axis=1))
+        first = int(finite.argmax()) if finite.any() else len(x)
+        if not finite[first:].all():
+            row = first + int(finite[first:].argmin())
+            raise InputError(f"the observer {name} must return finite states; row {row} of {run.source} has {x[row]}.")
+        if len(x) - first < 2:
+            breaks.append(_too_short(run, name, recordings.dt))
+        else:
+            runs.append(_from_step(first, run, x[first:], recordings.dt))
+    if not runs:
+        raise InputError(f"the observer {name} returns no two finite states in a row.")
+    n = min(widths)
+    states = dict(observer.states)
+    if not states:
+        states = recordings.states if n == len(recordings.states) else {f"x{k}": "" for k in range(n)}
+    if widths != {len(states)}:
+        raise InputError(
+            f"the observer {name} must return {len(states)} states ({enumerated(states, 6)}), got {max(widths)}."
+        )
+    note = f"the states are estimated by {name} from {enumerated(recordings.states, 6)}"
+    notes = (*recordings.notes, note)
+    return replace(recordings, runs=tuple(runs), breaks=tuple(breaks), states=states, notes=notes)
+
+
+def _with_lags(recordings: Recordings, lags: int) -> Recordings:
+    """Return recordings whose states have those of so many earlier steps beside them, and the inputs of these."""
+    if not lags:
+        return recordings
+    kept, breaks = _long_enough(recordings, lags + 1, f"{lags + 1} records in a row")
+    runs = []
+    for run in kept:
+        x, u, horizon = run.trajectory.states, run.trajectory.inputs, run.trajectory.horizon
+        states = [x[lags - k : horizon + 1 - k] for k in range(lags + 1)]
+        inputs = [u[lags - k : horizon + 1 - k] for k in range(1, lags + 1)]
+        runs.append(_from_step(lags, run, np.hstack([*states, *inputs]), recordings.dt))
+    named = dict(recordings.states)
+    for units in (recordings.states, recordings.inputs):
+        for k in range(1, lags + 1):
+            ago = "a step before" if k == 1 else f"{k} steps before"
+            named |= {f"{name} {ago}": unit for name, unit in units.items()}
+    return replace(recordings, runs=tuple(runs), breaks=breaks, states=named)
+
+
+def _long_enough(recordings: Recordings, records: int, what: str) -> tuple[list[Recording], tuple[Break, ...]]:
+    kept, left = list[Recording](), list[Recording]()
+    for run in recordings.runs:
+        (kept if len(run.trajectory.states) >= max(records, 2) else left).append(run)
+    if not kept:
+        raise InputError(f"no recording has {what}.")
+    return kept, (*recordings.breaks, *(_too_short(run, what, recordings.dt) for run in left))
+
+
+def _from_step(first: int, run: Recording, states: Array, dt: float) -> Recording:
+    """Return a recording from a step on, with states in the place of its own."""
+    whole = run.trajectory
+    later = Trajectory(whole.times[: len(states)], states, whole.inputs[first:])
+    return replace(run, start=run.start + first * dt, trajectory=later)
+
+
+def _too_short(run: Recording, what: str, dt: float) -> Break:
+    return Break(run.source, run.start, run.trajectory.horizon * dt, "a part", f"is too short for {what}")
+
+
 @part(files=("runs",))
-class Recorded(ShortRepr):
+class Recorded:
     """Recorded executions of named tasks, such as those of a :class:`ctxval.TaskSuite`, as the true system.
 
     The execution of a task is the recording with its name; the controller is not asked. So a campaign sees what it

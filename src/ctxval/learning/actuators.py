@@ -20,7 +20,7 @@ from ctxval.core.task import Task
 from ctxval.learning.histories import History, Record, Structure
 from ctxval.learning.hyperparameters import FAMILIES, HyperparameterPosterior, Mode, learning_rows, log_posterior
 from ctxval.learning.residual_data import NEGLIGIBLE
-from ctxval.models.scaling import standard_deviations
+from ctxval.models.increments import standard_deviations
 
 _LONGEST = 6.0  # steps, of a delay and of a time constant
 _DELAYS, _LAGS = (0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0), (0.5, 1.0, 1.5, 2.0, 3.0, 4.0)

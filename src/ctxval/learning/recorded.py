@@ -14,7 +14,7 @@ from ctxval.core.model import Model
 from ctxval.core.trajectory import Trajectory, Transitions
 from ctxval.core.validation import Validation
 from ctxval.learning.histories import Record
-from ctxval.models.scaling import standard_deviations
+from ctxval.models.increments import standard_deviations
 
 _POOL = 3000  # largest number of transitions that these are chosen from
 

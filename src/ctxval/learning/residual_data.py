@@ -15,8 +15,8 @@ from ctxval._util.arrays import Array, Mask, Rows
 from ctxval.core.model import Model
 from ctxval.core.trajectory import Transitions
 from ctxval.learning.hyperparameters import FAMILIES, ResidualKernel, climbed, learning_rows
+from ctxval.models.increments import standard_deviations, standardised_pairs
 from ctxval.models.linear import Linear
-from ctxval.models.scaling import standard_deviations, standardised_pairs
 
 NEGLIGIBLE = 1e-7
 """A residual below this share of the state's typical change is rounding."""

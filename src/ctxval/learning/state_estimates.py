@@ -19,7 +19,7 @@ from ctxval.core.trajectory import Trajectory
 from ctxval.core.validation import Validation
 from ctxval.learning.prediction import Executed
 from ctxval.models.corrected import before_refinement
-from ctxval.models.scaling import standard_deviations
+from ctxval.models.increments import standard_deviations
 
 _SHARES = np.array([1.0, 1e-1, 1e-2, 1e-3, 1e-4])
 """What M misses in recorded directions, beside what it misses in all others, as shares of their steps."""

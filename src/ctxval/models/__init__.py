@@ -5,16 +5,13 @@ from __future__ import annotations
 from ctxval._util.registry import Registry
 from ctxval.core.model import Function, Model, linearize
 from ctxval.models.corrected import Corrected, Correction, Refined
-from ctxval.models.gaussian_process import GaussianProcessModel, SquaredExponential
+from ctxval.models.foreign_networks import Onnx, Torch
+from ctxval.models.increments import FeedforwardReLU, GaussianProcessModel, IncrementScaling, SquaredExponential
 from ctxval.models.linear import Linear, state_space
 from ctxval.models.mujoco import MuJoCo
-from ctxval.models.neural_network import FeedforwardReLU
-from ctxval.models.onnx import Onnx
 from ctxval.models.parametric import Expected, Parametric
 from ctxval.models.saved import read_model, read_refined, write_model, write_transitions
-from ctxval.models.scaling import IncrementScaling
 from ctxval.models.scikit_learn import ScikitLearn
-from ctxval.models.torch import Torch
 
 __all__ = [
     "REGISTRY",

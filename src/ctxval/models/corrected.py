@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from dataclasses import dataclass, fields, replace
+from dataclasses import KW_ONLY, dataclass, fields, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -13,7 +13,7 @@ from ctxval._util.representation import ShortRepr
 from ctxval.core.model import Model, linearize
 from ctxval.core.trajectory import Transitions
 from ctxval.errors import InputError, ShapeError
-from ctxval.models.scaling import standardised_pairs
+from ctxval.models.increments import standardised_pairs
 from ctxval.models.smooth_maps import SmoothMap, affine, kernel_sum, matern, total
 
 Linearised = Literal["corrected", "model"]  #: whose Jacobian controllers are designed with
@@ -96,28 +96,17 @@ class Correction(ShortRepr):
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
 
+@dataclass(frozen=True, eq=False)
 class Corrected(ShortRepr):
-    """The model ``M'(x, u) = M(x, u) + r(x, u)`` of a model M and a correction r.
+    """The model ``M'(x, u) = M(x, u) + r(x, u)`` of a model M and a correction r."""
 
-    Args:
-        linearised: ``"corrected"`` for the Jacobian of M', or ``"model"`` for that of M. The Jacobian of M' at one
-            point may say less of the tasks than a linear model that was fitted to all of them, for instance to LQR,
-            which linearises once.
-        data: the transitions that the correction was learned from, if any.
-    """
-
-    def __init__(
-        self,
-        model: Model,
-        correction: Correction,
-        *,
-        linearised: Linearised = "corrected",
-        data: Transitions | None = None,
-    ) -> None:
-        self.model = model
-        self.correction = correction
-        self.linearised = linearised
-        self.data = data
+    model: Model
+    correction: Correction
+    _: KW_ONLY
+    #: ``"corrected"`` for the Jacobian of M', or ``"model"`` for that of M. That of M' at one point may say less of the
+    #: tasks than a linear model that was fitted to all of them, for instance to LQR, which linearises once.
+    linearised: Linearised = "corrected"
+    data: Transitions | None = None  #: the transitions that the correction was learned from, if any
 
     def step(self, x: Array, u: Array) -> Array:
         return np.asarray(self.model.step(x, u) + self.correction(x, u))

@@ -9,13 +9,12 @@ import numpy as np
 from ctxval._util.arrays import Array, ArrayLike, as_finite, single_threaded
 from ctxval._util.checked import Seconds, require
 from ctxval._util.registry import part
-from ctxval._util.representation import ShortRepr
 from ctxval.core.trajectory import Transitions
 from ctxval.errors import InputError, ShapeError
 
 
 @part()
-class Linear(ShortRepr):
+class Linear:
     """The model ``x_next = A x + B u + c``.
 
     Args:

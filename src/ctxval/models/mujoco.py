@@ -14,7 +14,6 @@ from ctxval._util.checked import Seconds
 from ctxval._util.mjcf import compile_mjcf, is_mjcf_text
 from ctxval._util.refusals import require_extra
 from ctxval._util.registry import part
-from ctxval._util.representation import ShortRepr
 from ctxval.core.model import paired
 from ctxval.core.trajectory import Transitions
 from ctxval.errors import InputError, ShapeError
@@ -23,7 +22,7 @@ _SYSID = "params_x_hat.yaml"  #: A file that ``mujoco.sysid.save_results`` write
 
 
 @part(files=("mjcf",))
-class MuJoCo(ShortRepr):
+class MuJoCo:
     """An MJCF model as the model M. The state is ``(qpos, qvel)``, and the input is MuJoCo's ``ctrl``.
 
     A step is a function of state and input alone: it starts without activations and without a warm start of the

@@ -9,7 +9,6 @@ import numpy as np
 from ctxval._util.arrays import Array, as_finite
 from ctxval._util.checked import PositiveInt
 from ctxval._util.registry import part
-from ctxval._util.representation import ShortRepr
 from ctxval.core.model import Function
 from ctxval.core.trajectory import Transitions
 from ctxval.errors import InputError, ModelError
@@ -18,7 +17,7 @@ ParametricStep = Callable[[Array, Array, Array], Array]
 
 
 @part(functions={"step": "(x, u, theta) -> x_next"})
-class Parametric(ShortRepr):
+class Parametric:
     """A function ``(x, u, theta) -> x_next`` with the values of its parameters theta as a model.
 
     Args:
@@ -53,7 +52,7 @@ class Parametric(ShortRepr):
 
 
 @part(functions={"step": "(x, u, w) -> x_next"})
-class Expected(ShortRepr):
+class Expected:
     """The expected step of a model with noise, such as an ensemble or a network that returns a distribution.
 
     The expectation is an average over fixed draws w of standard normal noise and their opposites, the same in every

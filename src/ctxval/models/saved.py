@@ -18,13 +18,10 @@ from ctxval.core.model import Model
 from ctxval.core.trajectory import Transitions
 from ctxval.errors import InputError
 from ctxval.models.corrected import Corrected, Correction, Refined
-from ctxval.models.gaussian_process import GaussianProcessModel, SquaredExponential
+from ctxval.models.increments import FeedforwardReLU, GaussianProcessModel, IncrementScaling, SquaredExponential
 from ctxval.models.linear import Linear
-from ctxval.models.neural_network import FeedforwardReLU
-from ctxval.models.scaling import IncrementScaling
 
 _FORMAT = "ctxval model"
-_SCALING = ("shift_in", "scale_in", "shift_out", "scale_out")
 _DATA = ("x", "u", "x_next")
 _CORRECTED = "corrected_"  # before the names of the arrays of the model that a correction belongs to
 
@@ -142,7 +139,7 @@ def _plain_model(arrays: Archive, kind: str, data: Transitions | None, prefix: s
 
     if kind == "Linear":
         return Linear(numbers("A"), numbers("B"), numbers("c") if f"{prefix}c" in arrays else None, data)
-    scaling = IncrementScaling(*map(numbers, _SCALING))
+    scaling = IncrementScaling(*(numbers(field.name) for field in fields(IncrementScaling)))
     if kind == "FeedforwardReLU":
         layers = range(min(100, sum(name.startswith(f"{prefix}weights_") for name in arrays.names)))
         weights, biases = ([numbers(f"{name}_{i}") for i in layers] for name in ("weights", "biases"))
@@ -152,17 +149,14 @@ def _plain_model(arrays: Archive, kind: str, data: Transitions | None, prefix: s
 
 
 def _arrays(model: Model) -> dict[str, Any]:
-    arrays: dict[str, Any]
     match model:
         case Linear():
             return {name: getattr(model, name) for name in "ABc"}
         case FeedforwardReLU():
-            layers = {f"weights_{i}": weight for i, weight in enumerate(model.weights)}
-            arrays = layers | {f"biases_{i}": bias for i, bias in enumerate(model.biases)}
+            layers = {"weights": model.weights, "biases": model.biases}
+            named = {f"{name}_{i}": array for name, arrays in layers.items() for i, array in enumerate(arrays)}
+            return vars(model.scaling) | named
         case GaussianProcessModel():
-            covariance = {"variance": model.covariance.variance, "length_scales": model.covariance.length_scales}
-            arrays = {**covariance, "centres": model.centres, "weights": model.weights}
-        case _:
-            known = "linear models, networks, Gaussian processes and corrections"
-            raise InputError(f"only {known} can be written, got {model!r}.")
-    return {name: getattr(model.scaling, name) for name in _SCALING} | arrays
+            return vars(model.scaling) | vars(model.covariance) | {"centres": model.centres, "weights": model.weights}
+    known = "linear models, networks, Gaussian processes and corrections"
+    raise InputError(f"only {known} can be written, got {model!r}.")

@@ -10,17 +10,16 @@ import numpy as np
 
 from ctxval._util.arrays import Array, Mask, rows_of
 from ctxval._util.registry import part
-from ctxval._util.representation import ShortRepr
 from ctxval.core.model import central_differences, paired
 from ctxval.core.trajectory import Transitions
 from ctxval.errors import InputError, ShapeError
 from ctxval.models import smooth_maps as maps
-from ctxval.models.scaling import require_finite
+from ctxval.models.increments import require_finite
 from ctxval.models.smooth_maps import Kernel, Slope, Slopes, SmoothMap
 
 
 @part()
-class ScikitLearn(ShortRepr):
+class ScikitLearn:
     """A fitted scikit-learn regressor as a model: a pipeline, a forest, ridge regression, a Gaussian process.
 
     Its features are the state, then the input. Networks, Gaussian processes, kernel ridge regression, linear models,

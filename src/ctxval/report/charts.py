@@ -186,7 +186,6 @@ class Chart(ShortRepr):
         return self
 
     def _named(self, label: str, *shapes: Markup) -> None:
-        """Add a label with the shapes of its swatch to the legend."""
         if label:
             self._legend[label] = joined(shapes)
 

@@ -29,7 +29,7 @@ from ctxval.core.validation import Validation
 from ctxval.errors import InputError
 from ctxval.learning.replays import Replay, replay_executed
 from ctxval.report.distance_model import DistanceModel, distance_of
-from ctxval.report.findings import DIAGNOSTICS, Finding, not_tested
+from ctxval.report.findings import DIAGNOSTICS, Finding, findings_of, not_tested
 from ctxval.report.insights import INSIGHTS
 
 
@@ -220,12 +220,12 @@ class ReportContext(ShortRepr):
     @functools.cached_property
     def diagnostics(self) -> list[Finding]:
         """What would speak against the verdict."""
-        return [finding for ask in DIAGNOSTICS if (finding := ask(self)) is not None]
+        return findings_of(self, DIAGNOSTICS)
 
     @functools.cached_property
     def insights(self) -> list[Finding]:
         """What the trials show of M, of the controllers and of the tasks."""
-        return [finding for ask in INSIGHTS if (finding := ask(self)) is not None]
+        return findings_of(self, INSIGHTS)
 
     @functools.cached_property
     def not_tested(self) -> list[str]:

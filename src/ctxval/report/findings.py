@@ -5,8 +5,7 @@ The diagnostics are those that would speak against the verdict; ``report/insight
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
@@ -48,34 +47,28 @@ class Finding(ShortRepr):
 
 
 Answer = tuple[Light, str, dict[str, Any]]
-Question = Callable[["ReportContext"], Finding | None]
+"""The light, the text and the numbers of a finding."""
+
+Question = Callable[["ReportContext"], Answer | None]
 """A function that looks for one thing; it returns None if there is nothing to say."""
 
 
-def asks(name: str) -> Callable[[Callable[[ReportContext], Answer | None]], Question]:
-    """Make a question of a function that returns the light, the text and the numbers of a finding.
-
-    A question that fails is a finding that is not known, because one about odd data must not hide the other answers.
-    """
-
-    def decorate(answer: Callable[[ReportContext], Answer | None]) -> Question:
-        @functools.wraps(answer)
-        def question(context: ReportContext) -> Finding | None:
-            try:
-                answered = answer(context)
-            except Exception as error:
-                return Finding(name, "unknown", f"This could not be computed: {reason_of(error)}.")
-            return None if answered is None else Finding(name, *answered)
-
-        return question
-
-    return decorate
+def findings_of(context: ReportContext, questions: Mapping[str, Question]) -> list[Finding]:
+    """Return what questions find. One that fails is not known, because odd data must not hide the other answers."""
+    findings = list[Finding]()
+    for name, question in questions.items():
+        try:
+            answer = question(context)
+        except Exception as error:
+            answer = "unknown", f"This could not be computed: {reason_of(error)}.", {}
+        if answer is not None:
+            findings.append(Finding(name, *answer))
+    return findings
 
 
 # Diagnostics
 
 
-@asks("Executions")
 def executions(context: ReportContext) -> Answer | None:
     """Whether executions have no distance, or are open."""
     states = ("failed", "unmeasured", "open")
@@ -91,7 +84,6 @@ def executions(context: ReportContext) -> Answer | None:
     return None if context.executions else ("unknown", "Nothing was executed.", numbers)
 
 
-@asks("Certificate")
 def certificate_stands(context: ReportContext) -> Answer | None:
     """Whether the certificate is refused or withdrawn."""
     verdict, certificate = context.verdict, context.certificate
@@ -112,7 +104,6 @@ def _rests_on_distances(context: ReportContext) -> bool:
     return certificate.kind != "dynamics" or certificate.doubt is not None
 
 
-@asks("Tasks covered")
 def tasks_covered(context: ReportContext) -> Answer | None:
     """How far tasks are from every trial."""
     if context.suite is not None:
@@ -138,7 +129,6 @@ def share_far_from_trials(points: Array) -> float:
     return float(np.mean(gaps / np.sqrt(d) > RESOLUTION))
 
 
-@asks("Search converged")
 def search_converged(context: ReportContext) -> Answer | None:
     """Whether many executions followed without a larger distance."""
     distances = context.distances
@@ -154,7 +144,6 @@ def search_converged(context: ReportContext) -> Answer | None:
     return "good" if good else "attention", text, {"last": last + 1, "after": quiet}
 
 
-@asks("Distance is smooth over the tasks")
 def smooth(context: ReportContext) -> Answer | None:
     """Whether a Gaussian process predicts each distance from the others."""
     model = context.distance_model
@@ -177,7 +166,6 @@ def stored_predictions(context: ReportContext) -> list[tuple[Trial, ExecutionPre
     return [(trial, prediction) for trial, prediction in read if prediction is not None]
 
 
-@asks("Predictions made beforehand")
 def predictions_held(context: ReportContext) -> Answer | None:
     """Whether executions came out as they had been predicted."""
     predicted = stored_predictions(context)
@@ -193,7 +181,6 @@ def predictions_held(context: ReportContext) -> Answer | None:
     return "good" if held == len(predicted) else "attention", text, {"made": len(predicted), "held": held}
 
 
-@asks("States and inputs covered")
 def states_covered(context: ReportContext) -> Answer | None:
     """How far the closed loops leave the recorded states and inputs."""
     certificate = context.certificate
@@ -207,9 +194,15 @@ def states_covered(context: ReportContext) -> Answer | None:
     return "good" if certificate.doubt is None else "attention", text, {"beyond": beyond, "gap": gap}
 
 
-DIAGNOSTICS = (
-    executions, certificate_stands, tasks_covered, search_converged, smooth, predictions_held, states_covered,
-)  # fmt: skip
+DIAGNOSTICS: dict[str, Question] = {
+    "Executions": executions,
+    "Certificate": certificate_stands,
+    "Tasks covered": tasks_covered,
+    "Search converged": search_converged,
+    "Distance is smooth over the tasks": smooth,
+    "Predictions made beforehand": predictions_held,
+    "States and inputs covered": states_covered,
+}
 
 
 def not_tested(context: ReportContext) -> list[str]:

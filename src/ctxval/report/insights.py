@@ -12,7 +12,7 @@ from ctxval._util.texts import enumerated
 from ctxval.certificates.bounds import state_of
 from ctxval.core import soundness
 from ctxval.core.distance import ComposedDistance
-from ctxval.report.findings import Answer, asks
+from ctxval.report.findings import Answer, Question
 from ctxval.report.markup import number, percent, quantity
 
 if TYPE_CHECKING:
@@ -21,7 +21,6 @@ if TYPE_CHECKING:
 _WORST = 5  # number of trials with the largest distances that the insights on closed loops look at
 
 
-@asks("Where M is weak")
 def weak_region(context: ReportContext) -> Answer | None:
     """Where the distance exceeds the threshold, executed and predicted."""
     tau, units = context.threshold, context.labels.units
@@ -57,7 +56,6 @@ def region_text(context: ReportContext, points: Array) -> str:
     return f"most of them have {' and '.join(parts)}" if parts else "they are spread over the task space"
 
 
-@asks("States visited there")
 def weak_states(context: ReportContext) -> Answer | None:
     """Which states and inputs the system visits where M is weak, and not elsewhere."""
     if len(context.recordings) < 4:
@@ -84,7 +82,6 @@ def weak_states(context: ReportContext) -> Answer | None:
     return "note", text, numbers
 
 
-@asks("Bias across the tasks")
 def bias(context: ReportContext) -> Answer | None:
     """How the distance of a typical task compares with the largest one, and whether S errs to one side of M."""
     model = context.distance_model
@@ -112,7 +109,6 @@ def bias(context: ReportContext) -> Answer | None:
     return "note", text, numbers
 
 
-@asks("Corrected model")
 def explained(context: ReportContext) -> Answer | None:
     """Whether the corrected model, learned from the other trials, predicts the distance."""
     if context.validation is None:
@@ -142,7 +138,6 @@ def explained(context: ReportContext) -> Answer | None:
     return "good" if share >= 0.8 else "attention", text, numbers
 
 
-@asks("What errs, and when")
 def components(context: ReportContext) -> Answer | None:
     """Which states err in the worst trials, and when their errors peak."""
     if not context.recordings:
@@ -182,7 +177,6 @@ def _shares(context: ReportContext, worst: list[TrajectoryPair]) -> dict[str, fl
     return {name: float(size) for name, size in zip(names, sizes / sizes.sum(), strict=True)}
 
 
-@asks("Controllers of neighbouring tasks")
 def flips(context: ReportContext) -> Answer | None:
     """Whether the controllers of neighbouring tasks differ abruptly."""
     if len(context.recordings) < 2:
@@ -202,7 +196,6 @@ def flips(context: ReportContext) -> Answer | None:
     return "attention", text, values
 
 
-@asks("Motion of M")
 def unusual_motion(context: ReportContext) -> Answer | None:
     """Whether M itself makes an unusual motion in the worst trials, such as turning over."""
     if len(context.recordings) < 4:
@@ -224,7 +217,6 @@ def unusual_motion(context: ReportContext) -> Answer | None:
     return "attention", text, values
 
 
-@asks("Inputs and their limits")
 def saturation(context: ReportContext) -> Answer | None:
     """Whether inputs stay at their limits."""
     synthesizer = None if context.validation is None else context.validation.synthesizer
@@ -240,7 +232,6 @@ def saturation(context: ReportContext) -> Answer | None:
     return "attention", text, values
 
 
-@asks("Design of the controllers")
 def converged(context: ReportContext) -> Answer | None:
     """Whether the designs of the controllers converged, and whether controllers jump."""
     if context.designs is None:
@@ -248,7 +239,6 @@ def converged(context: ReportContext) -> Answer | None:
     return "attention", f"{context.designs[0].upper()}{context.designs[1:]}.", {}
 
 
-@asks("Goals of M")
 def goals(context: ReportContext) -> Answer | None:
     """Whether M itself reaches its goals under the controllers that are designed on it."""
     if context.validation is None:
@@ -271,12 +261,21 @@ def goals(context: ReportContext) -> Answer | None:
     return "attention", text, values
 
 
-@asks("Why M fails")
 def cause(context: ReportContext) -> Answer | None:
     """What M lacks, if ``ctxval why`` has found it in the present trials."""
     return ("note", context.cause, {}) if context.cause else None
 
 
-INSIGHTS = (
-    cause, weak_region, weak_states, components, flips, saturation, converged, unusual_motion, goals, bias, explained,
-)  # fmt: skip
+INSIGHTS: dict[str, Question] = {
+    "Why M fails": cause,
+    "Where M is weak": weak_region,
+    "States visited there": weak_states,
+    "What errs, and when": components,
+    "Controllers of neighbouring tasks": flips,
+    "Inputs and their limits": saturation,
+    "Design of the controllers": converged,
+    "Motion of M": unusual_motion,
+    "Goals of M": goals,
+    "Bias across the tasks": bias,
+    "Corrected model": explained,
+}

@@ -16,8 +16,6 @@ from ctxval.report.markup import bar, bullets, details, joined, number, paragrap
 from ctxval.report.page import framed, now
 from ctxval.studies.replay import PredictedTask, PredictedTasks, ReplayReport, StepError
 
-__all__ = ["replay_page", "write_replay_page"]
-
 _CHARTED = 12  # largest number of states and inputs with charts of their own
 
 
@@ -166,7 +164,6 @@ def _named(name: str, unit: str) -> str:
 
 
 def _error_chart(errors: Sequence[StepError]) -> Chart:
-    """Return the root mean square error of one state over the number of steps, with the spread over recordings."""
     steps = np.array([float(error.steps) for error in errors])
     rms, low, high, change = (
         np.array([getattr(error, k) for error in errors]) for k in ("rms", "lowest", "highest", "change")
@@ -182,7 +179,6 @@ def _error_chart(errors: Sequence[StepError]) -> Chart:
 
 
 def _region_chart(report: ReplayReport, name: str) -> Chart:
-    """Return the error in the ranges of one state or input, as steps."""
     parts = [region for region in report.regions if region.variable == name]
     across = np.repeat([parts[0].low, *(region.high for region in parts)], 2)[1:-1]
     up = np.repeat([region.ratio for region in parts], 2)

@@ -16,8 +16,7 @@ from ctxval.report.context import ReportContext
 from ctxval.report.distance_model import distance_of
 from ctxval.report.findings import WORDS, Finding
 from ctxval.report.markup import UNCUT, number, quantity
-from ctxval.report.sections.appendix import appendix
-from ctxval.report.sections.repeat import command_snippet, identity, python_snippet, repeating_command
+from ctxval.report.sections.repeat import appendix, command_snippet, identity, python_snippet, repeating_command
 
 
 def to_json(context: ReportContext) -> dict[str, Any]:

@@ -6,10 +6,8 @@ from ctxval._util.registry import Registry
 from ctxval.core.system import Simulated, System, WithOutputs
 from ctxval.data.recordings import Recorded
 from ctxval.systems.fmu import FMU
-from ctxval.systems.function import Function, Manual
+from ctxval.systems.functions import Function, Imperfect, Manual, rk4
 from ctxval.systems.gymnasium import Gymnasium
-from ctxval.systems.imperfect import Imperfect
-from ctxval.systems.integrate import rk4
 from ctxval.systems.mujoco import MuJoCo
 from ctxval.systems.subprocess import Subprocess
 

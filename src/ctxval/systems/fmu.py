@@ -19,15 +19,14 @@ from typing import Any
 import numpy as np
 
 from ctxval._util.arrays import Array
-from ctxval._util.checked import Seconds
+from ctxval._util.checked import Seconds, require_known
 from ctxval._util.files import require_regular_file
 from ctxval._util.refusals import require_extra, reworded
 from ctxval._util.registry import part
-from ctxval._util.representation import ShortRepr
 from ctxval.core.controller import Controller
 from ctxval.core.task import Task
 from ctxval.core.trajectory import COMPLETE, Trajectory
-from ctxval.errors import ExecutionError, InputError, UnknownNameError
+from ctxval.errors import ExecutionError, InputError
 from ctxval.systems.episode import require_one, require_started, run_episode
 from ctxval.systems.subprocess import signal_name
 
@@ -35,7 +34,7 @@ _PROGRAM = Path(__file__).with_name("fmu_process.py")
 
 
 @part(runs_code=True, files=("path",))
-class FMU(ShortRepr):
+class FMU:
     """An FMU for co-simulation, FMI 2 or 3, as the true system.
 
     Every execution has its own instance: parameters and the initial state are set as start values, inputs are held
@@ -78,11 +77,9 @@ class FMU(ShortRepr):
         weakref.finalize(self, _clean, self._idle, self._unpacked, os.getpid())
         self._digest = hashlib.sha256(self.path.read_bytes()).hexdigest()[:16]
         known = {variable.name: variable for variable in self._description.modelVariables}
-        for foreign in sorted(set(self.start) - set(self.states)):
-            raise UnknownNameError.among("state", foreign, self.states)
-        for name in (*self.states, *self.inputs, *self.start.values(), *self.parameters):
-            if name not in known:
-                raise UnknownNameError.among("variable of the FMU", name, known)
+        require_known("state", self.start, self.states)
+        named = (*self.states, *self.inputs, *self.start.values(), *self.parameters)
+        require_known("variable of the FMU", named, known)
         start = [self.start[name] for name in self.states]
         _references(known, start)
         references = {"states": _references(known, self.states), "inputs": _references(known, self.inputs)}

@@ -95,7 +95,6 @@ class Unit:
             return None, f"the FMU failed ({error})"
 
     def free(self) -> None:
-        """End the simulation."""
         fmu, self.fmu = self.fmu, None
         if fmu is None:
             return

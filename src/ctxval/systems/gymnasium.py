@@ -15,19 +15,15 @@ from ctxval._util.checked import Must, NonNegativeInt, Seconds, require
 from ctxval._util.mjcf import warning_of
 from ctxval._util.refusals import require_extra, reworded
 from ctxval._util.registry import part
-from ctxval._util.representation import ShortRepr
 from ctxval.core.controller import Controller
 from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory
 from ctxval.errors import InputError, ShapeError
 from ctxval.systems.episode import require_one, require_started, run_episode
 
-StateGetter = Callable[[Any], Any]
-StateSetter = Callable[[Any, Array], None]
-
 
 @part(runs_code=True, functions={"get_state": "environment -> x", "set_state": "(environment, x)"})
-class Gymnasium(ShortRepr):
+class Gymnasium:
     """A gymnasium environment with continuous actions as the true system.
 
     An execution resets the environment with its seed, sets the task's initial state and runs the closed loop. The state
@@ -55,8 +51,8 @@ class Gymnasium(ShortRepr):
         self,
         environment: Any,
         *,
-        get_state: StateGetter | None = None,
-        set_state: StateSetter | None = None,
+        get_state: Callable[[Any], Any] | None = None,
+        set_state: Callable[[Any, Array], None] | None = None,
         dt: Seconds | None = None,
         seed: NonNegativeInt | None = 0,
         ignore_termination: bool = False,

@@ -10,19 +10,18 @@ from typing import Any
 import numpy as np
 
 from ctxval._util.arrays import Array, ArrayLike, Mask, Rows, as_finite, require_shape
-from ctxval._util.checked import PositiveInt
+from ctxval._util.checked import PositiveInt, require_known
 from ctxval._util.mjcf import compile_mjcf, warning_of
 from ctxval._util.registry import part
-from ctxval._util.representation import ShortRepr
 from ctxval.core.controller import Controller
 from ctxval.core.rollout import rollout
 from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory
-from ctxval.errors import InputError, ShapeError, UnknownNameError
+from ctxval.errors import InputError, ShapeError
 
 
 @part(files=("mjcf",))
-class MuJoCo(ShortRepr):
+class MuJoCo:
     """An MJCF model as the true system, with feedback, for whole batches of closed loops at once.
 
     The state is ``(qpos, qvel)``, followed by the selected coordinates of each selected site. An execution starts from
@@ -83,7 +82,10 @@ class MuJoCo(ShortRepr):
         if not np.isclose(task.dt, self.dt, rtol=1e-9, atol=0):
             wanted = f"{self._model.opt.timestep:g} s x {self.substeps} = {self.dt:g} s"
             raise InputError(f"the task's dt must be the model's timestep times substeps, {wanted}, got {task.dt:g} s.")
+        from mujoco import mjtStage
+
         simulations, steps, failure = self._started(task), 0, ""
+        stage = int(mjtStage.mjSTAGE_POS if self.sites else mjtStage.mjSTAGE_NONE)  # whether sites are located
         ctrl, healthy = simulations.ctrl, np.ones(len(simulations.qpos), dtype=bool)
 
         def mark(failed: Mask, reason: str) -> None:
@@ -100,8 +102,9 @@ class MuJoCo(ShortRepr):
             steps += 1
             mark(np.asarray(~np.isfinite(inputs).all(axis=1)), "an input is not finite")
             ctrl[healthy] = inputs[healthy]
-            simulations.advance(self.substeps, healthy, locate=bool(self.sites))
-            warned: Mask = np.asarray(simulations.warnings > 0)
+            ids = None if healthy.all() else np.flatnonzero(healthy)
+            simulations.batch.step(ids, self.substeps, stage)
+            warned: Mask = np.asarray(simulations.batch.warning[:, :, 1] > 0)
             if warned.any():
                 mark(np.asarray(warned.any(axis=1)), f"MuJoCo warned of {warning_of(warned.any(axis=0))}")
             states = self._observed(simulations)
@@ -139,25 +142,16 @@ class _Batch:
     """Simulations of one model: qpos ``(N, nq)``, qvel ``(N, nv)``, ctrl ``(N, nu)``, sites ``(N, nsite, 3)``."""
 
     def __init__(self, model: Any, count: int, threads: int) -> None:
-        from mujoco import mjtStage
         from mujoco.batch import Batch
 
         self.batch = Batch(model, count, threads)
-        self.located, self.moved = int(mjtStage.mjSTAGE_POS), int(mjtStage.mjSTAGE_NONE)
         self.qpos, self.qvel, self.ctrl = (self.batch.bind(name) for name in ("qpos", "qvel", "ctrl"))
         self.site_positions: Array = self.batch.bind("site_xpos")
 
-    @property
-    def warnings(self) -> Rows:
-        counts: Rows = self.batch.warning[:, :, 1]
-        return counts
-
     def locate(self) -> None:
-        self.batch.forward(stage=self.located)
+        from mujoco import mjtStage
 
-    def advance(self, substeps: int, rows: Mask, *, locate: bool) -> None:
-        ids = None if rows.all() else np.flatnonzero(rows)
-        self.batch.step(ids, substeps, self.located if locate else self.moved)
+        self.batch.forward(stage=int(mjtStage.mjSTAGE_POS))
 
 
 def _coordinates(model: Any, sites: Sequence[str], axes: str) -> tuple[Rows, ...]:
@@ -165,8 +159,6 @@ def _coordinates(model: Any, sites: Sequence[str], axes: str) -> tuple[Rows, ...
     if not axes or not set(axes) <= set("xyz"):
         raise InputError(f"axes must be letters of 'xyz', got {axes!r}.")
     known = [model.site(i).name for i in range(model.nsite)]
-    for site in sites:
-        if site not in known:
-            raise UnknownNameError.among("site", site, known)
+    require_known("site", sites, known)
     rows = np.array([known.index(site) for site in sites], dtype=np.intp)
     return np.ix_(rows, np.array(["xyz".index(axis) for axis in axes], dtype=np.intp))

@@ -25,7 +25,6 @@ from ctxval._util.checked import TimeLimit
 from ctxval._util.files import temporary_folder
 from ctxval._util.refusals import reworded
 from ctxval._util.registry import part
-from ctxval._util.representation import ShortRepr
 from ctxval.core.controller import Controller
 from ctxval.core.exchange import write_controller, write_task
 from ctxval.core.labels import require_names
@@ -116,7 +115,7 @@ def _end(supervisor: subprocess.Popen[bytes], child: int) -> None:
 
 
 @part(runs_code=True, folder="folder")
-class Subprocess(ShortRepr):
+class Subprocess:
     """A command that executes one task, as the true system.
 
     Every execution has a new folder with ``task.json`` and the controller as ``controller.json`` and
@@ -183,22 +182,20 @@ class Subprocess(ShortRepr):
             for kind in ("json", "npz"):
                 path = folder / f"controller.{kind}"
                 write_controller(path, controller, dt=task.dt, states=self.states, inputs=self.inputs)
-            self._run(folder)
-            return _trajectory(folder, task)
-
-    def _run(self, folder: Path) -> None:
-        home = self._home if self._home.is_dir() else None  # on another machine the folder may not exist
-        # Output goes to files, because a grandchild that keeps a pipe open would make us wait for it.
-        with (folder / "stdout.txt").open("wb") as stdout, (folder / "stderr.txt").open("w+b") as stderr:
-            status = run_supervised([*self._located, str(folder)], home, stdout, stderr, self.timeout)
+            home = self._home if self._home.is_dir() else None  # on another machine the folder may not exist
+            # Output goes to files, because a grandchild that keeps a pipe open would make us wait for it.
+            with (folder / "stdout.txt").open("wb") as stdout, (folder / "stderr.txt").open("w+b") as stderr:
+                status = run_supervised([*self._located, str(folder)], home, stdout, stderr, self.timeout)
+                # The file is not opened again, because its name may now stand for another file.
+                stderr.seek(max(0, stderr.seek(0, os.SEEK_END) - 4096))
+                lines = stderr.read().decode("utf-8", "replace").splitlines() if status else []
             if status is None:
                 raise ExecutionError(f"the command did not end within {self.timeout:g} s and was killed")
             if status:
                 how = f"was ended by {signal_name(-status)}" if status < 0 else f"ended with status {status}"
-                # The file is not opened again, because its name may now stand for another file.
-                stderr.seek(max(0, stderr.seek(0, os.SEEK_END) - 4096))
-                lines = [line.strip() for line in stderr.read().decode("utf-8", "replace").splitlines() if line.strip()]
-                raise ExecutionError(f"the command {how}: {lines[-1][:300] if lines else 'nothing on stderr'}")
+                last = next((line.strip()[:300] for line in reversed(lines) if line.strip()), "nothing on stderr")
+                raise ExecutionError(f"the command {how}: {last}")
+            return _trajectory(folder, task)
 
 
 def signal_name(number: int) -> str:

@@ -1,14 +1,18 @@
-"""The operator's page as an ASGI application."""
+"""The operator's page as an ASGI application, and its forms; what cannot be read is refused in one sentence."""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
 import io
+import math
 import tempfile
 import zipfile
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
+from pathlib import Path
+from typing import TypeVar
 
+import numpy as np
 from python_multipart.exceptions import FormParserError
 from starlette.applications import Starlette
 from starlette.datastructures import UploadFile
@@ -18,9 +22,13 @@ from starlette.responses import HTMLResponse, RedirectResponse, Response, Stream
 from starlette.routing import BaseRoute, Mount, Route
 from starlette.staticfiles import StaticFiles
 
+from ctxval._util.checked import NonNegativeFloat, require
 from ctxval._util.texts import shortened, visible
+from ctxval.campaign.telling import SuppliedResult
+from ctxval.core.space import TaskSpace
+from ctxval.core.task_suite import TASK, TaskSuite
 from ctxval.errors import CampaignError, CtxvalError, InputError, StoreError
-from ctxval.web import forms
+from ctxval.web.jobs import TaskRequest
 from ctxval.web.page import Page, Problem
 from ctxval.web.security import Access, Guard, Hosts
 from ctxval.web.service import CampaignService
@@ -31,6 +39,10 @@ _OUT_OF_DATE = (
 )
 
 Handler = Callable[[Request, str], Awaitable[Response]]
+
+Number = TypeVar("Number", int, float)
+
+Fields = Mapping[str, str]  #: the fields of a form that are texts
 
 
 class PageRoutes:
@@ -101,8 +113,8 @@ class PageRoutes:
         page = self.page.campaign(
             self.access.form_token(session),
             problem=problem,
-            told=_number(request.query_params.get("told", "")),
-            replaced=request.path_params["number"] if replaces else _number(request.query_params.get("replace", "")),
+            told=_count(request.query_params.get("told", "")),
+            replaced=request.path_params["number"] if replaces else _count(request.query_params.get("replace", "")),
             all_="all" in request.query_params,
         )
         return HTMLResponse(page, 200 if problem is None else problem.status)
@@ -144,7 +156,7 @@ class OperatorPage(PageRoutes):
             return await self._campaign(request, session, Problem("choose", _OUT_OF_DATE, fields, 403))
         status = 422
         try:
-            wanted = forms.task_request(fields, self.service.served.campaign.validation.space)
+            wanted = task_request(fields, self.service.served.campaign.validation.space)
             status = 409
             self.service.choose(wanted)
         except InputError as error:
@@ -179,11 +191,10 @@ class OperatorPage(PageRoutes):
         with tempfile.TemporaryDirectory(prefix="ctxval-") as folder:
             path = None
             if isinstance(upload, UploadFile) and upload.filename:
-                path = forms.recording_in(folder, upload.filename)
+                path = recording_in(folder, upload.filename)
                 path.write_bytes(await upload.read())
             try:
-                result = forms.result(kind, fields, path)
-                await self.service.tell(number, result, fields.get("submission", ""))
+                await self.service.tell(number, result(kind, fields, path), fields.get("submission", ""))
             except InputError as error:
                 # The operator knows the name of the file, not the folder in which it is read.
                 raise InputError(str(error).replace(f"{folder}/", "")) from error
@@ -210,7 +221,7 @@ class OperatorPage(PageRoutes):
         return Response(content, media_type="application/octet-stream", headers=headers)
 
 
-def _number(text: str) -> int | None:
+def _count(text: str) -> int | None:
     return int(text) if text.isdecimal() and len(text) < 10 else None
 
 
@@ -222,6 +233,74 @@ async def _form(request: Request, **limits: int) -> AsyncIterator[tuple[dict[str
             yield {name: value for name, value in form.items() if isinstance(value, str)}, form.get("file")
     except FormParserError as error:
         raise HTTPException(400, "it is damaged") from error
+
+
+# Forms
+
+
+def task_request(fields: Fields, space: TaskSpace) -> TaskRequest:
+    seen = _read(fields, "seen", "the number of trials on the page must be a whole number", int)
+    match fields.get("how"):
+        case "next":
+            return TaskRequest(trials=seen)
+        case "decides":
+            return TaskRequest(decides=True, trials=seen)
+        case "draw":
+            return TaskRequest(draw=True, trials=seen)
+        case "own" if isinstance(space, TaskSuite):
+            named = {TASK: fields.get(TASK, "")}
+            space.point(named)
+            return TaskRequest(named, trials=seen)
+        case "own":
+            names = zip(space.names, range(space.dimension), strict=True)
+            point = np.array([_number(fields, f"parameter-{place}", name) for name, place in names])
+            parameters = space.describe_point(point)
+            space.point(parameters)
+            return TaskRequest(parameters, trials=seen)
+        case "again":
+            number = _read(fields, "trial", "the trial must be a whole number", int)
+            return TaskRequest(again=number, because=fields.get("because", "").strip() or None, trials=seen)
+    raise InputError("choose how the next task is to be found.")
+
+
+def result(kind: str, fields: Fields, recording: Path | None) -> SuppliedResult:
+    replace = fields.get("replace")
+    if kind == "failure":
+        reason = fields.get("reason", "").strip()
+        if not reason:
+            raise InputError('a failure needs a reason, such as "the motor cut out".')
+        return SuppliedResult(failed=reason, replace=replace)
+    if kind == "distance":
+        return SuppliedResult(distance=_number(fields, "distance", "the distance"), replace=replace)
+    if recording is None:
+        raise InputError("choose the file of the recording.")
+    tolerance = _number(fields, "tolerance", "the start tolerance") if fields.get("tolerance", "").strip() else None
+    require("the start tolerance", NonNegativeFloat | None, tolerance)
+    resample = "resample" in fields
+    failed = fields.get("reason", "").strip() or None
+    return SuppliedResult(
+        recording, failed=failed, resample=resample, start_tolerance=tolerance, replace=replace, uploaded=True
+    )
+
+
+def _number(fields: Fields, field: str, name: str) -> float:
+    return _read(fields, field, f"{name} must be a number", float)
+
+
+def _read(fields: Fields, field: str, sentence: str, kind: Callable[[str], Number]) -> Number:
+    given = fields.get(field, "").strip()
+    with contextlib.suppress(ValueError, OverflowError):  # a whole number may be too large for a float
+        value = kind(given)
+        if math.isfinite(value):
+            return value
+    raise InputError(f"{sentence}, got {given[:60]!r}.")
+
+
+def recording_in(folder: str, name: str) -> Path:
+    """Return the path for an uploaded recording: its own name without anything that is not plain."""
+    base = name.replace("\\", "/").rpartition("/")[2]
+    plain = "".join(letter if letter.isalnum() or letter in "._- " else "_" for letter in base)[-80:].lstrip(".")
+    return Path(folder) / (plain or "recording.csv")
 
 
 def application(state: PageState, access: Access, hosts: Hosts) -> Guard:

@@ -81,7 +81,6 @@ class ServedCampaign:
 
     @property
     def decides(self) -> bool:
-        """Whether executions can be chosen that decide the verdict."""
         with suppress(InputError):
             require_decisive(self.certificate)
             return self.threshold is not None
@@ -184,21 +183,18 @@ def pictures_of(served: ServedCampaign) -> Pictures:
     import matplotlib
     from matplotlib.figure import Figure
 
-    def distance() -> Figure:
-        figure = Figure(figsize=(6.4, 4.2), layout="constrained")
-        overview(served.campaign, threshold=served.threshold, ax=figure.add_subplot())
-        return figure
-
-    def worst() -> Figure:
-        return worst_trajectories(served.campaign)
-
     pictures: Pictures = {}
-    for name, figure in (("distance", distance), ("worst", worst)) if served.campaign.worst else ():
+    for name in ("distance", "worst") if served.campaign.worst else ():
         # Names of parameters may contain a $, which is not mathematics; a stated id makes equal pictures equal files.
         try:
             with matplotlib.rc_context({"text.parse_math": False, "svg.hashsalt": "ctxval"}):
+                if name == "worst":
+                    figure = worst_trajectories(served.campaign)
+                else:
+                    figure = Figure(figsize=(6.4, 4.2), layout="constrained")
+                    overview(served.campaign, threshold=served.threshold, ax=figure.add_subplot())
                 content = io.BytesIO()
-                figure().savefig(content, format="svg", metadata={"Date": None})
+                figure.savefig(content, format="svg", metadata={"Date": None})
             pictures[name] = content.getvalue()
         except Exception as error:  # a picture must not hide the verdict
             pictures[name] = reason_of(error)

@@ -94,7 +94,6 @@ class Page:
         )
 
     def render(self, name: str, **values: Any) -> str:
-        """Return the page of a template: the campaign, ``enter.html`` or ``message.html``."""
         return self._templates.get_template(name).render(**values)
 
     def _open_trial(self, trial: Trial) -> dict[str, Any]:
@@ -179,7 +178,6 @@ def text(value: object, longest: int = 400) -> str:
 
 
 def values_of(parameters: Mapping[str, Any], units: Mapping[str, str]) -> list[tuple[str, str]]:
-    """Return the names of task parameters, and their values with units."""
     return [
         (line(name, 80), f"{_value(value)} {line(units.get(name, ''), 40)}".rstrip())
         for name, value in parameters.items()
@@ -196,5 +194,4 @@ def _value(value: Any) -> str:
 
 
 def in_words(trial: Trial, units: Mapping[str, str]) -> str:
-    """Return the task of a trial in one line."""
     return ", ".join(f"{name} = {value}" for name, value in values_of(trial.parameters, units))

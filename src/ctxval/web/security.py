@@ -19,7 +19,6 @@ from starlette.requests import ClientDisconnect, HTTPConnection
 from starlette.responses import HTMLResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from ctxval._util.representation import call
 from ctxval.errors import InputError
 
 MOST_UPLOAD = 64 * 2**20  #: largest size of a recording in bytes
@@ -58,7 +57,6 @@ class Access:
         return self._token is not None and _same(self._token, token)
 
     def new_session(self) -> tuple[str, str]:
-        """Return the name and the cookie of a new session."""
         name = secrets.token_urlsafe(18)
         return name, f"{name}.{self._signed('session', name)}"
 
@@ -75,9 +73,6 @@ class Access:
 
     def _signed(self, purpose: str, text: str) -> str:
         return hmac.new(self._key, f"{purpose}:{text}".encode("utf-8", "replace"), hashlib.sha256).hexdigest()
-
-    def __repr__(self) -> str:
-        return call(self, needs_token=self.needs_token)  # neither the key nor the token
 
 
 def _same(known: str, given: str) -> bool:

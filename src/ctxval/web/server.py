@@ -97,7 +97,7 @@ class Server(uvicorn.Server):
 
     def end(self) -> None:
         """End the server; any thread may call this."""
-        self._state.end_from_elsewhere()
+        self._state.post(self._state.end_events)
         self.should_exit = True
 
 

@@ -5,16 +5,17 @@ from __future__ import annotations
 import asyncio
 import concurrent.futures as cf
 import contextlib
+import functools
 import multiprocessing
 import os
 import signal
 import sys
 import threading
-from collections import OrderedDict
 from collections.abc import Callable
 from multiprocessing.connection import Connection
 from typing import Any, TypeVar
 
+from ctxval._util.latest import Latest
 from ctxval._util.progress import Listener, listening, stage
 from ctxval._util.texts import reason_of
 from ctxval.campaign.by_hand import tell_result
@@ -44,10 +45,12 @@ class CampaignService(PageState):
             self._thread.shutdown()
             raise
         self._preparing: dict[int, asyncio.Task[None]] = {}
-        self._submitted: OrderedDict[str, int] = OrderedDict()
+        self._submitted = Latest[str, int](1_000)  # forms that are remembered, to recognise one that is sent twice
         self._telling = asyncio.Lock()
-        self._chooser = BackgroundProcess(reopen, self._follow_progress("choosing"))
-        self._judge = BackgroundProcess(reopen, self._follow_progress("judging"))
+        self._chooser, self._judge = (
+            BackgroundProcess(reopen, functools.partial(self.post, self._progressed, kind))
+            for kind in ("choosing", "judging")
+        )
 
     async def start(self) -> None:
         await super().start()
@@ -94,8 +97,6 @@ class CampaignService(PageState):
                 finally:
                     await self._look()
                 self._submitted[submission] = number
-                if len(self._submitted) > 1_000:  # forms that are remembered, to recognise one that is sent twice
-                    self._submitted.popitem(last=False)
             return self.snapshot.trials[number]
 
     async def files_of(self, number: int) -> Files:

@@ -7,10 +7,11 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import functools
 import json
 import threading
 import time
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -130,12 +131,11 @@ class PageState:
         finally:
             self.listeners -= 1
 
-    def end_from_elsewhere(self) -> None:
-        """Let all listeners end; any thread may call this."""
-        self._loop.call_soon_threadsafe(self.end_events)
+    def post(self, function: Callable[..., None], *arguments: Any) -> None:
+        """Call a function in the event loop of the server; any thread may call this."""
+        self._loop.call_soon_threadsafe(function, *arguments)
 
     def end_events(self) -> None:
-        """Let all listeners end, because the server stops."""
         self._closing = True
         self._notify()
 
@@ -147,14 +147,6 @@ class PageState:
     def _notify(self) -> None:
         changed, self._changed = self._changed, asyncio.Event()
         changed.set()
-
-    def _follow_progress(self, kind: str) -> Listener:
-        """Return a listener for another thread, which shows how far choosing or judging is."""
-
-        def hear(progress: Progress) -> None:
-            self._loop.call_soon_threadsafe(self._progressed, kind, progress)
-
-        return hear
 
     def _progressed(self, kind: str, progress: Progress) -> None:
         work: Work | None = getattr(self, kind)
@@ -181,7 +173,7 @@ class LiveCampaign(PageState):
     def __init__(self, served: ServedCampaign, search: IntervalSearch | None) -> None:
         super().__init__(served, Snapshot(served.campaign.trials))
         self._search = search
-        self.hear = Innermost(self._follow_progress("choosing"))
+        self.hear = Innermost(functools.partial(self.post, self._progressed, "choosing"))
         self._drawn = self._cost = 0.0
         self.started = threading.Event()
 
@@ -204,12 +196,12 @@ class LiveCampaign(PageState):
             changes["pictures"] = pictures_of(self.served)
             self._drawn = time.monotonic()
             self._cost = self._drawn - begun
-        self._post(changes)
+        self.post(lambda: self.update(**changes))
 
     def end(self, verdict: Verdict | None, certificate: Certificate | None, report: str | None) -> None:
         outcome = "the campaign has ended, and so will this page" + (f". The report is {report}" if report else "")
         shown = {"verdict": verdict, "certificate": certificate, "pictures": pictures_of(self.served)}
-        self._post({**shown, "choosing": None, "interval": None, "outcome": outcome})
+        self.post(lambda: self.update(**shown, choosing=None, interval=None, outcome=outcome))
 
     def wait_until_seen(self) -> None:
         """Give open pages time to load the last state: until one has, at most 5 s, and a moment for the others."""
@@ -218,9 +210,6 @@ class LiveCampaign(PageState):
             time.sleep(0.05)
         if self.listeners:
             time.sleep(0.5)
-
-    def _post(self, changes: dict[str, Any]) -> None:
-        self._loop.call_soon_threadsafe(lambda: self.update(**changes))
 
     # In the event loop of the server
 

@@ -248,7 +248,6 @@ def _executions(validation: Validation, plan: Plan, execute: bool) -> Findings:
 
 
 def _cost(validation: Validation, plans: Sequence[Plan]) -> Findings:
-    """State what designs, closed loops on M and a suggestion of ``auto`` cost in CPU time."""
     with stage("measuring what a suggestion costs"):
         thinking = ThinkingCosts.measured(validation, [plan.parameters.points for plan in plans[:3]])
     text = f"a design takes {thinking.design:.2g} s of CPU, a closed loop on the model {thinking.closed_loop:.2g} s"

@@ -12,12 +12,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
-from pydantic import ConfigDict, TypeAdapter, ValidationError
-from pydantic.errors import PydanticUserError
-from pydantic_core import SchemaError
-
 from ctxval import controllers, distances, models, systems
-from ctxval._util.checked import require
+from ctxval._util.checked import require, require_known
 from ctxval._util.files import Archive, read_bytes
 from ctxval._util.refusals import reworded
 from ctxval._util.registry import Declaration, Registry, construct, declaration_of
@@ -30,7 +26,7 @@ from ctxval.core.task_distribution import Normal
 from ctxval.core.trajectory import Transitions
 from ctxval.core.validation import Validation
 from ctxval.data import LogMapping, read_recordings
-from ctxval.errors import InputError, UnknownNameError
+from ctxval.errors import InputError
 from ctxval.models.saved import stored_transitions
 from ctxval.paper import cases
 
@@ -158,9 +154,7 @@ def task_function(given: str | Mapping[str, Any], space: TaskSpace, system: Any,
     """Return the map p -> task of an experiment file, from ``module:attr`` or from a table."""
     if isinstance(given, str):
         return require_function(f"the task {given}", reference(given, folder), "p -> Task")
-    for key in given:
-        if key not in TaskTable.__dataclass_fields__:
-            raise UnknownNameError.among("entry of [task]", key, TaskTable.__dataclass_fields__)
+    require_known("entry of [task]", given, TaskTable.__dataclass_fields__)
     table = {"goal": None, "dt": getattr(system, "dt", None), **given}
     missing = [key for key in ("initial_state", "horizon", "dt") if table.get(key) is None]
     if missing:
@@ -180,41 +174,12 @@ def task_function(given: str | Mapping[str, Any], space: TaskSpace, system: Any,
 def require_types(what: str, function: Any, options: Mapping[str, Any]) -> dict[str, Any]:
     """Return the options, with lists converted to tuples."""
     target = getattr(function, "__init__") if isinstance(function, type) else function  # noqa: B009
-    try:
-        hints = get_type_hints(target)
-    except (NameError, TypeError):
-        return dict(options)
-    return {name: _typed(f"{what}: {name}", hints.get(name, Any), value) for name, value in options.items()}
-
-
-def _typed(what: str, hint: Any, value: Any) -> Any:
-    try:
-        adapter = TypeAdapter(hint, config=ConfigDict(arbitrary_types_allowed=True))
-    except (PydanticUserError, SchemaError, TypeError):
-        # The annotation is a protocol, which no plain value fulfils.
-        if isinstance(value, str | int | float | list | dict):
-            raise InputError(
-                f"{what} must be an object in Python, written as {{ ref = 'module:attr' }}, got {value!r}."
-            ) from None
-        return value
-    given = tuple(value) if isinstance(value, list) else value
-    try:
-        return adapter.validate_python(given, strict=True)
-    except ValidationError as error:
-        raise InputError(f"{what}{refusal_of(error.errors()[0])}, got {value!r}.") from error
-
-
-def refusal_of(problem: Mapping[str, Any]) -> str:
-    """Return what follows the name of a value that pydantic refuses, such as `` must be a positive integer``."""
-    match problem:
-        case {"type": "greater_than_equal", "ctx": {"ge": 1}}:
-            return " must be a positive integer"
-        case {"type": "greater_than_equal", "ctx": {"ge": bound}}:
-            return f" must be at least {bound}"
-        case {"type": "greater_than", "ctx": {"gt": 0}}:
-            return " must be a positive number"
-    message = str(problem["msg"]).lower()
-    return message.replace("input should", " must", 1) if message.startswith("input should") else f": {message}"
+    hints = dict[str, Any]()
+    with suppress(NameError, TypeError):
+        hints = get_type_hints(target, include_extras=True)
+    given = {name: tuple(value) if isinstance(value, list) else value for name, value in options.items()}
+    with reworded(what, InputError):
+        return {name: require(name, hints.get(name, Any), value) for name, value in given.items()}
 
 
 def with_distribution(
@@ -239,8 +204,7 @@ def with_distribution(
         kind = given.pop("type", None)
         if kind == "uniform":
             continue
-        if kind != "normal":
-            raise UnknownNameError.among(f"distribution of {name}", str(kind), ("normal", "uniform"))
+        require_known(f"distribution of {name}", [str(kind)], ("normal", "uniform"))
         if given.keys() <= {"mean", "deviation"} and len(given) < 2:
             raise InputError(f"the normal distribution of {name} needs a mean and a deviation, got {given!r}.")
         stated[name] = construct(f"the distribution of {name}", Normal, given)

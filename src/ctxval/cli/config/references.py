@@ -62,11 +62,9 @@ def _require_place(text: str, module: str, home: str) -> None:
     """Check that a top-level module is found, and that no other module of this name is already loaded."""
     importlib.invalidate_caches()
     # None for a module without a file, such as a built-in one.
-    specs = (finder.find_spec(module, None) for finder in sys.meta_path)
-    spec = next((spec for spec in specs if spec is not None), None)
-    place = None
-    if spec is not None:
-        place = _place(spec.origin if spec.has_location else None, spec.submodule_search_locations)
+    spec = next(filter(None, (finder.find_spec(module, None) for finder in sys.meta_path)), None)
+    origin = spec.origin if spec is not None and spec.has_location else None
+    place = None if spec is None else _place(origin, spec.submodule_search_locations)
     beside = place is not None and os.path.dirname(place) in (home, os.path.join(home, module))
     if module in sys.stdlib_module_names and not beside:
         raise InputError(f"{text} is in Python's standard library, which contains no part of an experiment.")

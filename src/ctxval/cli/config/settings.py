@@ -10,9 +10,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, Field, ValidationError, model_validator
 from pydantic_core import PydanticCustomError
 
+from ctxval._util.checked import require_known
 from ctxval._util.files import read_toml
 from ctxval.campaign.campaign import Campaign
 from ctxval.campaign.interval_search import is_decisive
@@ -21,7 +22,7 @@ from ctxval.certificates import KINDS, RESOLUTION, CertificateOptions, require_u
 from ctxval.certificates.options import CONFIDENCE, LEAST_CONFIDENCE, MOST_VOLUME, WITHIN
 from ctxval.certificates.prediction_tests import TESTS
 from ctxval.cli.config import parts
-from ctxval.cli.config.parts import argument, part, refusal_of, require_types
+from ctxval.cli.config.parts import argument, part, require_types
 from ctxval.cli.config.references import reference, require_function
 from ctxval.cli.config.signatures import code_named, signed
 from ctxval.core.experiment import Experiment
@@ -43,13 +44,11 @@ from ctxval.studies.safety import judged_by
 Part = str | dict[str, Any]  #: ``module:attr``, or a table with a type and its arguments
 
 
-class CertificateTable(BaseModel):
+class CertificateTable(BaseModel, extra="allow"):
     """The table ``[certificate]``: the certificate for the verdict, chosen before the campaign is run.
 
     A kind of certificate from another package has its own options in the table.
     """
-
-    model_config = ConfigDict(extra="allow")
 
     kind: str = "auto"
     #: the share of the task space that may exceed the threshold
@@ -70,9 +69,7 @@ class CertificateTable(BaseModel):
         fields, extra = type(self).model_fields, self.model_extra or {}
         changed = {name for name, field in fields.items() if name != "kind" and getattr(self, name) != field.default}
         try:
-            for name in extra:
-                if name not in (names := {*fields, *KINDS[self.kind].options()}):
-                    raise UnknownNameError.among("setting", name, names)
+            require_known("setting", extra, {*fields, *KINDS[self.kind].options()})
             require_use(self.kind, sorted({*changed, *extra}))
             require_types(f"certificate {self.kind!r}", KINDS[self.kind], extra)
         except (CertificateError, InputError) as error:
@@ -92,10 +89,8 @@ class CertificateTable(BaseModel):
         return CertificateOptions(chosen.of(merged), confidence, merged["volume"])
 
 
-class SearchTable(BaseModel):
+class SearchTable(BaseModel, extra="allow"):
     """The table ``[search]``: the name of a search, and its options."""
-
-    model_config = ConfigDict(extra="allow")
 
     name: str = DEFAULT_SEARCH
     repeats: int = Field(default=1, ge=1)
@@ -106,28 +101,24 @@ class SearchTable(BaseModel):
         return by_name(self.name, repeats=self.repeats, **options)
 
 
-class Aspect1Table(BaseModel):
+class Aspect1Table(BaseModel, extra="forbid"):
     """The table ``[aspect1]``, which ``ctxval check --aspect1`` reads; a campaign does not use it.
 
     The distance tells how far a trajectory is from completing its task; by default it is derived from that of the
     experiment. The threshold is in the units of the goal.
     """
 
-    model_config = ConfigDict(extra="forbid")
-
     distance: Part | None = None
     threshold: float | None = Field(default=None, gt=0, allow_inf_nan=False, strict=True)
     tasks: int = Field(default=TASKS, ge=2)
 
 
-class SpecTable(BaseModel):
+class SpecTable(BaseModel, extra="allow"):
     """The table ``[spec]``: what a closed loop shall do, which ``ctxval safe`` judges.
 
     Its other entries are the arguments of the specification. The margin is the robustness of M that shall suffice for a
     task to be safe; None to find it.
     """
-
-    model_config = ConfigDict(extra="allow")
 
     type: str = "ReachAvoid"
     margin: float | None = Field(default=None, gt=0, allow_inf_nan=False, strict=True)
@@ -140,13 +131,11 @@ class SpecTable(BaseModel):
 _WHOLE = ("space", "task", "system", "model", "synthesizer")
 
 
-class Settings(BaseModel):
+class Settings(BaseModel, extra="forbid"):
     """The content of an experiment file, overridden by the options of the command line.
 
     Either ``experiment`` names the experiment, or ``name`` to ``units`` describe it completely.
     """
-
-    model_config = ConfigDict(extra="forbid")
 
     experiment: str | None = None
     options: dict[str, Any] = Field(default_factory=dict)
@@ -200,23 +189,20 @@ class Settings(BaseModel):
                 where = "write it at the top of the file, or give --seed"
                 raise InputError(f"[options] must not contain the seed: {where}.")
             experiment = parts.named_experiment(self.experiment, self.seed, self.options, self.folder)
-        validation = given = experiment.validation
+        validation = experiment.validation
+        stated: dict[str, Any] = {"longest": self.longest, "physical": self.physical}
+        changed = {name: value for name, value in stated.items() if value is not None}
         if self.refined is not None:  # a model that was learned from executions of the given one
             path = (self.folder or Path()) / self.refined
-            refined = read_refined(path, given.model)
+            refined = read_refined(path, validation.model)
             if refined.data is None:
                 raise InputError(f"{path} lacks the recorded steps that the model was learned from.")
-            validation = validation.with_model(Refined(refined, refined.data, given.model))
+            changed["model"] = Refined(refined, refined.data, validation.model)
             experiment = replace(experiment, truth=None)
-        if self.longest is not None:
-            validation = validation.with_parts(longest=self.longest)
-        if self.physical is not None:
-            validation = validation.with_parts(physical=self.physical)
         if self.distribution is not None:
-            validation = validation.with_space(
-                parts.with_distribution(validation.space, self.distribution, self.folder)
-            )
-        experiment = experiment if validation is given else replace(experiment, validation=validation)
+            changed["space"] = parts.with_distribution(validation.space, self.distribution, self.folder)
+        if changed:
+            experiment = replace(experiment, validation=validation.with_parts(**changed))
         if self.judge == "distance":
             return experiment
         if self.spec is None:
@@ -379,4 +365,11 @@ def sentence_of(source: str, error: ValidationError) -> str:
         return f"{source}{UnknownNameError.among('setting', str(first['loc'][-1]), Settings.model_fields)}"
     name, value = ".".join(map(str, first["loc"])), first["input"]
     shown = repr(value[:100]) if isinstance(value, str) else str(value)[:100]
-    return f"{source}{name}{refusal_of(first)}, got {shown}."
+    match first:
+        case {"type": "greater_than_equal", "ctx": {"ge": bound}}:
+            why = " must be a positive integer" if bound == 1 else f" must be at least {bound}"
+        case {"type": "greater_than", "ctx": {"gt": 0}}:
+            why = " must be a positive number"
+        case _:
+            why = f": {first['msg'].lower()}".replace(": input should", " must", 1)
+    return f"{source}{name}{why}, got {shown}."

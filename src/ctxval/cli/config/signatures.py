@@ -52,7 +52,6 @@ def signed(settings: Mapping[str, Any], before: Mapping[str, Any]) -> dict[str, 
 
 
 def verifies(settings: Mapping[str, Any]) -> bool:
-    """Return whether settings carry a valid signature of this user."""
     if signatures := _signatures(settings):
         with suppress(OSError):
             signature = _signature(_read_key(key_path()), settings)

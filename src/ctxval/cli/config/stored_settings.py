@@ -20,11 +20,10 @@ from ctxval.campaign.campaign import Campaign
 from ctxval.campaign.storage.other_stores import STORE_SUFFIXES
 from ctxval.campaign.storage.store import Store
 from ctxval.certificates import KINDS
+from ctxval.cli.base import Allowed, err
 from ctxval.cli.config.parts import REGISTRIES
 from ctxval.cli.config.settings import Settings, not_an_experiment, read_settings, sentence_of
 from ctxval.cli.config.signatures import code_named, unsigned, verifies, why_no_key
-from ctxval.cli.options import Allowed
-from ctxval.cli.screen import Screen
 from ctxval.core.experiment import Experiment
 from ctxval.errors import InputError
 
@@ -171,7 +170,7 @@ def open_store(path: Path, allowed: Allowed, *, remeasure: bool = False) -> Open
         does = "now carries your signature, and the question will not be asked again"
         if reason is not None:
             does = f"cannot carry your signature, and the question will be asked again: {reason}"
-        Screen(stderr=True).say(f"{path} {does}.")
+        err.say(f"{path} {does}.")
     return Opened(settings, experiment, campaign, path)
 
 

@@ -159,7 +159,6 @@ def _map(context: ReportContext, title: str, values: Array, label: str) -> Marku
 
 
 def _predicted(context: ReportContext, model: DistanceModel) -> Chart:
-    """Return predicted against executed distances, each predicted without its own execution."""
     band, label = model.left_out, context.distance_label
     replayed = {k: replay.distance for k, replay in context.replays.items() if np.isfinite(replay.distance)}
     # A wide interval would hide everything else.
@@ -322,6 +321,5 @@ def _trusted_tasks(context: ReportContext, known: Envelope) -> Chart:
 
 
 def _runs(mask: Mask) -> list[slice]:
-    """Return the runs of trusted points."""
     ends = np.flatnonzero(np.diff(mask, prepend=False, append=False)).tolist()
     return [slice(*pair) for pair in zip(ends[::2], ends[1::2], strict=True)]

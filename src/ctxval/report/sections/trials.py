@@ -73,7 +73,6 @@ def _row(trial: Trial, task: list[float | str], recorded: bool) -> Markup:
 
 
 def _worst(context: ReportContext) -> list[Markup]:
-    """Return the trajectories of the worst trials, drawn without a script."""
     worst = context.worst_tasks(recorded=True)
     if not worst:
         return [paragraph("No trajectories are recorded, so the worst tasks cannot be drawn.")]

@@ -24,8 +24,8 @@ from ctxval.learning.histories import History, Record, Structure
 from ctxval.learning.innovations import fit_lagged
 from ctxval.learning.residual_data import NEGLIGIBLE
 from ctxval.models import Corrected, Correction, FeedforwardReLU, GaussianProcessModel, Linear, Parametric
+from ctxval.models.increments import standard_deviations
 from ctxval.models.parametric import ParametricStep
-from ctxval.models.scaling import standard_deviations
 from ctxval.studies.causes import CauseReport, Repaired, evidence, find_causes
 from ctxval.studies.fitting import FittedParameter, fit_parameters
 from ctxval.studies.fitting.fit import as_bounds, learned_model
