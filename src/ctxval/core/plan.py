@@ -10,11 +10,12 @@ import numpy as np
 
 from ctxval._util.arrays import ArrayLike
 from ctxval._util.representation import ShortRepr
+from ctxval._util.texts import reason_of
 from ctxval.core.controller import Controller, started
 from ctxval.core.space import Parameters
 from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory, require_times
-from ctxval.errors import InputError, ShapeError
+from ctxval.errors import CtxvalError, DesignError, InputError, ShapeError
 
 if TYPE_CHECKING:
     from ctxval.core.validation import Validation
@@ -113,6 +114,10 @@ def gives_inputs(plan: Plan, trajectory: Trajectory, tolerance: float) -> bool:
         return False
 
 
+_REPEATABLE = 1e-3
+"""Largest difference of two closed loops with one controller on M, as a share of the magnitude of a state or input."""
+
+
 class DistanceWarning(UserWarning):
     """The distance between a trajectory and itself is not 0."""
 
@@ -131,6 +136,30 @@ def try_distance(validation: Validation, plan: Plan) -> None:
             DistanceWarning,
             stacklevel=2,
         )
+
+
+def require_repeatable(validation: Validation, plan: Plan) -> None:
+    """Refuse a controller or a model whose closed loop differs if it runs again: M and S would not see the same one.
+
+    A controller that remembers steps in itself goes on from the run on M when S is executed, and a difference that the
+    system does not have would be measured. Solvers that begin at their last solution differ by less than is permitted.
+    """
+    first = plan.model_trajectory
+    try:
+        again = validation.closed_loop(plan.controller, plan.task)
+    except CtxvalError:
+        raise
+    except Exception as error:
+        raise DesignError(f"the controller failed when it ran a second time: {reason_of(error)}.") from error
+    for kind, before, after in (("input", first.inputs, again.inputs), ("state", first.states, again.states)):
+        same = np.abs(after - before) <= _REPEATABLE * np.abs(before).max(axis=0, initial=0.0)
+        if not same.all():
+            t, i = np.argwhere(~same)[0]
+            raise DesignError(
+                f"the closed loop on the model must be the same if it runs again, and {kind} {i} at step {t} is "
+                f"{after[t, i]:.4g}, was {before[t, i]:.4g}: the controller or the model remembers the first run, or "
+                "is random. Keep the memory of a controller in `start` and `step`, or begin it anew at step 0."
+            )
 
 
 @dataclass(frozen=True)
