@@ -33,7 +33,7 @@ from ctxval.certificates.envelope import Envelope
 from ctxval.certificates.expiry import WatchState
 from ctxval.certificates.options import CONFIDENCE, WITHIN
 from ctxval.core.distance import Distance
-from ctxval.core.plan import StartOffset, start_offset
+from ctxval.core.plan import StartOffset, input_difference, start_offset
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import Trial
 from ctxval.core.validation import Validation
@@ -154,6 +154,15 @@ class Campaign:
         executed = self.store.trajectories([trial.number], "system").get(trial.number)
         point = self.validation.space.point(trial.parameters)
         return None if executed is None else start_offset(self.validation, point, executed)
+
+    def input_difference(self, trial: Trial) -> str | None:
+        """Return where the recorded inputs of a trial are not those of its controller at the recorded states.
+
+        It is a hint that the recording is of another run, or begins at another moment than the controller. Returns None
+        if they agree up to a third, or if nothing was recorded.
+        """
+        executed = self.store.trajectories([trial.number], "system").get(trial.number)
+        return None if executed is None else input_difference(self.validation, self.recorder.plan(trial), executed)
 
     # Running
 

@@ -114,6 +114,33 @@ def gives_inputs(plan: Plan, trajectory: Trajectory, tolerance: float) -> bool:
         return False
 
 
+def input_difference(validation: Validation, plan: Plan, trajectory: Trajectory) -> str | None:
+    """Return where recorded inputs are not those that the controller of the plan gives at the recorded states.
+
+    Returns None if they differ by at most a third, as the root mean square of each input over the steps: sensors,
+    clocks and drives make such differences, and a recording of another run makes larger ones. It is also None if the
+    controller cannot be run along these states.
+    """
+    states, inputs = trajectory.states, trajectory.inputs
+    try:
+        with np.errstate(all="ignore"):
+            pi = started(plan.controller, plan.task)
+            given = np.array([np.asarray(pi(t, states[t]), dtype=np.float64) for t in range(len(inputs))])
+            gaps = np.abs(given - inputs)
+    except Exception:  # the user's controller, at states that it never reached by itself
+        return None
+    sizes = np.sqrt(np.maximum(np.mean(given**2, axis=0), np.mean(inputs**2, axis=0)))
+    apart = np.sqrt(np.mean(gaps**2, axis=0)) > np.maximum(_AGREEING * sizes, 1e-9)
+    if not apart.any():
+        return None
+    t, i = np.unravel_index(np.argmax(np.where(apart, gaps / np.maximum(sizes, 1e-300), -1.0)), gaps.shape)
+    name, unit = list(validation.names(states.shape[-1], inputs.shape[-1])[1].items())[i]
+    return f"{name} is {inputs[t, i]:.3g} {unit}".rstrip() + f" at {trajectory.times[t]:.3g} s, not {given[t, i]:.3g}"
+
+
+_AGREEING = 1 / 3
+"""Largest root mean square of the difference between recorded inputs and those of the controller that is no remark."""
+
 _REPEATABLE = 1e-3
 """Largest difference of two closed loops with one controller on M, as a share of the magnitude of a state or input."""
 
