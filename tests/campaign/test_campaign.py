@@ -151,10 +151,17 @@ def test_a_failure_is_told_with_what_was_recorded_before(validation: Validation)
     assert (ended.state, ended.failure, ended.distance) == ("failed", "it was stopped", None)
     recorded = campaign.store.trajectory(0, "system")
     assert np.array_equal(recorded.states, states[:8])
+    assert recorded.ended == "it was stopped"
     assert campaign.remeasure(distances.MaximumDeviation()) == []
     opened = campaign.ask()
-    with pytest.raises(InputError, match="recording of the failed execution has no step of this task"):
-        campaign.tell(opened, Trajectory(whole.times, whole.states + 9.0, whole.inputs), failed="it was stopped")
+    for unusable, why in (
+        (Trajectory(whole.times, whole.states + 9.0, whole.inputs), "starts elsewhere"),
+        (Trajectory(0.1 * whole.times, whole.states, whole.inputs), "must have steps of 0.02 s"),
+        (Trajectory(whole.times, np.where(whole.times[:, None] > 0, np.nan, whole.states), whole.inputs), "not finite"),
+        (Trajectory(whole.times, whole.states[:, :1], whole.inputs), "2 states and 1 inputs, got 1 and 1"),
+    ):
+        with pytest.raises(InputError, match=f"failed execution has no step of this task: .*{why}"):
+            campaign.tell(opened, unusable, failed="it was stopped")
 
 
 def test_failures_do_not_change_what_a_resumed_campaign_chooses(validation: Validation, tmp_path: Path) -> None:

@@ -106,10 +106,11 @@ class Execution:
         """
         if self.failed is not None and self.trajectory is not None:
             tolerance = validation.start_tolerance if start_tolerance is None else start_tolerance
-            recorded = recorded_before_failure(plan, self.trajectory, tolerance)
-            if recorded is None:
-                raise InputError("the recording of the failed execution has no step of this task.")
-            return replace(self, trajectory=recorded)
+            try:
+                recorded = recorded_before_failure(plan, self.trajectory, tolerance)
+            except InputError as error:
+                raise InputError(f"the recording of the failed execution has no step of this task: {error}") from error
+            return replace(self, trajectory=replace(recorded, ended=text_of(self.failed)))
         if self.failed is not None or self.distance is not None:
             return self
         measurement = validation.accept(plan, self.trajectory, start_tolerance)

@@ -174,7 +174,9 @@ class ExecutionLoop:
             execution = execution.measured(self.recorder.validation, opened.plan)
         except (ExecutionError, InputError) as error:
             validation = self.recorder.validation
-            recorded = recorded_before_failure(opened.plan, execution.trajectory, validation.start_tolerance)
+            recorded = None
+            with suppress(InputError):
+                recorded = recorded_before_failure(opened.plan, execution.trajectory, validation.start_tolerance)
             execution = Execution(recorded, failed=str(error), seconds=execution.seconds)
         if execution.failed is not None:
             self.failures[opened.number] += 1

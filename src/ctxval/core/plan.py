@@ -74,23 +74,21 @@ def require_execution(plan: Plan, trajectory: Trajectory, start_tolerance: float
         )
 
 
-def recorded_before_failure(plan: Plan, trajectory: object, start_tolerance: float) -> Trajectory | None:
-    """Return the steps of a plan that were recorded before its execution failed; None if there are none."""
+def recorded_before_failure(plan: Plan, trajectory: object, start_tolerance: float) -> Trajectory:
+    """Return the steps of a plan that were recorded before its execution failed; refuse what has none of them."""
     expected = plan.model_trajectory
-    widths = expected.states.shape[-1], expected.inputs.shape[-1]
-    if not isinstance(trajectory, Trajectory) or trajectory.batch_shape:
-        return None
-    if (trajectory.states.shape[-1], trajectory.inputs.shape[-1]) != widths:
-        return None
+    if not isinstance(trajectory, Trajectory):
+        raise InputError("nothing was recorded.")
+    shapes = [(run.states.ndim, run.states.shape[-1], run.inputs.shape[-1]) for run in (trajectory, expected)]
+    if shapes[0] != shapes[1]:
+        _, states, inputs = shapes[1]
+        raise ShapeError(f"it must have {states} states and {inputs} inputs, got {shapes[0][1]} and {shapes[0][2]}.")
     unknown = ~np.isfinite(np.concatenate([trajectory.states[1:], trajectory.inputs], axis=1)).all(axis=1)
     steps = min([trajectory.horizon, expected.horizon, *np.flatnonzero(unknown)[:1].tolist()])
     if not steps:
-        return None
+        raise InputError("its first step is not finite.")
     recorded = trajectory.first(steps)
-    try:
-        require_execution(replace(plan, model_trajectory=expected.first(steps)), recorded, start_tolerance)
-    except InputError:
-        return None  # it is a recording of another task
+    require_execution(replace(plan, model_trajectory=expected.first(steps)), recorded, start_tolerance)
     return recorded
 
 
