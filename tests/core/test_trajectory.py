@@ -328,7 +328,7 @@ def test_a_gap_and_times_that_do_not_increase_are_not_resampled_over() -> None:
     few, after = np.delete(rows, slice(50, 60)), np.delete(rows, slice(210, 290))
     for kept in (rows, few, after):
         np.testing.assert_allclose(recorded(kept).resampled(wanted).states[:, 0], np.sin(wanted), atol=2e-3)
-    with pytest.raises(InputError, match=r"nothing was recorded for 1\.01 s from 0\.49 s on, which is more than 3 steps"):
+    with pytest.raises(InputError, match=r"nothing was recorded for 1\.01 s from 0\.49 s on"):
         recorded(np.delete(rows, slice(50, 150))).resampled(wanted)
     with pytest.raises(InputError, match=r"the times must increase, and record 8 is at 0\.07 s after 0\.07 s"):
         recorded(np.insert(rows, 8, 7)).resampled(wanted)
