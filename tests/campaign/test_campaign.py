@@ -311,6 +311,9 @@ def test_a_store_of_another_experiment_is_refused(validation: Validation, tmp_pa
         Campaign(longer, store=tmp_path / "a.sqlite")
     with pytest.raises(StoreMismatchError, match="seed was 0 and is now 1"):
         Campaign(validation, store=tmp_path / "a.sqlite", seed=1)
+    Campaign(validation, name="rig", store=tmp_path / "b.sqlite")
+    with pytest.raises(StoreMismatchError, match="give the campaign the name 'rig', or use another store"):
+        Campaign(validation, store=tmp_path / "b.sqlite")
     assert Campaign(validation, store=tmp_path / "a.sqlite").executions == 2
 
 
