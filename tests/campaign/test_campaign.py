@@ -164,6 +164,33 @@ def test_a_failure_is_told_with_what_was_recorded_before(validation: Validation)
             campaign.tell(opened, unusable, failed="it was stopped")
 
 
+def test_tasks_of_failed_executions_are_executed_again_first(validation: Validation) -> None:
+    class Fuse:
+        blown = True
+
+        def execute(self, controller: Any, task: Task) -> Trajectory:
+            if self.blown and task.goal[0] > 0:
+                raise RuntimeError("no current")
+            return validation.system.execute(controller, task)
+
+    fuse = Fuse()
+    campaign = Campaign(validation.with_system(fuse), search=searches.Random(), seed=1).run(6)
+    failed = [trial.parameters for trial in campaign.failed]
+    assert 0 < len(failed) < 6
+    with pytest.raises(InputError, match="again needs a reason"):
+        campaign.run(8, again=" ")
+    fuse.blown = False
+    campaign.run(7 + len(failed), again="fuse replaced")
+    repeated = campaign.trials[6 : 6 + len(failed)]
+    assert [trial.parameters for trial in repeated] == failed
+    assert {(trial.state, trial.because, trial.origin) for trial in repeated} == {
+        ("completed", "fuse replaced", "manual")
+    }
+    assert campaign.trials[-1].because is None
+    assert len(campaign.run(8 + len(failed), again="fuse replaced").trials) == 8 + len(failed)
+    assert campaign.trials[-1].because is None  # nothing is left to repeat
+
+
 def test_failures_do_not_change_what_a_resumed_campaign_chooses(validation: Validation, tmp_path: Path) -> None:
     def campaign(store: Path | None, done: int) -> Campaign:
         faults = {k - done: "raise" for k in (1, 6) if k >= done}

@@ -32,6 +32,7 @@ from ctxval.certificates import RESOLUTION, Certificate, CertificateOptions, Pro
 from ctxval.certificates.envelope import Envelope
 from ctxval.certificates.expiry import WatchState
 from ctxval.certificates.options import CONFIDENCE, WITHIN
+from ctxval.certificates.sample import executions_of
 from ctxval.core.distance import Distance
 from ctxval.core.plan import StartOffset, input_difference, start_offset
 from ctxval.core.trajectory import Trajectory
@@ -180,6 +181,7 @@ class Campaign:
         resolution: float = RESOLUTION,
         certificate: CertificateOptions | None = None,
         until: Callable[[Campaign], bool] | None = None,
+        again: str | None = None,
         workers: PositiveInt | None = None,
         executor: Executor | None = None,
         timeout: Seconds | None = None,
@@ -214,6 +216,8 @@ class Campaign:
                 kind of the certificate must be ``auto``, ``dynamics``, ``posterior`` or, with an acceptable volume,
                 ``anytime``.
             until: called before each execution; the campaign stops early if it returns True.
+            again: the change that was made to the system since executions failed, such as "fuse replaced": their tasks
+                are executed again first, and certificates list the reason.
             workers: number of processes, each with its own copy of the system; with an executor, the number of
                 executions that it has at a time.
             executor: an executor that replaces these processes: one of ``concurrent.futures``, or any object whose
@@ -238,8 +242,20 @@ class Campaign:
             raise InputError("an envelope needs a threshold, and a campaign that does not explore.")
         enlarges = EnvelopeSearch(decides) if envelope and decides is not None else None
         by_search = Choice(planned_draws=budget if until is None else 0)
+        if again is not None:
+            if not again.strip():
+                raise InputError('again needs a reason, such as "fuse replaced".')
+            self.refresh()
+        failed = [] if again is None else [each for each in self.failed if each.executed]
+        # Each task once, and none that has succeeded since.
+        lost = list(
+            {each.unit_point.tobytes(): each for each in failed if not executions_of(each, self.trials)}.values()
+        )
 
         def rule() -> Choice | None:
+            if lost and not (until is not None and until(self)):
+                repeated = lost.pop(0)
+                return Choice(repeated.unit_point, "manual", again, parameters=repeated.parameters)
             if not self.recorder.has_tasks or (until is not None and until(self)):
                 return None
             if decides is None:
