@@ -54,7 +54,7 @@ def falsified(
         )
     return (
         f"trial {worst.number} has the distance {quantities.of(distance)}, which exceeds {quantities.of(limit)}, "
-        f"in the task {quantities.task(worst)}{reproduced}{noise}."
+        f"in the task {quantities.task(worst).removeprefix('task ')}{reproduced}{noise}."  # of a suite: its name
     )
 
 
