@@ -128,7 +128,8 @@ def input_difference(validation: Validation, plan: Plan, trajectory: Trajectory)
     except Exception:  # the user's controller, at states that it never reached by itself
         return None
     sizes = np.sqrt(np.maximum(np.mean(given**2, axis=0), np.mean(inputs**2, axis=0)))
-    apart = np.sqrt(np.mean(gaps**2, axis=0)) > np.maximum(_AGREEING * sizes, 1e-9 * np.abs(given).max())  # rounding is no difference
+    least = 1e-9 * np.abs(given).max(initial=0.0)  # rounding is no difference
+    apart = np.sqrt(np.mean(gaps**2, axis=0)) > np.maximum(_AGREEING * sizes, least)
     if not apart.any():
         return None
     t, i = np.unravel_index(np.argmax(np.where(apart, gaps / np.maximum(sizes, 1e-300), -1.0)), gaps.shape)
