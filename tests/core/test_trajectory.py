@@ -330,5 +330,11 @@ def test_a_gap_and_times_that_do_not_increase_are_not_resampled_over() -> None:
         np.testing.assert_allclose(recorded(kept).resampled(wanted).states[:, 0], np.sin(wanted), atol=2e-3)
     with pytest.raises(InputError, match=r"nothing was recorded for 1\.01 s from 0\.49 s on"):
         recorded(np.delete(rows, slice(50, 150))).resampled(wanted)
+    for twice in (8, 1, len(rows)):
+        again = recorded(np.insert(rows, twice, rows[twice - 1])).resampled(wanted)
+        np.testing.assert_array_equal(again.states, recorded(rows).resampled(wanted).states)
+        np.testing.assert_array_equal(again.inputs, recorded(rows).resampled(wanted).inputs)
+    contradicting = recorded(np.insert(rows, 8, 7))
+    contradicting.states[8] += 0.1
     with pytest.raises(InputError, match=r"the times must increase, and record 8 is at 0\.07 s after 0\.07 s"):
-        recorded(np.insert(rows, 8, 7)).resampled(wanted)
+        contradicting.resampled(wanted)

@@ -224,10 +224,17 @@ class Trajectory:
         """Return one recorded trajectory at other times ``(H + 1,)``, in seconds after its first time, from 0.
 
         States are interpolated linearly. Inputs, which hold until the next sample, are averaged over the steps.
+        A record that is there twice counts once.
         """
-        recorded, wanted, steps = self.times - self.times[0], as_floats("times", times), np.diff(self.times)
         if self.batch_shape:
             raise InputError("only a single trajectory can be resampled.")
+        recorded, wanted, steps = self.times - self.times[0], as_floats("times", times), np.diff(self.times)
+        repeated = (steps == 0) & (np.diff(self.states, axis=0) == 0).all(axis=-1)
+        repeated[:-1] &= (np.diff(self.inputs, axis=0) == 0).all(axis=-1)
+        if repeated.any():  # loggers write records twice
+            kept = np.append(True, ~repeated)
+            inputs = self.inputs[kept[:-1]][: int(kept.sum()) - 1]
+            return Trajectory(self.times[kept], self.states[kept], inputs, self.ended).resampled(wanted)
         if not (steps > 0).all():
             row = int(np.argmin(steps > 0)) + 1
             before, after = self.times[row - 1 : row + 1]
