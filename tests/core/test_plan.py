@@ -76,6 +76,14 @@ def test_a_model_that_is_random_costs_nothing() -> None:
     assert campaign.trials == ()
 
 
+def test_a_task_function_that_is_random_costs_nothing() -> None:
+    rng, plain = np.random.default_rng(0), make_validation().task
+    campaign = Campaign(make_validation().with_parts(task=lambda p: plain(p).starting_at(rng.normal(size=2))))
+    with pytest.raises(InputError, match="must make the same task of the same parameters, and it made two"):
+        campaign.run(1)
+    assert campaign.trials == ()
+
+
 def test_a_distance_that_works_in_place_does_not_change_what_is_stored() -> None:
     def in_place(model: Any, system: Any, task: Task) -> Any:
         system.states[...] -= model.states

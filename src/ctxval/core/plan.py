@@ -165,12 +165,19 @@ def try_distance(validation: Validation, plan: Plan) -> None:
 
 
 def require_repeatable(validation: Validation, plan: Plan) -> None:
-    """Refuse a controller or a model whose closed loop differs if it runs again: M and S would not see the same one.
+    """Refuse a task that differs if it is made again, and a closed loop on M that differs if it runs again.
 
     A controller that remembers steps in itself goes on from the run on M when S is executed, and a difference that the
     system does not have would be measured. Solvers that begin at their last solution differ by less than is permitted.
     """
-    first = plan.model_trajectory
+    task, first = validation.task_at(plan.parameters), plan.model_trajectory
+    if any(
+        not np.array_equal(getattr(task, name), getattr(plan.task, name)) for name in ("initial_state", "reference")
+    ):
+        raise InputError(
+            "the task function must make the same task of the same parameters, and it made two: it is random, or it "
+            "depends on more than the parameters."
+        )
     try:
         again = validation.closed_loop(plan.controller, plan.task)
     except CtxvalError:
@@ -184,7 +191,8 @@ def require_repeatable(validation: Validation, plan: Plan) -> None:
             raise DesignError(
                 f"the closed loop on the model must be the same if it runs again, and {kind} {i} at step {t} is "
                 f"{after[t, i]:.4g}, was {before[t, i]:.4g}: the controller or the model remembers the first run, or "
-                "is random. Keep the memory of a controller in `start` and `step`, or begin it anew at step 0."
+                "is random. Keep the memory of a controller in `start` and `step`, or begin it anew at step 0, with a fixed "
+                "seed if it draws numbers."
             )
 
 
