@@ -84,7 +84,7 @@ class CauseReport(ShortRepr):
     #: whether M predicts the executions from where they began, and not from where their tasks begin
     began_elsewhere: bool = False
     #: the largest distance from M with the first causes if its loops begin where the tasks begin; None if states are
-    #: estimated, or if no cause is in the dynamics
+    #: estimated, if no cause is in the dynamics, or if a loop fails
     from_tasks: float | None = None
     separating: Separating | None = None  #: the task that tells causes apart which these executions do not
     ranked: tuple[Explanation, ...] = ()  #: the most probable causes alone, the best one first
