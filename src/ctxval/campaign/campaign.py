@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import replace as replaced
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -38,7 +39,7 @@ from ctxval.core.plan import StartOffset, input_difference, start_offset
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import Trial
 from ctxval.core.validation import Validation
-from ctxval.errors import CertificateError, InputError
+from ctxval.errors import CertificateError, CtxvalError, InputError
 from ctxval.gp.surrogate import Surrogate, fit_surrogate
 from ctxval.searches import Auto, Search
 
@@ -163,7 +164,10 @@ class Campaign:
         if they agree up to a third, or if nothing was recorded.
         """
         executed = self.store.trajectories([trial.number], "system").get(trial.number)
-        return None if executed is None else input_difference(self.validation, self.recorder.plan(trial), executed)
+        if executed is not None:
+            with suppress(CtxvalError):  # the result is stored, whether or not its controller can be designed again
+                return input_difference(self.validation, self.recorder.plan(trial), executed)
+        return None
 
     # Running
 
