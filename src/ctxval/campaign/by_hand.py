@@ -228,7 +228,8 @@ def result_sentence(trial: Trial, units: str = "", start: StartOffset | None = N
     if inputs is not None:
         sentence += (
             f"; its inputs are not those of the controller at the recorded states ({inputs}): check that it is a "
-            "recording of this trial that begins when the controller does (`ctxval tell --replace` corrects it)"
+            "recording of this trial in the units of the experiment, and begins when the controller does (`ctxval tell "
+            "--replace` corrects it)"
         )
     return sentence
 
