@@ -16,7 +16,7 @@ import numpy as np
 from ctxval._util.arrays import Array
 from ctxval._util.representation import ShortRepr
 from ctxval.certificates import Certificate, CertificateKind, Sample
-from ctxval.core.controller import Controller, ControllerWithMemory, Synthesizer, converged_of, each_alone
+from ctxval.core.controller import Controller, Synthesizer, converged_of, each_alone
 from ctxval.core.distance import Distance
 from ctxval.core.model import Model, central_differences, linearize
 from ctxval.core.rollout import rollout
@@ -98,8 +98,8 @@ def check_system(
 def check_synthesizer(synthesizer: Synthesizer, task: Task, model: Model) -> None:
     """Check that a synthesizer designs the same controller for a batch of tasks ``(N,)`` as task by task.
 
-    If the controllers have the attribute ``converged``, it must be a boolean of each task, the same in a batch. If they
-    have memory, each run must repeat itself.
+    If the controllers have the attribute ``converged``, it must be a boolean of each task, the same in a batch. Each
+    run must repeat itself.
     """
     singles, converged = [], []
     for index in range(task.batch_shape[0]):
@@ -108,10 +108,9 @@ def check_synthesizer(synthesizer: Synthesizer, task: Task, model: Model) -> Non
             converged.append(converged_of(controller))
             singles.append(rollout(model.step, controller, task[index]))
             _require(bool(singles[-1].finite), f"the closed loop on the model is not finite for task {index}")
-            if isinstance(controller, ControllerWithMemory):
-                again = rollout(model.step, controller, task[index])
-                run = "the closed loop of a second run"
-                _require_close(run, again.states, "that of the first", singles[-1].states, _TOLERANCE)
+            again = rollout(model.step, controller, task[index])
+            run = "the closed loop of a second run"
+            _require_close(run, again.states, "that of the first", singles[-1].states, _TOLERANCE)
     if getattr(synthesizer, "batched", False):
         controller = synthesizer.design(task, model)
         with _conforming():

@@ -151,10 +151,44 @@ def test_a_failure_is_told_with_what_was_recorded_before(validation: Validation)
     assert (ended.state, ended.failure, ended.distance) == ("failed", "it was stopped", None)
     recorded = campaign.store.trajectory(0, "system")
     assert np.array_equal(recorded.states, states[:8])
+    assert recorded.ended == "it was stopped"
     assert campaign.remeasure(distances.MaximumDeviation()) == []
     opened = campaign.ask()
-    with pytest.raises(InputError, match="recording of the failed execution has no step of this task"):
-        campaign.tell(opened, Trajectory(whole.times, whole.states + 9.0, whole.inputs), failed="it was stopped")
+    for unusable, why in (
+        (Trajectory(whole.times, whole.states + 9.0, whole.inputs), "starts elsewhere"),
+        (Trajectory(0.1 * whole.times, whole.states, whole.inputs), "must have steps of 0.02 s"),
+        (Trajectory(whole.times, np.where(whole.times[:, None] > 0, np.nan, whole.states), whole.inputs), "not finite"),
+        (Trajectory(whole.times, whole.states[:, :1], whole.inputs), "2 states and 1 inputs, got 1 and 1"),
+    ):
+        with pytest.raises(InputError, match=f"failed execution has no step of this task: .*{why}"):
+            campaign.tell(opened, unusable, failed="it was stopped")
+
+
+def test_tasks_of_failed_executions_are_executed_again_first(validation: Validation) -> None:
+    class Fuse:
+        blown = True
+
+        def execute(self, controller: Any, task: Task) -> Trajectory:
+            if self.blown and task.goal[0] > 0:
+                raise RuntimeError("no current")
+            return validation.system.execute(controller, task)
+
+    fuse = Fuse()
+    campaign = Campaign(validation.with_system(fuse), search=searches.Random(), seed=1).run(6)
+    failed = [trial.parameters for trial in campaign.failed]
+    assert 0 < len(failed) < 6
+    with pytest.raises(InputError, match="again needs a reason"):
+        campaign.run(8, again=" ")
+    fuse.blown = False
+    campaign.run(7 + len(failed), again="fuse replaced")
+    repeated = campaign.trials[6 : 6 + len(failed)]
+    assert [trial.parameters for trial in repeated] == failed
+    assert {(trial.state, trial.because, trial.origin) for trial in repeated} == {
+        ("completed", "fuse replaced", "manual")
+    }
+    assert campaign.trials[-1].because is None
+    assert len(campaign.run(8 + len(failed), again="fuse replaced").trials) == 8 + len(failed)
+    assert campaign.trials[-1].because is None  # nothing is left to repeat
 
 
 def test_an_emergency_stop_falsifies_if_the_steps_before_it_exceed_the_threshold(tmp_path: Path) -> None:
@@ -327,6 +361,9 @@ def test_a_store_of_another_experiment_is_refused(validation: Validation, tmp_pa
         Campaign(longer, store=tmp_path / "a.sqlite")
     with pytest.raises(StoreMismatchError, match="seed was 0 and is now 1"):
         Campaign(validation, store=tmp_path / "a.sqlite", seed=1)
+    Campaign(validation, name="rig", store=tmp_path / "b.sqlite")
+    with pytest.raises(StoreMismatchError, match="give the campaign the name 'rig', or use another store"):
+        Campaign(validation, store=tmp_path / "b.sqlite")
     assert Campaign(validation, store=tmp_path / "a.sqlite").executions == 2
 
 

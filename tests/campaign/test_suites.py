@@ -64,7 +64,9 @@ def test_a_distance_above_the_threshold_ends_the_campaign() -> None:
     given = validation(FINE, lambda p: p.goal)
     largest = true_distances(given).max()
     campaign = Campaign(given, seed=0).run(41, 0.9 * largest)
-    assert campaign.verdict(0.9 * largest).answer == "falsified"
+    verdict = campaign.verdict(0.9 * largest)
+    assert verdict.answer == "falsified"
+    assert f"in the task {names(campaign)[-1]!r}, executed once" in verdict.reason
     assert campaign.executions < 8
 
 

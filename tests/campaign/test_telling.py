@@ -151,3 +151,23 @@ def test_a_result_is_not_estimated_by_an_observer(campaign: Campaign, tmp_path: 
     trial, made = campaign.ask(), Experiment("pendulum", campaign.validation)
     with pytest.raises(InputError, match="names an observer, which is for replay, fit and start"):
         tell_result(campaign, made, trial.number, SuppliedResult(tmp_path / "run.csv", mapping=mapping))
+
+
+def test_a_recording_of_another_run_with_the_same_start_is_remarked() -> None:
+    campaign = Campaign(make_validation(), search=searches.Random(), seed=0)
+    validation, trials = campaign.validation, [campaign.ask({"goal": goal}) for goal in (2.5, -1.0, 2.0)]
+    executed = [validation.execute(opened.plan) for opened in trials]
+    late = Trajectory(
+        executed[2].times,
+        np.concatenate([executed[2].states[:1].repeat(8, axis=0), executed[2].states[:-8]]),
+        np.concatenate([np.zeros((8, 1)), executed[2].inputs[:-8]]),
+    )
+    right, other, waited = (
+        campaign.tell(opened, run) for opened, run in zip(trials, (executed[0], executed[0], late), strict=True)
+    )
+    assert campaign.input_difference(right) is None
+    assert "u0 is" in str(campaign.input_difference(other))
+    assert "u0 is 0 at " in str(campaign.input_difference(waited))
+    sentence = result_sentence(other, "rad", inputs=campaign.input_difference(other))
+    assert "; its inputs are not those of the controller at the recorded states (u0 is" in sentence
+    assert campaign.input_difference(campaign.tell(campaign.ask(), distance=0.1)) is None

@@ -166,6 +166,14 @@ def test_a_chosen_task_counts_as_no_test() -> None:
     assert missing_tests(chosen, 7) == 0
 
 
+def test_a_noisy_prediction_that_could_not_have_failed_counts_as_no_test() -> None:
+    largest = max(test.distance for test in TESTS)
+    noisy = replace(TESTS[0], quantiles=(0.0, 1.0), runs=100)
+    for upper, missing in ((1.9 * largest, 0), (2.1 * largest, 1), (1e3 * largest, 1), (np.inf, 1)):
+        assert missing_tests((replace(noisy, upper=upper), *TESTS[1:]), len(TESTS)) == missing
+    assert missing_tests((replace(TESTS[0], upper=1e3), *TESTS[1:]), len(TESTS)) == 0  # its median must have agreed
+
+
 def test_a_failure_long_ago_is_forgiven() -> None:
     long_ago = after(prediction(0, 0.1, 0.5), *GOOD.predictions)
     assert doubt_of(long_ago, BEST, BOUND) is None

@@ -53,7 +53,7 @@ def test_a_model_that_does_not_exits_as_falsified_and_names_the_worst_task() -> 
     assert not report["ok"]
     assert report["aspect1"]["completes"] is False
     assert report["aspect1"]["verdict"] == "falsified"
-    assert set(report["aspect1"]["worst"]["parameters"]) == {"goal", "load"}
+    assert set(report["aspect1"]["worst"]["parameters"]) == {"goal", "start_speed"}
     state, text = texts(report)["tasks on the model"]
     assert state == "failed"
     assert "of 20 tasks within 1e-06 m: the worst of 20 tasks is goal = " in text

@@ -89,6 +89,15 @@ def test_the_command_of_a_report_repeats_the_campaign(invoke: Any, options: list
     assert command_of(context_of_store(other)) == command_of(context_of_store(one))
 
 
+def test_the_command_of_a_report_names_the_experiment_file(invoke: Any) -> None:
+    Path("rig 3.toml").write_text('experiment = "pendulum"\nthreshold = 0.5\n')
+    assert invoke("run", "rig 3.toml", "--budget", "2", "--search", "random", "--store", "a.sqlite").exit_code == 0
+    command = shlex.split(command_of(context_of_store(Store.existing("a.sqlite"))))
+    assert command[:3] == ["ctxval", "run", "rig 3.toml"]
+    assert invoke(*command[1:], "--store", "b.sqlite").exit_code == 0
+    assert Store.existing("b.sqlite").trials()[1].distance == Store.existing("a.sqlite").trials()[1].distance
+
+
 def test_run_writes_a_report_next_to_the_store(invoke: Any) -> None:
     done = invoke("run", "short_rig:experiment", "--search", "gp-ucb", "--resolution", "1", "--tests", "0", "--json")
     report = json.loads(done.stdout)

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 from conftest import make_validation
-from ctxval import Campaign, Task, Validation, distances, searches
+from ctxval import Campaign, Task, Validation, controllers, distances, searches
 from ctxval.core.labels import Labels
 from ctxval.core.plan import DistanceWarning, start_offset
 from ctxval.core.validation import CostWarning
 from ctxval.distances import AtCrossing, AtTimes, CrossingTime, FinalState, GoalError, RelativeDeviation, TrackingError
-from ctxval.errors import DistanceError, InputError, UnknownNameError
+from ctxval.errors import DesignError, DistanceError, InputError, UnknownNameError
 
 
 @pytest.mark.parametrize(
@@ -30,6 +30,7 @@ from ctxval.errors import DistanceError, InputError, UnknownNameError
         lambda model, system, task: -1.0,
         lambda model, system, task: np.zeros(3),
         lambda model, system, task: 1 / 0,
+        lambda model, system, task: 1j,
     ],
     ids=lambda distance: getattr(distance, "__name__", None) or repr(distance),
 )
@@ -41,6 +42,61 @@ def test_a_distance_that_cannot_be_used_costs_nothing(distance: Any, how: str) -
         with pytest.raises(DistanceError):
             calls[how]()
     assert campaign.trials == ()
+
+
+@pytest.mark.parametrize("how", ["run", "ask"])
+def test_a_controller_that_remembers_its_run_in_itself_costs_nothing(how: str) -> None:
+    class Integrating:
+        """Adds up its errors, and never forgets them."""
+
+        def __init__(self, forgets: bool) -> None:
+            self.forgets, self.sum = forgets, 0.0
+
+        def __call__(self, t: int, x: Any, task: Task) -> Any:
+            self.sum = 0.0 if self.forgets and t == 0 else self.sum + float(x[0] - task.goal[0])
+            return np.array([-3.0 * (x[0] - task.goal[0]) - 0.1 * self.sum])
+
+    def campaign(forgets: bool) -> Campaign:
+        policy = controllers.Policy(Integrating(forgets), vectorized=False)
+        return Campaign(make_validation().with_parts(synthesizer=policy), search=searches.Random())
+
+    remembering, forgetting = campaign(False), campaign(True)
+    with pytest.raises(DesignError, match=r"must be the same if it runs again, and input 0 at step 0 is .* remembers"):
+        {"run": lambda: remembering.run(1), "ask": remembering.ask}[how]()
+    assert remembering.trials == ()
+    forgetting.run(1)
+    assert len(forgetting.completed) == 1
+
+
+def test_a_model_that_is_random_costs_nothing() -> None:
+    rng, linear = np.random.default_rng(0), make_validation().model
+    campaign = Campaign(make_validation(model=lambda x, u: linear.step(x, u) + 0.1 * rng.normal(size=np.shape(x))))
+    with pytest.raises(DesignError, match="or is random"):
+        campaign.run(1)
+    assert campaign.trials == ()
+
+
+def test_a_task_function_that_is_random_costs_nothing() -> None:
+    rng, plain = np.random.default_rng(0), make_validation().task
+    campaign = Campaign(make_validation().with_parts(task=lambda p: plain(p).starting_at(rng.normal(size=2))))
+    with pytest.raises(InputError, match="must make the same task of the same parameters, and it made two"):
+        campaign.run(1)
+    assert campaign.trials == ()
+
+
+def test_a_distance_that_works_in_place_does_not_change_what_is_stored() -> None:
+    def in_place(model: Any, system: Any, task: Task) -> Any:
+        system.states[...] -= model.states
+        model.states[...] = 0.0
+        return np.abs(system.states[..., -1, :]).sum(axis=-1)
+
+    plain = Campaign(make_validation(distance=distances.FinalState(norm=1)), search=searches.Random()).run(1)
+    changing = Campaign(make_validation(distance=in_place), search=searches.Random()).run(1)
+    assert changing.trials[0].distance == plain.trials[0].distance
+    for stored, expected in zip(
+        changing.trajectories(changing.trials[0]), plain.trajectories(plain.trials[0]), strict=True
+    ):
+        np.testing.assert_array_equal(stored.states, expected.states)
 
 
 def test_a_distance_of_a_trajectory_with_itself_that_is_not_0_is_a_warning() -> None:

@@ -125,3 +125,13 @@ def test_a_state_of_the_wrong_shape_is_refused_with_both_shapes(shape: tuple[int
         rollout(lambda x, u: np.zeros(shape), zero, Task([1.0, 0.0], horizon=3, dt=0.1))
     assert "states of shape (2,)" in str(caught.value)
     assert f"got {shape}" in str(caught.value)
+
+
+def test_a_step_that_works_in_place_does_not_change_the_recorded_inputs() -> None:
+    def weak(x: np.ndarray, u: np.ndarray) -> np.ndarray:
+        u *= 0.5
+        return x + u
+
+    loop = rollout(weak, lambda t, x: np.ones(1), Task([0.0], horizon=3, dt=0.1))
+    np.testing.assert_array_equal(loop.inputs, np.ones((3, 1)))
+    np.testing.assert_array_equal(loop.states[:, 0], [0.0, 0.5, 1.0, 1.5])

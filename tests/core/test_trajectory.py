@@ -315,3 +315,26 @@ def test_recorded_steps_of_different_sizes_are_not_joined() -> None:
     small, large = (Transitions(np.ones((4, n)), np.ones((4, 1)), np.ones((4, n))) for n in (2, 3))
     with pytest.raises(ShapeError, match="got 2 states and 1 inputs and 3 states and 1 inputs"):
         Transitions.joined([small, large])
+
+
+def test_a_gap_and_times_that_do_not_increase_are_not_resampled_over() -> None:
+    times = np.arange(0.0, 3.001, 0.01)
+    wanted = 0.05 * np.arange(41)  # the task ends at 2 s
+
+    def recorded(rows: np.ndarray) -> Trajectory:
+        return Trajectory(times[rows], np.sin(times[rows])[:, None], np.ones((len(rows) - 1, 1)))
+
+    rows = np.arange(len(times))
+    few, after = np.delete(rows, slice(50, 60)), np.delete(rows, slice(210, 290))
+    for kept in (rows, few, after):
+        np.testing.assert_allclose(recorded(kept).resampled(wanted).states[:, 0], np.sin(wanted), atol=2e-3)
+    with pytest.raises(InputError, match=r"nothing was recorded for 1\.01 s from 0\.49 s on"):
+        recorded(np.delete(rows, slice(50, 150))).resampled(wanted)
+    for twice in (8, 1, len(rows)):
+        again = recorded(np.insert(rows, twice, rows[twice - 1])).resampled(wanted)
+        np.testing.assert_array_equal(again.states, recorded(rows).resampled(wanted).states)
+        np.testing.assert_array_equal(again.inputs, recorded(rows).resampled(wanted).inputs)
+    contradicting = recorded(np.insert(rows, 8, 7))
+    contradicting.states[8] += 0.1
+    with pytest.raises(InputError, match=r"the times must increase, and record 8 is at 0\.07 s after 0\.07 s"):
+        contradicting.resampled(wanted)

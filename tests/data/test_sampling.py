@@ -103,7 +103,9 @@ def test_times_that_do_not_tell_rows_apart_are_refused() -> None:
         with pytest.raises(InputError, match=r"of 60 rows have the time of the row before.*more digits"):
             recorded({"t": times, "x": values, "u": values}, dt=dt)
     twice = np.insert(np.arange(0, 3, 0.05), 3, 0.1)
-    assert len(recorded({"t": twice, "x": np.arange(61.0), "u": np.arange(61.0)}).runs) == 2
+    repeated = recorded({"t": twice, "x": np.arange(61.0), "u": np.arange(61.0)})
+    assert len(repeated.runs) == 2
+    assert "stay at 0.1 s at row 3" in repeated.breaks[0].reason
 
 
 def test_a_held_command_is_no_gap() -> None:

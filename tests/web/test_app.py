@@ -303,6 +303,17 @@ def wait_for(server: Server, text: str, page: Response, seconds: float = 60) -> 
     raise AssertionError(f"{text!r} is not in {found}")
 
 
+def test_a_recording_of_another_run_is_remarked(tmp_path: Path) -> None:
+    new_store(tmp_path)
+    lines = record(tmp_path / "a.trials" / "0", tmp_path / "run.csv").read_text().splitlines()
+    idle = "\n".join([lines[0], *(f"{line.rpartition(',')[0]},0" for line in lines[1:])])
+    with serving(tmp_path) as server:
+        page = server.request("GET", "/")
+        assert upload(server, 0, page, idle.encode(), submission="one").status == 303
+        shown = server.request("GET", "/?told=0", Cookie=page.cookie).text
+        assert "its inputs are not those of the controller at the recorded states (force is 0 N at 0 s, not " in shown
+
+
 def test_a_campaign_by_hand_by_forms_alone(tmp_path: Path) -> None:
     new_store(tmp_path)
     recording = record(tmp_path / "a.trials" / "0", tmp_path / "run.csv").read_bytes()

@@ -213,14 +213,25 @@ def tell_result(campaign: Campaign, experiment: Experiment, trial: OpenTrial | i
     )
 
 
-def result_sentence(trial: Trial, units: str = "", start: StartOffset | None = None) -> str:
-    """Return the result of a trial that has ended, in one sentence without its full stop."""
+def result_sentence(trial: Trial, units: str = "", start: StartOffset | None = None, inputs: str | None = None) -> str:
+    """Return the result of a trial that has ended, in one sentence without its full stop.
+
+    The start and the inputs say how a recording differs from its task and its controller.
+    """
     if trial.state == "unmeasured":
         return f"trial {trial.number} is stored without a distance: {trial.failure}"
     if trial.distance is None:
         return f"trial {trial.number} failed: {trial.failure}"
     sentence = f"trial {trial.number} has the distance {trial.distance:.4g} {units}".rstrip()
-    return sentence if start is None or not start.size else f"{sentence}; its start was off by {start.text}"
+    if start is not None and start.size:
+        sentence += f"; its start was off by {start.text}"
+    if inputs is not None:
+        sentence += (
+            f"; its inputs are not those of the controller at the recorded states ({inputs}): check that it is a "
+            "recording of this trial in the units of the experiment, and begins when the controller does (`ctxval tell "
+            "--replace` corrects it)"
+        )
+    return sentence
 
 
 def parameters_of_trial(campaign: Campaign, number: int) -> Mapping[str, Any]:

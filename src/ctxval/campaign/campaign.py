@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import replace as replaced
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -32,12 +33,13 @@ from ctxval.certificates import RESOLUTION, Certificate, CertificateOptions, Pro
 from ctxval.certificates.envelope import Envelope
 from ctxval.certificates.expiry import WatchState
 from ctxval.certificates.options import CONFIDENCE, WITHIN
+from ctxval.certificates.sample import executions_of
 from ctxval.core.distance import Distance
-from ctxval.core.plan import StartOffset, start_offset
+from ctxval.core.plan import StartOffset, input_difference, start_offset
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import Trial
 from ctxval.core.validation import Validation
-from ctxval.errors import CertificateError, InputError
+from ctxval.errors import CertificateError, CtxvalError, InputError
 from ctxval.gp.surrogate import Surrogate, fit_surrogate
 from ctxval.searches import Auto, Search
 
@@ -155,6 +157,18 @@ class Campaign:
         point = self.validation.space.point(trial.parameters)
         return None if executed is None else start_offset(self.validation, point, executed)
 
+    def input_difference(self, trial: Trial) -> str | None:
+        """Return where the recorded inputs of a trial are not those of its controller at the recorded states.
+
+        It is a hint that the recording is of another run, or begins at another moment than the controller. Returns None
+        if they agree up to a third, or if nothing was recorded.
+        """
+        executed = self.store.trajectories([trial.number], "system").get(trial.number)
+        if executed is not None:
+            with suppress(CtxvalError):  # the result is stored, whether or not its controller can be designed again
+                return input_difference(self.validation, self.recorder.plan(trial), executed)
+        return None
+
     # Running
 
     @checked
@@ -171,6 +185,7 @@ class Campaign:
         resolution: float = RESOLUTION,
         certificate: CertificateOptions | None = None,
         until: Callable[[Campaign], bool] | None = None,
+        again: str | None = None,
         workers: PositiveInt | None = None,
         executor: Executor | None = None,
         timeout: Seconds | None = None,
@@ -205,6 +220,8 @@ class Campaign:
                 kind of the certificate must be ``auto``, ``dynamics``, ``posterior`` or, with an acceptable volume,
                 ``anytime``.
             until: called before each execution; the campaign stops early if it returns True.
+            again: the change that was made to the system since executions failed, such as "fuse replaced": their tasks
+                are executed again first, and certificates list the reason.
             workers: number of processes, each with its own copy of the system; with an executor, the number of
                 executions that it has at a time.
             executor: an executor that replaces these processes: one of ``concurrent.futures``, or any object whose
@@ -229,8 +246,20 @@ class Campaign:
             raise InputError("an envelope needs a threshold, and a campaign that does not explore.")
         enlarges = EnvelopeSearch(decides) if envelope and decides is not None else None
         by_search = Choice(planned_draws=budget if until is None else 0)
+        if again is not None:
+            if not again.strip():
+                raise InputError('again needs a reason, such as "fuse replaced".')
+            self.refresh()
+        failed = [] if again is None else [each for each in self.failed if each.executed]
+        # Each task once, and none that has succeeded since.
+        lost = list(
+            {each.unit_point.tobytes(): each for each in failed if not executions_of(each, self.trials)}.values()
+        )
 
         def rule() -> Choice | None:
+            if lost and not (until is not None and until(self)):
+                repeated = lost.pop(0)
+                return Choice(repeated.unit_point, "manual", again, parameters=repeated.parameters)
             if not self.recorder.has_tasks or (until is not None and until(self)):
                 return None
             if decides is None:

@@ -84,12 +84,15 @@ class Execution:
     def before_failure(
         cls, validation: Validation, plan: Plan, trajectory: object, failed: str, start_tolerance: float | None = None
     ) -> Execution:
-        """Return a failed execution with the steps before the failure, if there are any, and their distance."""
+        """Return a failed execution with the steps before the failure, and what their distance is at least.
+
+        Raises:
+            InputError: if no step of the task was recorded.
+        """
         tolerance = validation.start_tolerance if start_tolerance is None else start_tolerance
-        recorded, least = recorded_before_failure(plan, trajectory, tolerance), None
-        if recorded is not None:
-            least = least_distance(validation, plan.parameters.points, plan.model_trajectory, recorded)
-        return cls(recorded, failed=failed, at_least=least)
+        recorded = recorded_before_failure(plan, trajectory, tolerance)
+        least = least_distance(validation, plan.parameters.points, plan.model_trajectory, recorded)
+        return cls(replace(recorded, ended=text_of(failed)), failed=failed, at_least=least)
 
     def measured(self, validation: Validation, plan: Plan, start_tolerance: float | None = None) -> Execution:
         """Return the execution with its distance, after the checks of :meth:`Validation.accept`.
@@ -97,9 +100,10 @@ class Execution:
         Of one that failed, the steps before the failure remain.
         """
         if self.failed is not None and self.trajectory is not None:
-            ended = self.before_failure(validation, plan, self.trajectory, self.failed, start_tolerance)
-            if ended.trajectory is None:
-                raise InputError("the recording of the failed execution has no step of this task.")
+            try:
+                ended = self.before_failure(validation, plan, self.trajectory, self.failed, start_tolerance)
+            except InputError as error:
+                raise InputError(f"the recording of the failed execution has no step of this task: {error}") from error
             return replace(ended, seconds=self.seconds)
         if self.failed is not None or self.distance is not None:
             return self

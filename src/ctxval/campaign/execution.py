@@ -174,7 +174,11 @@ class ExecutionLoop:
         try:
             execution = execution.measured(self.recorder.validation, opened.plan)
         except (ExecutionError, InputError) as error:
-            failed = Execution.before_failure(self.recorder.validation, opened.plan, execution.trajectory, str(error))
+            failed = Execution(failed=str(error))
+            with suppress(InputError):
+                failed = Execution.before_failure(
+                    self.recorder.validation, opened.plan, execution.trajectory, str(error)
+                )
             execution = replace(failed, seconds=execution.seconds)
         if execution.failed is not None:
             self.failures[opened.number] += 1

@@ -97,7 +97,8 @@ def identify(
 
     for path, sentence in differing:
         if path.startswith(_QUESTION):
-            refuse(sentence, "use another store")
+            named = f"give the campaign the name {stored.get('name')!r}, or " if path == "name" else ""
+            refuse(sentence, f"{named}use another store")
     loop = _changed_loop(store, validation, samples)
     if loop is not None:
         advice = "the model, the task or the controller design has changed since the executions: use another store"

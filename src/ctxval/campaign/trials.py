@@ -24,7 +24,7 @@ from ctxval.campaign.storage.store import Store
 from ctxval.certificates import PLANNED
 from ctxval.core.controller import converged_of
 from ctxval.core.distance import Distance
-from ctxval.core.plan import Plan, try_distance
+from ctxval.core.plan import Plan, require_repeatable, try_distance
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import CONVERGED, Origin, Trial
 from ctxval.core.validation import Validation
@@ -58,7 +58,7 @@ class TrialRecorder:
         self._goals_of_model = GoalsOfModel(validation)
         self._proposals = Proposals(validation, self.search, self.dynamics)
         self._seed = seed
-        self._distance_tried = False
+        self._parts_tried = False
         self.executing: set[int] = set()
         self.replay()
 
@@ -148,7 +148,7 @@ class TrialRecorder:
         return changed
 
     def _redefine(self, validation: Validation, description: dict[str, Any]) -> None:
-        self.validation, self.description, self._distance_tried = validation, description, False
+        self.validation, self.description, self._parts_tried = validation, description, False
         elsewhere = self.dynamics.elsewhere
         self.dynamics = CampaignDynamics(validation, self.store, self._seed, description)
         self.dynamics.elsewhere = elsewhere
@@ -199,9 +199,10 @@ class TrialRecorder:
                         raise
                     unplanned = True
                     break
-                if not self._distance_tried:
+                if not self._parts_tried:
+                    require_repeatable(self.validation, plan)
                     try_distance(self.validation, plan)
-                    self._distance_tried = True
+                    self._parts_tried = True
                 with suppress(InputError):  # an attribute of a user's controller with this name that is something else
                     if (converged := converged_of(plan.controller)) is not None:
                         trial = replace(trial, note={**(trial.note or {}), CONVERGED: bool(converged)})

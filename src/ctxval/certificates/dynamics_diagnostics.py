@@ -42,6 +42,8 @@ NOISY_FEWEST = 5  # executions for a bound if the system is noisy
 NOISY_BEYOND = 0.06  # the same as BEYOND: noise leads a little beyond what a few executions have recorded
 NOISY_TESTED = 0.75  # the same as TESTED, of the median posterior sample, which has the noise of all executions
 TOLERATED = 0.02  # share of the bound by which a distance may exceed its prediction without being an excess
+VAGUE = 2.0
+"""Multiple of the largest executed distance from which the 0.95 quantile of a noisy prediction makes it no test."""
 UNLIKELY = 0.01  # least predicted probability of a distance as large as the executed one
 EVIDENCE = 20.0  # e-value of the last predictions of a noisy system at which they are rejected
 EVIDENCE_OF = 6  # number of these predictions
@@ -86,8 +88,13 @@ def tested(predictions: Sequence[CheckedPrediction], tests: int) -> list[Checked
 
 
 def missing_tests(predictions: Sequence[CheckedPrediction], tests: int) -> int:
-    """Return the number of executions that complete the tests; those that were predicted beforehand count."""
-    return max(tests - sum(each.stored and each.origin in DRAWN for each in predictions), 0)
+    """Return the number of executions that complete the tests; those that were predicted beforehand count.
+
+    A noisy prediction that expects far more than what was ever executed could not have failed, and is no test.
+    """
+    largest = max((each.distance for each in predictions), default=0.0)
+    drawn = [each for each in predictions if each.stored and each.origin in DRAWN]
+    return max(tests - sum(not (each.is_noisy and each.upper > VAGUE * largest) for each in drawn), 0)
 
 
 def is_explained(prediction: CheckedPrediction, bound: float) -> bool:

@@ -138,8 +138,9 @@ def _require_bounding(sample: Sample) -> None:
     if failed:
         raise CertificateError(
             f"{failed} of {len(sample)} executions failed: the distance of their tasks is unknown, so nothing bounds "
-            f"d*; once the cause is removed, execute the same tasks again and say what it was (ctxval ask STORE "
-            f'--again N --because "..."): {listed(sample.numbers_of("failed"))}.{advice_to_remeasure(sample)}'
+            "d*; once the cause is removed, execute the same tasks again and say what it was (`ctxval run` with "
+            '--again-failed "...", or `ctxval ask STORE --again N --because "..."` if people execute them): '
+            f"{listed(sample.numbers_of('failed'))}.{advice_to_remeasure(sample)}"
         )
     if sample.failed:
         raise CertificateError(

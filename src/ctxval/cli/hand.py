@@ -144,7 +144,8 @@ def tell(
     campaign, file, mapping = opened.campaign, trajectory or npz, opened.settings.log_mapping
     result = SuppliedResult(file, distance, failed, npz is not None, resample, start_tolerance, mapping, replace)
     ended = by_hand.tell_result(campaign, opened.experiment, trial, result)
-    out.say(by_hand.result_sentence(ended, opened.experiment.units, campaign.start_offset(ended)))
+    differences = campaign.start_offset(ended), campaign.input_difference(ended)
+    out.say(by_hand.result_sentence(ended, opened.experiment.units, *differences))
     return _ended(ended, campaign.executions, store)
 
 
@@ -173,7 +174,8 @@ def import_runs(
     new = [trial for trial in ended if trial is not None]
     known = len(ended) - len(new)
     for trial in new[:10]:
-        out.say(by_hand.result_sentence(trial, experiment.units, campaign.start_offset(trial)))
+        differences = campaign.start_offset(trial), campaign.input_difference(trial)
+        out.say(by_hand.result_sentence(trial, experiment.units, *differences))
     if len(new) > 10:
         out.say(f"... and {len(new) - 10} other trials; --json lists them.")
     out.say(f"{len(new)} runs imported, {known} already in the store.")

@@ -53,6 +53,7 @@ def run(
     workers: int | None = None,
     dask: str | None = None,
     timeout: float | None = None,
+    again_failed: str | None = None,
     accept_change: str | None = None,
     with_report: bool = True,
     live: bool = False,
@@ -94,6 +95,7 @@ def run(
                 within=settings.within,
                 certificate=certificate,
                 timeout=timeout,
+                again=again_failed,
                 **execution,
             )
         known = experiment.truth() if truth and experiment.truth is not None else None

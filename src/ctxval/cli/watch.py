@@ -60,9 +60,10 @@ def watch(
                 judged.append({**latest, "evidence": state.evidence})
             advance(1)
     for each in judged:
-        distance = "" if each["distance"] is None else f"distance {each['distance']:.4g}, "
-        differs = f"{distance}{each['statistic']} {each['ratio']:.2g} times those certified"
-        out.say(f"{each['run']}: {differs}, evidence of a change {each['evidence']:.2g}")
+        parts = [f"{each['statistic']} {each['ratio']:.2g} times those certified"]
+        if each["distance"] is not None:
+            parts.insert(0, f"distance {each['distance']:.4g} {opened.experiment.units}".rstrip())
+        out.say(f"{each['run']}: {', '.join(parts)}, evidence of a change {each['evidence']:.2g}")
     for failure in skipped:
         notes.say((f"{failure['run']} is not judged", "yellow"), f": {failure['reason']}")
     if not judged:

@@ -11,11 +11,12 @@ import numpy as np
 
 from ctxval._util.arrays import ArrayLike
 from ctxval._util.representation import ShortRepr
+from ctxval._util.texts import reason_of
 from ctxval.core.controller import Controller, started
 from ctxval.core.space import Parameters
 from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory, require_times
-from ctxval.errors import DistanceError, InputError, ShapeError
+from ctxval.errors import CtxvalError, DesignError, DistanceError, InputError, ShapeError
 
 if TYPE_CHECKING:
     from ctxval.core.validation import Validation
@@ -74,23 +75,21 @@ def require_execution(plan: Plan, trajectory: Trajectory, start_tolerance: float
         )
 
 
-def recorded_before_failure(plan: Plan, trajectory: object, start_tolerance: float) -> Trajectory | None:
-    """Return the steps of a plan that were recorded before its execution failed; None if there are none."""
+def recorded_before_failure(plan: Plan, trajectory: object, start_tolerance: float) -> Trajectory:
+    """Return the steps of a plan that were recorded before its execution failed; refuse what has none of them."""
     expected = plan.model_trajectory
-    widths = expected.states.shape[-1], expected.inputs.shape[-1]
-    if not isinstance(trajectory, Trajectory) or trajectory.batch_shape:
-        return None
-    if (trajectory.states.shape[-1], trajectory.inputs.shape[-1]) != widths:
-        return None
+    if not isinstance(trajectory, Trajectory):
+        raise InputError("nothing was recorded.")
+    shapes = [(run.states.ndim, run.states.shape[-1], run.inputs.shape[-1]) for run in (trajectory, expected)]
+    if shapes[0] != shapes[1]:
+        _, states, inputs = shapes[1]
+        raise ShapeError(f"it must have {states} states and {inputs} inputs, got {shapes[0][1]} and {shapes[0][2]}.")
     unknown = ~np.isfinite(np.concatenate([trajectory.states[1:], trajectory.inputs], axis=1)).all(axis=1)
     steps = min([trajectory.horizon, expected.horizon, *np.flatnonzero(unknown)[:1].tolist()])
     if not steps:
-        return None
+        raise InputError("its first step is not finite.")
     recorded = trajectory.first(steps)
-    try:
-        require_execution(replace(plan, model_trajectory=expected.first(steps)), recorded, start_tolerance)
-    except InputError:
-        return None  # it is a recording of another task
+    require_execution(replace(plan, model_trajectory=expected.first(steps)), recorded, start_tolerance)
     return recorded
 
 
@@ -129,6 +128,38 @@ def gives_inputs(plan: Plan, trajectory: Trajectory, tolerance: float) -> bool:
         return False
 
 
+def input_difference(validation: Validation, plan: Plan, trajectory: Trajectory) -> str | None:
+    """Return where recorded inputs are not those that the controller of the plan gives at the recorded states.
+
+    Returns None if they differ by at most a third, as the root mean square of each input over the steps: sensors,
+    clocks and drives make such differences, and a recording of another run makes larger ones. It is also None if the
+    controller cannot be run along these states.
+    """
+    states, inputs = trajectory.states, trajectory.inputs
+    try:
+        with np.errstate(all="ignore"):
+            pi = started(plan.controller, plan.task)
+            given = np.array([np.asarray(pi(t, states[t]), dtype=np.float64) for t in range(len(inputs))])
+            gaps = np.abs(given - inputs)
+    except Exception:  # the user's controller, at states that it never reached by itself
+        return None
+    sizes = np.sqrt(np.maximum(np.mean(given**2, axis=0), np.mean(inputs**2, axis=0)))
+    least = 1e-9 * np.abs(given).max(initial=0.0)  # rounding is no difference
+    apart = np.sqrt(np.mean(gaps**2, axis=0)) > np.maximum(_AGREEING * sizes, least)
+    if not apart.any():
+        return None
+    t, i = np.unravel_index(np.argmax(np.where(apart, gaps / np.maximum(sizes, 1e-300), -1.0)), gaps.shape)
+    name, unit = list(validation.names(states.shape[-1], inputs.shape[-1])[1].items())[i]
+    return f"{name} is {inputs[t, i]:.3g} {unit}".rstrip() + f" at {trajectory.times[t]:.3g} s, not {given[t, i]:.3g}"
+
+
+_AGREEING = 1 / 3
+"""Largest root mean square of the difference between recorded inputs and those of the controller that is no remark."""
+
+_REPEATABLE = 1e-3
+"""Largest difference of two closed loops with one controller on M, as a share of the magnitude of a state or input."""
+
+
 class DistanceWarning(UserWarning):
     """The distance between a trajectory and itself is not 0."""
 
@@ -147,6 +178,38 @@ def try_distance(validation: Validation, plan: Plan) -> None:
             DistanceWarning,
             stacklevel=2,
         )
+
+
+def require_repeatable(validation: Validation, plan: Plan) -> None:
+    """Refuse a task that differs if it is made again, and a closed loop on M that differs if it runs again.
+
+    A controller that remembers steps in itself goes on from the run on M when S is executed, and a difference that the
+    system does not have would be measured. Solvers that begin at their last solution differ by less than is permitted.
+    """
+    task, first = validation.task_at(plan.parameters), plan.model_trajectory
+    if any(
+        not np.array_equal(getattr(task, name), getattr(plan.task, name)) for name in ("initial_state", "reference")
+    ):
+        raise InputError(
+            "the task function must make the same task of the same parameters, and it made two: it is random, or it "
+            "depends on more than the parameters."
+        )
+    try:
+        again = validation.closed_loop(plan.controller, plan.task)
+    except CtxvalError:
+        raise
+    except Exception as error:
+        raise DesignError(f"the controller failed when it ran a second time: {reason_of(error)}.") from error
+    for kind, before, after in (("input", first.inputs, again.inputs), ("state", first.states, again.states)):
+        same = np.abs(after - before) <= _REPEATABLE * np.abs(before).max(axis=0, initial=0.0)
+        if not same.all():
+            t, i = np.argwhere(~same)[0]
+            raise DesignError(
+                f"the closed loop on the model must be the same if it runs again, and {kind} {i} at step {t} is "
+                f"{after[t, i]:.4g}, was {before[t, i]:.4g}: the controller or the model remembers the first run, or "
+                "is random. Keep the memory of a controller in `start` and `step`, or begin it anew at step 0, with a "
+                "fixed seed if it draws numbers."
+            )
 
 
 @dataclass(frozen=True)

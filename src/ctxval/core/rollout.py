@@ -38,7 +38,7 @@ def rollout(step: Step, controller: Controller, task: Task, *, partial: bool = F
                     wanted = f"inputs of shape {of_inputs} at every step"
                     raise ShapeError(f"the controller must return {wanted}, got {np.shape(u)}.")
                 inputs[t] = u
-                x = step(x, inputs[t])
+                x = step(x, inputs[t].copy())  # a step that works in place may not change what was recorded
                 if getattr(x, "shape", None) != of_states and np.shape(x) != of_states:
                     wanted = f"from states of shape {of_states} must return the same shape"
                     raise ShapeError(f"a step {wanted}, got {np.shape(x)}.")

@@ -217,14 +217,30 @@ class Trajectory:
         """Return one recorded trajectory at other times ``(H + 1,)``, in seconds after its first time, from 0.
 
         States are interpolated linearly. Inputs, which hold until the next sample, are averaged over the steps.
+        A record that is there twice counts once.
         """
-        recorded, wanted = self.times - self.times[0], as_floats("times", times)
-        if self.batch_shape or not (np.diff(recorded) > 0).all():
-            raise InputError("only a single trajectory with increasing times can be resampled.")
-        dt, period = float(wanted[1] - wanted[0]), float(np.median(np.diff(recorded)))
+        if self.batch_shape:
+            raise InputError("only a single trajectory can be resampled.")
+        recorded, wanted, steps = self.times - self.times[0], as_floats("times", times), np.diff(self.times)
+        repeated = (steps == 0) & (np.diff(self.states, axis=0) == 0).all(axis=-1)
+        repeated[:-1] &= (np.diff(self.inputs, axis=0) == 0).all(axis=-1)
+        if repeated.any():  # loggers write records twice
+            kept = np.append(True, ~repeated)
+            inputs = self.inputs[kept[:-1]][: int(kept.sum()) - 1]
+            return Trajectory(self.times[kept], self.states[kept], inputs, self.ended).resampled(wanted)
+        if not (steps > 0).all():
+            row = int(np.argmin(steps > 0)) + 1
+            before, after = self.times[row - 1 : row + 1]
+            raise InputError(f"the times must increase, and record {row} is at {after:.6g} s after {before:.6g} s.")
+        dt, period = float(wanted[1] - wanted[0]), float(np.median(steps))
         advice = f"; {text}" if (text := unit_advice(period, dt)) else ""
         if period > FAR * dt:
             raise InputError(f"the recording has steps of {period:g} s instead of {dt:g} s{advice}.")
+        gaps = np.where(recorded[:-1] < wanted[-1], steps, 0.0)  # what comes after the end of the task is not used
+        if gaps.max() > FAR * dt:
+            row = int(np.argmax(gaps))
+            gap = f"nothing was recorded for {gaps[row]:.4g} s from {self.times[row]:.6g} s on"
+            raise InputError(f"{gap}, which is more than {FAR:g} steps of {dt:g} s.")
         if not recorded[-1] >= wanted[-1] - _TIMES * dt:
             ends = f"the recording ends after {recorded[-1]:g} s, and {wanted[-1]:g} s are needed"
             raise InputError(f"{ends}{advice}.")

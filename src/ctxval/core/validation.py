@@ -362,8 +362,11 @@ class Validation:
 
     def _distance(self, task: Task, model: Trajectory, system: Trajectory) -> Array:
         try:
-            with np.errstate(all="ignore"):
-                return np.asarray(self.distance(model, system, task), dtype=np.float64)
+            with np.errstate(all="ignore"):  # a function that works in place may not change what was recorded
+                values = np.asarray(self.distance(model.copy(), system.copy(), task))
+                if np.iscomplexobj(values):
+                    raise TypeError(f"it must be a real number, got {values}")
+                return np.asarray(values, dtype=np.float64)
         except BaseException as error:
             if raised_by_signal(error):
                 raise

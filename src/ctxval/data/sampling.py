@@ -98,7 +98,9 @@ def _forward_pieces(source: str, channels: Sequence[Channel], breaks: list[Break
         )
     ends = np.flatnonzero(steps <= 0).tolist()
     for end in ends:
-        reason = f"go back from {first.times[end]:g} s to {first.times[end + 1]:g} s at {word} {line + end + 1}"
+        before, after = f"{first.times[end]:g} s", f"{first.times[end + 1]:g} s"
+        how = f"stay at {before}" if steps[end] == 0 else f"go back from {before} to {after}"
+        reason = f"{how} at {word} {line + end + 1}"
         breaks.append(Break(source, float(first.times[end]), 0.0, "times", reason))
 
     def piece(channel: Channel, start: int, stop: int) -> Channel:

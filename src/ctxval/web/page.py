@@ -133,7 +133,8 @@ class Page:
         trials = self._state.snapshot.trials
         if not 0 <= number < len(trials) or trials[number].state == "open":
             return None
-        return text(result_sentence(trials[number], self._units), 1_000)
+        differs = self._state.input_differences.get(number)
+        return text(result_sentence(trials[number], self._units, inputs=differs), 1_000)
 
 
 _ORIGINS = {

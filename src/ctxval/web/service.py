@@ -85,7 +85,8 @@ class CampaignService(PageState):
 
         def record() -> None:
             try:
-                tell_result(self.served.campaign, self.served.experiment, number, result)
+                ended = tell_result(self.served.campaign, self.served.experiment, number, result)
+                self.input_differences[number] = self.served.campaign.input_difference(ended)
             except DistanceError:
                 if self.served.campaign.trials[number].state != "unmeasured":
                     raise

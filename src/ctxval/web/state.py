@@ -92,6 +92,7 @@ class PageState:
         self.served, self.snapshot = served, snapshot
         self.pictures: Pictures = {}
         self.files: dict[int, Files | str] = {}  # of open trials; a text says why there are none
+        self.input_differences: dict[int, str | None] = {}  # of the recordings that were told here
         self.version = time.time_ns()  # which grows with each change, also when the server is started again
         self.listeners = self.shown = 0  # open pages, and the version that was last sent to one
         self._changed = asyncio.Event()

@@ -89,7 +89,11 @@ def test_the_file_of_init_passes_its_check(invoke: Any) -> None:
 
 def test_a_file_is_an_experiment_in_python_too(invoke: Any) -> None:
     experiment = ctxval.load_experiment(Path("experiment.toml"))
-    assert (experiment.name, experiment.units, experiment.validation.space.names) == ("cart", "m", ("goal", "load"))
+    assert (experiment.name, experiment.units, experiment.validation.space.names) == (
+        "cart",
+        "m",
+        ("goal", "start_speed"),
+    )
     assert experiment.validation.distances(np.array([[1.0, 0.1]]))[0] > 0
     assert ctxval.load_experiment("linear", seed=1, dim=2).validation.space.dimension == 4
     with pytest.raises(InputError, match="there is no experiment file none"):

@@ -366,9 +366,10 @@ def test_files_are_sought_in_the_folder_unless_their_path_is_whole(here: Path) -
 
 
 def test_where_to_seek_is_no_setting_of_a_file(here: Path) -> None:
-    Path("a.toml").write_text('experiment = "pendulum"\nfolder = "/"\n')
-    with pytest.raises(InputError, match="no setting is called 'folder'"):
-        read_settings("a.toml", {})
+    for key in ("folder", "file"):
+        Path("a.toml").write_text(f'experiment = "pendulum"\n{key} = "/"\n')
+        with pytest.raises(InputError, match=f"no setting is called '{key}'"):
+            read_settings("a.toml", {})
 
 
 def test_a_missing_file_says_how_to_begin(here: Path) -> None:

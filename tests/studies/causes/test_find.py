@@ -164,17 +164,17 @@ def test_executions_that_begin_elsewhere_are_not_explained_by_the_dynamics() -> 
 
         def execute(self, controller: Any, task: Any) -> Any:
             start = task.initial_state + self.shift * np.array([1.0, 0.0])
-            return systems.Simulated(slide(no_force), vectorized=True).execute(controller, task.starting_at(start))
+            return systems.Simulated(slide(self.force), vectorized=True).execute(controller, task.starting_at(start))
 
-        def __init__(self, *shifts: float) -> None:
-            self.shifts = [*shifts]
+        def __init__(self, *shifts: float, force: Any) -> None:
+            self.shifts, self.force = [*shifts], force
 
         @property
         def shift(self) -> float:
             return self.shifts.pop(0)
 
-    def report_of(*shifts: float) -> CauseReport:
-        validation = campaign(slide(no_force)).validation.with_system(Shifted(*shifts))
+    def report_of(*shifts: float, force: Any = no_force) -> CauseReport:
+        validation = campaign(slide(no_force)).validation.with_system(Shifted(*shifts, force=force))
         return find_causes(Campaign(validation, search=searches.by_name("random"), seed=0).run(3))
 
     report = report_of(0.1, 0.1, 0.1)
@@ -184,3 +184,8 @@ def test_executions_that_begin_elsewhere_are_not_explained_by_the_dynamics() -> 
     report = report_of(0.1, -0.2, 0.15)
     assert report.causes == ()
     assert "M predicts the executions from where they began, and that is not where their tasks begin" in report.sentence
+    # What is left of the distance is where the executions began, which a cause in the dynamics does not change.
+    report = report_of(0.1, -0.2, 0.15, force=lambda position, speed, stop: -0.5 * speed)
+    assert [cause.name for cause in report.causes] == ["viscous friction"]
+    assert report.from_tasks == pytest.approx(0.2, rel=0.05)
+    assert "predicted from where the executions began; from where their tasks begin, it is 0.2 m" in report.sentence

@@ -44,7 +44,8 @@ def falsified(
             f"trial {worst.number} failed ({quoted(worst.failure or '')}), but its distance is at least "
             f"{quantities.of(distance)} by the steps before the failure, which exceeds {quantities.of(limit)}, in the "
             f"task {quantities.task(worst)}; if a fault caused this that is mended by now, execute the task again and "
-            f'say what it was (ctxval ask STORE --again {worst.number} --because "...").'
+            f'say what it was (`ctxval run` with --again-failed "...", or `ctxval ask STORE --again {worst.number} '
+            '--because "..."` if people execute it).'
         )
     again = [(trial.distance or 0.0) > tau for trial in executions_of(worst, trials) if trial is not worst]
     reproduced = ", executed once" if not again else ""
@@ -61,7 +62,7 @@ def falsified(
         )
     return (
         f"trial {worst.number} has the distance {quantities.of(distance)}, which exceeds {quantities.of(limit)}, "
-        f"in the task {quantities.task(worst)}{reproduced}{noise}."
+        f"in the task {quantities.task(worst).removeprefix('task ')}{reproduced}{noise}."  # of a suite: its name
     )
 
 

@@ -17,7 +17,7 @@ from ctxval.certificates.bounds import of_tasks
 from ctxval.core.controller import converged_of
 from ctxval.core.experiment import Experiment, mixed_units_sentence
 from ctxval.core.labels import labels_of, names_of
-from ctxval.core.plan import Plan
+from ctxval.core.plan import Plan, require_repeatable
 from ctxval.core.soundness import MISSED, SATURATED, goal_misses
 from ctxval.core.task import Task
 from ctxval.core.task_suite import TaskSuite
@@ -106,6 +106,7 @@ def _tasks(validation: Validation, seed: int, plans: list[Plan]) -> Findings:
     states = f"{n} states" if validation.outputs is None else f"{recorded} outputs of {n} states"
     sizes = f"{states}, {on_model.inputs.shape[-1]} inputs"
     yield "ok", f"{len(plans)} tasks planned: {sizes}, {task.horizon} steps of {task.dt:g} s"
+    require_repeatable(validation, plans[0])
 
 
 def _goals(validation: Validation, plans: Sequence[Plan]) -> Findings:

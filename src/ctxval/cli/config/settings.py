@@ -176,6 +176,7 @@ class Settings(BaseModel, extra="forbid"):
     recordings: dict[str, Any] | None = None
     #: the folder of modules and files, which is that of the experiment file; None for the current folder
     folder: Path | None = None
+    file: str | None = None  #: the name of the experiment file, for the commands that reports state
 
     def load(self) -> Experiment:
         if self.experiment is None:
@@ -313,9 +314,9 @@ def read_settings(target: str, overrides: dict[str, Any]) -> Settings:
             example = f"`ctxval init {shlex.quote(target)}` writes an example"
             raise InputError(f"there is no experiment file {target}; {example}.")
         content = read_toml(target)
-    if "folder" in content:
+    for key in sorted({"folder", "file"} & content.keys()):
         where = "modules and files are read from the folder of this file"
-        raise InputError(f"{target}: no setting is called 'folder'; {where}.")
+        raise InputError(f"{target}: no setting is called {key!r}; {where}.")
     given = {key: value for key, value in overrides.items() if value is not None}
     options: Any = content.get("options", {})
     search: Any = content.get("search", {})
@@ -329,6 +330,8 @@ def read_settings(target: str, overrides: dict[str, Any]) -> Settings:
     whole = {**content, **given, "options": options, "search": search}
     if is_file or ":" in target:
         whole["folder"] = (Path(target).parent if is_file else Path()).resolve()
+    if is_file:
+        whole["file"] = Path(target).name
     try:
         return Settings.model_validate(whole)
     except ValidationError as error:

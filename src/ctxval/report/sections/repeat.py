@@ -104,8 +104,9 @@ def command_of(context: ReportContext, budget: int | None = None, *others: str) 
     settings = context.settings
     if not settings:
         return ""
-    named = settings.get("experiment")
-    words = ["ctxval", "run", str(named) if named else f"{settings.get('name') or 'experiment'}.toml"]
+    file = settings.get("file")
+    named = None if file else settings.get("experiment")
+    words = ["ctxval", "run", str(file or named or f"{settings.get('name') or 'experiment'}.toml")]
     # A store may hold anything.
     tables = {name: table for name, table in settings.items() if isinstance(table, Mapping)}
     search, certificate, options = (tables.get(name, {}) for name in ("search", "certificate", "options"))

@@ -78,7 +78,10 @@ def _next(context: ReportContext) -> tuple[str, str]:
     by_hand = any(trial.told for trial in context.trials)
     if context.failed:
         number = context.failed[0].number
-        again = shlex.join(["ctxval", "ask", path, "--again", str(number)]) if by_hand else ""
+        again = shlex.join(["ctxval", "ask", path, "--again", str(number)])
+        if not by_hand:
+            budget = context.executions + len(context.failed)
+            again = command_of(context, budget, "--again-failed", "what was changed", "--store", path)
         return f"Find out why trial {number} has no distance, and execute its task again.", again
     expected = None if verdict.expected is None else verdict.expected.executions
     advice = f"about {expected} are expected to decide" if expected else "how many will decide cannot be forecast"

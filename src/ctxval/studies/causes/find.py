@@ -133,6 +133,9 @@ class _Study:
         self, group: list[Explained], ranked: Sequence[Explanation] = (), *, began_elsewhere: bool = False
     ) -> CauseReport:
         named = bool(group) and group[0].complete >= _NAMED
+        from_tasks = None
+        if group and not self.outputs and not began_elsewhere:
+            from_tasks = self.loops.distance_from_tasks(group[0].explanation.repaired)
         return CauseReport(
             plant=self.plant,
             explained=tuple(group),
@@ -141,6 +144,7 @@ class _Study:
             tried=len(self.dictionary),
             executions=len(self.executions),
             before=max(self.loops.distances),
+            from_tasks=from_tasks,
             failed=self.failed,
             units=self.validation.labels.units,
             separating=self._separating(group) if named and len(group) > 1 else None,

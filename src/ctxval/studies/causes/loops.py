@@ -48,7 +48,7 @@ class ClosedLoops:
     """
 
     def __init__(self, validation: Validation, executions: Sequence[ExecutedTask]) -> None:
-        self.validation = validation
+        self.validation, self.executions = validation, executions
         whole = np.concatenate([each.executed.states for each in executions])
         self.ranges = np.maximum(np.ptp(whole, axis=0), 1e-12)
         efforts = np.concatenate([each.executed.inputs for each in executions])
@@ -80,6 +80,15 @@ class ClosedLoops:
         mean = Trajectory(first.times, states, inputs)
         by_noise = np.array([self._deviation(loop, mean) for loop in loops]) * (count + 1) / max(count - 1, 1)
         return Predicted(self._deviation(execution.executed, mean), by_noise, self._distance(execution, mean))
+
+    def distance_from_tasks(self, repaired: Repaired) -> float | None:
+        """Return the largest distance of the executions from loops that begin where their tasks begin.
+
+        Returns None if one of these loops fails.
+        """
+        loops = ((each, self.of_plan(repaired, each.plan, steps=each.executed.horizon)) for each in self.executions)
+        largest = max(np.inf if loop is None else self._distance(each, loop) for each, loop in loops)
+        return largest if np.isfinite(largest) else None
 
     def of_plan(
         self, repaired: Repaired, plan: Plan, start: Array | None = None, steps: int | None = None

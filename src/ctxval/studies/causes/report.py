@@ -15,6 +15,8 @@ from ctxval.studies.causes.cause import Cause, Repaired
 from ctxval.studies.causes.evidence import Explanation
 from ctxval.studies.causes.plant import Plant
 
+_APART = 0.1  # share of the largest distance from M which starts elsewhere must cause, to be remarked
+
 
 @dataclass(frozen=True, eq=False)
 class Explained(ShortRepr):
@@ -81,6 +83,9 @@ class CauseReport(ShortRepr):
     units: str = ""
     #: whether M predicts the executions from where they began, and not from where their tasks begin
     began_elsewhere: bool = False
+    #: the largest distance from M with the first causes if its loops begin where the tasks begin; None if states are
+    #: estimated, if no cause is in the dynamics, or if a loop fails
+    from_tasks: float | None = None
     separating: Separating | None = None  #: the task that tells causes apart which these executions do not
     ranked: tuple[Explanation, ...] = ()  #: the most probable causes alone, the best one first
 
@@ -118,6 +123,11 @@ class CauseReport(ShortRepr):
             f"the largest distance of {self.executions} executions{failed} falls from {self.before:.3g} to "
             f"{first.distance:.3g}{units}"
         )
+        if self.from_tasks is not None and self.from_tasks > max(2 * first.distance, _APART * self.before):
+            effect += (
+                ", predicted from where the executions began; from where their tasks begin, it is "
+                f"{self.from_tasks:.3g}{units}"
+            )
         part, of = (first.share, "deviations") if first.resolved else (first.structure, "residuals, except for noise")
         share = f"{np.floor(1e3 * part) / 10:.4g} % of the squared {of}"
         if not self.named:
@@ -191,6 +201,7 @@ class CauseReport(ShortRepr):
             "began_elsewhere": self.began_elsewhere,
             "distance_before": self.before,
             "distance_after": self.after,
+            "distance_from_tasks": self.from_tasks,
             "units": self.units,
             "python": self.python,
             "mjcf": list(self.mjcf),
