@@ -25,8 +25,9 @@ from noise_misleading import PLANTS as MISLEADING
 from noise_reporting import PLANTS as REPORTING
 from noise_systems import IMPERFECTIONS, Plant, near_best, outcome, random_and_corners
 
-RULE = 3
-"""Version of the rule by which campaigns are run."""
+RULE = 4
+"""Version of the rule by which campaigns are run. Since version 4, a vague prediction is no test; campaigns that were
+over before any test in version 3 are the same, and are kept with this number."""
 
 CONFIDENCES = (0.8, 0.9, 0.95)
 """Those for which the coverage of bounds is counted."""

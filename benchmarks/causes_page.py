@@ -93,12 +93,18 @@ def servo() -> str:
     by = "" if found[0]["rule"] == RULE else " by the first rule"
     loads = sum(each["first"] == "LoadFriction" for each in found)
     shares = ", ".join(f"{100 * each['share']:.0f} %" for each in found)
+    effect = (
+        f"It explains {shares} of the squared deviations in closed loop, and is not always named as the whole cause."
+    )
+    if not any(each["share"] for each in found):
+        effect = (
+            "It is not named, because with it, and fitted to the other recordings, a recording is further from its "
+            "prediction than the furthest one is from M."
+        )
     return (
         f"On the [real servo](../servo.md) with the published model m1, which has viscous and Coulomb friction, "
-        f"friction that depends on the load comes first{by} in {loads} of {len(found)} draws of {EXECUTIONS} "
-        f"recordings. It explains {shares} of the squared deviations in closed loop, and "
-        f"{'is' if all(each['named'] for each in found) else 'is not always'} named as the whole cause. The published "
-        "models m3 and m4 have such a friction."
+        f"friction that depends on the load is the most probable cause{by} in {loads} of {len(found)} draws of "
+        f"{EXECUTIONS} recordings. {effect} The published models m3 and m4 have such a friction."
     )
 
 

@@ -16,6 +16,7 @@ from ctxval._util.arrays import Array
 from ctxval.certificates import RESOLUTION, CertificateOptions, Posterior, farthest_task
 from ctxval.core.trial import Trial
 from ctxval.errors import (
+    CampaignError,
     CertificateError,
     CtxvalError,
     DistanceError,
@@ -189,6 +190,20 @@ def test_tasks_of_failed_executions_are_executed_again_first(validation: Validat
     assert campaign.trials[-1].because is None
     assert len(campaign.run(8 + len(failed), again="fuse replaced").trials) == 8 + len(failed)
     assert campaign.trials[-1].because is None  # nothing is left to repeat
+
+
+def test_what_fails_each_time_for_one_reason_costs_three_executions(validation: Validation) -> None:
+    class Broken:
+        def execute(self, controller: Any, task: Task) -> Trajectory:
+            raise RuntimeError(f"cannot open port {task.goal[0]:g}")
+
+    campaign = Campaign(make_validation(system=Broken()))
+    for executions in (3, 4):  # running again tries once more
+        with pytest.raises(CampaignError, match=f"all {executions} executions failed for one reason.*cannot open port"):
+            campaign.run(20, 0.5)
+        assert campaign.executions == executions
+    some = gp_ucb(make_validation(system=FaultyRig(validation.system, dict.fromkeys((0, 1, 3, 4, 5), "raise"))))
+    assert some.run(8).executions == 8
 
 
 def test_an_emergency_stop_falsifies_if_the_steps_before_it_exceed_the_threshold(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
@@ -17,7 +18,9 @@ from ctxval.campaign.workers import AHEAD, SerialPool, WorkerPool
 from ctxval.core.plan import start_offset
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import CONVERGED, Trial
-from ctxval.errors import CtxvalError, ExecutionError, InputError, StoreError
+from ctxval.errors import CampaignError, CtxvalError, ExecutionError, InputError, StoreError
+
+_ALIKE = 3  # executions that fail alike, after which a campaign stops if there are no others
 
 
 class ExecutionLoop:
@@ -157,11 +160,24 @@ class ExecutionLoop:
                 ended.append(self.recorder.close(trial, execution))
             except CtxvalError as error:
                 self.stopped = self.stopped or error
+        self.stopped = self.stopped or self._one_reason()
         for trial in ended:
             if is_heard():
                 advance(int(trial.executed), _result(self.recorder, trial, by_number[trial.number]))
             if self.on_trial is not None:
                 self.on_trial(trial)
+
+    def _one_reason(self) -> CampaignError | None:
+        """Return an error if all executions so far failed for one reason, except for its numbers; None if not."""
+        ended = [trial for trial in self.recorder.trials if trial.executed]
+        reasons = {re.sub(r"[-+.\d]+", "", trial.failure or "") for trial in ended}
+        if len(ended) < _ALIKE or len(reasons) > 1 or any(trial.state != "failed" for trial in ended):
+            return None
+        reason = (ended[-1].failure or "").rstrip(".")
+        return CampaignError(
+            f"all {len(ended)} executions failed for one reason, so no more is executed: {reason}. Correct the "
+            "experiment (`ctxval check` with --execute tries one task), or run again to go on."
+        )
 
     def _measured(self, opened: OpenTrial, execution: Execution) -> Execution | None:
         """Return an execution with its distance; None if it is to be repeated."""

@@ -259,7 +259,7 @@ def condition_on_dynamics(details: Mapping[str, Any]) -> str:
     if details["quantile"] is not None:
         return (
             f" with noise, if what M misses is a smooth function of {enumerated([*recorded, *physical], 10)}, the same "
-            "in every task and over time, and noise is independent from step to step"
+            "in every task and over time, and noise is independent from step to step and like that of the records"
         )
     if not lags:
         recorded = [state, f"input{acting}"] if physical else [f"{state} and input{acting}"]
