@@ -58,6 +58,11 @@ def percent(probability: float) -> str:
     return f"{100 * probability:.9g} %"
 
 
+def two_digits(value: float) -> str:
+    """Return a number with two digits that count, such as 210 and not 2.1e+02."""
+    return f"{float(f'{value:.2g}'):g}"
+
+
 def of_tasks(distribution: str | None) -> str:
     """Return of what a share is a share; the distribution of tasks is a text, None if it is uniform."""
     return "of the tasks" if distribution is None else "of the tasks under the stated distribution"

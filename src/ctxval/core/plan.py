@@ -71,7 +71,8 @@ def require_execution(plan: Plan, trajectory: Trajectory, start_tolerance: float
         i = int(np.argmin(near))
         wanted = f"{start[i]:g} within {start_tolerance * scale[i]:.3g}, got {trajectory.states[0, i]:g}"
         raise InputError(
-            f"the trajectory starts elsewhere: state {i} must start at {wanted}. Check that it belongs to this trial."
+            f"the trajectory starts elsewhere: state {i} must start at {wanted}. Check that it belongs to this trial; "
+            "if it does, a larger start_tolerance permits it."
         )
 
 

@@ -17,6 +17,7 @@ from ctxval.certificates.bounds import (
     distinguishable,
     of_tasks,
     percent,
+    two_digits,
     with_error,
     with_units,
 )
@@ -207,7 +208,7 @@ def _push(tolerance: Tolerance) -> str:
 
 def _rate(label: str, value: float) -> str:
     name, unit = parted(label)
-    return f"{f'{value:.2g} {unit}'.rstrip()} in {name}"
+    return f"{f'{two_digits(value)} {unit}'.rstrip()} in {name}"
 
 
 def _not_entered(pocket: Mapping[str, Any] | None) -> str:
@@ -215,10 +216,10 @@ def _not_entered(pocket: Mapping[str, Any] | None) -> str:
     if pocket is None:
         return ""
     radii = [(*parted(label), radius) for label, radius in pocket["within"].items()]
-    within = " and ".join(f"{f'{radius:.2g} {unit}'.rstrip()} in {name}" for name, unit, radius in radii)
+    within = " and ".join(f"{f'{two_digits(radius)} {unit}'.rstrip()} in {name}" for name, unit, radius in radii)
     if len({(unit, radius) for _, unit, radius in radii}) == 1:
         _, unit, radius = radii[0]
-        within = f"{radius:.2g} {unit}".rstrip()
+        within = f"{two_digits(radius)} {unit}".rstrip()
     return (
         f" The least tested place is {with_units(pocket['place'])}: predicted runs lead there, and no execution came "
         f"within {within}."

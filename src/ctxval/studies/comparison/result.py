@@ -86,7 +86,8 @@ class PairResult:
             return WORDS[self.question], *names, "-", "-", "-"
         sign = -1 if self.smaller == self.second else 1
         ends = sorted(sign * end for end in (self.low, self.high) if end is not None)
-        interval = f"{_number(ends[0])} to {_number(ends[1])}" if len(ends) == 2 else "-"
+        is_limited = len(ends) == 2 and np.isfinite(ends).any()
+        interval = f"{_number(ends[0])} to {_number(ends[1])}" if is_limited else "-"
         estimate = _number(None if self.estimate is None else sign * self.estimate)
         return WORDS[self.question], *names, estimate, interval, str(self.tasks)
 
