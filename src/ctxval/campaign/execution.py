@@ -168,8 +168,10 @@ class ExecutionLoop:
                 self.on_trial(trial)
 
     def _one_reason(self) -> CampaignError | None:
-        """Return an error if all executions so far failed for one reason, except for its numbers; None if not."""
+        """Return an error if all executions so far failed for one reason, and more would follow; numbers may differ."""
         ended = [trial for trial in self.recorder.trials if trial.executed]
+        if self.budget is not None and len(ended) >= self.budget:
+            return None
         reasons = {re.sub(r"[-+.\d]+", "", trial.failure or "") for trial in ended}
         if len(ended) < _ALIKE or len(reasons) > 1 or any(trial.state != "failed" for trial in ended):
             return None
