@@ -78,6 +78,7 @@ def test_a_failure_beyond_the_threshold_is_outside_or_contradicts_it(
 
 
 @pytest.mark.slow
+@pytest.mark.thorough
 def test_a_resumed_campaign_makes_the_same_choices(whole: Campaign, tmp_path: Path) -> None:
     path = tmp_path / "c.sqlite"
     validation = make_validation_without_inputs()

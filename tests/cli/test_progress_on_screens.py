@@ -153,6 +153,7 @@ class Holding:
 
 
 @pytest.mark.slow
+@pytest.mark.thorough
 def test_certifying_is_shown(folder: Path) -> None:
     run = calling("run")("rig:experiment", "--budget", "6", "--search", "random", "--store", "a.sqlite", "--no-report")
     assert run.exit_code == 0

@@ -168,7 +168,7 @@ class ExecutionLoop:
                 self.on_trial(trial)
 
     def _one_reason(self) -> CampaignError | None:
-        """Return an error if all executions so far failed for one reason without a recorded step, and more would follow.
+        """Return an error if all executions failed for one reason, before any step was recorded, and more would follow.
 
         The numbers in the reason may differ.
         """

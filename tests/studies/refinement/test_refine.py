@@ -176,6 +176,7 @@ def executions(store: Path) -> int:
 
 
 @pytest.mark.slow
+@pytest.mark.thorough
 def test_a_killed_refinement_resumes_with_the_same_choices(
     found: Refinement, store: Path, tmp_path: Path, request: pytest.FixtureRequest
 ) -> None:
