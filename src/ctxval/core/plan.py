@@ -209,7 +209,7 @@ def require_repeatable(validation: Validation, plan: Plan) -> None:
                 f"the closed loop on the model must be the same if it runs again, and {kind} {i} at step {t} is "
                 f"{after[t, i]:.4g}, was {before[t, i]:.4g}: the controller or the model remembers the first run, or "
                 "is random. Keep the memory of a controller in `start` and `step`, or begin it anew at step 0, with a "
-                "fixed seed if it draws numbers."
+                "fixed seed if it draws numbers; `models.Expected` is the expected step of a random model."
             )
 
 
