@@ -94,6 +94,7 @@ def alone(folder: Path) -> tuple[Trial, ...]:
 
 
 @pytest.mark.slow
+@pytest.mark.thorough
 def test_a_job_that_slurm_preempts_and_queues_again_is_no_failure(tmp_path: Path) -> None:
     require("submitit")
     trials = trials_of_recipe(tmp_path, "slurm", signal.SIGUSR2)

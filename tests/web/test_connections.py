@@ -85,6 +85,7 @@ def opened_page(server: Server) -> Iterator[BinaryIO]:
 
 
 @pytest.mark.slow
+@pytest.mark.thorough
 def test_requests_that_do_not_come_end_and_pages_stay_up_to_date_meanwhile(servers: dict[str, Server]) -> None:
     with contextlib.ExitStack() as stack:
         pages = [stack.enter_context(opened_page(server)) for server in servers.values()]

@@ -126,6 +126,7 @@ def test_a_whole_campaign_by_hand(browser: Any, folder: Path, address: str) -> N
     assert [trial.state for trial in stored(folder)] == ["completed"] * 7
 
 
+@pytest.mark.thorough
 def test_a_wrong_file_is_refused_in_place_and_the_right_one_taken(browser: Any, folder: Path, address: str) -> None:
     one = Operator(browser, folder, address, accept_downloads=True)
     number = one.opened()
@@ -264,6 +265,7 @@ def test_everything_works_without_javascript(browser: Any, folder: Path, address
     assert [trial.state for trial in stored(folder)][:2] == ["completed"] * 2
 
 
+@pytest.mark.thorough
 def test_the_keyboard_reaches_everything_in_order(browser: Any, folder: Path, address: str) -> None:
     one = Operator(browser, folder, address)
     one.opened()
