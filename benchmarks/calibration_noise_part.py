@@ -32,7 +32,9 @@ needs beside them: how many are at least d_q*.
 {coverage}
 
 Before each execution, noisy dynamics predict with which probability its distance is smaller than each value. With the
-right law, the probabilities of what was executed are uniform.
+right law, the probabilities of what was executed are uniform. They are not quite: distances are more often far below
+what was predicted than they should be, and after measurement noise less often far above it. The predictions err on the
+safe side, except that noise of both kinds leads a little more often far above them.
 
 ![How often each tenth of the predicted probabilities was met, beside chance](calibration/noise_ranks.png)
 
@@ -108,7 +110,7 @@ def draw() -> None:
     panels = figure.subplots(1, len(kinds), sharey=True)
     for panel, kind in zip(panels, kinds, strict=True):
         ranks = [rank for line in stored if line["imperfection"].startswith(kind) for rank in line["ranks"]]
-        panel.set(title=f"{kind} ({len(ranks)} executions)", xlabel="predicted probability of less", xlim=(0, 1))
+        panel.set(title=f"{kind}\n{len(ranks):,} executions", xlabel="predicted probability of less", xlim=(0, 1))
         if not ranks:
             continue
         low, high = binom.interval(0.95, len(ranks), 1 / BINS)
