@@ -122,6 +122,14 @@ def test_a_built_in_part_is_never_replaced(site: Path) -> None:
     assert not (site / "imported.txt").exists()
 
 
+def test_a_package_that_quits_while_it_is_loaded_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    entry_points = "[ctxval.distances]\nQuits = their_script:main\n"
+    monkeypatch.syspath_prepend(str(install(tmp_path / "site", entry_points=entry_points)))
+    (tmp_path / "site" / "their_script.py").write_text("raise SystemExit('this is a program')")
+    with pytest.raises(InputError, match=r"cannot be loaded from 'their_script:main': SystemExit: this is a program"):
+        distances.by_name("Quits")
+
+
 @pytest.mark.parametrize(
     ("name", "sentence"),
     [

@@ -229,6 +229,27 @@ def test_an_emergency_stop_falsifies_if_the_steps_before_it_exceed_the_threshold
     assert campaign.verdict(0.9 * gap).answer != "falsified"
 
 
+def test_a_replaced_failure_keeps_no_distance_of_the_one_before() -> None:
+    validation = make_validation(distance=distances.MaximumDeviation())
+    campaign = Campaign(validation, search=searches.Random())  # nothing else is noted with the trial
+    opened = campaign.ask({"goal": 1.0})
+    whole = validation.execute(opened.plan)
+    states = whole.states + np.linspace(0, 9, len(whole.states))[:, None]
+    stopped = Trajectory(whole.times, states, whole.inputs).first(8)
+    assert campaign.tell(opened, stopped, failed="emergency stop").least > 1
+    replaced = campaign.tell(0, failed="it was never started", replace="the file of another run")
+    assert replaced.least == 0
+    assert campaign.verdict(1.0).answer == "undecided"
+
+
+def test_a_task_that_failed_after_a_success_is_executed_again(validation: Validation) -> None:
+    campaign = Campaign(validation)
+    first = campaign.ask({"goal": 1.0})
+    campaign.tell(first, validation.execute(first.plan))
+    campaign.tell(campaign.ask({"goal": 1.0}), failed="the fuse blew")
+    assert campaign.run(3, 1e-3, explore=True, again="fuse replaced").trials[2].because == "fuse replaced"
+
+
 def test_failures_do_not_change_what_a_resumed_campaign_chooses(validation: Validation, tmp_path: Path) -> None:
     def campaign(store: Path | None, done: int) -> Campaign:
         faults = {k - done: "raise" for k in (1, 6) if k >= done}

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Generic, TypeVar
 from ctxval._util.checked import checked, require_known
 from ctxval._util.refusals import reworded
 from ctxval._util.representation import ShortRepr
+from ctxval._util.texts import reason_of
 from ctxval.errors import InputError, UnknownNameError
 
 if TYPE_CHECKING:  # importlib.metadata is slow to import, and is needed only for names that are not built in
@@ -117,8 +118,10 @@ class Registry(Mapping[str, Any], Generic[Made]):
             both = " and ".join(packages)
             raise InputError(f"two installed packages have a {self.kind} {name!r}: {both}; uninstall one of them.")
         what, value = f"the {self.kind} {name!r} of the installed package {packages[0]}", points[0].value
-        with reworded(f"{what} cannot be loaded from {value!r}"):
+        try:
             made = points[0].load()
+        except (Exception, SystemExit) as error:  # the module of another package may quit
+            raise InputError(f"{what} cannot be loaded from {value!r}: {reason_of(error)}.") from error
         if not callable(made) or (isinstance(made, type) and not has_method(made, self.method)):
             wanted = "a function" if self.method is None else f"a class with the method {self.method}"
             raise InputError(f"{what} must be {wanted}, which {value!r} is not.")

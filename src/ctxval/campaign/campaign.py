@@ -33,7 +33,7 @@ from ctxval.certificates import RESOLUTION, Certificate, CertificateOptions, Pro
 from ctxval.certificates.envelope import Envelope
 from ctxval.certificates.expiry import WatchState
 from ctxval.certificates.options import CONFIDENCE, WITHIN
-from ctxval.certificates.sample import executions_of
+from ctxval.certificates.sample import without_success
 from ctxval.core.distance import Distance
 from ctxval.core.plan import StartOffset, input_difference, start_offset
 from ctxval.core.trajectory import Trajectory
@@ -246,15 +246,13 @@ class Campaign:
             raise InputError("an envelope needs a threshold, and a campaign that does not explore.")
         enlarges = EnvelopeSearch(decides) if envelope and decides is not None else None
         by_search = Choice(planned_draws=budget if until is None else 0)
+        lost = list[Trial]()
         if again is not None:
             if not again.strip():
                 raise InputError('again needs a reason, such as "fuse replaced".')
             self.refresh()
-        failed = [] if again is None else [each for each in self.failed if each.executed]
-        # Each task once, and none that has succeeded since.
-        lost = list(
-            {each.unit_point.tobytes(): each for each in failed if not executions_of(each, self.trials)}.values()
-        )
+            failed = (each for each in without_success(self.trials) if each.executed and each.state == "failed")
+            lost = list({each.unit_point.tobytes(): each for each in failed}.values())  # each task once
 
         def rule() -> Choice | None:
             if lost and not (until is not None and until(self)):

@@ -117,7 +117,7 @@ class Execution:
         if self.at_least is not None:
             note[AT_LEAST] = self.at_least
         ended = replace(trial, state=state, executed=executed, distance=self.distance, failure=self._failure)
-        return replace(ended, seconds=self.seconds, note=note or trial.note)
+        return replace(ended, seconds=self.seconds, note=note or None)
 
     def is_that_of(self, trial: Trial) -> bool:
         """Return whether a trial of the same task has stored this execution already."""
