@@ -172,11 +172,13 @@ class ExecutionLoop:
 
         The numbers in the reason may differ.
         """
-        ended = [trial for trial in self.recorder.trials if trial.executed]
-        if self.budget is not None and len(ended) >= self.budget:
+        trials = self.recorder.trials
+        if any(trial.executed and trial.state != "failed" for trial in trials):
             return None
-        reasons = {re.sub(r"[-+.\d]+", "", trial.failure or "") for trial in ended}
-        if len(ended) < _ALIKE or len(reasons) > 1 or any(trial.state != "failed" for trial in ended):
+        ended = [trial for trial in trials if trial.executed]
+        if len(ended) < _ALIKE or (self.budget is not None and len(ended) >= self.budget):
+            return None
+        if len({re.sub(r"[-+.\d]+", "", trial.failure or "") for trial in ended}) > 1:
             return None
         if self.recorder.store.trajectories([trial.number for trial in ended], "system"):
             return None  # the system moved, and a loop that diverges is one of its properties

@@ -86,12 +86,6 @@ class IntervalSearch:
         return largest_distance(self.recorder.trials)
 
     @property
-    def _least_of_failed(self) -> float:
-        """What the distance of a failed execution is at least; 0 if nothing is known, or if there is no threshold."""
-        failed = (trial.least for trial in self.recorder.trials if trial.state == "failed")
-        return 0.0 if self.threshold is None else max(failed, default=0.0)
-
-    @property
     def tests(self) -> int:
         """The number of tests that the certificate needs."""
         return self.options.kind.tests if isinstance(self.options.kind, Automatic | Dynamics) else 0
@@ -123,7 +117,7 @@ class IntervalSearch:
         kind = self.options.kind
         if not self.recorder.has_tasks:
             return None
-        if max(self.best, self._least_of_failed) > self.limit:
+        if self.threshold is not None and any(trial.least > self.threshold for trial in self.recorder.trials):
             if (repeated := self._against_noise()) is not None:
                 return repeated
             if self.is_falsified:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ctxval._util.arrays import ArrayLike
+from ctxval._util.arrays import Array, ArrayLike
 from ctxval._util.representation import ShortRepr
 from ctxval._util.texts import reason_of
 from ctxval.core.controller import Controller, started
@@ -109,6 +110,13 @@ def least_distance(validation: Validation, point: ArrayLike, model: Trajectory, 
     return None
 
 
+def _inputs_along(plan: Plan, states: Array) -> Iterator[Array]:
+    """Yield the inputs ``(m,)`` that the controller of a plan gives at states ``(H, n)``, each when it is asked for."""
+    pi = started(plan.controller, plan.task)
+    for t, x in enumerate(states):
+        yield np.asarray(pi(t, x), dtype=np.float64)
+
+
 def gives_inputs(plan: Plan, trajectory: Trajectory, tolerance: float) -> bool:
     """Return whether the controller of a plan gives the recorded inputs at the recorded states.
 
@@ -122,9 +130,8 @@ def gives_inputs(plan: Plan, trajectory: Trajectory, tolerance: float) -> bool:
     nearest = tolerance * np.maximum(np.abs(inputs).max(axis=0, initial=0.0), 1e-300)
     try:
         with np.errstate(all="ignore"):
-            pi = started(plan.controller, plan.task)
-            gaps = (np.asarray(pi(t, states[t])) - u for t, u in enumerate(inputs))
-            return all(bool((np.abs(gap) <= nearest).all()) for gap in gaps)
+            pairs = zip(_inputs_along(plan, states[:-1]), inputs, strict=True)
+            return all(bool((np.abs(given - u) <= nearest).all()) for given, u in pairs)
     except Exception:  # the user's controller, at states that it never reached by itself
         return False
 
@@ -139,26 +146,18 @@ def input_difference(validation: Validation, plan: Plan, trajectory: Trajectory)
     states, inputs = trajectory.states, trajectory.inputs
     try:
         with np.errstate(all="ignore"):
-            pi = started(plan.controller, plan.task)
-            given = np.array([np.asarray(pi(t, states[t]), dtype=np.float64) for t in range(len(inputs))])
+            given = np.array(list(_inputs_along(plan, states[:-1])))
             gaps = np.abs(given - inputs)
     except Exception:  # the user's controller, at states that it never reached by itself
         return None
     sizes = np.sqrt(np.maximum(np.mean(given**2, axis=0), np.mean(inputs**2, axis=0)))
     least = 1e-9 * np.abs(given).max(initial=0.0)  # rounding is no difference
-    apart = np.sqrt(np.mean(gaps**2, axis=0)) > np.maximum(_AGREEING * sizes, least)
+    apart = np.sqrt(np.mean(gaps**2, axis=0)) > np.maximum(sizes / 3, least)
     if not apart.any():
         return None
     t, i = np.unravel_index(np.argmax(np.where(apart, gaps / np.maximum(sizes, 1e-300), -1.0)), gaps.shape)
     name, unit = list(validation.names(states.shape[-1], inputs.shape[-1])[1].items())[i]
     return f"{name} is {inputs[t, i]:.3g} {unit}".rstrip() + f" at {trajectory.times[t]:.3g} s, not {given[t, i]:.3g}"
-
-
-_AGREEING = 1 / 3
-"""Largest root mean square of the difference between recorded inputs and those of the controller that is no remark."""
-
-_REPEATABLE = 1e-3
-"""Largest difference of two closed loops with one controller on M, as a share of the magnitude of a state or input."""
 
 
 class DistanceWarning(UserWarning):
@@ -170,7 +169,7 @@ def try_distance(validation: Validation, plan: Plan) -> None:
 
     A distance to the task has the attribute ``to_task = True``.
     """
-    value = validation.measure(plan, plan.model_trajectory.copy())
+    value = validation.measure(plan, plan.model_trajectory)
     if value > 1e-9 and not (validation.is_on_model or getattr(validation.distance, "to_task", False)):
         where = validation.space.describe_point(plan.parameters.points)
         warnings.warn(
@@ -202,7 +201,7 @@ def require_repeatable(validation: Validation, plan: Plan) -> None:
     except Exception as error:
         raise DesignError(f"the controller failed when it ran a second time: {reason_of(error)}.") from error
     for kind, before, after in (("input", first.inputs, again.inputs), ("state", first.states, again.states)):
-        same = np.abs(after - before) <= _REPEATABLE * np.abs(before).max(axis=0, initial=0.0)
+        same = np.abs(after - before) <= 1e-3 * np.abs(before).max(axis=0, initial=0.0)  # of each magnitude
         if not same.all():
             t, i = np.argwhere(~same)[0]
             raise DesignError(
