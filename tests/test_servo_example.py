@@ -12,7 +12,8 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from ctxval import Campaign, compare
+from ctxval import Campaign, compare, searches
+from ctxval.studies.causes import find_causes
 
 FOLDER = Path(__file__).parents[1] / "examples" / "servo"
 
@@ -98,3 +99,14 @@ def test_one_recording_counts_for_all_compared_models(servo: ModuleType) -> None
     assert found.executions == 1
     assert [(result.executions, result.shared) for result in found.candidates].count((0, 0)) == 0
     assert sum(result.executions + result.shared for result in found.candidates) == 2
+
+
+@pytest.mark.slow
+@pytest.mark.thorough
+def test_load_friction_explains_most_of_what_the_first_model_misses(servo: ModuleType) -> None:
+    campaign = Campaign(servo.experiment(friction="m1").validation, search=searches.by_name("random"), seed=0).run(5)
+    report = find_causes(campaign)
+    assert not report.named
+    assert [cause.name for cause in report.explained[0].causes] == ["load-dependent friction"]
+    assert report.explained[0].share > 0.4
+    assert "the largest distance of 5 executions rises" in report.sentence

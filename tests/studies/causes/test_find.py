@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -121,6 +122,15 @@ def test_a_report_is_plain_values_and_its_python_makes_the_model() -> None:
     exec(report.python, made)
     x, u = np.array([0.3, -0.2]), np.array([0.5])
     np.testing.assert_allclose(made["model"].step(x, u), weak(x, u + 0.3), atol=2e-3)
+
+
+def test_what_explains_most_is_said_although_the_largest_distance_rises() -> None:
+    weak = slide(no_force)
+    report = find_causes(campaign(lambda x, u: weak(x, u + 0.3)), most=1)
+    partial = replace(report.explained[0], distance=2 * report.before)
+    assert not partial.counts(report.before)
+    sentence = replace(report, named=False, explained=(partial,)).sentence
+    assert f"but the largest distance of 3 executions rises from {report.before:.3g} to" in sentence
 
 
 def test_one_execution_is_too_few() -> None:

@@ -27,6 +27,7 @@ from ctxval.studies.causes.signals import SensorOffset
 
 _ALIKE = 10.0  # differences of the criterion that do not tell causes apart
 _NAMED = 0.98  # share of the squared deviations of M in closed loop that causes must explain, to be the cause
+_LITTLE = 0.1  # share of the squared deviations that is not worth a sentence
 _FITTED = 8  # explanations by one more cause that are fitted to all records
 _CHECKED = 4  # explanations that are tried in closed loop
 _FAILED = 4  # executions that failed
@@ -116,13 +117,16 @@ class _Study:
         with stage("fitting causes", (2 * most - 1) * len(self.dictionary), "causes"):
             ranked = self._ranked(())
             chosen, alike = self._chosen(ranked)
-            while chosen is not None and len(chosen.explanation.candidates) < most:
+            before = max(self.loops.distances)
+            while chosen is not None and chosen.counts(before) and len(chosen.explanation.candidates) < most:
                 if chosen.explanation.left < 0.02 or chosen.complete > 0.99:  # nothing is left for another cause
                     break
                 better, others = self._chosen(self._ranked(chosen.explanation.candidates))
                 if better is not None:  # the first one was chosen without the other ones
                     better, others = self._chosen(self._ranked(better.explanation.candidates[1:]))
-                if better is None or better.explanation.criterion > chosen.explanation.criterion - _ALIKE:
+                if better is None or not better.counts(before):
+                    break
+                if better.explanation.criterion > chosen.explanation.criterion - _ALIKE:
                     break
                 if 1 - better.complete > 0.5 * (1 - chosen.complete):
                     break
@@ -132,7 +136,8 @@ class _Study:
     def _reported(
         self, group: list[Explained], ranked: Sequence[Explanation] = (), *, began_elsewhere: bool = False
     ) -> CauseReport:
-        named = bool(group) and group[0].complete >= _NAMED
+        before = max(self.loops.distances)
+        named = bool(group) and group[0].counts(before) and group[0].complete >= _NAMED
         from_tasks = None
         if group and not self.outputs and not began_elsewhere:
             from_tasks = self.loops.distance_from_tasks(group[0].explanation.repaired)
@@ -143,7 +148,7 @@ class _Study:
             began_elsewhere=began_elsewhere,
             tried=len(self.dictionary),
             executions=len(self.executions),
-            before=max(self.loops.distances),
+            before=before,
             from_tasks=from_tasks,
             failed=self.failed,
             units=self.validation.labels.units,
@@ -188,17 +193,21 @@ class _Study:
         """Return the most probable explanation that counts, and those that the executions do not tell from it.
 
         Of those that explain alike, the one with the fewest sizes is the first, and what has it as a special case is
-        no other explanation.
+        no other explanation. If none counts, it is the one that explains most, if this is not little.
         """
-        before = max(self.loops.distances)
-        tried = (self._in_closed_loop(each) for each in ranked[:_CHECKED])
-        best = next((each for each in tried if each.counts(before)), None)
-        if best is None:
-            return None, []
+        before, tried = max(self.loops.distances), list[Explained]()
+        for each in ranked[:_CHECKED]:
+            tried.append(self._in_closed_loop(each))
+            if tried[-1].counts(before):
+                break
+        else:
+            most = max(tried, key=lambda each: each.share)
+            return (most if most.resolved and most.share > _LITTLE else None), []
+        best = tried[-1]
         others = [each for each in ranked if each is not best.explanation and _alike(best.explanation, each)]
         group = [best, *(self._in_closed_loop(each) for each in others[:_CHECKED])]
         group = [each for each in group if 1 - each.share <= 2 * (1 - best.share) + 1e-3]
-        first = min(group, key=lambda each: len(each.explanation.sizes))
+        first = min((each for each in group if each.counts(before)), key=lambda each: len(each.explanation.sizes))
         return first, [each for each in group if each is not first and not _contains(each, first)]
 
     def _in_closed_loop(self, explanation: Explanation) -> Explained:

@@ -154,7 +154,7 @@ class LoadFriction(Force):
         return np.clip(stopping, -most, most)
 
     def text(self, plant: Plant) -> str:
-        more = f", and {self.amount(plant, self.sizes[1])}" if self.sizes[1] > 0 else ""
+        more = f", and {self.amount(plant, self.sizes[1])}" if self.sizes[1] > 1e-3 * self.probe else ""
         name = plant.joint_name(self.joint)
         return f"the friction of {name} depends on the load ({100 * self.sizes[0]:.3g} % of it{more})"
 

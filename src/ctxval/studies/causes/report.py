@@ -119,9 +119,10 @@ class CauseReport(ShortRepr):
         failed = "" if not self.failed else " until they failed"
         if 0 < self.failed < self.executions:
             failed = f", {self.failed} of them until {'they' if self.failed > 1 else 'it'} failed,"
+        falls = first.distance < self.before
         effect = (
-            f"the largest distance of {self.executions} executions{failed} falls from {self.before:.3g} to "
-            f"{first.distance:.3g}{units}"
+            f"the largest distance of {self.executions} executions{failed} "
+            f"{'falls' if falls else 'rises'} from {self.before:.3g} to {first.distance:.3g}{units}"
         )
         if self.from_tasks is not None and self.from_tasks > max(2 * first.distance, _APART * self.before):
             effect += (
@@ -132,7 +133,8 @@ class CauseReport(ShortRepr):
         share = f"{np.floor(1e3 * part) / 10:.4g} % of the squared {of}"
         if not self.named:
             less = "The largest part of the error that one explains" if first.share > 0.5 else "What comes nearest"
-            return f"None of these {self.tried} causes. {less}: {self._text(first)}. It explains {share}, and {effect}."
+            effect = f"{'and' if falls else 'but'} {effect}"
+            return f"None of these {self.tried} causes. {less}: {self._text(first)}. It explains {share}, {effect}."
         what = "; or ".join(map(self._text, self.explained))
         if len(self.explained) > 1:
             what = f"One of these, which the executions do not tell apart: {what}"
