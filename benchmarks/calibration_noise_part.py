@@ -7,11 +7,13 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
-from scipy.stats import binom
+from scipy.stats import binom, chisquare
 
 from calibrate import ROOT
 from calibrate_noise import BUDGET, CONFIDENCES, HALVES, IMPERFECTIONS, QUANTILE, RULE, STORED, table
 from calibration_verdicts_part import interval, validated_share
+from ctxval._util.arrays import Array
+from ctxval.certificates.prediction_tests import DRAWN
 
 PICTURE, BINS = ROOT / "docs" / "calibration" / "noise_ranks.png", 10
 
@@ -32,9 +34,9 @@ needs beside them: how many are at least d_q*.
 {coverage}
 
 Before each execution, noisy dynamics predict with which probability its distance is smaller than each value. With the
-right law, the probabilities of what was executed are uniform. They are not quite: distances are more often far below
-what was predicted than they should be, and after measurement noise less often far above it. The predictions err on the
-safe side, except that noise of both kinds leads a little more often far above them.
+right law, the probabilities of what was executed are uniform. They can be so only where nobody chose the task by its
+prediction: of tasks that were chosen because a large distance was predicted, the chosen predictions are too large. The
+picture has both. {ranks}
 
 ![How often each tenth of the predicted probabilities was met, beside chance](calibration/noise_ranks.png)
 
@@ -76,6 +78,7 @@ def under_noise() -> str:
         **validated_share(below),
         reported=table("reporting"),
         coverage=_coverage(results),
+        ranks=_uniform(results),
         developed=of("development", DEVELOPED),
         misleading=of("misleading", MISLEADING),
     )
@@ -102,22 +105,59 @@ def _kinds() -> dict[str, list[str]]:
     return {"no imperfection": ["none"], "delays and lags": late, "noise and encoders": noisy}
 
 
+NOISES = ("process", "measurement", "both", "encoder")
+
+
+def _ranks(results: Sequence[dict[str, Any]], noise: str) -> tuple[Array, Array]:
+    """Return the predicted probabilities of less, of drawn tests and of tasks that were chosen."""
+    drawn, chosen = [], []
+    for line in results:
+        if line["imperfection"].startswith(noise) and None not in line["distances"]:
+            # Once a prediction knows noise, all later ones do.
+            origins = line["origins"][len(line["origins"]) - len(line["ranks"]) :]
+            for origin, rank in zip(origins, line["ranks"], strict=True):
+                (drawn if origin in DRAWN else chosen).append(rank)
+    return np.array(drawn), np.array(chosen)
+
+
+def _uniform(results: Sequence[dict[str, Any]]) -> str:
+    """Return what a test of fit says of drawn tests, and how often chosen tasks are in the lowest tenth."""
+    tests, lowest = [], []
+    for noise in NOISES:
+        drawn, chosen = _ranks(results, noise)
+        if len(drawn):
+            probability = chisquare(np.histogram(drawn, BINS, (0, 1))[0]).pvalue
+            tests.append(f"{noise} {probability:.2g} ({len(drawn)} executions)")
+        if len(chosen):
+            lowest.append(f"{noise} {(chosen < 1 / BINS).mean() * BINS:.1f}")
+    return (
+        "At drawn tests, the probability of ranks that are less uniform, if the law is right, is by noise: "
+        f"{', '.join(tests)}. Chosen tasks fall into the lowest tenth more often than one time in ten, by a factor "
+        f"of: {', '.join(lowest)}. After measurement noise, distances are more rarely far above what was predicted than "
+        "they should be, so its predictions err on the safe side."
+    )
+
+
 def draw() -> None:
     """Draw how often each tenth of the predicted probabilities was met on reporting plants, by kind of noise."""
     stored = [line for line in STORED.select(rule=RULE) if line["plant"] in HALVES["reporting"]]
-    kinds = ["process", "measurement", "both", "encoder"]
-    figure = Figure(figsize=(10, 2.8), layout="constrained")
-    panels = figure.subplots(1, len(kinds), sharey=True)
-    for panel, kind in zip(panels, kinds, strict=True):
-        ranks = [rank for line in stored if line["imperfection"].startswith(kind) for rank in line["ranks"]]
-        panel.set(title=f"{kind}\n{len(ranks):,} executions", xlabel="predicted probability of less", xlim=(0, 1))
-        if not ranks:
+    figure = Figure(figsize=(10, 2.9), layout="constrained")
+    panels = figure.subplots(1, len(NOISES), sharey=True)
+    for panel, noise in zip(panels, NOISES, strict=True):
+        drawn, chosen = _ranks(stored, noise)
+        panel.set(title=f"{noise}\n{len(drawn):,} drawn, {len(chosen):,} chosen", xlim=(0, 1))
+        panel.set_xlabel("predicted probability of less")
+        if not len(drawn):
             continue
-        low, high = binom.interval(0.95, len(ranks), 1 / BINS)
-        panel.axhspan(low * BINS / len(ranks), high * BINS / len(ranks), color="0.85", label="95 % of chance")
+        low, high = binom.interval(0.95, len(drawn), 1 / BINS)
+        panel.axhspan(low * BINS / len(drawn), high * BINS / len(drawn), color="0.88", label="95 % of chance, drawn")
         panel.axhline(1.0, color="0.4", linewidth=1)
-        density, edges = np.histogram(ranks, bins=BINS, range=(0, 1), density=True)
-        panel.stairs(density, edges, color="#0072b2", linewidth=1.8, label="executions")
+        for ranks, style in (
+            (drawn, {"color": "#0072b2", "linewidth": 1.8, "label": "drawn tests"}),
+            (chosen, {"color": "#d55e00", "linewidth": 1.2, "linestyle": "--", "label": "chosen tasks"}),
+        ):
+            density, edges = np.histogram(ranks, bins=BINS, range=(0, 1), density=True)
+            panel.stairs(density, edges, **style)
     panels[0].set_ylabel("share, relative to uniform")
-    panels[0].legend(loc="lower center", frameon=False, fontsize=8)
+    panels[0].legend(loc="upper right", frameon=False, fontsize=8)
     figure.savefig(PICTURE, dpi=110)
