@@ -133,8 +133,8 @@ def _uniform(results: Sequence[dict[str, Any]]) -> str:
     return (
         "At drawn tests, the probability of ranks that are less uniform, if the law is right, is by noise: "
         f"{', '.join(tests)}. Chosen tasks fall into the lowest tenth more often than one time in ten, by a factor "
-        f"of: {', '.join(lowest)}. After measurement noise, distances are more rarely far above what was predicted than "
-        "they should be, so its predictions err on the safe side."
+        f"of: {', '.join(lowest)}. After measurement noise, distances are more rarely far above what was predicted "
+        "than they should be, so its predictions err on the safe side."
     )
 
 
