@@ -226,12 +226,13 @@ class Validation:
 
     def measure(self, plan: Plan, trajectory: Trajectory) -> float:
         """Return d(p)."""
-        return self._measured(plan.parameters.points, self._distance(plan.task, plan.model_trajectory, trajectory))
+        value = self.distance_between(plan.model_trajectory, trajectory, plan.task)
+        return self._measured(plan.parameters.points, value)
 
     def remeasure(self, point: ArrayLike, model_trajectory: Trajectory, system_trajectory: Trajectory) -> float:
         """Return d(p) between two known trajectories, as :meth:`measure` does, without the design of a controller."""
         parameters = self.space.parameters(point)
-        value = self._distance(self.task_at(parameters), model_trajectory, system_trajectory)
+        value = self.distance_between(model_trajectory, system_trajectory, self.task_at(parameters))
         return self._measured(parameters.points, value)
 
     def _measured(self, point: Array, value: Array) -> float:
@@ -281,6 +282,23 @@ class Validation:
             return np.concatenate([self._batch_distances(rows[i : i + 4096]) for i in range(0, len(rows), 4096)])
         return np.array([self._distance_or_nan(plan) for plan in self._planned(rows)])
 
+    def distance_between(self, model: Trajectory, system: Trajectory, task: Task) -> Array:
+        """Return the distance ``(...)`` of trajectories, which it may not change.
+
+        Raises:
+            DistanceError: if the distance fails, or gives no real number.
+        """
+        try:
+            with np.errstate(all="ignore"):  # some distances change the arrays that they are given
+                values = np.asarray(self.distance(model.copy(), system.copy(), task))
+                if np.iscomplexobj(values):
+                    raise TypeError(f"it must be a real number, got {values}")
+                return np.asarray(values, dtype=np.float64)
+        except BaseException as error:
+            if raised_by_signal(error):
+                raise
+            raise DistanceError(f"the distance failed: {reason_of(error).rstrip('.')}.") from error
+
     def _distance_or_nan(self, plan: Plan) -> float:
         try:
             trajectory = self.execute(plan)
@@ -304,7 +322,7 @@ class Validation:
             trajectory = self.system.execute(plan.controller, plan.task)
         except Exception:  # only single executions show which task failed
             return np.array([self._distance_or_nan(self.plan(point)) for point in points])
-        values = self._distance(plan.task, expected, trajectory)
+        values = self.distance_between(expected, trajectory, plan.task)
         if values.shape != (len(points),):
             raise DistanceError(f"the distance must have shape ({len(points)},) over the batch, got {values.shape}.")
         fits = trajectory.states.shape == expected.states.shape and trajectory.inputs.shape == expected.inputs.shape
@@ -359,18 +377,6 @@ class Validation:
             raise InputError(f"{cost}, and at most {self.longest} steps are permitted: {permit}.")
         _stated.add(self)
         warnings.warn(f"{cost}, and a simulated execution about as much.", CostWarning, stacklevel=2)
-
-    def _distance(self, task: Task, model: Trajectory, system: Trajectory) -> Array:
-        try:
-            with np.errstate(all="ignore"):  # a function that works in place may not change what was recorded
-                values = np.asarray(self.distance(model.copy(), system.copy(), task))
-                if np.iscomplexobj(values):
-                    raise TypeError(f"it must be a real number, got {values}")
-                return np.asarray(values, dtype=np.float64)
-        except BaseException as error:
-            if raised_by_signal(error):
-                raise
-            raise DistanceError(f"the distance failed: {reason_of(error).rstrip('.')}.") from error
 
     def __repr__(self) -> str:
         return lines(

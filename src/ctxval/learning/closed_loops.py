@@ -20,6 +20,7 @@ from ctxval.core.rollout import rollout
 from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.validation import Validation
+from ctxval.errors import DistanceError
 from ctxval.learning.draws import DisturbedDynamics, DrawnModel, DynamicsDraws
 from ctxval.learning.dynamics_posterior import DynamicsPosterior
 from ctxval.learning.noisy_draws import NoisyDraws, NoisyRuns
@@ -241,9 +242,8 @@ class LoopPlanner:
 
         It is infinity if the distance raises an exception or returns no finite number: nothing is known then.
         """
-        with contextlib.suppress(Exception), np.errstate(all="ignore"):  # the user's distance
-            # The trajectories are used again, and some distances change the arrays that they are given.
-            values = np.asarray(self.validation.distance(model.copy(), system.copy(), task), dtype=np.float64)
+        with contextlib.suppress(DistanceError):
+            values = self.validation.distance_between(model, system, task)
             if values.shape == model.batch_shape:
                 return np.where(np.isfinite(values), values, np.inf)
         if not model.batch_shape:

@@ -69,9 +69,7 @@ def _replayed(study: DynamicsStudy, model: DrawnModel | None, point: Array) -> R
     try:
         promised = validation.closed_loop(controller, task)
         predicted = rollout(model.step, controller, task)
-        with np.errstate(all="ignore"):
-            # Some distances change the arrays that they are given.
-            distance = float(validation.distance(promised, predicted.copy(), task))
+        distance = float(validation.distance_between(promised, predicted, task))
     except Exception:  # the same
         return nothing
     finite = bool(predicted.finite.all()) and np.isfinite(distance)

@@ -252,7 +252,7 @@ class _Study:
                     continue
                 gap = float(np.max(np.abs(loop.states - promised.states) / self.loops.ranges))
                 if best is None or gap > best.gap:
-                    apart = float(self.validation.distance(promised.copy(), loop.copy(), plan.task))
+                    apart = float(self.validation.distance_between(promised, loop, plan.task))
                     best = Separating(space.describe_point(point), apart, number, gap)
         return best
 

@@ -14,6 +14,7 @@ from ctxval.core.plan import Plan
 from ctxval.core.system import System, WithOutputs
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.validation import Validation
+from ctxval.errors import DistanceError
 from ctxval.studies.causes.cause import Repaired
 
 _DRAWS = 12  # of noise
@@ -138,6 +139,6 @@ class ClosedLoops:
         return squares
 
     def _distance(self, execution: ExecutedTask, loop: Trajectory) -> float:
-        with contextlib.suppress(Exception), np.errstate(all="ignore"):  # the user's distance
-            return float(self.validation.distance(loop.copy(), execution.executed.copy(), execution.plan.task))
+        with contextlib.suppress(DistanceError):
+            return float(self.validation.distance_between(loop, execution.executed, execution.plan.task))
         return np.inf
