@@ -89,5 +89,3 @@ def test_initial_states_that_scatter_are_noise_too() -> None:
     assert verdict.bound is not None
     assert 0.9 * largest < verdict.bound < 1.5 * largest
     assert "in at least 90 % of its executions" in verdict.reason
-    falsified = Campaign(validation, seed=0).run(20, 0.8 * largest, certificate=FEW_TESTS)
-    assert falsified.verdict(0.8 * largest, certificate=FEW_TESTS).answer == "falsified"
