@@ -17,8 +17,8 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 # Tests start hundreds of processes, which would each compile the package again.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 # Each trial waits until the disk has its store. Where a folder in memory has space, that takes no time.
-if "TMPDIR" not in os.environ and os.access("/dev/shm", os.W_OK) and shutil.disk_usage("/dev/shm").free > 2**31:
-    os.environ["TMPDIR"] = tempfile.tempdir = "/dev/shm"
+if os.access("/dev/shm", os.W_OK) and shutil.disk_usage("/dev/shm").free > 2**31:
+    os.environ.setdefault("PYTEST_DEBUG_TEMPROOT", "/dev/shm")
 
 import numpy as np
 import pytest

@@ -319,7 +319,7 @@ class Acts(RuleBasedStateMachine):
 
     def __init__(self) -> None:
         super().__init__()
-        self.folder = tempfile.TemporaryDirectory()
+        self.folder = tempfile.TemporaryDirectory(dir=os.environ.get("PYTEST_DEBUG_TEMPROOT"))
         self.path = Path(self.folder.name) / "a.sqlite"
         self.terminals = [self.opened(), self.opened()]
         self.expected: list[tuple[str, float | None, str | None]] = []
