@@ -398,9 +398,8 @@ def test_a_wrong_result_is_replaced_with_a_reason(tmp_path: Path) -> None:
     store.close()
 
 
-@pytest.mark.parametrize(
-    ("how", "options"), [pytest.param("next", ("--explore",), marks=pytest.mark.thorough), ("decides", ())]
-)
+@pytest.mark.thorough
+@pytest.mark.parametrize(("how", "options"), [("next", ("--explore",)), ("decides", ())])
 def test_the_choices_are_those_of_the_command_line(tmp_path: Path, how: str, options: tuple[str, ...]) -> None:
     by_hand, by_page = tmp_path / "hand", tmp_path / "page"
     for folder in (by_hand, by_page):

@@ -322,7 +322,8 @@ def test_the_entrance_is_accessible_and_the_token_leaves_the_address(browser: An
 
 
 def test_a_run_is_shown_as_it_goes_and_takes_nothing(browser: Any, tmp_path: Path) -> None:
-    command = [*SMALL, "run", "pendulum", "--threshold", "0.5", "--tests", "0", "--live"]
+    case = ("linear", "--option", "dim=1", "--seed", "1")
+    command = [*SMALL, "run", *case, "--threshold", "90", "--tests", "0", "--live"]
     process = subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
     assert process.stdout is not None
     address = next(found[0] for line in process.stdout if (found := re.search(r"http://127\.0\.0\.1:\d+/", line)))
@@ -333,7 +334,7 @@ def test_a_run_is_shown_as_it_goes_and_takes_nothing(browser: Any, tmp_path: Pat
     assert refused.status == 404
     one.page.locator("#next .done").wait_for(timeout=4 * WAIT)
     assert ".report.html" in one.page.locator("#next").inner_text()
-    assert one.page.locator(".answer").inner_text() == "validated against 0.5 rad"
+    assert one.page.locator(".answer").inner_text() == "validated against 90"
     assert one.page.evaluate("document.documentElement.scrollWidth") <= 400
     assert accessibility_findings(one.page) == []
     output, _ = process.communicate(timeout=120)
