@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import os
+import shutil
 import signal
 import tempfile
 from collections.abc import Callable, Iterator
@@ -15,6 +16,9 @@ from typing import Any
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 # Tests start hundreds of processes, which would each compile the package again.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+# Each trial waits until the disk has its store. Where a folder in memory has space, that takes no time.
+if os.access("/dev/shm", os.W_OK) and shutil.disk_usage("/dev/shm").free > 2**31:
+    os.environ.setdefault("PYTEST_DEBUG_TEMPROOT", "/dev/shm")
 
 import numpy as np
 import pytest
@@ -48,7 +52,7 @@ settings.load_profile("short")
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--thorough", action="store_true", help="what `make thorough` runs: more seeds and sizes")
     parser.addoption("--manual", help="a folder with the built manual, whose pages are checked")
-    parser.addoption("--kills", type=int, default=4, help="how many campaigns are killed and resumed")
+    parser.addoption("--kills", type=int, default=2, help="how many campaigns are killed and resumed")
     parser.addoption("--switches", type=int, default=1, help="how often two processes on one store are switched")
 
 

@@ -91,7 +91,7 @@ NOT_OF_PARTS = "not (load or loads or without_the_parts or all_brings or new_pro
 
 def not_needed(folder: str, names: list[str]) -> set[str]:
     """Return what of a folder is left out of the copy: results, pictures, and what `make docs` has written."""
-    written = ("__pycache__", "results", "_build", "api", "auto_examples")
+    written = ("results", "_build", "api", "auto_examples")
     return {name for name in names if name in written or name.endswith((".json", ".png", ".sqlite"))}
 
 

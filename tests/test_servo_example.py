@@ -14,6 +14,7 @@ import pytest
 
 from ctxval import Campaign, compare, searches
 from ctxval.studies.causes import find_causes
+from rig_thorough import more
 
 FOLDER = Path(__file__).parents[1] / "examples" / "servo"
 
@@ -66,12 +67,17 @@ def test_the_firmware_is_limited_and_counts(servo: ModuleType) -> None:
     assert duty[1] == pytest.approx(800 * 0.001 * 4096 / (2 * np.pi) / (256 * 885))  # 0.0007 rad is less than a count
 
 
-def test_distances_of_published_models_are_those_of_the_page(servo: ModuleType) -> None:
-    for friction, (largest, task) in {"m1": (0.427, "sin_sin-400"), "m4": (0.522, "sin_time_square-800")}.items():
-        validation = servo.experiment(friction=friction).validation
-        known = validation.distances(validation.space.grid(2))
-        assert known.max() == pytest.approx(largest, abs=0.01)
-        assert validation.space.task_names[int(known.argmax())] == task
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("friction", "largest", "task"), [("m1", 0.427, "sin_sin-400"), *more(("m4", 0.522, "sin_time_square-800"))]
+)
+def test_distances_of_published_models_are_those_of_the_page(
+    servo: ModuleType, friction: str, largest: float, task: str
+) -> None:
+    validation = servo.experiment(friction=friction).validation
+    known = validation.distances(validation.space.grid(2))
+    assert known.max() == pytest.approx(largest, abs=0.01)
+    assert validation.space.task_names[int(known.argmax())] == task
 
 
 @pytest.mark.thorough  # `make servo` runs it for all published models

@@ -9,8 +9,9 @@ import os
 import shutil
 import sqlite3
 import sys
+import tempfile
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
@@ -37,10 +38,18 @@ EACH = dict.fromkeys(attack.FAMILIES, 1) | {"told": 2}
 NAMES = {module.__name__: module for module in (base64, ctypes, os, sqlite3, sys)}
 
 
+@pytest.fixture
+def tmp_path() -> Iterator[Path]:
+    """A folder that is not in /dev, where the cage permits everything."""
+    with tempfile.TemporaryDirectory() as folder:
+        yield Path(folder)
+
+
 @pytest.fixture(scope="module")
-def base(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def base() -> Iterator[Path]:
     attack._warm()
-    return attack.prepare(tmp_path_factory.mktemp("attack") / "base")
+    with tempfile.TemporaryDirectory() as folder:
+        yield attack.prepare(Path(folder) / "base")
 
 
 @pytest.mark.slow
@@ -119,6 +128,7 @@ def test_what_ends_well_is_let_be(monkeypatch: pytest.MonkeyPatch, tmp_path: Pat
 
 
 @pytest.mark.slow
+@pytest.mark.thorough  # `make attack` resumes
 def test_the_attack_goes_on_where_it_was(base: Path) -> None:
     none: dict[str, Any] = {}
     first, _ = attack.attack(20, 1, base, workers=1, done=none, apart=10**6, only=["told"])
@@ -132,6 +142,7 @@ def test_the_page_is_what_the_stored_counts_give() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.thorough
 def test_an_interpreter_of_its_own_says_the_same(base: Path, tmp_path: Path) -> None:
     (tmp_path / "f").mkdir()
     shutil.copy(base / "a.sqlite", tmp_path / "f" / "a.sqlite")

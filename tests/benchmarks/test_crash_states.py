@@ -86,9 +86,9 @@ def test_a_renamed_file_has_one_of_its_names() -> None:
     ("name", "mode"), [("hand", "ordered"), pytest.param("full", "strict", marks=pytest.mark.thorough)]
 )
 def test_no_acknowledged_execution_is_lost_or_doubled(name: str, mode: Mode, tmp_path: Path) -> None:
-    counts = count(recorded(name, tmp_path), mode, each=1, seed=0, resume_each=60, workers=1)
+    counts = count(recorded(name, tmp_path), mode, each=1, seed=0, resume_each=100, workers=1)
     assert counts["distinct"] > 200
-    assert counts["resumed"] > 3
+    assert counts["resumed"] > 1
     assert counts["opened"] == counts["distinct"]
     assert counts["went on"] == counts["resumed"]
     assert not any(counts[bad] for bad in ("lost", "twice", "changed", "refused", "crashed"))

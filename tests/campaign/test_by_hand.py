@@ -158,7 +158,7 @@ def test_asking_by_command_chooses_what_a_campaign_chooses(invoke: Any) -> None:
     sys.path.insert(0, os.getcwd())
     import my_rig  # type: ignore[import-not-found]
 
-    for number in range(7):
+    for number in range(4):
         target = ("a.sqlite",) if number else ("my_rig:experiment", "--store", "a.sqlite")
         report = asked(invoke, *target, "--explore")
         record(report["folder"])

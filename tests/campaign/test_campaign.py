@@ -594,6 +594,7 @@ def test_a_campaign_ends_at_its_counterexample(validation: Validation) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.thorough  # test_controllers_with_memory.py decides with two workers, too
 def test_workers_decide_together(validation: Validation) -> None:
     class InOrder(cf.Executor):
         """Executes each task as soon as it is submitted, so that results come in the same order on any machine."""

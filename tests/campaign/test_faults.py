@@ -235,7 +235,7 @@ def test_a_full_disk_loses_no_execution(tmp_path: Path) -> None:
     campaign = long_campaign(store).run(3)
     campaign.store.close()
     rescued = 0
-    for extra in range(0, 40000, 16384):
+    for extra in (0, 16384):
         copy = tmp_path / f"{extra}.sqlite"
         shutil.copy(store, copy)
         done = run_limited(copy, 20, store.stat().st_size + extra)
@@ -319,7 +319,7 @@ class Acts(RuleBasedStateMachine):
 
     def __init__(self) -> None:
         super().__init__()
-        self.folder = tempfile.TemporaryDirectory()
+        self.folder = tempfile.TemporaryDirectory(dir=os.environ.get("PYTEST_DEBUG_TEMPROOT"))
         self.path = Path(self.folder.name) / "a.sqlite"
         self.terminals = [self.opened(), self.opened()]
         self.expected: list[tuple[str, float | None, str | None]] = []
@@ -469,7 +469,7 @@ def test_what_a_system_prints_does_not_spoil_the_json(tmp_path: Path) -> None:
         done = subprocess.run(
             [
                 *(*SMALL, "run", "talking:validation", "--search", "random"),
-                *("--budget", "3", "--store", f"{workers}.sqlite", "--workers", workers, "--json"),
+                *("--budget", "3", "--store", f"{workers}.sqlite", "--workers", workers, "--no-report", "--json"),
             ],
             capture_output=True,
             text=True,

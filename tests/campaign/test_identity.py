@@ -19,6 +19,7 @@ from ctxval.cli.config.settings import read_settings
 from ctxval.errors import DistanceError, InputError, StoreMismatchError
 from ctxval.gp.kernels import Matern
 from ctxval.testing import FaultyRig
+from rig_thorough import more
 
 SEARCH = searches.GPUCB
 
@@ -238,7 +239,7 @@ def test_a_failure_cannot_be_dropped(store: Path) -> None:
     "search",
     [
         SEARCH(beta=3.0, noise=(1e-6, 0.5)),
-        searches.Auto(40),
+        *more(searches.Auto(40)),
         searches.Auto("fast"),
         searches.Random(),
         searches.SamplingDiscarding(2),

@@ -131,7 +131,7 @@ ACTS: dict[str, Callable[[Campaign], Any]] = {
     "remeasure": lambda one: len(one.remeasure()),
 }
 
-SOON = [("ask", "ask"), ("tell", "run"), ("desk", "remeasure")]
+SOON = [("tell", "run")]
 PAIRS = [*SOON, *more(*((pair,) for pair in combinations_with_replacement(ACTS, 2) if pair not in SOON))]
 """Which acts meet; `make interleavings` and `make thorough` run all of them."""
 

@@ -33,6 +33,7 @@ from ctxval.errors import InputError
 from ctxval.learning import dynamics_study
 from ctxval.learning.dynamics_posterior import condition
 from ctxval.testing import FaultyRig
+from rig_thorough import more
 
 
 def facts(campaign: Campaign) -> list[tuple[object, ...]]:
@@ -66,7 +67,7 @@ def test_a_linear_system_is_validated_in_few_executions_by_a_bound_that_is_true(
 @pytest.mark.slow
 @pytest.mark.in_full
 # a task that the search chose, and a test
-@pytest.mark.parametrize("failing", [2, pytest.param(6, marks=pytest.mark.thorough)])
+@pytest.mark.parametrize("failing", [2, *more(6)])
 def test_a_failure_stops_no_search_and_is_decided_by_one_repetition(failing: int) -> None:
     validation, largest = linear()
     threshold = 1.25 * largest
@@ -129,12 +130,12 @@ def test_a_system_without_inputs_is_validated(batched: bool) -> None:
 @pytest.mark.slow
 def test_it_resumes_with_the_same_choices_and_the_same_predictions(tmp_path: Path) -> None:
     validation, largest = linear()
-    whole = Campaign(validation, seed=3).run(12, 1.1 * largest)
+    whole = Campaign(validation, seed=3).run(7, 1.1 * largest)
     store = tmp_path / "a.sqlite"
     for _ in range(20):
         pieces = Campaign(linear()[0], seed=3, store=store)
         try:
-            pieces.run(12, 1.1 * largest, on_trial=lambda trial: interrupt_at_once())
+            pieces.run(7, 1.1 * largest, on_trial=lambda trial: interrupt_at_once())
         except KeyboardInterrupt:
             continue
         break
@@ -220,7 +221,7 @@ def test_after_many_executions_of_a_search_the_tests_alone_are_missing() -> None
     ("tests", "origin", "sentence"),
     [
         (8, "spread", "at most 39 % of the tasks exceed 1000 (8 tests drawn as a Latin hypercube, 95 %)"),
-        (22, "iid", "at most 13 % of the tasks exceed 1000 (22 independent draws, 95 %)"),
+        *more((22, "iid", "at most 13 % of the tasks exceed 1000 (22 independent draws, 95 %)")),
     ],
 )
 def test_the_tests_bound_the_share_of_the_tasks_that_exceed_the_threshold(
@@ -326,7 +327,7 @@ def asked(found: DynamicsEvidence, known: np.ndarray, threshold: float, best: fl
 
 @pytest.mark.slow
 def test_without_a_threshold_it_ends_when_the_interval_is_narrow() -> None:
-    validation, largest = linear(2)
+    validation, largest = linear()
     campaign = Campaign(validation).run(20)
     bound = campaign.certify().upper_bound
     assert campaign.executions < 20

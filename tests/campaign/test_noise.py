@@ -32,8 +32,8 @@ def cart(process: float = 0.01, seed: int = 1, start: float = 0.0) -> Validation
 
 
 def largest_quantile(validation: Validation) -> float:
-    tasks = np.linspace(-2, 2, 81)[:, None]
-    return float(np.quantile([validation.distances(tasks) for _ in range(200)], 0.9, axis=0).max())
+    tasks = np.repeat(np.linspace(-2, 2, 41), 100)[:, None]
+    return float(np.quantile(validation.distances(tasks).reshape(41, 100), 0.9, axis=1).max())
 
 
 @pytest.mark.slow
@@ -89,5 +89,3 @@ def test_initial_states_that_scatter_are_noise_too() -> None:
     assert verdict.bound is not None
     assert 0.9 * largest < verdict.bound < 1.5 * largest
     assert "in at least 90 % of its executions" in verdict.reason
-    falsified = Campaign(validation, seed=0).run(20, 0.8 * largest, certificate=FEW_TESTS)
-    assert falsified.verdict(0.8 * largest, certificate=FEW_TESTS).answer == "falsified"

@@ -9,7 +9,7 @@ import pytest
 
 from conftest import make_validation
 from ctxval import Campaign, cases, searches
-from ctxval.certificates import AnytimeAudit, Audit, CertificateOptions
+from ctxval.certificates import AnytimeAudit, Audit, Automatic, CertificateOptions
 from ctxval.errors import InputError
 
 
@@ -45,17 +45,18 @@ def test_each_task_is_predicted_beforehand_and_a_reopened_store_goes_on(tmp_path
     case = cases.by_name("linear", 1, dim=1)
     assert case.truth is not None
     threshold, path = 1.1 * case.truth().distance, tmp_path / "people.sqlite"
+    options = CertificateOptions(Automatic(tests=2))
     for _ in range(20):
         # A new process for each task, as people have it.
         campaign = Campaign(case.validation, store=path)
-        opened = campaign.ask_for_verdict(threshold, 20)
+        opened = campaign.ask_for_verdict(threshold, 20, certificate=options)
         if opened is None:
             break
         campaign.tell(opened, case.validation.system.execute(opened.plan.controller, opened.plan.task))
         campaign.store.close()
-    assert campaign.verdict(threshold).answer == "validated"
+    assert campaign.verdict(threshold, certificate=options).answer == "validated"
     assert all(trial.note is not None for trial in campaign.trials)
-    assert facts(campaign) == facts(Campaign(case.validation).run(20, threshold))
+    assert facts(campaign) == facts(Campaign(case.validation).run(20, threshold, certificate=options))
 
 
 def test_the_budget_counts_open_trials() -> None:

@@ -18,6 +18,7 @@ from ctxval.campaign.interval_search import IntervalSearch
 from ctxval.campaign.workers import WorkerPool, execute_task
 from ctxval.certificates import CertificateOptions
 from ctxval.core.plan import Plan
+from rig_thorough import more
 
 
 @dataclass
@@ -82,7 +83,7 @@ def test_without_trajectories_in_mind_the_search_chooses_the_first_tasks_itself(
     np.testing.assert_array_equal(found, points(Campaign(linear(), search=searches.Random(), seed=2).run(4)))
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, *more(1, 2)])
 def test_workers_never_run_the_same_task_at_the_same_time(seed: int) -> None:
     validation = linear(2, seed)
     pool = Pool(validation, 4, seed)
@@ -105,7 +106,7 @@ def test_spare_workers_that_decide_execute_different_tasks() -> None:
     assert all(trial.distance is not None for trial in campaign.trials)
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [1, *more(0, 2)])
 def test_a_choice_is_a_function_of_the_history(tmp_path: Path, seed: int) -> None:
     path, rng = tmp_path / "a.sqlite", np.random.default_rng(seed)
     validation = linear(1, seed)

@@ -26,6 +26,7 @@ from ctxval.campaign.trials import TrialRecorder
 from ctxval.campaign.workers import ProcessPool
 from ctxval.errors import CampaignError, InputError, ModelError
 from ctxval.testing import FaultyRig
+from rig_thorough import more
 from rig_workers import Logging
 from rig_workers import campaign as logged
 
@@ -467,7 +468,7 @@ def ended(store: Path) -> int:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("workers", [1, 3])
+@pytest.mark.parametrize("workers", [*more(1), 3])
 def test_the_first_interrupt_ends_after_the_running_executions(tmp_path: Path, workers: int) -> None:
     store, marks = tmp_path / "a.sqlite", tmp_path / "marks"
     process = start(store, marks, workers)
@@ -509,7 +510,7 @@ def test_an_interrupt_while_an_execution_begins_leaves_it_to_end(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("workers", [1, 3])
+@pytest.mark.parametrize("workers", [*more(1), 3])
 def test_the_second_interrupt_ends_at_once_and_the_store_can_be_resumed(tmp_path: Path, workers: int) -> None:
     store, marks = tmp_path / "a.sqlite", tmp_path / "marks"
     process = start(store, marks, workers)

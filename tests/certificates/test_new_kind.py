@@ -15,7 +15,7 @@ from pydantic import ValidationError
 from typer.testing import CliRunner
 
 from conftest import make_validation
-from ctxval import Campaign, certificates
+from ctxval import Campaign, certificates, searches
 from ctxval.certificates import (
     KINDS,
     PLANNED,
@@ -182,7 +182,7 @@ def test_a_verdict_gives_any_kind_only_draws_whose_number_did_not_depend_on_resu
 
 @pytest.mark.slow
 def test_the_new_kind_is_found_by_name_and_judges(recipe: ModuleType) -> None:
-    campaign = Campaign(make_validation(), seed=1).run(8, explore=True)
+    campaign = Campaign(make_validation(), search=searches.GPUCB(), seed=1).run(8)
     kind = KINDS.find("lipschitz").of({"slope": 2.0})
     assert kind == recipe.Lipschitz(2.0)
     verdict = campaign.verdict(1e3, certificate=CertificateOptions(kind))
@@ -200,7 +200,7 @@ def test_the_command_line_and_files_know_the_new_kind(
     recipe: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    store = Campaign(make_validation(), store="own.sqlite", seed=1).run(8, explore=True).store.path
+    store = Campaign(make_validation(), search=searches.GPUCB(), store="own.sqlite", seed=1).run(8).store.path
     result = CliRunner().invoke(app, ["certify", str(store), "--kind", "lipschitz", "--option", "slope=2.0"])
     assert result.exit_code == 0, result.stderr
     assert result.stdout.startswith("lipschitz: d* is at most")

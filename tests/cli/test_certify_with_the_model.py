@@ -131,11 +131,14 @@ def step(x, u):
 """
 
 
+RUN = ("run", "rotor.toml", "--budget", "4", "--store", "r.sqlite", "--search", "cma-es", "--no-report")
+
+
 def test_code_of_another_user_is_asked_about_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     Path("rotor_parts.py").write_text(PARTS)
     Path("rotor.toml").write_text(FILE)
-    run = invoke("run", "rotor.toml", "--budget", "4", "--store", "r.sqlite", "--search", "cma-es")
+    run = invoke(*RUN)
     assert run.exit_code == 0, run.output
     assert invoke("certify", "r.sqlite", "--audit", "12").exit_code == 0
     own = invoke("certify", "r.sqlite", "--kind", "region")
@@ -169,7 +172,7 @@ def test_what_was_planned_for_a_kind_holds_although_the_kind_is_named_again(
     Path("rotor.toml").write_text(
         f'{FILE.replace("rotor_parts", "planned_parts")}[certificate]\nkind = "region"\ndiscard = 2\n'
     )
-    assert invoke("run", "rotor.toml", "--budget", "4", "--store", "r.sqlite", "--search", "cma-es").exit_code == 0
+    assert invoke(*RUN).exit_code == 0
     assert invoke("certify", "r.sqlite", "--audit", "12").exit_code == 0
     for named in ((), ("--kind", "region")):
         shown = invoke("certify", "r.sqlite", *named, "--json")

@@ -8,11 +8,14 @@ import subprocess
 import sys
 import threading
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 
-from rig_cli import calling
+from ctxval import Store
+from rig_cli import SMALL, calling
 
 pty = pytest.importorskip("pty", reason="there are no pseudo-terminals here")
 
@@ -64,10 +67,6 @@ def environment(folder: Path) -> dict[str, str]:
     return {**os.environ, "PYTHONPATH": path, "TERM": "xterm-256color", "COLUMNS": "120"}
 
 
-def command(*arguments: str) -> list[str]:
-    return [sys.executable, "-m", "ctxval.cli", *arguments]
-
-
 def at_terminal(folder: Path, *arguments: str, release_after: bytes | None = None) -> tuple[str, str, int]:
     """Return what a command writes to its terminal and to its redirected standard output, and its exit status.
 
@@ -75,7 +74,7 @@ def at_terminal(folder: Path, *arguments: str, release_after: bytes | None = Non
     """
     master, slave = pty.openpty()
     process = subprocess.Popen(
-        command(*arguments), cwd=folder, env=environment(folder), stdout=subprocess.PIPE, stderr=slave, text=True
+        [*SMALL, *arguments], cwd=folder, env=environment(folder), stdout=subprocess.PIPE, stderr=slave, text=True
     )
     os.close(slave)
     seen: list[bytes] = []
@@ -101,7 +100,7 @@ def at_terminal(folder: Path, *arguments: str, release_after: bytes | None = Non
 @pytest.mark.slow
 def test_a_run_shows_its_executions_and_what_it_is_doing(folder: Path) -> None:
     screen, out, status = at_terminal(
-        folder, "run", "rig:experiment", "--explore", "--budget", "2", "--store", "a.sqlite"
+        folder, "run", "rig:experiment", "--explore", "--budget", "2", "--store", "a.sqlite", "--no-report"
     )
     assert status == 0
     assert re.search(r"executions +\S+ +1/2", screen)
@@ -123,33 +122,32 @@ def test_a_log_has_a_line_for_each_trial(folder: Path) -> None:
 @pytest.mark.slow
 def test_asking_and_waiting_for_the_lock_are_shown(folder: Path) -> None:
     assert calling("ask")("rig:by_hand", "--store", "a.sqlite").exit_code == 0
-    with Holding(folder):
+    with held(folder):
         screen, _, status = at_terminal(folder, "ask", "a.sqlite", release_after=b"waiting for another process")
     assert status == 0
     assert "choosing a task" in screen
     assert re.search(r"waiting for another process that is running the store +\S+ +\d+/60 s", screen)
 
 
-class Holding:
-    """Another process that holds the lock of the store until the file ``release`` exists."""
+@contextmanager
+def held(folder: Path) -> Iterator[None]:
+    """Hold the lock of the store, as another process does, until the file ``release`` exists."""
+    taken = threading.Event()
 
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
+    def hold() -> None:
+        with Store(folder / "a.sqlite").sole_writer():
+            taken.set()
+            while not (folder / "release").exists():
+                time.sleep(0.02)
 
-    def __enter__(self) -> None:
-        script = (
-            "import pathlib, time\nfrom ctxval import Store\n"
-            "with Store('a.sqlite').sole_writer():\n"
-            "    pathlib.Path('held').touch()\n"
-            "    while not pathlib.Path('release').exists(): time.sleep(0.05)\n"
-        )
-        self.process = subprocess.Popen([sys.executable, "-c", script], cwd=self.folder, env=environment(self.folder))
-        while not (self.folder / "held").exists():
-            time.sleep(0.05)
-
-    def __exit__(self, *_: object) -> None:
-        (self.folder / "release").touch()
-        self.process.wait()
+    holder = threading.Thread(target=hold)
+    holder.start()
+    assert taken.wait(30)
+    try:
+        yield
+    finally:
+        (folder / "release").touch()
+        holder.join()
 
 
 @pytest.mark.slow

@@ -117,7 +117,6 @@ def test_a_falsified_store_is_refined_until_the_model_is_validated(invoke: Invok
     certified = invoke("certify", "cart.round-1.sqlite", "--kind", "dynamics", "--threshold", "0.05", "--json")
     assert certified.exit_code == 0, certified.stdout + certified.stderr
     assert json.loads(certified.stdout)["trials"] == found["rounds"][1]["executions"]
-    assert invoke("report", "cart.round-1.sqlite").exit_code == 0
     # The same command again resumes: nothing is executed.
     again = json.loads(invoke("refine", store, "--budget", "20", "--json").stdout)
     assert {**again, "files": found["files"]} == found

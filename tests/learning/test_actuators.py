@@ -131,6 +131,7 @@ def test_none_is_found_where_a_state_is_hidden_that_is_no_actuator() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("few_loops")
 def test_the_posterior_is_of_the_inputs_that_act_and_predicts_what_is_recorded() -> None:
     validation = cart(delay=1.3)
     executed = executions(validation, 8)
@@ -148,6 +149,7 @@ def test_the_posterior_is_of_the_inputs_that_act_and_predicts_what_is_recorded()
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("few_loops")
 def test_a_distance_of_inputs_sees_what_is_commanded() -> None:
     def effort(model: Any, system: Any, task: Task) -> Any:
         return np.abs(model.inputs - system.inputs).max(axis=(-2, -1))

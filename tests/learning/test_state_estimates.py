@@ -62,6 +62,8 @@ def test_executions_with_outputs_predict_as_well_as_with_states() -> None:
     assert errors["outputs"] < 0.03
 
 
+@pytest.mark.slow
+@pytest.mark.usefixtures("few_loops")
 def test_a_replay_has_the_outputs() -> None:
     validation = swing_validation()
     executed = executions_of(validation)

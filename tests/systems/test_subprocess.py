@@ -434,7 +434,7 @@ def test_a_campaign_on_a_command_records_its_failures(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("workers", [None, 2])
+@pytest.mark.parametrize("workers", [*more(None), 2])
 def test_a_killed_command_costs_its_own_trial_and_nothing_else(tmp_path: Path, workers: int | None) -> None:
     whole = rig_command.campaign(tmp_path, seconds=0).run(6)
     shutil.rmtree(tmp_path / "marks")

@@ -303,17 +303,6 @@ def wait_for(server: Server, text: str, page: Response, seconds: float = 60) -> 
     raise AssertionError(f"{text!r} is not in {found}")
 
 
-def test_a_recording_of_another_run_is_remarked(tmp_path: Path) -> None:
-    new_store(tmp_path)
-    lines = record(tmp_path / "a.trials" / "0", tmp_path / "run.csv").read_text().splitlines()
-    idle = "\n".join([lines[0], *(f"{line.rpartition(',')[0]},0" for line in lines[1:])])
-    with serving(tmp_path) as server:
-        page = server.request("GET", "/")
-        assert upload(server, 0, page, idle.encode(), submission="one").status == 303
-        shown = server.request("GET", "/?told=0", Cookie=page.cookie).text
-        assert "its inputs are not those of the controller at the recorded states (force is 0 N at 0 s, not " in shown
-
-
 def test_a_campaign_by_hand_by_forms_alone(tmp_path: Path) -> None:
     new_store(tmp_path)
     recording = record(tmp_path / "a.trials" / "0", tmp_path / "run.csv").read_bytes()
@@ -349,12 +338,19 @@ def test_a_campaign_by_hand_by_forms_alone(tmp_path: Path) -> None:
         picture = server.request("GET", "/pictures/distance.svg", Cookie=page.cookie)
         assert picture.text.startswith("<?xml")
         assert "sandbox" in picture.headers["content-security-policy"]
-        found = zipfile.ZipFile(io.BytesIO(server.request("GET", "/trials/3/files.zip", Cookie=page.cookie).content))
+        archive = zipfile.ZipFile(io.BytesIO(server.request("GET", "/trials/3/files.zip", Cookie=page.cookie).content))
         files = [f"trial-3/{name}" for name in ("controller.json", "controller.npz", "model.csv", "task.json")]
-        assert sorted(found.namelist()) == files
+        assert sorted(archive.namelist()) == files
         before = b"\n".join(recording.splitlines()[:9])  # a header and eight samples
         assert upload(server, 4, page, before, reason="it hit the stop").status == 303
         wait_for(server, "it hit the stop", page)
+
+        archive.extractall(tmp_path)
+        lines = record(tmp_path / "trial-3", tmp_path / "idle.csv").read_text().splitlines()
+        idle = "\n".join([lines[0], *(f"{line.rpartition(',')[0]},0" for line in lines[1:])])
+        assert upload(server, 3, page, idle.encode(), submission="three").status == 303
+        shown = server.request("GET", "/?told=3", Cookie=page.cookie).text
+        assert "its inputs are not those of the controller at the recorded states (force is 0 N at 0 s, not " in shown
         status, said = server.stop()
     assert (status, "stopped. All executions are stored" in said) == (130, True)
     stored = trials(tmp_path)
@@ -362,7 +358,7 @@ def test_a_campaign_by_hand_by_forms_alone(tmp_path: Path) -> None:
         ("completed", "initial"),
         ("failed", "acquisition"),
         ("completed", "manual"),
-        ("open", "manual"),
+        ("completed", "manual"),
         ("failed", "iid"),
     ]
     assert stored[2].because == "motor <replaced>"
@@ -402,9 +398,8 @@ def test_a_wrong_result_is_replaced_with_a_reason(tmp_path: Path) -> None:
     store.close()
 
 
-@pytest.mark.parametrize(
-    ("how", "options"), [pytest.param("next", ("--explore",), marks=pytest.mark.thorough), ("decides", ())]
-)
+@pytest.mark.thorough
+@pytest.mark.parametrize(("how", "options"), [("next", ("--explore",)), ("decides", ())])
 def test_the_choices_are_those_of_the_command_line(tmp_path: Path, how: str, options: tuple[str, ...]) -> None:
     by_hand, by_page = tmp_path / "hand", tmp_path / "page"
     for folder in (by_hand, by_page):

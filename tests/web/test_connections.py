@@ -10,6 +10,7 @@ from typing import BinaryIO
 import pytest
 
 from rig_page import Server, new_store, serving
+from rig_thorough import more
 
 TOKEN = "a-token-of-the-rig"
 
@@ -23,21 +24,13 @@ HALVES = {
 }
 
 
-@pytest.fixture(scope="module")
-def servers(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Server]]:
-    """Two servers, one of which asks for a token."""
-    with contextlib.ExitStack() as stack:
-        found = {}
-        for name, arguments in {"token": ("--token", TOKEN), "no token": ()}.items():
-            folder = tmp_path_factory.mktemp("rig")
-            new_store(folder)
-            found[name] = stack.enter_context(serving(folder, *arguments))
+@pytest.fixture(scope="module", params=[("--token", TOKEN), *more(((),))], ids=["token", "no token"])
+def server(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
+    """A server that asks for a token, and one that does not."""
+    folder = tmp_path_factory.mktemp("rig")
+    new_store(folder)
+    with serving(folder, *request.param) as found:
         yield found
-
-
-@pytest.fixture(params=["token", "no token"])
-def server(request: pytest.FixtureRequest, servers: dict[str, Server]) -> Server:
-    return servers[request.param]
 
 
 def session(server: Server) -> str:
@@ -86,20 +79,18 @@ def opened_page(server: Server) -> Iterator[BinaryIO]:
 
 @pytest.mark.slow
 @pytest.mark.thorough
-def test_requests_that_do_not_come_end_and_pages_stay_up_to_date_meanwhile(servers: dict[str, Server]) -> None:
+def test_requests_that_do_not_come_end_and_pages_stay_up_to_date_meanwhile(server: Server) -> None:
     with contextlib.ExitStack() as stack:
-        pages = [stack.enter_context(opened_page(server)) for server in servers.values()]
+        events = stack.enter_context(opened_page(server))
         last = []
-        for server in servers.values():
-            stack.enter_context(half_sent(server, 180, HALVES["half a head"]))
-            for half in list(HALVES)[:3]:  # so few that none of them must make room for another one
-                last += stack.enter_context(half_sent(server, 40, HALVES[half]))
+        stack.enter_context(half_sent(server, 180, HALVES["half a head"]))
+        for half in list(HALVES)[:3]:  # so few that none of them must make room for another one
+            last += stack.enter_context(half_sent(server, 40, HALVES[half]))
         for one in last:
             with contextlib.suppress(ConnectionResetError):
                 while one.recv(2**16):
                     pass
-        for events in pages:
-            assert any(line.startswith(b": the server") for line in events)
+        assert any(line.startswith(b": the server") for line in events)
 
 
 def test_nobody_without_the_token_can_send_much(server: Server) -> None:

@@ -8,16 +8,14 @@ import pytest
 from conftest import make_validation
 from ctxval import Experiment, Parameters, Task, cases
 from ctxval.cli.config.check import check_experiment
+from rig_thorough import more
 
 CASES: list[tuple[str, dict[str, Any]]] = [
     ("pendulum", {}),
-    ("pendulum", {"variant": "biased"}),
     ("dubins", {}),
-    ("dubins", {"variant": "basin"}),
-    ("dubins", {"variant": "heavy-tail"}),
     ("arm", {"model": "linear"}),
-    pytest.param("arm", {"model": "gp"}, marks=pytest.mark.thorough),
-    pytest.param("arm", {"model": "fnn"}, marks=pytest.mark.thorough),
+    *more(("pendulum", {"variant": "biased"}), ("dubins", {"variant": "basin"}), ("dubins", {"variant": "heavy-tail"})),
+    *more(("arm", {"model": "gp"}), ("arm", {"model": "fnn"})),
     ("linear", {"dim": 1}),
     ("linear", {"dim": 10}),
 ]

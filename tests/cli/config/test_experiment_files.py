@@ -27,6 +27,7 @@ from ctxval.cli.config.settings import Settings, read_settings
 from ctxval.core.experiment import UnitsWarning
 from ctxval.errors import CtxvalError, InputError
 from ctxval.testing import FaultyRig
+from rig_thorough import more
 
 
 @pytest.fixture
@@ -61,16 +62,16 @@ def sentence(result: Result) -> str:
 
 
 @pytest.mark.slow
-@pytest.mark.in_full
-def test_the_file_of_init_reaches_a_verdict_as_it_is(invoke: Any) -> None:
-    result = invoke("run", "experiment.toml", "--json")
+@pytest.mark.parametrize("draws", ["few", pytest.param("all", marks=[pytest.mark.in_full, pytest.mark.thorough])])
+def test_the_file_of_init_reaches_a_verdict_as_it_is(invoke: Any, draws: str) -> None:
+    result = invoke("run", "experiment.toml", "--no-report", "--json")
     assert result.exit_code == 0, result.stderr
     report = json.loads(result.stdout)
     assert (report["case"], report["search"], report["units"]) == ("cart", "auto", "m")
     assert report["verdict"] == "validated"
     assert 4 <= report["executions"] <= 20
     assert report["worst"]["distance"] > 0.01
-    again = json.loads(invoke("run", "experiment.toml", "--json").stdout)
+    again = json.loads(invoke("run", "experiment.toml", "--no-report", "--json").stdout)
     assert again == report
 
 
@@ -225,13 +226,13 @@ def test_the_file_says_the_largest_horizon_that_is_planned(invoke: Any, target: 
 def test_the_certificate_of_the_file_is_what_run_and_certify_judge_by(invoke: Any) -> None:
     scenario = ('kind = "auto"', 'kind = "scenario"\nvolume = 0.5')
     target = changed(scenario, ('name = "auto"', 'name = "random"'))
-    run = json.loads(invoke("run", target, "--json").stdout)
+    run = json.loads(invoke("run", target, "--no-report", "--json").stdout)
     assert (run["verdict"], run["certificate"]["kind"]) == ("validated", "scenario")
     certified = json.loads(invoke("certify", run["store"], "--threshold", "0.5", "--json").stdout)
     assert (certified["kind"], certified["verdict"]) == ("scenario", "validated")
     assert "needs one of the certificates" in sentence(invoke("run", target, "--decide"))
     adaptive = changed(scenario, ('name = "auto"', 'name = "gp-ucb"'))
-    refused = json.loads(invoke("run", adaptive, "--store", "b.sqlite", "--json").stdout)
+    refused = json.loads(invoke("run", adaptive, "--store", "b.sqlite", "--no-report", "--json").stdout)
     assert refused["verdict"] == "undecided"
     assert "independent draws alone" in refused["reason"]
 
@@ -614,7 +615,7 @@ FILTERED = (
 )
 
 
-@pytest.mark.parametrize(("outputs", "synthesizer"), [("[0]", PID), ('"angles:angle"', PID), ("[0]", FILTERED)])
+@pytest.mark.parametrize(("outputs", "synthesizer"), [*more(("[0]", PID)), ('"angles:angle"', PID), ("[0]", FILTERED)])
 def test_outputs_are_indices_or_a_function_of_a_module(outputs: str, synthesizer: str, invoke: Any) -> None:
     sys.modules.pop("angles", None)
     Path("angles.py").write_text(
