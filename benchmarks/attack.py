@@ -294,7 +294,7 @@ def inflict(name: str, number: int, seed: int, base: Path, keep: Path | None = N
 
 def _apart(case: Case, folder: Path) -> Outcome:
     """Run a command line as a shell does, and look at all files that it opens, also in native code, with strace."""
-    command = [sys.executable, "-m", "ctxval.cli", *case.arguments]
+    command = [sys.executable, "-m", "ctxval", *case.arguments]
     trace = folder.parent / "trace"
     if shutil.which("strace"):
         command = ["strace", "-f", "-qq", "--seccomp-bpf", "-e", "trace=open,openat,creat", "-o", str(trace), *command]

@@ -136,7 +136,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         write_data_sets(folder)
-        program, found = [sys.executable, "-m", "ctxval.cli"], {}
+        program, found = [sys.executable, "-m", "ctxval"], {}
         if "--install" in sys.argv:
             program, found["install"] = installed(folder)
         for kind in ("mcap", "mat", "lerobot"):

@@ -26,7 +26,7 @@ MOST = {
 }
 """What is imported, and the largest ratio that is asked for."""
 
-HELP = ("-m", "ctxval.cli", "--help")
+HELP = ("-m", "ctxval", "--help")
 MOST_HELP = 0.4
 """CPU seconds of ``ctxval --help``."""
 

@@ -110,7 +110,7 @@ def measure(path: Path, search: str) -> dict[str, float]:
         again.tell(asked, distance=float(height(asked.trial.unit_point)))
     again.store.close()
     began = cpu_seconds()
-    command = [sys.executable, "-m", "ctxval.cli", "status", str(path), "--json"]
+    command = [sys.executable, "-m", "ctxval", "status", str(path), "--json"]
     subprocess.run(command, check=True, capture_output=True)
     status = cpu_seconds() - began
     return {

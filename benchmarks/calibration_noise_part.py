@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Sequence
 from typing import Any
 
@@ -36,7 +37,9 @@ needs beside them: how many are at least d_q*.
 Before each execution, noisy dynamics predict with which probability its distance is smaller than each value. With the
 right law, the probabilities of what was executed are uniform. They can be so only where nobody chose the task by its
 prediction: of tasks that were chosen because a large distance was predicted, the chosen predictions are too large. The
-picture has both. {ranks}
+picture has both.
+
+{ranks}
 
 ![How often each tenth of the predicted probabilities was met, beside chance](calibration/noise_ranks.png)
 
@@ -130,12 +133,13 @@ def _uniform(results: Sequence[dict[str, Any]]) -> str:
             tests.append(f"{noise} {probability:.2g} ({len(drawn)} executions)")
         if len(chosen):
             lowest.append(f"{noise} {(chosen < 1 / BINS).mean() * BINS:.1f}")
-    return (
+    text = (
         "At drawn tests, the probability of ranks that are less uniform, if the law is right, is by noise: "
         f"{', '.join(tests)}. Chosen tasks fall into the lowest tenth more often than one time in ten, by a factor "
         f"of: {', '.join(lowest)}. After measurement noise, distances are more rarely far above what was predicted "
         "than they should be, so its predictions err on the safe side."
     )
+    return textwrap.fill(text, 120, break_long_words=False, break_on_hyphens=False)
 
 
 def draw() -> None:

@@ -34,5 +34,5 @@ def photograph(page: Path, picture: Path) -> None:
 
 if __name__ == "__main__":
     with tempfile.TemporaryDirectory() as folder:
-        subprocess.run([sys.executable, "-m", "ctxval.cli", "run", "pendulum"], cwd=folder, check=True)
+        subprocess.run([sys.executable, "-m", "ctxval", "run", "pendulum"], cwd=folder, check=True)
         photograph(next(Path(folder).glob("runs/*.report.html")), PICTURE)

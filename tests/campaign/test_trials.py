@@ -129,7 +129,7 @@ def test_run_ends_with_a_report_if_the_system_leaves_hard(tmp_path: Path) -> Non
         """)
     )
     done = subprocess.run(
-        [sys.executable, "-m", "ctxval.cli", "run", "rig:experiment", "--budget", "2", "--no-report", "--json"],
+        [sys.executable, "-m", "ctxval", "run", "rig:experiment", "--budget", "2", "--no-report", "--json"],
         capture_output=True,
         text=True,
         cwd=tmp_path,

@@ -676,7 +676,7 @@ def test_an_error_that_cannot_be_written_as_json_keeps_its_exit_status(
         os.close(ours)
     else:
         theirs = os.open("/dev/full", os.O_WRONLY)
-    command = [sys.executable, "-m", "ctxval.cli", "status", "none.sqlite", "--json"]
+    command = [sys.executable, "-m", "ctxval", "status", "none.sqlite", "--json"]
     done = subprocess.run(command, stdout=theirs, stderr=subprocess.PIPE, text=True, cwd=tmp_path, check=False)
     os.close(theirs)
     assert done.returncode == status

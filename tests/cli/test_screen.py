@@ -128,7 +128,7 @@ def test_whatever_is_rendered_acts_on_nothing(capsys: pytest.CaptureFixture[str]
 def run_ascii(*arguments: str) -> subprocess.CompletedProcess[bytes]:
     """Run a command on a terminal that has no other characters than ASCII."""
     environment = {**os.environ, "PYTHONIOENCODING": "ascii", "LC_ALL": "C"}
-    command = [sys.executable, "-m", "ctxval.cli", *arguments]
+    command = [sys.executable, "-m", "ctxval", *arguments]
     return subprocess.run(command, capture_output=True, env=environment, check=False)
 
 

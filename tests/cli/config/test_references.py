@@ -278,7 +278,7 @@ def test_the_file_of_init_is_checked_from_another_folder(here: Path) -> None:
 @pytest.mark.slow
 def test_a_command_from_another_folder_finds_what_the_file_names(here: Path) -> None:
     described(here / "one", "x * 0.5")
-    program = [sys.executable, "-m", "ctxval.cli"]
+    program = [sys.executable, "-m", "ctxval"]
     for arguments in (("run", "one/experiment.toml", "--budget", "1", "--store", "a.sqlite"), ("ask", "../a.sqlite")):
         cwd = here if arguments[0] == "run" else here / "one"
         result = subprocess.run([*program, *arguments], cwd=cwd, capture_output=True, text=True)

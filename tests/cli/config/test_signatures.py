@@ -188,7 +188,7 @@ def test_nothing_that_a_foreign_store_names_is_imported_or_run(attack: str, fold
 def test_the_store_of_the_attack_runs_nothing_through_the_real_command_line(folder: Path) -> None:
     store_with(HOSTILE)
     started = [
-        subprocess.Popen([sys.executable, "-m", "ctxval.cli", *command], stderr=subprocess.PIPE, text=True)
+        subprocess.Popen([sys.executable, "-m", "ctxval", *command], stderr=subprocess.PIPE, text=True)
         for command in [*COMMANDS.values()][::3]  # all of them are called in this process above
     ]
     for process in started:
@@ -300,7 +300,7 @@ def test_a_module_beside_a_copied_store_is_not_found(folder: Path) -> None:
     sys.modules.pop("my_rig")
     (folder / "my_rig.py").unlink()
     shutil.rmtree(folder / "__pycache__", ignore_errors=True)
-    program = [sys.executable, "-m", "ctxval.cli", "ask", "a.sqlite"]
+    program = [sys.executable, "-m", "ctxval", "ask", "a.sqlite"]
     result = subprocess.run(program, capture_output=True, text=True, timeout=60)
     assert result.returncode == 2
     assert f"no module named 'my_rig' is in {folder}" in result.stderr

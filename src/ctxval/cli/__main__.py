@@ -1,5 +1,0 @@
-"""``python -m ctxval.cli``."""
-
-from ctxval.cli import main
-
-main()
