@@ -92,6 +92,7 @@ def test_a_table_of_runs_is_judged_and_nothing_is_stored(folder: Path, invoke: I
     assert "speed residuals since run 1 are" in expired.stdout
     assert "next: ctxval ask cart.sqlite --again" in expired.stdout
     assert "line 5 is not judged: the motor cut out" in " ".join(expired.stderr.split())
+    assert "2 of 8 runs are not judged, and nothing is said of them" in expired.stdout
     assert Store.existing(folder / "cart.sqlite").digest() == before
 
 

@@ -71,6 +71,10 @@ def watch(
     state, again = watching.state, watching.again()
     first, colon, rest = state.sentence.partition(":")
     out.say((first.upper(), "bold red" if state.expired else "bold green"), f"{colon}{rest}.", wrap=True)
+    if skipped:
+        are = "is" if len(skipped) == 1 else "are"
+        text = f"{len(skipped)} of {len(runs)} runs {are} not judged, and nothing is said of them"
+        out.say((text, "yellow"), "; an execution that fails may itself be a change.", wrap=True)
     for trial in again:
         out.say(f"execute again: trial {trial.number}, {task_text(trial.parameters)}")
     if again:
