@@ -97,6 +97,21 @@ def test_a_table_of_runs_is_judged_and_nothing_is_stored(folder: Path, invoke: I
 
 
 @pytest.mark.slow
+def test_a_system_that_is_executed_is_validated_anew_in_another_store(folder: Path, invoke: Invoke) -> None:
+    """`ctxval ask` would open a trial that only people execute."""
+    from watched_cart import experiment  # type: ignore[import-not-found]
+
+    validation: Validation = experiment().validation
+    Campaign(validation, store=folder / "ran.sqlite", seed=0, name="cart").run(6)
+    watch = calling("watch", "ran.sqlite", "--experiment", "watched_cart:experiment")
+    expired = watch("heavier.csv")
+    assert expired.exit_code == 1, expired.stderr
+    assert "next: ctxval run watched_cart:experiment --threshold 0.5 --store ran.changed.sqlite" in expired.stdout
+    resampled = watch("same0.csv", "--set", "goal=-1.5", "--resample")
+    assert "steps with missing samples are no steps of the system" in resampled.stderr
+
+
+@pytest.mark.slow
 def test_a_trajectory_with_its_task_and_recordings_without(folder: Path, invoke: Invoke) -> None:
     one = report(invoke("same0.csv", "--set", "goal=-1.5", "--json"))
     names = [each["name"] for each in one["watch"]["channels"] if each["later"] != [None]]
