@@ -162,7 +162,7 @@ def test_bad_input_is_one_sentence(invoke: Invoke, arguments: list[str], sentenc
 
 
 def test_a_store_without_enough_executions(folder: Path, invoke: Invoke) -> None:
-    from watched_cart import experiment  # type: ignore[import-not-found]
+    from watched_cart import experiment
 
     store = folder / "few.sqlite"
     if not store.exists():
