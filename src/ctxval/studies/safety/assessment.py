@@ -194,7 +194,7 @@ def assess(
             bound = (1 + searched) * (bound + ERRORS * certified.error)
         elif certified is not None:
             doubt = certified.doubt or "the certificate leaves out a share of the tasks"
-        with stage("predicting the largest deviation"):
+        with stage("predicting the largest deviation", unit="closed loops"):
             of_deviation = _deviation_bound(campaign, spec, options.confidence)
         planner = LoopPlanner(validation)
         count = tasks if planner.batched else max(tasks // 10, 1)
