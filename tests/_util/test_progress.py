@@ -70,6 +70,18 @@ def test_a_listener_hears_the_stages_and_their_ends() -> None:
     assert [p.note for p in heard if p.note] == ["lunch"]
 
 
+def test_closed_loops_are_no_executions() -> None:
+    heard: list[Progress] = []
+    with listening(heard.append), stage("executions", 20):
+        advance(10_825, units=("closed loops",))
+        advance()
+        with stage("searching", unit="closed loops"):
+            advance(7, units=("closed loops",))
+    assert [(p.stage, p.done) for p in heard if p.done] == [
+        ("executions", 1), ("searching", 7), ("searching", 7), ("executions", 1)
+    ]  # fmt: skip
+
+
 def test_an_estimate_that_was_too_small_is_none_any_more() -> None:
     heard: list[Progress] = []
     with listening(heard.append):

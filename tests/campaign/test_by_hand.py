@@ -585,7 +585,8 @@ def test_a_table_of_runs_is_converted_to_the_units_of_the_tasks(invoke: Any) -> 
     found = json.loads(invoke("import", "a.sqlite", "runs.csv", "--json").stdout)["imported"]
     assert [(one["task"]["goal"], one["distance"]) for one in found] == [(0.75, 0.25)]
     Path("runs.csv").write_text("goal [s],distance\n1,0.25\n")
-    assert "no known factor from s to m" in refused(invoke("import", "a.sqlite", "runs.csv"))
+    sentence = refused(invoke("import", "a.sqlite", "runs.csv"))
+    assert "runs.csv: a column of a parameter has another unit: there is no known factor from s to m" in sentence
 
 
 def test_a_little_jitter_is_refused_with_its_size_and_the_option_that_helps(invoke: Any) -> None:

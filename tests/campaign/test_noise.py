@@ -80,6 +80,19 @@ def test_without_noise_nothing_changes() -> None:
 
 
 @pytest.mark.slow
+def test_measurement_noise_that_hardly_moves_a_distance_is_no_end() -> None:
+    """It is a large part of what M misses, and a small one of the distance: the bound is one on the quantile."""
+    noisy = systems.Imperfect(step, vectorized=True, measurement=[3e-4, 3e-4], seed=1)
+    campaign = Campaign(cart().with_parts(system=noisy), seed=0).run(14, 0.6, certificate=FEW_TESTS)
+    verdict = campaign.verdict(0.6, certificate=FEW_TESTS)
+    assert verdict.answer == "validated"
+    assert verdict.certificate is not None
+    assert verdict.certificate.kind == "dynamics"
+    assert verdict.certificate.details["noise"] > 0.01
+    assert verdict.certificate.details["quantile"] == 0.9
+
+
+@pytest.mark.slow
 def test_initial_states_that_scatter_are_noise_too() -> None:
     validation = cart(0.0, start=0.03)
     largest = largest_quantile(validation)

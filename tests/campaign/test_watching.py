@@ -117,6 +117,8 @@ def test_what_cannot_be_judged_is_refused(watch: Watch) -> None:
     before = watch.state
     with pytest.raises(InputError, match="a watch needs the trajectory of an execution"):
         watch.update(Execution(distance=0.1))
+    with pytest.raises(InputError, match=r"run must be .*Trajectory.*, got None"):
+        watch.update(None)  # type: ignore[arg-type]
     with pytest.raises(InputError, match="must have 2 states and 1 inputs of complete runs, got 3 and 1"):
         watch.update(Trajectory([0.0, 0.1], np.zeros((2, 3)), np.zeros((1, 1))))
     failed = replace(execute(1.0), ended="the motor cut out")
@@ -187,6 +189,7 @@ def test_outputs_and_physical_parameters_are_watched(make: Callable[..., Validat
         trajectory, task = run(plain, goal, load)
         campaign.add(task, trajectory)
     watch = campaign.watch(THRESHOLD)
+    assert not [channel.name for channel in watch.state.channels if "load" in channel.name]  # a load has no residual
     for goal, load in [(1.0, 0.4), (-1.5, 0.7), (1.6, 0.2)]:
         assert not watch.update(*run(plain, goal, load)).expired
     with pytest.raises(InputError, match="a recording needs the parameters of its task"):

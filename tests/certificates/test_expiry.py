@@ -51,6 +51,17 @@ def test_it_says_what_has_changed_and_since_when() -> None:
     assert 2 < (state.ratio or 0) < 4.5
 
 
+def test_evidence_that_is_too_little_for_an_alarm_is_no_agreement() -> None:
+    state = begun()
+    while state.evidence < 20:
+        state = watched(state, 3.0, 1, seed=len(state.runs))
+    assert not state.expired
+    assert state.sentence.startswith(
+        f"holds so far: rate residuals since run {state.since} are {state.ratio:.2g} times"
+    )
+    assert state.sentence.endswith("judge further runs")
+
+
 def test_an_alarm_stays() -> None:
     state = watched(begun(), 4.0, 8)
     after = watched(state, 1.0, 30, seed=3)

@@ -38,3 +38,15 @@ def test_one_that_is_not_stated_says_why_and_writes_no_function(
     assert stated["share"] == 0
     assert stated["file"] is None
     assert not Path("trusted.py").exists()
+    shown = calling("envelope")("p.sqlite", "--threshold", "0.3", "--out", "trusted.py").stdout
+    assert "trusted.py is not written, because no task is trusted" in " ".join(shown.split())
+
+
+def test_what_an_envelope_assumes_is_printed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "200")
+    ran = calling("run")("pendulum", "--threshold", "0.3", "--budget", "16", "--seed", "7", "--envelope", "--no-report")
+    assert ran.exit_code == 1
+    shown = " ".join(ran.stdout.split())
+    assert "Trusted: " in shown
+    assert "It assumes: the recorded state is complete" in shown

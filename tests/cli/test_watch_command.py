@@ -92,7 +92,23 @@ def test_a_table_of_runs_is_judged_and_nothing_is_stored(folder: Path, invoke: I
     assert "speed residuals since run 1 are" in expired.stdout
     assert "next: ctxval ask cart.sqlite --again" in expired.stdout
     assert "line 5 is not judged: the motor cut out" in " ".join(expired.stderr.split())
+    assert "2 of 8 runs are not judged, and nothing is said of them" in expired.stdout
     assert Store.existing(folder / "cart.sqlite").digest() == before
+
+
+@pytest.mark.slow
+def test_a_system_that_is_executed_is_validated_anew_in_another_store(folder: Path, invoke: Invoke) -> None:
+    """`ctxval ask` would open a trial that only people execute."""
+    from watched_cart import experiment  # type: ignore[import-not-found]
+
+    validation: Validation = experiment().validation
+    Campaign(validation, store=folder / "ran.sqlite", seed=0, name="cart").run(6)
+    watch = calling("watch", "ran.sqlite", "--experiment", "watched_cart:experiment")
+    expired = watch("heavier.csv")
+    assert expired.exit_code == 1, expired.stderr
+    assert "next: ctxval run watched_cart:experiment --threshold 0.5 --store ran.changed.sqlite" in expired.stdout
+    resampled = watch("same0.csv", "--set", "goal=-1.5", "--resample")
+    assert "steps with missing samples are no steps of the system" in resampled.stderr
 
 
 @pytest.mark.slow
@@ -146,7 +162,7 @@ def test_bad_input_is_one_sentence(invoke: Invoke, arguments: list[str], sentenc
 
 
 def test_a_store_without_enough_executions(folder: Path, invoke: Invoke) -> None:
-    from watched_cart import experiment  # type: ignore[import-not-found]
+    from watched_cart import experiment
 
     store = folder / "few.sqlite"
     if not store.exists():

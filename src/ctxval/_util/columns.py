@@ -56,7 +56,7 @@ def conversion(recorded: str, wanted: str) -> float:
     source, target = _parsed(recorded), _parsed(wanted)
     if source is None or target is None or source[1] != target[1]:
         units = f"from {recorded or 'no unit'} to {wanted or 'no unit'}"
-        raise InputError(f"there is no known factor {units}: give factor = ...")
+        raise InputError(f"there is no known factor {units}: give factor = ... in a mapping, or convert the values.")
     return source[0] / target[0]
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
@@ -109,10 +109,10 @@ def stage(name: str, expected: float | None = None, unit: str = "", done: float 
         begun.report(ended=True)
 
 
-def advance(count: float = 1, note: str = "") -> None:
-    """Report that so much more of the innermost stage is done."""
+def advance(count: float = 1, note: str = "", units: Collection[str] | None = None) -> None:
+    """Report that so much more of the innermost stage is done; with units, only if it counts in one of these."""
     current = _innermost.get()
-    if current is not None and current.depth >= 0:
+    if current is not None and current.depth >= 0 and (units is None or current.unit in units):
         current.done += count
         current.report(note)
 

@@ -109,7 +109,10 @@ def _table(path: Path, space: TaskSpace, reading: Mapping[str, Any]) -> list[Kno
         )
     units = {name: space.units.get(name, space.units.get(name.partition("[")[0], "")) for name in columns}
     named = [(name, *column) for name, column in columns.items() if column is not None]
-    factors = {name: (column, conversion(unit, units[name]) if unit else 1.0) for name, column, unit in named}
+    try:
+        factors = {name: (column, conversion(unit, units[name]) if unit else 1.0) for name, column, unit in named}
+    except InputError as error:
+        raise InputError(f"{path}: a column of a parameter has another unit: {error}") from error
     runs = []
     for line, cells in table.rows():
         where, row = f"{table.path}, line {line}", dict(zip(table.names, cells, strict=True))

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ctxval._util.checked import require
 from ctxval._util.progress import advance, stage
 from ctxval.campaign.choices import Execution
 from ctxval.campaign.history import executed_trials
@@ -107,6 +108,7 @@ class Watch:
         Raises:
             ExecutionError: if the trajectory is not a complete execution of the task.
         """
+        require("run", Trajectory | Execution, run)
         execution = Execution(run) if isinstance(run, Trajectory) else run
         trajectory, distance, validation = execution.trajectory, execution.distance, self.campaign.validation
         if trajectory is None:
@@ -159,8 +161,9 @@ class Watch:
         learned = self._statistics.learned
         if learned.study.given.physical or self.campaign.validation.outputs is not None:
             raise InputError(
-                "a recording needs the parameters of its task: the learned dynamics depend on a task parameter, or "
-                "only outputs are recorded."
+                f"a recording needs the parameters of its task, {', '.join(self.campaign.validation.space.names)}: the "
+                "learned dynamics depend on a task parameter, or only outputs are recorded. On the command line, give "
+                "--set NAME=VALUE for one recording, or a table of recordings with a column for each parameter."
             )
         wanted = len(learned.posterior.data.sizes), learned.posterior.data.inputs
         if (trajectory.states.shape[-1], trajectory.inputs.shape[-1]) != wanted or trajectory.ended != COMPLETE:

@@ -93,7 +93,7 @@ class Dynamics(CertificateKind):
         unknown = [sample.numbers[row] for row in np.flatnonzero(np.isnan(sample.distances)).tolist()]
         if unknown:
             raise CertificateError(
-                f"{listed(unknown)} failed or has no distance, so d* is not bounded there; execute the task again, or "
+                f"{listed(unknown)} failed or gave no distance, so d* is not bounded there; execute the task again, or "
                 f"audit.{advice_to_remeasure(sample)}"
             )
         if not sample.best > 0:

@@ -26,6 +26,9 @@ from ctxval.errors import InputError
 EXCEEDED = "distances above the threshold"
 """Cause of an alarm that needs no evidence: without noise, an executed distance above the threshold is a fact."""
 
+SUSPECTED = 20.0
+"""Evidence from which runs are not said to agree with the certified ones: that of a single test at level 0.05."""
+
 FEWEST = 3
 """Fewest certified runs from which later ones are judged."""
 
@@ -134,11 +137,13 @@ class WatchState(ShortRepr):
         if self.cause == EXCEEDED and self.alarm is not None:
             distance = self.distances[self.alarm - 1]
             return withdrawals.EXCEEDED.format(run=self.alarm, distance=distance, threshold=self.threshold)
-        if self.ratio is not None and self.expired:
+        against = {"evidence": self.evidence, "limit": 1 / self.false_alarms}
+        if self.ratio is not None and (self.expired or self.evidence >= SUSPECTED):
             times = f"{self.ratio:.2g}" if self.ratio < 100 else f"{self.ratio:.0f}"
-            return withdrawals.CHANGED.format(cause=self.cause, since=self.since, times=times)
+            text = withdrawals.CHANGED if self.expired else withdrawals.SUSPECTED
+            return text.format(cause=self.cause, since=self.since, times=times, **against)
         agree = "1 run agrees" if len(self.runs) == 1 else f"{len(self.runs)} runs agree"
-        return withdrawals.HOLDS.format(agree=agree, evidence=self.evidence, limit=1 / self.false_alarms)
+        return withdrawals.HOLDS.format(agree=agree, **against)
 
     def to_json(self) -> dict[str, Any]:
         """Return all attributes and the sentence, ready for JSON."""

@@ -97,12 +97,13 @@ def _print(report: SafetyReport, drawn: DrawnTasks | None) -> None:
         out.say((report.answer.upper(), f"bold {colour}"), f": margin {of(report.margin)}")
     out.say(report.statement[0].upper() + report.statement[1:], wrap=True)
     executed, predicted = "largest executed", "predicted to be at most"
+    certified = "not certified" if report.d_b_bound is None else f"certified at most {of(report.d_b_bound)}"
     rows = {
         "largest deviation": f"{executed} {of(report.d_a)}, {predicted} {of(report.d_a_bound)}",
-        "largest margin of an unsafe task": f"{executed} {of(report.d_b)}, certified at most {of(report.d_b_bound)}",
+        "largest margin of an unsafe task": f"{executed} {of(report.d_b)}, {certified}",
     }
     if report.share_by_deviation is not None:
-        rows["safe by the largest deviation"] = f"{100 * report.share_by_deviation:.1f} %"
+        rows["safe if no deviation is larger"] = f"{100 * report.share_by_deviation:.1f} %, which is not certified"
     if report.tightened is not None:
         if report.tightened.avoid:
             rows["avoid on the model"] = enumerated([repr(part) for part in report.tightened.avoid], 6)
@@ -115,6 +116,7 @@ def _print(report: SafetyReport, drawn: DrawnTasks | None) -> None:
             f"{drawn.unsafe} of {drawn.draws} tasks with a margin above {of(drawn.margin)} are unsafe: at most "
             f"{100 * drawn.share:.3g} % of them, with {100 * drawn.confidence:g} % confidence"
         )
+    rows["between recorded times"] = f"the system moves by up to {of(report.between)}, which is not seen"
     rows["executions"] = str(report.executions)
     print_table(rows)
     for task in report.counterexamples[:5]:

@@ -248,6 +248,8 @@ def state_envelope(
     written = None if out_ is None or not envelope.share else str(envelope.save(out_))
     if written is not None:
         out.say(f"the function trusted(task) is in {written}", wrap=True)
+    elif out_ is not None:
+        out.say(f"{out_} is not written, because no task is trusted", wrap=True)
     return {**envelope.to_json(), "store": str(store), "file": written}
 
 
@@ -256,6 +258,8 @@ def print_envelope(envelope: Envelope) -> None:
         out.say(("envelope", "bold"), f": {envelope.statement}", wrap=True)
     out.say(envelope.words, wrap=True)
     if envelope.doubt is None:
+        if envelope.share:
+            out.say(f"It assumes: {'; '.join(envelope.assumptions)}.", wrap=True)
         print_table({"executions": f"{envelope.executions}, of which {envelope.tests} were predicted at drawn tasks"})
 
 

@@ -45,6 +45,10 @@ def watch(
     runs = list(_runs(opened, logs, reading, parameters, how))  # all are read before any is judged
     watching = opened.campaign.watch(limit, false_alarms)
     judged, skipped = list[dict[str, Any]](), list[dict[str, str]]()
+    if resample:
+        notes.say(
+            "--resample interpolates: steps with missing samples are no steps of the system, and look like a change."
+        )
     with stage("judging", len(runs), "runs"):
         for name, execution, task in runs:
             try:
@@ -71,10 +75,14 @@ def watch(
     state, again = watching.state, watching.again()
     first, colon, rest = state.sentence.partition(":")
     out.say((first.upper(), "bold red" if state.expired else "bold green"), f"{colon}{rest}.", wrap=True)
+    if skipped:
+        are = "is" if len(skipped) == 1 else "are"
+        text = f"{len(skipped)} of {len(runs)} runs {are} not judged, and nothing is said of them"
+        out.say((text, "yellow"), "; an execution that fails may itself be a change.", wrap=True)
     for trial in again:
         out.say(f"execute again: trial {trial.number}, {task_text(trial.parameters)}")
     if again:
-        out.say(f"next: ctxval ask {shlex.quote(str(store))} --again {again[0].number} --because REASON")
+        out.say(f"next: {_next(opened, allowed, store, limit, again[0].number)}")
     report = {
         "runs": judged,
         "skipped": skipped,
@@ -83,6 +91,25 @@ def watch(
         "store": str(store),
     }
     return report, FALSIFIED if state.expired else 0
+
+
+def _next(opened: Opened, allowed: Allowed, store: Path, threshold: float, trial: int) -> str:
+    """Return the command that goes on after an alarm.
+
+    People execute a trial again. A system that is executed is validated as it is now: in another store, because the
+    executions of this one are those of the system before.
+    """
+    by_people = getattr(opened.experiment.validation.system, "manual", False)
+    if by_people or any(each.told for each in opened.campaign.trials):
+        return shlex.join(["ctxval", "ask", str(store), "--again", str(trial), "--because", "REASON"])
+    settings = opened.settings
+    target = allowed.experiment or settings.experiment or ""
+    if allowed.experiment is None and settings.file is not None:
+        target = (
+            settings.file if settings.folder in (None, Path.cwd()) else str(Path(settings.folder or "", settings.file))
+        )
+    other = store.with_name(f"{store.stem}.changed{store.suffix}")
+    return shlex.join(["ctxval", "run", target, "--threshold", f"{threshold:g}", "--store", str(other)])
 
 
 _Run = tuple[str, Execution, Mapping[str, Any] | None]

@@ -33,6 +33,7 @@ AnyDraws = DynamicsDraws | NoisyDraws
 Together = AnyDraws | DisturbedDynamics
 """Systems that are run together."""
 
+_UNITS = "closed loops", "designs", "tasks"  # of stages that closed loops are progress of
 _REMEMBERED = 64_000_000  # largest size of the plans that are kept, in bytes, approximately
 
 
@@ -102,7 +103,7 @@ class LoopPlanner:
                 self._size += needed
                 while self._size > _REMEMBERED:
                     self._size -= self._kept.popitem(last=False)[1][1]
-            advance(len(some))  # as if those that are kept were planned again
+            advance(len(some), units=_UNITS)  # as if those that are kept were planned again
             plans += [replace(plan, rows=first + plan.rows) for plan in planned]
         return plans
 
@@ -157,7 +158,7 @@ class LoopPlanner:
     def distances(self, draws: Together, planned: Sequence[PlannedTasks], tasks: int) -> Array:
         """Return the distances ``(S, q)`` of all draws on the same q tasks; NaN for a task without a finite plan."""
         distances = distances_of(draws, self.run(draws, planned), planned, tasks)
-        advance(len(draws) * sum(len(plan.rows) for plan in planned))
+        advance(len(draws) * sum(len(plan.rows) for plan in planned), units=_UNITS)
         return distances
 
     def own_distances(self, draws: AnyDraws, points: Array) -> Array:
@@ -182,7 +183,7 @@ class LoopPlanner:
 
                 of_tasks = step if plan.task.batch_shape else draws.model_of(first).step
                 distances[0, plan.rows] = self.compared(plan, rollout(of_tasks, plan.controller, plan.task))
-            advance(R * len(plan.rows))
+            advance(R * len(plan.rows), units=_UNITS)
         of_loops = distances.reshape(R, S, q).swapaxes(0, 1).reshape(S * R, q)
         return draws.reduced(of_loops) if isinstance(draws, NoisyDraws) else of_loops
 

@@ -111,6 +111,11 @@ class ExtendedValidation:
                 labels = replace(labels, states=(*labels_of(states), *more))
         return labels
 
+    @property
+    def parameters(self) -> int:
+        """The number of task parameters that are states, the last ones."""
+        return len(self._columns)
+
     @functools.cached_property
     def loops(self) -> Trajectory | None:
         """Closed loops on M; None if no task can be planned."""

@@ -38,6 +38,7 @@ MATTERS = 0.01
 """Standard deviation of the distance of a task over its executions, as a share of the largest distance, from which
 noise matters."""
 
+_ROUNDING = 1e-5  # standard deviation, as a share of a state's, below which it is rounding
 _TRIED = 32  # tasks of the pool among which those with the largest distances show what noise does
 _TASKS, _RUNS = 6, 10  # these tasks, and how often each of them is run
 
@@ -91,8 +92,13 @@ class NoiseStudy:
         if learned is None:
             return None
         noisy, _ = learned
-        # If it changes distances by a negligible share of the largest one, it is left out.
-        return noisy if self._effect(noisy) > MATTERS else replace(noisy, replicates=1)
+        # If it changes distances by a negligible share of the largest one, it is left out. A certificate for all
+        # executions would be withdrawn for it, though, so it is kept if first records show that there is noise indeed,
+        # and no part of the dynamics that is not learned. Estimates of states deviate without noise, too.
+        n = len(posterior.data.sizes)
+        scatters = _scatter_of(records)[:n] > _ROUNDING * posterior.data.scale[:n]
+        is_measured = self.extended.given.outputs is None and noisy.noise > NOISY and bool(scatters.any())
+        return noisy if is_measured or self._effect(noisy) > MATTERS else replace(noisy, replicates=1)
 
     def again(
         self, noisy: NoisyPosterior, records: Sequence[Record], posterior: DynamicsPosterior, others: Sequence[Record]
@@ -132,8 +138,7 @@ class NoiseStudy:
         causes, planner = [posterior.deviations] if starts is None else [starts], self.planner
         if starts is None and isinstance(posterior, NoisyPosterior):
             causes.append(posterior.scatter)
-        # Standard deviation, as a share of a state's, below which it is rounding.
-        rounding = 1e-5 * posterior.data.scale[: len(posterior.data.sizes)]
+        rounding = _ROUNDING * posterior.data.scale[: len(posterior.data.sizes)]
         if not any((each > rounding).any() for each in causes):
             return 0.0
 

@@ -123,8 +123,8 @@ DISTANCE = "errors of the predicted distance"
 
 
 def names(study: DynamicsStudy, states: int) -> Sequence[str]:
-    """Return the names of the states that are learned."""
-    return list(study.validation.names(states, 0)[0])
+    """Return the names of the states; the last ones are task parameters if these are states, and never change."""
+    return list(study.validation.names(states, 0)[0])[: states - study.extended.parameters]
 
 
 def influences(learned: LearnedDynamics) -> Array:

@@ -368,15 +368,23 @@ def test_noise_is_measured() -> None:
     assert "the system is stochastic" in text
 
 
-def test_a_start_that_is_not_the_tasks_is_found() -> None:
+@pytest.mark.parametrize(
+    ("moved", "state", "sentence"),
+    [(10.0, "failed", "the trajectory starts elsewhere: state 0 must start at"), (0.002, "ok", "are the same")],
+)
+def test_a_start_is_refused_if_campaigns_refuse_it(moved: float, state: str, sentence: str) -> None:
+    """The first record of a sensor with noise is not the initial state of the task."""
     plain = make_validation()
 
     class Elsewhere:
         def execute(self, controller: Any, task: Task) -> Trajectory:
             whole = plain.system.execute(controller, task)
-            return Trajectory(whole.times, whole.states + 0.125, whole.inputs)
+            return Trajectory(whole.times, whole.states + moved, whole.inputs)
 
-    assert "starts 0.125 away" in findings(make_validation(system=Elsewhere()), execute=True)["execution"][1]
+    checked = check_experiment(Experiment("x", make_validation(system=Elsewhere())), execute=True)
+    of_execution = {(each.state, each.text) for each in checked if each.check == "execution"}
+    assert any(each == state and sentence in text for each, text in of_execution)
+    assert any("start up to 0.002 away" in text for _, text in of_execution) == (state == "ok")
 
 
 def test_a_model_whose_batches_differ_is_found() -> None:

@@ -4,11 +4,25 @@ import json
 
 import numpy as np
 import pytest
-from rig_safety import D_A, D_B, SPEC, closed_form, validation
+from rig_safety import D_A, D_B, DT, FASTER, FASTEST, SPEC, closed_form, step, validation
 
-from ctxval import Campaign, Experiment, Task, TaskSpace, Validation, controllers, distances, models, systems
+from ctxval import (
+    Campaign,
+    Experiment,
+    Task,
+    TaskSpace,
+    Trajectory,
+    Validation,
+    controllers,
+    distances,
+    models,
+    searches,
+    systems,
+)
 from ctxval._util.arrays import Array
 from ctxval._util.describe import describe
+from ctxval.core.controller import Controller
+from ctxval.core.rollout import rollout
 from ctxval.distances import MaximumDeviation, UnsafeMargin
 from ctxval.errors import InputError, ShapeError
 from ctxval.specs import Ball, Box, ReachAvoid
@@ -41,7 +55,27 @@ def test_a_campaign_certifies_the_margin_that_the_drift_needs() -> None:
     assert found.tightened is not None
     assert found.tightened.avoid[0].low[0] == pytest.approx(-found.d_b_bound)
     assert json.loads(json.dumps(describe(found.to_dict(), 10)))["d_b"] == found.d_b
-    assert "is safe on S" in found.statement
+    assert "is safe on S at its recorded times" in found.statement
+    assert 0 < found.between <= DT * (FASTEST + FASTER * FASTEST**2) + 1e-9  # nothing is seen between two records
+
+
+class Stops:
+    """The drift, whose motor cuts out at high speed."""
+
+    def execute(self, controller: Controller, task: Task) -> Trajectory:
+        if task.environment["speed"][0] > 1.0:
+            raise RuntimeError("the motor cut out")
+        return rollout(step, controller, task)
+
+
+@pytest.mark.slow
+def test_no_task_is_called_safe_by_deviations_if_an_execution_failed() -> None:
+    campaign = Campaign(validation().with_parts(system=Stops()), search=searches.Random(), seed=0)
+    found = assess(campaign.run(8, progress=False), tasks=200, progress=False)
+    assert campaign.failed
+    assert found.d_a_bound is not None
+    assert found.share_by_deviation is None
+    assert "failed" in found.statement
 
 
 @pytest.mark.slow

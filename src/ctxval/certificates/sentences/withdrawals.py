@@ -100,3 +100,7 @@ REFINED = (
 EXCEEDED = "expired: run {run} has the distance {distance:.4g}, above the threshold {threshold:g}"
 CHANGED = "expired: {cause} since run {since} are {times} times those certified"
 HOLDS = "holds: {agree} with the certified ones (evidence of a change {evidence:.2g}, alarm at {limit:.4g})"
+SUSPECTED = (
+    "holds so far: {cause} since run {since} are {times} times those certified, which is too little evidence for an "
+    "alarm (evidence of a change {evidence:.2g}, alarm at {limit:.4g}); judge further runs"
+)

@@ -235,9 +235,11 @@ def _executions(validation: Validation, plan: Plan, execute: bool) -> Findings:
         return
     first, second = validation.execute(plan), validation.execute(plan)
     for trajectory in (first, second):
-        gap = float(np.abs(trajectory.states[0] - plan.model_trajectory.states[0]).max())
-        if gap > 1e-6:
-            yield "failed", f"the execution starts {gap:.3g} away from the initial state of the task"
+        validation.require(plan, trajectory)  # refuses another start
+    gap = max(float(np.abs(run.states[0] - plan.model_trajectory.states[0]).max()) for run in (first, second))
+    if gap > 1e-6:
+        text = f"executions start up to {gap:.3g} away from the initial state of the task, which the start tolerance"
+        yield "noted", f"{text} permits"
     noise = float(np.abs(first.states - second.states).max())
     distance, again = validation.measure(plan, first), validation.measure(plan, second)
     if noise == 0:

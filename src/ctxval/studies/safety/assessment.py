@@ -23,6 +23,7 @@ from ctxval.certificates import Certificate, CertificateOptions, Dynamics
 from ctxval.certificates.bounds import ERRORS, rank_of
 from ctxval.certificates.dynamics import draws_for
 from ctxval.certificates.verdict import Answer, usable_bound
+from ctxval.core.distance import selected
 from ctxval.core.experiment import Experiment
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import Trial
@@ -69,10 +70,14 @@ class SafetyReport(ShortRepr):
     tasks: int  #: number of drawn tasks, on M alone, that the shares are of
     share_satisfied: float  #: the share of the tasks that M satisfies
     share_certified: float | None  #: the share whose rho_M exceeds the bound of d_b; None if there is none
-    share_by_deviation: float | None  #: the share whose rho_M exceeds the bound of d_a; None if there is none
+    #: the share whose rho_M exceeds the bound of d_a; None if there is none, or if an execution failed
+    share_by_deviation: float | None
     #: the specification whose sets to avoid have grown, and whose set to reach has shrunk, by the bound; None if there
     #: is no bound, no sets, or nothing left of the set to reach
     tightened: ReachAvoid | None
+    #: how far S moved at most between two recorded times of an execution, in the states that the specification looks
+    #: at: what happens there is not seen
+    between: float
     executions: int  #: the number of executions of S
     confidence: float  #: the confidence of the certificate
     units: str  #: the unit of all distances
@@ -99,8 +104,9 @@ class SafetyReport(ShortRepr):
         often = "" if quantile is None else f" in {100 * quantile:g} % of its executions"
         return (
             f"With {100 * self.confidence:g} % confidence, every task that M satisfies with a robustness above "
-            f"{self.d_b_bound:.4g}{unit} is safe on S{often}: {100 * (self.share_certified or 0):.1f} % of the tasks, "
-            f"and M satisfies {100 * self.share_satisfied:.1f} %."
+            f"{self.d_b_bound:.4g}{unit} is safe on S at its recorded times{often}: "
+            f"{100 * (self.share_certified or 0):.1f} % of the tasks, and M satisfies "
+            f"{100 * self.share_satisfied:.1f} %."
         )
 
     def __repr__(self) -> str:
@@ -188,7 +194,7 @@ def assess(
             bound = (1 + searched) * (bound + ERRORS * certified.error)
         elif certified is not None:
             doubt = certified.doubt or "the certificate leaves out a share of the tasks"
-        with stage("predicting the largest deviation"):
+        with stage("predicting the largest deviation", unit="closed loops"):
             of_deviation = _deviation_bound(campaign, spec, options.confidence)
         planner = LoopPlanner(validation)
         count = tasks if planner.batched else max(tasks // 10, 1)
@@ -199,12 +205,17 @@ def assess(
             rho = on_model(planner, spec, unit)
     if not (rho > 0).any():
         raise InputError(f"none of {len(unit)} drawn tasks satisfies the specification on the model.")
-    if bound is None and not (campaign.worst is not None and campaign.worst.distance):
+    if bound is None and not campaign.failed and not (campaign.worst is not None and campaign.worst.distance):
         doubt = (
             "no executed task came near a violation, so that no prediction of one was tested; ask for a margin, or "
             "draw tasks with an audit"
         )
     deviation = max((moved for _, moved in executed), default=0.0)
+    by_deviation = None  # a failed execution has deviations that nobody knows
+    if of_deviation is not None and not campaign.failed:
+        by_deviation = float((rho > max(of_deviation, deviation)).mean())
+    looked_at = [selected(system.states, getattr(spec, "components", None)) for _, system in runs]
+    between = max((float(np.linalg.norm(np.diff(x, axis=0), axis=-1).max()) for x in looked_at), default=0.0)
     tightened = None
     if bound is not None and isinstance(spec, ReachAvoid):
         with suppress(InputError):  # nothing is left of a set
@@ -224,8 +235,9 @@ def assess(
         tasks=len(unit),
         share_satisfied=float((rho > 0).mean()),
         share_certified=None if bound is None else float((rho > bound).mean()),
-        share_by_deviation=None if of_deviation is None else float((rho > max(of_deviation, deviation)).mean()),
+        share_by_deviation=by_deviation,
         tightened=tightened,
+        between=between,
         executions=campaign.executions,
         confidence=options.confidence,
         units=validation.labels.units,
