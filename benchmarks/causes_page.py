@@ -31,7 +31,7 @@ is named and first, with its joint or input, or together with others that are al
 
 {{reporting}}
 
-**Development robots**, on which rules and thresholds were chosen; they have all kinds of faults:
+**Development robots**, on which rules and thresholds were chosen; they have all kinds of faults. {by_which_rule}
 
 {{development}}
 
@@ -72,9 +72,9 @@ def counts(records: Sequence[dict[str, Any]]) -> dict[str, int]:
     }
 
 
-def table(of: str) -> str:
+def table(of: str, rule: int = RULE) -> str:
     """Return a table of the robots of a part."""
-    records, rows = STORED.select(rule=RULE, of=of), []
+    records, rows = STORED.select(rule=rule, of=of), []
     for robot, noise in dict.fromkeys((each["robot"], each["noise"]) for each in records):
         n = counts([each for each in records if (each["robot"], each["noise"]) == (robot, noise)])
         noisy = f"{100 * noise:g} %" if noise else "none"
@@ -83,6 +83,22 @@ def table(of: str) -> str:
         rows.append([robot, noisy, str(n["faults"]), *shares, sizes, f"{n['none']} of {n['foreign']}"])
     lines = [HEADER, ["---"] * len(HEADER), *rows]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def rule_of_development() -> tuple[int, str]:
+    """Return the newest rule that ran on development robots, and what that means for their table."""
+    if STORED.select(rule=RULE, of="development"):
+        return RULE, "They were run by the present rule:"
+    answers = [
+        {(each["robot"], each["fault"], each["noise"]): (each["named"], each.get("causes")) for each in records}
+        for records in (STORED.select(rule=RULE - 1), STORED.select(rule=RULE))
+    ]
+    both = set(answers[0]) & set(answers[1])
+    same = sum(answers[0][key] == answers[1][key] for key in both)
+    return RULE - 1, (
+        f"They were run by rule {RULE - 1}; of {len(both)} faults of reporting robots that rules {RULE - 1} and {RULE} "
+        f"have seen, {same} have the same answer:"
+    )
 
 
 def servo() -> str:
@@ -115,8 +131,9 @@ def said(records: Sequence[dict[str, Any]]) -> str:
 def not_run() -> str:
     """Return which robots and noises are missing or incomplete."""
     of = {name: part for part, robots in ROBOTS.items() for name in robots}
+    rules = {"reporting": RULE, "development": rule_of_development()[0]}
     missing = [
-        (name, noise, len(STORED.select(rule=RULE, robot=name, noise=noise)), len(faults(robot, of[name])))
+        (name, noise, len(STORED.select(rule=rules[of[name]], robot=name, noise=noise)), len(faults(robot, of[name])))
         for name, robot in {**DEVELOPMENT, **REPORTING}.items()
         for noise in NOISES
     ]
@@ -157,13 +174,15 @@ def section() -> str:
     text = SECTION.strip().format(
         second=len(second), lost=" and ".join(lost),
         executions=EXECUTIONS, reported=said(records), first=said(first), third=said(third),
-        missed=missed(records), servo=servo(), not_run=not_run(),
+        missed=missed(records), servo=servo(), not_run=not_run(), by_which_rule=rule_of_development()[1],
     )  # fmt: skip
     paragraphs = [
         textwrap.fill(part, 120, break_long_words=False, break_on_hyphens=False) for part in text.split("\n\n")
     ]
     whole = "\n\n".join(filter(None, paragraphs))
-    return whole.replace("{reporting}", table("reporting")).replace("{development}", table("development"))
+    return whole.replace("{reporting}", table("reporting")).replace(
+        "{development}", table("development", rule_of_development()[0])
+    )
 
 
 def main() -> None:

@@ -371,8 +371,8 @@ def test_what_is_no_file_is_neither_waited_for_nor_read(make: str, reason: str, 
 
 
 def test_a_trajectory_may_be_a_link_to_a_file(tmp_path: Path) -> None:
-    code = RIG + f"os = __import__('os'); os.replace(folder / 'trajectory.csv', {str(tmp_path / 'log')!r})\n"
-    code += f"os.symlink({str(tmp_path / 'log')!r}, folder / 'trajectory.csv')"
+    code = RIG + f"__import__('shutil').move(folder / 'trajectory.csv', {str(tmp_path / 'log')!r})\n"  # another disk
+    code += f"__import__('os').symlink({str(tmp_path / 'log')!r}, folder / 'trajectory.csv')"
     assert python(tmp_path, code).execute(designed(), TASK).ended == "complete"
 
 
