@@ -33,6 +33,7 @@ NAMES = {
     "enter a gap in the joint records": "joint gap",
     "hardly changes the closed loops": "untried parameter",
     "has a task near the corner": "untried corner",
+    "where predicted runs lead, and a post": "unentered place",
     "is not tested where it matters": "largest distance untested",
     "small distances hardly test it": "no large prediction that held",
     "must be predicted beforehand": "tests missing",

@@ -316,6 +316,20 @@ def test_a_validation_names_the_largest_region_that_no_execution_has_entered(
     assert sentence in str(verdict)
 
 
+def test_a_place_of_a_position_that_no_execution_has_entered_withdraws_the_bound() -> None:
+    pocket = StatePocket(0.2, {"x [m]": 0.55, "y [m]": -0.35}, {"x [m]": 0.2, "y [m]": 0.2}, ((0.5, 0.5), (0.1, 0.9)))
+    evidence = replace(GOOD, pocket=pocket)
+    known = DynamicsEvidence.from_json(json.loads(json.dumps(evidence.to_json())))
+    assert known is not None
+    assert known.pocket == pocket
+    verdict = judge(trials(), 1.35, CertificateOptions(Dynamics(tests=0)), Provenance(learned=Learned(known)))
+    assert verdict.answer == "undecided"
+    assert "no execution came within 0.2 of x 0.55 m, y -0.35 m" in verdict.reason
+    small = replace(evidence, pocket=replace(pocket, size=0.1))
+    verdict = judge(trials(), 1.35, CertificateOptions(Dynamics(tests=0)), Provenance(learned=Learned(small)))
+    assert verdict.answer == "validated"
+
+
 def test_without_a_pocket_nothing_is_said_of_one() -> None:
     verdict = judge(trials(), 1.35, CertificateOptions(Dynamics(tests=0)), Provenance(learned=Learned(GOOD)))
     assert "No execution" not in str(verdict)

@@ -11,7 +11,7 @@ from ctxval import Task, TaskSpace, Trajectory, Transitions, Validation, control
 from ctxval._util.arrays import Array
 from ctxval.core.coverage import StateInputCoverage
 from ctxval.learning.closed_loops import LoopPlanner
-from ctxval.learning.coverage import MOST_COORDINATES, largest_pocket, untried_corner
+from ctxval.learning.coverage import MOST_COORDINATES, largest_pocket, position_states, untried_corner
 from ctxval.learning.coverage import coverage as coverage_of
 from ctxval.learning.dynamics_posterior import DynamicsPosterior, PosteriorSettings, learn_posterior
 
@@ -185,6 +185,39 @@ def test_no_execution_came_nearer_to_a_pocket(seed: int, units: list[str]) -> No
     assert nearest >= 1 - 1e-9
     assert nearest <= 20
     assert (within > 0).all()
+
+
+def test_the_next_task_leaves_the_smallest_pocket_and_the_other_leads_into_it() -> None:
+    """Runs are lines in a square; one was executed at its lower end."""
+    heights = np.linspace(-1, 1, 21)
+    lines = [np.column_stack([np.linspace(-1, 1, 41), np.full(41, height)]) for height in heights]
+    visited, of_task = np.concatenate(lines), np.repeat(np.arange(21), 41)
+    tasks = (heights[:, None] + 1) / 2
+    executed = [trajectory([-1.0, -0.9], [1.0, -0.9])]
+    found = largest_pocket(visited, executed, ["x", "y"], [[0, 1]], of_task, tasks)
+    assert found is not None
+    best, inside = (2 * task[0] - 1 for task in found.tasks)
+    assert inside == pytest.approx(found.place["y"])
+    assert 0.2 <= best <= 0.8  # between the executed line and the farthest one
+    assert largest_pocket(visited, executed, ["x", "y"]) is not None
+    assert largest_pocket(visited, executed, ["x", "y"], [], of_task, tasks).tasks == ()  # type: ignore[union-attr]
+
+
+def test_coordinates_of_a_position_are_states_that_begin_at_it_or_have_it_as_goal() -> None:
+    validation = Validation(
+        space=TaskSpace(goal=([-1.0, -1.0], [1.0, 1.0], "m"), start=([-1.0, -1.0], [0.0, 1.0], "m"), load=(1, 2, "kg")),
+        task=lambda p: Task(
+            np.stack([0 * p.load, p.start[..., 1], p.start[..., 0], 0 * p.load], axis=-1),
+            goal=np.stack([0 * p.load, 0 * p.load, p.goal[..., 0], p.goal[..., 1]], axis=-1), horizon=5, dt=0.1,
+        ),
+        system=systems.Simulated(lambda x, u: x, vectorized=True),
+        model=models.Linear(0.9 * np.eye(4), np.full((4, 1), 0.1)),
+        synthesizer=controllers.LQR([1.0] * 4, [0.1]),
+        distance=distances.MeanDeviation(),
+    )  # fmt: skip
+    points = np.random.default_rng(0).random((5, 5))
+    planned = LoopPlanner(validation).plan(points)
+    assert position_states(validation.space, planned, points) == [[2, 3], [2, 1]]
 
 
 def test_where_an_execution_moves_in_one_step_there_is_no_pocket() -> None:

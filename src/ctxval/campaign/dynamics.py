@@ -219,7 +219,7 @@ class CampaignDynamics:
             return evidence
         # Many closed loops, which only matter to a bound that nothing else withdraws.
         jump = learned.study.search.largest_jump(learned.drawn_from)
-        evidence = replace(evidence, jump=jump, pocket=learned.pocket())
+        evidence = replace(evidence, jump=jump, pocket=learned.pocket)
         # The maxima of a distance with kinks lie on ridges, which deeper searches climb higher.
         if is_kinked(learned.study.given.distance) or (evidence.dense and jumps(evidence, bound)):
             values, points = learned.deeper

@@ -36,6 +36,7 @@ from ctxval.certificates.dynamics_diagnostics import (
     only_tests_missing,
     raised,
     uncovered,
+    unentered_pocket,
     untested,
     untried_corner,
     untried_parameter,
@@ -145,7 +146,11 @@ class IntervalSearch:
             return self._by_distance()
         # The whole evidence may decide if nothing that a few draws show leaves the verdict open.
         bound, enough = self._bound(evidence), len(self._ended) >= FEWEST
-        if enough and raised(evidence, bound) <= self.limit and doubt_of(evidence, self.best, bound) is None:
+        decides = enough and raised(evidence, bound) <= self.limit
+        if decides and doubt_of(evidence, self.best, bound) is None:
+            learned = dynamics.learned(trials)
+            evidence = replace(evidence, pocket=None if learned is None else learned.pocket)
+        if decides and doubt_of(evidence, self.best, bound) is None:
             whole = dynamics.evidence(trials, self.options.confidence, keep=self.keeps)
             if whole is None:
                 return self._by_distance()
@@ -157,7 +162,7 @@ class IntervalSearch:
             known = self._points(trials)
             # Executions, besides tests, after which `auto` uses the posterior bound if the dynamics decide nothing.
             chosen = sum(trial.origin not in DRAWN for trial in trials)
-            patient = chosen < 16 or self._lacks_tests_alone(evidence)
+            patient = chosen < 16 or self._lacks_tests_alone(evidence) or unentered_pocket(evidence) is not None
             # In few dimensions, executions soon cover the tasks, and the posterior bound of the distance may decide.
             if not patient or covering(known, kind.posterior.resolution, 0) is not None:
                 choice = self._by_distance()
@@ -380,6 +385,8 @@ def next_task(
             candidates = [evidence.untried.task[None], *candidates]
         elif evidence.corner is not None and untried_corner(evidence) is not None:
             candidates = [evidence.corner.task[None], *candidates]
+        elif evidence.pocket is not None and unentered_pocket(evidence) is not None:
+            candidates = [np.array(evidence.pocket.tasks), *candidates]
     elif evidence.missed > 1 or untested(evidence, best, limit):
         candidates = [largest, highest, farthest]
     else:

@@ -28,6 +28,7 @@ NOISE = 0.01  # learned variance of noise, as a share of the mean square of the 
 LEFT_OUT = 0.5  # share of the posterior variance that posterior samples leave out between their pivots
 GAP = 0.25  # gap of the records in a state or an input, as a share of the range that closed loops visit
 CORNER = 0.05  # distance of the nearest executed task from a corner of a position in space, as a share of its ranges
+POCKET = 0.125  # radius of a place that predicted runs enter and no execution has entered, as a share of the range
 PAIR_GAP = 0.5  # the same for two of them together
 BEYOND = 0.02
 """Largest excess of a state or an input over its largest record, or below its smallest one, as a share of that range.
@@ -233,7 +234,8 @@ def uncovered(evidence: DynamicsEvidence) -> list[str]:
         missing.append(sentences.GAP.format(gap=at(coverage.marginal)))
     if pair is not None and pair.size > PAIR_GAP:
         missing.append(sentences.PAIR_GAP.format(gap=at(pair)))
-    return [*missing, *filter(None, [untried_parameter(evidence), untried_corner(evidence)])]
+    others = untried_parameter(evidence), untried_corner(evidence), unentered_pocket(evidence)
+    return [*missing, *filter(None, others)]
 
 
 def most_beyond(evidence: DynamicsEvidence) -> float:
@@ -255,6 +257,14 @@ def untried_corner(evidence: DynamicsEvidence) -> str | None:
     if corner is None or corner.gap <= CORNER:
         return None
     return sentences.UNTRIED_CORNER.format(place=with_units(corner.place))
+
+
+def unentered_pocket(evidence: DynamicsEvidence) -> str | None:
+    """Return that no execution has entered a place in space that predicted runs enter; None if it is small."""
+    pocket = evidence.pocket
+    if pocket is None or not pocket.tasks or pocket.size <= POCKET:
+        return None
+    return sentences.POCKET.format(within=f"{max(pocket.within.values()):.2g}", place=with_units(pocket.place))
 
 
 def untested(evidence: DynamicsEvidence, best: float, bound: float, allowed: float | None = None) -> list[str]:

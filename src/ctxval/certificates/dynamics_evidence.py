@@ -207,7 +207,7 @@ class DynamicsEvidence(ShortRepr):
     def from_json(cls, values: Any) -> Self | None:
         """Return the evidence that :meth:`to_json` returned; None if these are not its values."""
         try:
-            coverage, untried, corner = values["coverage"], values["untried"], values["corner"]
+            coverage, untried, corner, pocket = (values[name] for name in ("coverage", "untried", "corner", "pocket"))
             tuples = ("point", "quantiles", "p_values")
             gaps = {
                 name: gap and StateInputGap(**{**gap, "coordinates": tuple(gap["coordinates"])})
@@ -225,7 +225,7 @@ class DynamicsEvidence(ShortRepr):
                 "untried": untried and UntriedParameter(**{**untried, "task": np.array(untried["task"])}),
                 "corner": corner and UntriedCorner(**{**corner, "task": np.array(corner["task"])}),
                 "pushed": values["pushed"] and PushedDistances.from_json(values["pushed"]),
-                "pocket": values["pocket"] and StatePocket(**values["pocket"]),
+                "pocket": pocket and StatePocket(**{**pocket, "tasks": tuple(map(tuple, pocket["tasks"]))}),
                 "physical": tuple(values["physical"]),
             }
             return cls(**{**values, **parts})

@@ -112,22 +112,33 @@ def _some(count: int, most: int) -> Rows:
 # Pockets
 
 
-def largest_pocket(visited: Array, executed: Sequence[Trajectory], labels: Sequence[str]) -> StatePocket | None:
+def largest_pocket(
+    visited: Array,
+    executed: Sequence[Trajectory],
+    labels: Sequence[str],
+    positions: Sequence[Sequence[int]] = (),
+    of_task: Rows | None = None,
+    tasks: Array | None = None,
+) -> StatePocket | None:
     """Return the largest pocket; None if there are no two states, or nothing was executed.
 
-    Two states with one unit that is no rate are places, and distances in their plane mean something. If there are such
-    states, only they are compared; otherwise all are, each as a share of its range.
+    Coordinates of a position, and two states with one unit that is no rate, are places, and distances in their plane
+    mean something. If there are such states, only they are compared; otherwise all are, each as a share of its range.
 
     Args:
         visited: states that closed loops of tasks visit, in the system's units, shape ``(N, n)``.
         executed: the executed trajectories.
         labels: the label of each state, with its unit if that is known.
+        positions: of each position that is a task parameter, the states that are its coordinates.
+        of_task, tasks: of each visited state, the row of its task ``(N,)``, and these tasks, points of the unit cube
+            ``(q, d)``; only needed if there are positions.
     """
     low, high = np.quantile(visited, _MOSTLY, axis=0)
-    usual = visited[((visited >= low) & (visited <= high)).all(axis=1)]
-    if not executed or not len(usual):
+    rows = np.flatnonzero(((visited >= low) & (visited <= high)).all(axis=1))
+    if not executed or not len(rows):
         return None
-    parts, some = [], usual[_some(len(usual), 4000)]
+    rows = rows[_some(len(rows), 4000)]
+    parts, some = [], visited[rows]
     for trajectory in executed:  # eight points on the straight line of each step
         steps = np.arange(len(trajectory.states))
         fine = np.linspace(0, steps[-1], 8 * int(steps[-1]) + 1)
@@ -135,7 +146,8 @@ def largest_pocket(visited: Array, executed: Sequence[Trajectory], labels: Seque
     entered = np.concatenate(parts)
     widths, couples = np.maximum(high - low, 1e-9), list(combinations(range(len(labels)), 2))
     units = [parted(label)[1] for label in labels]
-    places = [(i, j) for i, j in couples if units[i] == units[j] and units[i] and "/" not in units[i]]
+    places = list(dict.fromkeys(pair for position in positions for pair in combinations(sorted(position), 2)))
+    places = places or [(i, j) for i, j in couples if units[i] == units[j] and units[i] and "/" not in units[i]]
     pockets = []
     for i, j in places or couples:
         width = widths[[i, j]]
@@ -143,9 +155,47 @@ def largest_pocket(visited: Array, executed: Sequence[Trajectory], labels: Seque
         away, _ = cKDTree(entered[:, [i, j]] / scale).query(some[:, [i, j]] / scale)
         at = int(away.argmax())
         place, within = some[at, [i, j]].tolist(), (away[at] * scale).tolist()
-        names = labels[i], labels[j]
-        pockets.append(StatePocket(float(away[at]), *(dict(zip(names, of, strict=True)) for of in (place, within))))
+        at_place, radii = (dict(zip((labels[i], labels[j]), of, strict=True)) for of in (place, within))
+        chosen: tuple[tuple[float, ...], ...] = ()
+        if positions and of_task is not None and tasks is not None:
+            # The task whose run leaves the smallest pockets, large ones above all.
+            few = _some(len(some), 1000)
+            left = [
+                (
+                    np.minimum(away[few], cKDTree(path[:, [i, j]] / scale).query(some[few][:, [i, j]] / scale)[0]) ** 6
+                ).sum()
+                for path in (visited[of_task == row] for row in range(len(tasks)))
+                if len(path)
+            ]
+            known = [row for row in range(len(tasks)) if (of_task == row).any()]
+            chosen = tuple(map(tuple, tasks[[known[int(np.argmin(left))], of_task[rows[at]]]].tolist()))
+        pockets.append(StatePocket(float(away[at]), at_place, radii, chosen))
     return max(pockets, key=lambda pocket: pocket.size, default=None)
+
+
+def position_states(space: TaskSpace, planned: Sequence[PlannedTasks], points: Array) -> list[list[int]]:
+    """Return, of each position that is a task parameter, the states that are its coordinates.
+
+    In each task, these states begin at the position, or have it as their goal.
+
+    Args:
+        points: the tasks in the order of their planning, points of the unit cube ``(q, d)``.
+    """
+    groups = list[list[int]]()
+    for at in space.positions:
+        states = list[int]()
+        for j in range(at.start, at.stop):
+            agree = None
+            for each in planned:
+                values = space.from_unit(points[each.rows])[:, j, None]
+                ends = [end for end in (each.task.initial_state, each.task.goal) if end is not None]
+                same = [(np.abs(np.atleast_2d(end) - values) <= 1e-9).all(axis=0) for end in ends]
+                agree = same if agree is None else [a & b for a, b in zip(agree, same, strict=True)]
+            here = [k for of_end in agree or [] for k in np.flatnonzero(of_end).tolist()]
+            states += here[:1]
+        if len(states) == at.stop - at.start:
+            groups.append(states)
+    return groups
 
 
 # Corners

@@ -15,7 +15,7 @@ from ctxval.core.coverage import StateInputCoverage, StatePocket
 from ctxval.core.labels import labels_of
 from ctxval.core.trajectory import Trajectory
 from ctxval.learning.closed_loops import AnyDraws, distances_of, loop_pairs
-from ctxval.learning.coverage import beyond_records, coverage, largest_pocket
+from ctxval.learning.coverage import beyond_records, coverage, largest_pocket, position_states
 from ctxval.learning.dynamics_posterior import DynamicsPosterior
 from ctxval.learning.execution_prediction import ExecutionPrediction, predict_execution
 from ctxval.learning.noisy_draws import SETTLED, NoisyDraws, NoisyPosterior
@@ -186,14 +186,25 @@ class LearnedDynamics(ShortRepr):
             for (letter, i), label in zip(coordinates, labels, strict=True)
         )
 
+    @functools.cached_property
     def pocket(self) -> StatePocket | None:
-        """Return the largest region of two states that loops enter and no execution has entered."""
-        planner, states = self.study.planner, len(self.posterior.data.sizes)
+        """The largest region of two states that loops enter and no execution has entered."""
+        planner, states, pool = self.study.planner, len(self.posterior.data.sizes), self.study.search.pool[:256]
         with single_threaded():
-            loops = planner.run(self.posterior.mean, planner.plan(self.study.search.pool[:256]))
+            planned = planner.plan(pool)
+            loops = planner.run(self.posterior.mean, planned)
         visited = np.concatenate([each.states.reshape(-1, states) for each in loops])
-        finite = visited[np.isfinite(visited).all(axis=1)]
-        return largest_pocket(finite, self.trajectories_of_system, self.labels[:states])
+        of_task = [
+            np.broadcast_to(plan.rows[:, None], each.states.shape[:3])
+            for plan, each in zip(planned, loops, strict=True)
+        ]
+        rows, finite = np.concatenate([each.ravel() for each in of_task]), np.isfinite(visited).all(axis=1)
+        given = self.study.validation
+        # A suite has no other tasks, and estimated states are no places.
+        known = given.space.members is None and given.outputs is None
+        positions = position_states(given.space, planned, pool) if known else []
+        labels = self.labels[:states]
+        return largest_pocket(visited[finite], self.trajectories_of_system, labels, positions, rows[finite], pool)
 
     @property
     def untried_parameter(self) -> tuple[int, float, Array] | None:

@@ -44,6 +44,10 @@ UNTRIED_CORNER = (
     "no execution has a task near the corner {place}, and what stands in a corner, such as a post or a wall, concerns "
     "few tasks; an execution there helps (`ctxval run` executes it)"
 )
+POCKET = (
+    "no execution came within {within} of {place}, where predicted runs lead, and a post, a hole or a current there "
+    "would concern few tasks; an execution that leads there helps (`ctxval run` executes it)"
+)
 NOT_TESTED = (
     "the largest distance is predicted to be {highest:.4g}, but the largest executed one is {best:.4g}: the prediction "
     "is not tested where it matters; an execution of that task helps (`ctxval run` executes it)"
