@@ -25,9 +25,10 @@ from dynamics_reporting import REPORTING
 from dynamics_rough import ROUGH
 from dynamics_truths import truth
 
-RULE = 6
+RULE = 7
 """Version of the rule by which campaigns are run now: eight tests at drawn tasks come before a validation (5), and the
-corners of positions are executed (6). Campaigns of systems without positions are the same by both."""
+corners of positions are executed (6), and places of positions are entered after the tests (7). Campaigns of systems
+without positions are the same by both, and so are falsified ones by 6 and 7; they have the newer number."""
 
 WITH_TESTS = 5  # the first rule with tests at drawn tasks
 
