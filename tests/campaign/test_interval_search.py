@@ -11,7 +11,20 @@ import numpy as np
 import pytest
 
 from conftest import interrupt_at_once, make_validation, make_validation_without_inputs
-from ctxval import Campaign, cases, distances, searches, specs
+from ctxval import (
+    Campaign,
+    Parameters,
+    Task,
+    TaskSpace,
+    Validation,
+    cases,
+    controllers,
+    distances,
+    models,
+    searches,
+    specs,
+    systems,
+)
 from ctxval.campaign.dynamics import NEAR, PREDICTION
 from ctxval.campaign.interval_search import IntervalSearch, next_task
 from ctxval.certificates import (
@@ -28,7 +41,9 @@ from ctxval.certificates import (
     UntriedParameter,
 )
 from ctxval.certificates.automatic import Automatic
+from ctxval.certificates.dynamics_diagnostics import POCKET
 from ctxval.certificates.prediction_tests import DRAWN, TESTS
+from ctxval.core.coverage import StatePocket
 from ctxval.errors import InputError
 from ctxval.learning import dynamics_study
 from ctxval.learning.dynamics_posterior import condition
@@ -62,6 +77,41 @@ def test_a_linear_system_is_validated_in_few_executions_by_a_bound_that_is_true(
     assert campaign.worst is not None
     assert low == campaign.worst.distance
     assert high == verdict.certificate.upper_bound  # the store keeps the evidence of the end
+
+
+@pytest.mark.slow
+def test_places_of_a_position_are_entered_before_a_validation() -> None:
+    """A puck that slows down more than M says is pushed from the left of a square to goals in it."""
+    h = 0.1
+    A, B = np.kron([[1.0, h], [0.0, 1.0]], np.eye(2)), np.kron([[0.0], [h]], np.eye(2))
+
+    def task(p: Parameters) -> Task:
+        still = np.zeros_like(p.goal)
+        begin = np.broadcast_to([-1.0, 0.0], p.goal.shape)
+        ends = (np.concatenate([at, still], axis=-1) for at in (begin, p.goal))
+        return Task(next(ends), goal=next(ends), horizon=25, dt=h)
+
+    validation = Validation(
+        space=TaskSpace(goal=([-1.0, -1.0], [1.0, 1.0], "m")),
+        task=task,
+        system=systems.Simulated(lambda x, u: x @ A.T + u @ B.T - 0.02 * x * np.array([0, 0, 1, 1]), vectorized=True),
+        model=models.Linear(A, B),
+        synthesizer=controllers.LQR([10.0, 10.0, 1.0, 1.0], [1.0, 1.0]),
+        distance=distances.MaximumDeviation(components=(0, 1)),
+    )
+    options = CertificateOptions(Automatic(tests=0))
+    campaign = Campaign(validation).run(24, 1.0, certificate=options)
+    verdict = campaign.verdict(1.0, certificate=options)
+    assert verdict.answer == "validated"
+    assert verdict.certificate is not None
+    pocket = verdict.certificate.details["pocket"]
+    assert list(pocket["place"]) == ["x[0]", "x[1]"]
+    assert pocket["size"] <= POCKET
+    # The runs of the last tasks led into places, as nothing else was missing.
+    less = campaign.recorder.dynamics.learned(campaign.trials[:-1])
+    assert less is not None
+    assert less.pocket is not None
+    assert less.pocket.size > POCKET
 
 
 @pytest.mark.slow
@@ -295,6 +345,10 @@ def test_what_is_executed_next_depends_on_what_stands_in_the_way() -> None:
     assert asked(load, known, 2.0, best=0.2) == [0.3, 0.4]
     corner = replace(covered, corner=UntriedCorner({"x": 0.0, "y": 1.0}, 0.5, np.array([0.0, 1.0])))
     assert asked(corner, known, 2.0, best=0.2) == [0.0, 1.0]
+    tasks = ((0.2, 0.6), (0.1, 0.7))
+    place = replace(covered, pocket=StatePocket(0.3, {"x": 1.0, "y": 1.0}, {"x": 0.3, "y": 0.3}, tasks))
+    assert asked(place, known, 2.0, best=0.2) == [0.2, 0.6]
+    assert asked(place, np.array([[0.2, 0.6]]), 2.0, best=0.2) == [0.1, 0.7]
     # Every third execution explores, and no task is executed twice.
     assert asked(contested, np.tile(known, (2, 1)), 0.5) == farthest.tolist()
     assert asked(contested, np.array([[0.9, 0.9], [0.8, 0.8], [0.7, 0.7], farthest]), 2.0) == at_bound.tolist()

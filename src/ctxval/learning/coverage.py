@@ -174,9 +174,10 @@ def largest_pocket(
 
 
 def position_states(space: TaskSpace, planned: Sequence[PlannedTasks], points: Array) -> list[list[int]]:
-    """Return, of each position that is a task parameter, the states that are its coordinates.
+    """Return, of each position that is a task parameter, the two states that are its coordinates on the ground.
 
-    In each task, these states begin at the position, or have it as their goal.
+    In each task, these states begin at the position, or have it as their goal. Of three coordinates, the first two are
+    taken: posts and walls stand on the ground, and runs do not enter all of a volume in a few executions.
 
     Args:
         points: the tasks in the order of their planning, points of the unit cube ``(q, d)``.
@@ -194,7 +195,7 @@ def position_states(space: TaskSpace, planned: Sequence[PlannedTasks], points: A
             here = [k for of_end in agree or [] for k in np.flatnonzero(of_end).tolist()]
             states += here[:1]
         if len(states) == at.stop - at.start:
-            groups.append(states)
+            groups.append(states[:2])
     return groups
 
 
