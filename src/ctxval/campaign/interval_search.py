@@ -147,9 +147,9 @@ class IntervalSearch:
         # The whole evidence may decide if nothing that a few draws show leaves the verdict open.
         bound, enough = self._bound(evidence), len(self._ended) >= FEWEST
         decides = enough and raised(evidence, bound) <= self.limit
-        if decides and doubt_of(evidence, self.best, bound) is None:
-            learned = dynamics.learned(trials)
-            evidence = replace(evidence, pocket=None if learned is None else learned.pocket)
+        if decides and doubt_of(evidence, self.best, bound) is None and self.recorder.validation.space.positions:
+            learned = None if evidence.pocket is not None else dynamics.learned(trials)
+            evidence = evidence if learned is None else replace(evidence, pocket=learned.pocket)
         if decides and doubt_of(evidence, self.best, bound) is None:
             whole = dynamics.evidence(trials, self.options.confidence, keep=self.keeps)
             if whole is None:
