@@ -128,10 +128,10 @@ def said(records: Sequence[dict[str, Any]]) -> str:
     )
 
 
-def not_run() -> str:
-    """Return which robots and noises are missing or incomplete."""
+def not_run(of_development: int) -> str:
+    """Return which robots and noises are missing or incomplete; development robots were run by this rule."""
     of = {name: part for part, robots in ROBOTS.items() for name in robots}
-    rules = {"reporting": RULE, "development": rule_of_development()[0]}
+    rules = {"reporting": RULE, "development": of_development}
     missing = [
         (name, noise, len(STORED.select(rule=rules[of[name]], robot=name, noise=noise)), len(faults(robot, of[name])))
         for name, robot in {**DEVELOPMENT, **REPORTING}.items()
@@ -171,18 +171,18 @@ def section() -> str:
     seen = {each["robot"] for each in first}
     second = [each for each in STORED.select(rule=2, of="reporting") if each["robot"] not in seen]
     lost = [f"{each['robot']} {each['fault']}" for each in second if not (each["named"] and each["in_group"])]
+    of_development, by_which_rule = rule_of_development()
     text = SECTION.strip().format(
         second=len(second), lost=" and ".join(lost),
         executions=EXECUTIONS, reported=said(records), first=said(first), third=said(third),
-        missed=missed(records), servo=servo(), not_run=not_run(), by_which_rule=rule_of_development()[1],
+        missed=missed(records), servo=servo(), not_run=not_run(of_development), by_which_rule=by_which_rule,
     )  # fmt: skip
     paragraphs = [
         textwrap.fill(part, 120, break_long_words=False, break_on_hyphens=False) for part in text.split("\n\n")
     ]
     whole = "\n\n".join(filter(None, paragraphs))
-    return whole.replace("{reporting}", table("reporting")).replace(
-        "{development}", table("development", rule_of_development()[0])
-    )
+    whole = whole.replace("{reporting}", table("reporting"))
+    return whole.replace("{development}", table("development", of_development))
 
 
 def main() -> None:

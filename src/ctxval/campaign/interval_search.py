@@ -146,11 +146,12 @@ class IntervalSearch:
             return self._by_distance()
         # The whole evidence may decide if nothing that a few draws show leaves the verdict open.
         bound, enough = self._bound(evidence), len(self._ended) >= FEWEST
-        decides = enough and raised(evidence, bound) <= self.limit
-        if decides and doubt_of(evidence, self.best, bound) is None and self.recorder.validation.space.positions:
-            learned = None if evidence.pocket is not None else dynamics.learned(trials)
+        decides = enough and raised(evidence, bound) <= self.limit and doubt_of(evidence, self.best, bound) is None
+        if decides and evidence.pocket is None and self.recorder.validation.space.positions:
+            learned = dynamics.learned(trials)
             evidence = evidence if learned is None else replace(evidence, pocket=learned.pocket)
-        if decides and doubt_of(evidence, self.best, bound) is None:
+            decides = unentered_pocket(evidence) is None
+        if decides:
             whole = dynamics.evidence(trials, self.options.confidence, keep=self.keeps)
             if whole is None:
                 return self._by_distance()

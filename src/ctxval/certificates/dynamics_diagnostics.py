@@ -27,9 +27,9 @@ failed, of the margin that is left above the bound; see :func:`raised`."""
 NOISE = 0.01  # learned variance of noise, as a share of the mean square of the residual
 LEFT_OUT = 0.5  # share of the posterior variance that posterior samples leave out between their pivots
 GAP = 0.25  # gap of the records in a state or an input, as a share of the range that closed loops visit
+PAIR_GAP = 0.5  # the same for two of them together
 CORNER = 0.05  # distance of the nearest executed task from a corner of a position in space, as a share of its ranges
 POCKET = 0.125  # radius of a place that predicted runs enter and no execution has entered, as a share of the range
-PAIR_GAP = 0.5  # the same for two of them together
 BEYOND = 0.02
 """Largest excess of a state or an input over its largest record, or below its smallest one, as a share of that range.
 Contacts, end stops and saturation lie beyond what is recorded more often than between records. With too many

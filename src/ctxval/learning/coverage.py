@@ -148,29 +148,28 @@ def largest_pocket(
     units = [parted(label)[1] for label in labels]
     places = list(dict.fromkeys(pair for position in positions for pair in combinations(sorted(position), 2)))
     places = places or [(i, j) for i, j in couples if units[i] == units[j] and units[i] and "/" not in units[i]]
-    pockets = []
+    planes = []
     for i, j in places or couples:
-        width = widths[[i, j]]
+        two, width = [i, j], widths[[i, j]]
         scale = np.full(2, width.max()) if places else width
-        away, _ = cKDTree(entered[:, [i, j]] / scale).query(some[:, [i, j]] / scale)
-        at = int(away.argmax())
-        place, within = some[at, [i, j]].tolist(), (away[at] * scale).tolist()
-        at_place, radii = (dict(zip((labels[i], labels[j]), of, strict=True)) for of in (place, within))
-        chosen: tuple[tuple[float, ...], ...] = ()
-        if positions and of_task is not None and tasks is not None:
-            # The task whose run leaves the smallest pockets, large ones above all.
-            few = _some(len(some), 1000)
-            left = [
-                (
-                    np.minimum(away[few], cKDTree(path[:, [i, j]] / scale).query(some[few][:, [i, j]] / scale)[0]) ** 6
-                ).sum()
-                for path in (visited[of_task == row] for row in range(len(tasks)))
-                if len(path)
-            ]
-            known = [row for row in range(len(tasks)) if (of_task == row).any()]
-            chosen = tuple(map(tuple, tasks[[known[int(np.argmin(left))], of_task[rows[at]]]].tolist()))
-        pockets.append(StatePocket(float(away[at]), at_place, radii, chosen))
-    return max(pockets, key=lambda pocket: pocket.size, default=None)
+        away, _ = cKDTree(entered[:, two] / scale).query(some[:, two] / scale)
+        planes.append((away, two, scale))
+    if not planes:
+        return None
+    away, two, scale = max(planes, key=lambda plane: plane[0].max())
+    at, names = int(away.argmax()), [labels[k] for k in two]
+    place, within = some[at, two].tolist(), (away[at] * scale).tolist()
+    next_tasks: tuple[tuple[float, ...], ...] = ()
+    if positions and of_task is not None and tasks is not None:
+        # The task whose run leaves the smallest pockets, large ones above all.
+        few, left = _some(len(some), 1000), np.full(len(tasks), np.inf)
+        for row in np.unique(of_task):
+            path = cKDTree(visited[of_task == row][:, two] / scale)
+            left[row] = (np.minimum(away[few], path.query(some[few][:, two] / scale)[0]) ** 6).sum()
+        next_tasks = tuple(map(tuple, tasks[[left.argmin(), of_task[rows[at]]]].tolist()))
+    return StatePocket(
+        float(away[at]), dict(zip(names, place, strict=True)), dict(zip(names, within, strict=True)), next_tasks
+    )
 
 
 def position_states(space: TaskSpace, planned: Sequence[PlannedTasks], points: Array) -> list[list[int]]:
@@ -182,20 +181,19 @@ def position_states(space: TaskSpace, planned: Sequence[PlannedTasks], points: A
     Args:
         points: the tasks in the order of their planning, points of the unit cube ``(q, d)``.
     """
+    values = space.from_unit(points[np.concatenate([each.rows for each in planned])])
+    ends = [
+        np.concatenate([np.atleast_2d(getattr(each.task, end)) for each in planned])
+        for end in ("initial_state", "goal")
+    ]
     groups = list[list[int]]()
     for at in space.positions:
-        states = list[int]()
-        for j in range(at.start, at.stop):
-            agree = None
-            for each in planned:
-                values = space.from_unit(points[each.rows])[:, j, None]
-                ends = [end for end in (each.task.initial_state, each.task.goal) if end is not None]
-                same = [(np.abs(np.atleast_2d(end) - values) <= 1e-9).all(axis=0) for end in ends]
-                agree = same if agree is None else [a & b for a, b in zip(agree, same, strict=True)]
-            here = [k for of_end in agree or [] for k in np.flatnonzero(of_end).tolist()]
-            states += here[:1]
-        if len(states) == at.stop - at.start:
-            groups.append(states[:2])
+        same = [
+            [k for end in ends for k in np.flatnonzero((np.abs(end - column[:, None]) <= 1e-9).all(axis=0)).tolist()]
+            for column in values[:, at].T
+        ]
+        if all(same):
+            groups.append([states[0] for states in same][:2])
     return groups
 
 

@@ -199,11 +199,8 @@ class LearnedDynamics(ShortRepr):
             for plan, each in zip(planned, loops, strict=True)
         ]
         rows, finite = np.concatenate([each.ravel() for each in of_task]), np.isfinite(visited).all(axis=1)
-        given = self.study.validation
-        # A suite has no other tasks, and estimated states are no places.
-        known = given.space.members is None and given.outputs is None
-        positions = position_states(given.space, planned, pool) if known else []
-        labels = self.labels[:states]
+        space, labels = self.study.validation.space, self.labels[:states]
+        positions = position_states(space, planned, pool) if space.members is None else []  # a suite has no other tasks
         return largest_pocket(visited[finite], self.trajectories_of_system, labels, positions, rows[finite], pool)
 
     @property

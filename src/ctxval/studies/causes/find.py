@@ -107,6 +107,7 @@ class _Study:
         self.plant: Plant = plant_of(self.model, executions[0].plan.task.dt, states, inputs, x[usable], u[usable])
         self.dictionary = candidates(self.plant, x[usable], u[usable], residuals[usable], outputs=self.outputs)
         self.loops = ClosedLoops(validation, executions)
+        self.before = max(self.loops.distances)
 
     def report(self, most: int) -> CauseReport:
         from_start = None if self.outputs else self._in_closed_loop(Explanation((), Repaired(self.model, ()), 0.0, 1.0))
@@ -117,14 +118,13 @@ class _Study:
         with stage("fitting causes", (2 * most - 1) * len(self.dictionary), "causes"):
             ranked = self._ranked(())
             chosen, alike = self._chosen(ranked)
-            before = max(self.loops.distances)
-            while chosen is not None and chosen.counts(before) and len(chosen.explanation.candidates) < most:
+            while chosen is not None and chosen.counts(self.before) and len(chosen.explanation.candidates) < most:
                 if chosen.explanation.left < 0.02 or chosen.complete > 0.99:  # nothing is left for another cause
                     break
                 better, others = self._chosen(self._ranked(chosen.explanation.candidates))
                 if better is not None:  # the first one was chosen without the other ones
                     better, others = self._chosen(self._ranked(better.explanation.candidates[1:]))
-                if better is None or not better.counts(before):
+                if better is None or not better.counts(self.before):
                     break
                 if better.explanation.criterion > chosen.explanation.criterion - _ALIKE:
                     break
@@ -136,8 +136,7 @@ class _Study:
     def _reported(
         self, group: list[Explained], ranked: Sequence[Explanation] = (), *, began_elsewhere: bool = False
     ) -> CauseReport:
-        before = max(self.loops.distances)
-        named = bool(group) and group[0].counts(before) and group[0].complete >= _NAMED
+        named = bool(group) and group[0].counts(self.before) and group[0].complete >= _NAMED
         from_tasks = None
         if group and not self.outputs and not began_elsewhere:
             from_tasks = self.loops.distance_from_tasks(group[0].explanation.repaired)
@@ -148,7 +147,7 @@ class _Study:
             began_elsewhere=began_elsewhere,
             tried=len(self.dictionary),
             executions=len(self.executions),
-            before=before,
+            before=self.before,
             from_tasks=from_tasks,
             failed=self.failed,
             units=self.validation.labels.units,
@@ -195,10 +194,10 @@ class _Study:
         Of those that explain alike, the one with the fewest sizes is the first, and what has it as a special case is
         no other explanation. If none counts, it is the one that explains most, if this is not little.
         """
-        before, tried = max(self.loops.distances), list[Explained]()
+        tried = list[Explained]()
         for each in ranked[:_CHECKED]:
             tried.append(self._in_closed_loop(each))
-            if tried[-1].counts(before):
+            if tried[-1].counts(self.before):
                 break
         else:
             most = max(tried, key=lambda each: each.share)
@@ -207,7 +206,7 @@ class _Study:
         others = [each for each in ranked if each is not best.explanation and _alike(best.explanation, each)]
         group = [best, *(self._in_closed_loop(each) for each in others[:_CHECKED])]
         group = [each for each in group if 1 - each.share <= 2 * (1 - best.share) + 1e-3]
-        first = min((each for each in group if each.counts(before)), key=lambda each: len(each.explanation.sizes))
+        first = min((each for each in group if each.counts(self.before)), key=lambda each: len(each.explanation.sizes))
         return first, [each for each in group if each is not first and not _contains(each, first)]
 
     def _in_closed_loop(self, explanation: Explanation) -> Explained:
