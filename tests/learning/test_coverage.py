@@ -218,6 +218,7 @@ def test_coordinates_of_a_position_are_states_that_begin_at_it_or_have_it_as_goa
     points = np.random.default_rng(0).random((5, 5))
     planned = LoopPlanner(validation).plan(points)
     assert position_states(validation.space, planned, points) == [[2, 3], [2, 1]]
+    assert position_states(validation.space, planned, points, goals=False) == [[2, 1]]
 
 
 def test_where_an_execution_moves_in_one_step_there_is_no_pocket() -> None:

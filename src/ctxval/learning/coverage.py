@@ -172,7 +172,9 @@ def largest_pocket(
     )
 
 
-def position_states(space: TaskSpace, planned: Sequence[PlannedTasks], points: Array) -> list[list[int]]:
+def position_states(
+    space: TaskSpace, planned: Sequence[PlannedTasks], points: Array, *, goals: bool = True
+) -> list[list[int]]:
     """Return, of each position that is a task parameter, the two states that are its coordinates on the ground.
 
     In each task, these states begin at the position, or have it as their goal. Of three coordinates, the first two are
@@ -180,12 +182,11 @@ def position_states(space: TaskSpace, planned: Sequence[PlannedTasks], points: A
 
     Args:
         points: the tasks in the order of their planning, points of the unit cube ``(q, d)``.
+        goals: whether goals are states, and no outputs.
     """
     values = space.from_unit(points[np.concatenate([each.rows for each in planned])])
-    ends = [
-        np.concatenate([np.atleast_2d(getattr(each.task, end)) for each in planned])
-        for end in ("initial_state", "goal")
-    ]
+    known = ("initial_state", "goal") if goals else ("initial_state",)
+    ends = [np.concatenate([np.atleast_2d(getattr(each.task, end)) for each in planned]) for end in known]
     groups = list[list[int]]()
     for at in space.positions:
         same = [

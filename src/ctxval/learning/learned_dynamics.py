@@ -200,7 +200,9 @@ class LearnedDynamics(ShortRepr):
         ]
         rows, finite = np.concatenate([each.ravel() for each in of_task]), np.isfinite(visited).all(axis=1)
         space, labels = self.study.validation.space, self.labels[:states]
-        positions = position_states(space, planned, pool) if space.members is None else []  # a suite has no other tasks
+        goals = self.study.given.outputs is None
+        # A suite has no other tasks.
+        positions = position_states(space, planned, pool, goals=goals) if space.members is None else []
         return largest_pocket(visited[finite], self.trajectories_of_system, labels, positions, rows[finite], pool)
 
     @property
