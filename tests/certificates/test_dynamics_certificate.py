@@ -324,7 +324,7 @@ def test_a_place_of_a_position_that_no_execution_has_entered_withdraws_the_bound
     assert known.pocket == pocket
     verdict = judge(trials(), 1.35, CertificateOptions(Dynamics(tests=0)), Provenance(learned=Learned(known)))
     assert verdict.answer == "undecided"
-    assert "no execution came within 0.2 of x 0.55 m, y -0.35 m" in verdict.reason
+    assert "no execution came within 0.2 m of x 0.55 m, y -0.35 m" in verdict.reason
     small = replace(evidence, pocket=replace(pocket, size=0.1))
     verdict = judge(trials(), 1.35, CertificateOptions(Dynamics(tests=0)), Provenance(learned=Learned(small)))
     assert verdict.answer == "validated"

@@ -96,6 +96,15 @@ def with_units(values: Mapping[str, float | str], digits: int = 2) -> str:
     return ", ".join(f"{name} {text} {unit}".rstrip() for name, unit, text in texts)
 
 
+def radius_of(within: Mapping[str, float]) -> str:
+    """Return the radius of a pocket with its unit; both radii, with the names of the states, if they differ."""
+    radii = [(*parted(label), two_digits(radius)) for label, radius in within.items()]
+    each = [f"{radius} {unit}".rstrip() for _, unit, radius in radii]
+    if len(set(each)) == 1:
+        return each[0]
+    return " and ".join(f"{radius} in {name}" for radius, (name, _, _) in zip(each, radii, strict=True))
+
+
 def distinguishable(value: float, tau: float) -> tuple[str, str]:
     """Return two numbers as texts, with enough digits to show which one is larger."""
     for digits in range(4, 17):

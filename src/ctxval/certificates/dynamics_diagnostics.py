@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from ctxval.certificates.bounds import with_units
+from ctxval.certificates.bounds import radius_of, with_units
 from ctxval.certificates.dynamics_evidence import CheckedPrediction, DynamicsEvidence
 from ctxval.certificates.prediction_tests import DRAWN
 from ctxval.certificates.sentences import withdrawals as sentences
@@ -264,7 +264,7 @@ def unentered_pocket(evidence: DynamicsEvidence) -> str | None:
     pocket = evidence.pocket
     if pocket is None or not pocket.tasks or pocket.size <= POCKET:
         return None
-    return sentences.POCKET.format(within=f"{max(pocket.within.values()):.2g}", place=with_units(pocket.place))
+    return sentences.POCKET.format(within=radius_of(pocket.within), place=with_units(pocket.place))
 
 
 def untested(evidence: DynamicsEvidence, best: float, bound: float, allowed: float | None = None) -> list[str]:

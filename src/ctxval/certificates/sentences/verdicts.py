@@ -17,6 +17,7 @@ from ctxval.certificates.bounds import (
     distinguishable,
     of_tasks,
     percent,
+    radius_of,
     two_digits,
     with_error,
     with_units,
@@ -215,14 +216,9 @@ def _not_entered(pocket: Mapping[str, Any] | None) -> str:
     """Return, as a sentence after a space, the largest region of two states that loops enter and no execution has."""
     if pocket is None:
         return ""
-    radii = [(*parted(label), radius) for label, radius in pocket["within"].items()]
-    within = " and ".join(f"{f'{two_digits(radius)} {unit}'.rstrip()} in {name}" for name, unit, radius in radii)
-    if len({(unit, radius) for _, unit, radius in radii}) == 1:
-        _, unit, radius = radii[0]
-        within = f"{two_digits(radius)} {unit}".rstrip()
     return (
         f" The least tested place is {with_units(pocket['place'])}: predicted runs lead there, and no execution came "
-        f"within {within}."
+        f"within {radius_of(pocket['within'])}."
     )
 
 
