@@ -6,6 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ctxval.certificates import bare_corners, covering, farthest_task, most_contested
+from ctxval.certificates.covering import largest_empty_box
 
 
 def test_the_farthest_task_of_an_interval_is_the_middle_of_its_largest_gap() -> None:
@@ -71,3 +72,26 @@ def test_the_most_contested_point_is_where_most_are_and_no_trial_is() -> None:
     assert contested is not None
     assert contested[0] == pytest.approx(0.7)
     assert most_contested(points[:3], X, 0.125) is None
+
+
+def test_the_largest_empty_box_of_two_parameters_is_named() -> None:
+    X = np.array([[0.5, 0.1, 0.2], [0.1, 0.6, 0.9], [0.9, 0.9, 0.4]])
+    box = largest_empty_box(X)
+    assert box is not None
+    assert (box.parameters, box.low, box.high) == ((0, 1), (0.1, 0.1), (1.0, 0.9))
+    assert box.share == pytest.approx(0.72)
+    assert largest_empty_box(X[:, :1]) is None
+
+
+@given(st.integers(0, 10_000), st.integers(1, 12), st.integers(2, 4))
+def test_no_box_of_two_parameters_without_a_trial_is_larger(seed: int, n: int, d: int) -> None:
+    rng = np.random.default_rng(seed)
+    X = rng.random((n, d))
+    box = largest_empty_box(X)
+    assert box is not None
+    inside = (X[:, box.parameters] > box.low) & (X[:, box.parameters] < box.high)
+    assert not inside.all(axis=1).any()
+    ends = np.sort(rng.random((200, 2, 2)), axis=1)  # random boxes: (200, low and high, two parameters)
+    pair = rng.permutation(d)[:2]
+    filled = ((X[:, None, pair] > ends[:, 0]) & (X[:, None, pair] < ends[:, 1])).all(axis=2).any(axis=0)
+    assert (np.diff(ends, axis=1).prod(axis=2)[:, 0][~filled] <= box.share + 1e-12).all()

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ctxval import Trial
+from ctxval import TaskSpace, Trial
 from ctxval.certificates import (
     KINDS,
     Automatic,
@@ -328,6 +328,15 @@ def test_a_place_of_a_position_that_no_execution_has_entered_withdraws_the_bound
     small = replace(evidence, pocket=replace(pocket, size=0.1))
     verdict = judge(trials(), 1.35, CertificateOptions(Dynamics(tests=0)), Provenance(learned=Learned(small)))
     assert verdict.answer == "validated"
+
+
+def test_a_validation_names_the_largest_box_of_two_parameters_without_an_execution() -> None:
+    space = TaskSpace(shelf=(0.0, 2.0, "m"), size=(0.0, 10.0))
+    points = np.array([[0.5, 0.2], [0.1, 0.9], [0.9, 0.5], [0.1, 0.95]])
+    executed = [replace(trial, unit_point=point) for trial, point in zip(trials(), points, strict=True)]
+    known = Provenance(learned=Learned(GOOD), space=space)
+    verdict = judge(executed, 1.35, CertificateOptions(Dynamics(tests=0)), known)
+    assert "No execution had shelf 0.2 to 1.8 m and size 2 to 10 together (64 % of the task space, " in str(verdict)
 
 
 def test_without_a_pocket_nothing_is_said_of_one() -> None:

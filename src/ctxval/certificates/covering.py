@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from itertools import product
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import combinations, product
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -66,6 +68,35 @@ def most_contested(points: Array, X: Array, resolution: float) -> Array | None:
     near = (cdist(points, points) / np.sqrt(X.shape[1]) <= resolution / 2).sum(axis=1)
     best = int((gaps * near).argmax())
     return points[best] if gaps[best] > _NEXT_TO * resolution else None
+
+
+@dataclass(frozen=True)
+class EmptyBox:
+    """A box of two task parameters in which no trial lies, whatever their other parameters are."""
+
+    parameters: tuple[int, int]  #: the indices of the parameters
+    low: tuple[float, float]  #: their smallest values, as coordinates of the unit cube
+    high: tuple[float, float]  #: their largest values
+
+    @property
+    def share(self) -> float:
+        """The share of the task space that the box holds."""
+        return float(np.prod(np.subtract(self.high, self.low)))
+
+
+def largest_empty_box(X: Array) -> EmptyBox | None:
+    """Return the largest box of two task parameters without a row of X ``(n, d)``; None if d is 1."""
+
+    def boxes(pair: tuple[int, int]) -> Iterator[EmptyBox]:
+        x, y = X[:, pair].T
+        ends = np.unique([0.0, *y, 1.0])
+        for low, high in combinations(ends.tolist(), 2):
+            inside = np.sort([0.0, *x[(y > low) & (y < high)], 1.0])
+            k = int(np.diff(inside).argmax())
+            yield EmptyBox(pair, (float(inside[k]), low), (float(inside[k + 1]), high))
+
+    every = (box for pair in combinations(range(X.shape[1]), 2) for box in boxes(pair))
+    return max(every, key=lambda box: box.share, default=None)
 
 
 def _probes(d: int) -> Array:

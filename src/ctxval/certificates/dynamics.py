@@ -23,6 +23,7 @@ from ctxval._util.checked import NonNegativeInt, Probability, checked
 from ctxval._util.registry import part
 from ctxval.certificates.base import Certificate, CertificateKind
 from ctxval.certificates.bounds import rank_within
+from ctxval.certificates.covering import largest_empty_box
 from ctxval.certificates.dynamics_diagnostics import (
     ACCURATE,
     PREDICTIONS,
@@ -137,6 +138,7 @@ def certify_dynamics(sample: Sample, evidence: DynamicsEvidence, confidence: Pro
             f"{two_distances(sample, rows)} in the recorded state, or was changed in between, so the bound is "
             "withdrawn; record more states, use --kind posterior, or use a new store after a change"
         )
+    empty = None if sample.suite is not None else largest_empty_box(sample.points)
     return Certificate(
         kind="dynamics",
         statement=dynamics_statement(upper, error, confidence, evidence.quantile),
@@ -188,6 +190,7 @@ def certify_dynamics(sample: Sample, evidence: DynamicsEvidence, confidence: Pro
             "disagreement": evidence.disagreement,
             "variance_left_out": evidence.left_out,
             "pocket": evidence.pocket and asdict(evidence.pocket),
+            "empty_box": None if empty is None else asdict(empty),
             "pushed": evidence.pushed and evidence.pushed.to_json(),
             "failures": sample.failures,
             "differing": None if differing is None else [sample.numbers[row] for row in differing],

@@ -189,7 +189,8 @@ def evidence(certificate: Certificate, tau: float, quantities: Quantities) -> st
             f"where no record is near; its largest recorded error is {_rate(everywhere.state, everywhere.residual)}."
         )
     executions = counted(certificate.trials, "execution")
-    return f"{executions}{largest}{tested}{missing}.{survives}{_not_entered(details.get('pocket'))} "
+    least = _not_entered(details.get("pocket")) + _not_tried(details.get("empty_box"), quantities.space)
+    return f"{executions}{largest}{tested}{missing}.{survives}{least} "
 
 
 def tolerances(certificate: Certificate, tau: float) -> tuple[Tolerance, Tolerance] | None:
@@ -220,6 +221,18 @@ def _not_entered(pocket: Mapping[str, Any] | None) -> str:
         f" The least tested place is {with_units(pocket['place'])}: predicted runs lead there, and no execution came "
         f"within {radius_of(pocket['within'])}."
     )
+
+
+def _not_tried(empty: Mapping[str, Any] | None, space: TaskSpace | None) -> str:
+    """Return, as a sentence after a space, the largest box of two task parameters without an execution."""
+    if empty is None or space is None:
+        return ""
+    low, high = space.low, space.high
+    ends = zip(empty["parameters"], empty["low"], empty["high"], strict=True)
+    sides = ((*parted(space.labels[j]), *(low[j] + np.array(box) * (high[j] - low[j])).tolist()) for j, *box in ends)
+    both = " and ".join(f"{name} {first:.3g} to {last:.3g} {unit}".rstrip() for name, unit, first, last in sides)
+    share = 100 * np.prod(np.subtract(empty["high"], empty["low"]))
+    return f" No execution had {both} together ({share:.0f} % of the task space, the largest box of two parameters)."
 
 
 def conditions(certificate: Certificate, space: TaskSpace | None) -> list[str]:
