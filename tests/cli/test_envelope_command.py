@@ -48,5 +48,5 @@ def test_what_an_envelope_assumes_is_printed(tmp_path: Path, monkeypatch: pytest
     ran = calling("run")("pendulum", "--threshold", "0.3", "--budget", "16", "--seed", "7", "--envelope", "--no-report")
     assert ran.exit_code == 1
     shown = " ".join(ran.stdout.split())
-    assert "Trusted: " in shown
+    assert "The largest boxes of trusted tasks: " in shown
     assert "It assumes: the recorded state is complete" in shown

@@ -137,7 +137,8 @@ class Envelope(ShortRepr):
         if not self.regions:
             return "No task is trusted." if not self.share else "It holds no box of more than 2 % of the tasks."
         each = "; or ".join(f"{region.text} ({100 * region.share:.0f} % of the tasks)" for region in self.regions)
-        return f"Trusted: {each}."
+        whole = len(self.regions) == 1 and self.regions[0].share > self.share - 0.005
+        return f"Trusted: {each}." if whole else f"The largest boxes of trusted tasks: {each}."
 
     def to_json(self) -> dict[str, Any]:
         """Return the statement and its numbers, ready for JSON."""
