@@ -373,6 +373,26 @@ def test_no_task_is_executed_a_second_time() -> None:
     assert next_task(contested, everywhere, 0.2, 2.0, 0.95) is None
 
 
+def test_beside_a_failed_test_the_task_is_looked_for_that_it_would_make_worse() -> None:
+    validation, _ = linear(dim=2)
+    campaign = Campaign(validation, seed=1).run(3, explore=True)
+    assert campaign.worst is not None
+    worst, best = campaign.worst.unit_point, campaign.worst.distance
+    assert best is not None
+    search = IntervalSearch(campaign.recorder, CertificateOptions(Automatic()), 20, 2 * best, keeps=False)
+    point = tuple(np.round(1 - worst, 3).tolist())
+    failed = CheckedPrediction(2, best, best, best, 0.5 * best, stored=True, origin="spread", point=point)
+
+    def beside(test: CheckedPrediction) -> list[float] | None:
+        task = search._beside_a_failed_test(replace(evidence(best, best), predictions=(test,)))
+        return None if task is None else task.tolist()
+
+    assert beside(failed) == [point[0], *worst[1:]]
+    assert beside(replace(failed, explained=best)) == [point[0], *worst[1:]]
+    assert beside(replace(failed, explained=0.5 * best)) is None  # one function of state and input has it by now
+    assert beside(replace(failed, distance=best)) is None
+
+
 def asked(found: DynamicsEvidence, known: np.ndarray, threshold: float, best: float = 0.2) -> list[float]:
     point = next_task(found, known, best, threshold, 0.95)
     assert point is not None

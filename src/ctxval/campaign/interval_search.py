@@ -31,6 +31,7 @@ from ctxval.certificates.dynamics_diagnostics import (
     FEWEST,
     doubt_of,
     held,
+    is_explained,
     missing_tests,
     only_a_failed_test,
     only_tests_missing,
@@ -208,13 +209,16 @@ class IntervalSearch:
         """Return a task where a test that failed may be worst; None if there is no such test, or all are executed.
 
         A dynamics that depends on the task is large where the one parameter that it depends on is that of the test and
-        the others are those of the worst task. Parameters that M's loops do not depend on come first.
+        the others are those of the worst task. Parameters that M's loops do not depend on come first. If one function
+        of state and input has the distance of the test by now, the test failed because too little was known.
         """
-        if raised(evidence, self._bound(evidence)) <= self.limit:
+        bound = self._bound(evidence)
+        if raised(evidence, bound) <= self.limit:
             return None
         trials = self.recorder.trials
         tests = (test for test in reversed(evidence.predictions) if test.stored and test.origin in DRAWN)
-        failed = next((test for test in tests if not held(test, self.best)), None)
+        wrong = (test for test in tests if not held(test, self.best))
+        failed = next((t for t in wrong if t.is_noisy or t.explained is None or not is_explained(t, bound)), None)
         worst = next((trial.unit_point for trial in trials if trial.distance == self.best), None)
         if failed is None or worst is None:
             return None
