@@ -29,8 +29,7 @@ from ctxval.campaign.storage.disks import StoreWarning
 from ctxval.certificates import KINDS
 from ctxval.certificates.bounds import as_text
 from ctxval.certificates.verdict import Verdict
-from ctxval.cli.commands import TEXTS, app
-from ctxval.cli.screen import Screen, line
+from ctxval.cli.commands import TEXTS, Screen, app, line
 from ctxval.core.experiment import UnitsWarning
 from ctxval.core.plan import DistanceWarning
 from ctxval.core.trial import Trial

@@ -15,7 +15,7 @@ from ctxval.paper.cases import by_name
 from ctxval.studies.replay import Suggestion, replay
 from ctxval.studies.replay.accuracy import RecordedSteps, normalised, root_mean_square, step_errors
 from ctxval.studies.replay.causes import suggestions
-from ctxval.studies.replay.untested import _informative
+from ctxval.studies.replay.report import _informative
 from rig_logs import DT, run
 
 A, B = [[1.0, DT], [0.0, 1.0 - 0.3 * DT]], [[0.0], [DT]]

@@ -17,11 +17,10 @@ from ctxval.core.validation import Validation
 from ctxval.errors import CtxvalError, InputError
 from ctxval.learning.extended import estimates_by_loops_on_model
 from ctxval.studies.causes.candidates import Candidate, candidates
-from ctxval.studies.causes.cause import Repaired
+from ctxval.studies.causes.cause import Plant, Repaired, plant_of
 from ctxval.studies.causes.evidence import STEPS, Evidence, Explanation, explained, screened
 from ctxval.studies.causes.loops import ClosedLoops, ExecutedTask, Predicted
 from ctxval.studies.causes.mechanics import Force
-from ctxval.studies.causes.plant import Plant, plant_of
 from ctxval.studies.causes.report import CauseReport, Explained, Separating
 from ctxval.studies.causes.signals import SensorOffset
 

@@ -11,9 +11,8 @@ import numpy as np
 
 from ctxval._util.describe import describe
 from ctxval._util.representation import ShortRepr, call, line, lines, task_text
-from ctxval.studies.causes.cause import Cause, Repaired
+from ctxval.studies.causes.cause import Cause, Plant, Repaired
 from ctxval.studies.causes.evidence import Explanation
-from ctxval.studies.causes.plant import Plant
 
 _APART = 0.1  # share of the largest distance from M which starts elsewhere must cause, to be remarked
 

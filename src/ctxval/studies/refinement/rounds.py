@@ -19,8 +19,20 @@ from ctxval.errors import InputError
 from ctxval.models import Refined
 from ctxval.studies.fitting import FittedParameter
 from ctxval.studies.fitting.model_file import write_model_file
-from ctxval.studies.refinement.design import SameControllers
 from ctxval.studies.refinement.held_out import MeasuredResidual
+
+
+@dataclass(frozen=True)
+class SameControllers:
+    """Executed tasks of earlier rounds on which the refined model has the controller that was executed.
+
+    The distance of the refined model on such a task is known without another execution, if the system is
+    deterministic. The model has learned from them, so they can falsify it, and they never count for it.
+    """
+
+    tasks: int = 0  #: number of executed tasks that were compared, and of those with numerically the same controller
+    same: int = 0
+    worst: float | None = None  #: the largest distance of the refined model on the latter; None if there are none
 
 
 @dataclass(frozen=True, eq=False)
