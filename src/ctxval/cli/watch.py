@@ -20,6 +20,7 @@ from ctxval.cli.config.stored_settings import Opened, limit_of, open_store
 from ctxval.cli.recordings import Logs
 from ctxval.core.trajectory import Trajectory
 from ctxval.errors import ExecutionError, InputError
+from ctxval.report.sections.repeat import run_command
 
 
 @command(false_alarms=f"{FALSE_ALARMS:g}")
@@ -102,14 +103,11 @@ def _next(opened: Opened, allowed: Allowed, store: Path, threshold: float, trial
     by_people = getattr(opened.experiment.validation.system, "manual", False)
     if by_people or any(each.told for each in opened.campaign.trials):
         return shlex.join(["ctxval", "ask", str(store), "--again", str(trial), "--because", "REASON"])
-    settings = opened.settings
-    target = allowed.experiment or settings.experiment or ""
-    if allowed.experiment is None and settings.file is not None:
-        target = (
-            settings.file if settings.folder in (None, Path.cwd()) else str(Path(settings.folder or "", settings.file))
-        )
+    settings, target = opened.settings.model_copy(update={"threshold": threshold}), allowed.experiment or ""
+    if not target and settings.file is not None and settings.folder not in (None, Path.cwd()):
+        target = str(Path(settings.folder or "", settings.file))
     other = store.with_name(f"{store.stem}.changed{store.suffix}")
-    return shlex.join(["ctxval", "run", target, "--threshold", f"{threshold:g}", "--store", str(other)])
+    return run_command(settings.model_dump(mode="json"), settings.budget, "--store", str(other), target=target)
 
 
 _Run = tuple[str, Execution, Mapping[str, Any] | None]
