@@ -25,7 +25,7 @@ from ctxval.core.model import Model
 from ctxval.core.trajectory import Trajectory, Transitions
 from ctxval.data.recordings import Recording, Recordings
 from ctxval.learning import PosteriorSettings, learn_posterior
-from ctxval.studies.replay.accuracy import RecordedSteps, Windows, squared, stepped
+from ctxval.studies.replay.accuracy import Windows, squared, stepped
 
 
 @dataclass(frozen=True)
@@ -44,9 +44,9 @@ class ResidualShare(ShortRepr):
     rest: float  #: root mean square of what state and input do not explain
 
 
-def residual_shares(model: Model, recorded: RecordedSteps, seed: int) -> tuple[ResidualShare, ...]:
+def residual_shares(model: Model, recordings: Recordings, seed: int) -> tuple[ResidualShare, ...]:
     """Return how much of the residual of each state can be explained; none if there are too few recorded steps."""
-    where = recorded.windows(1, 1, 12_000)
+    where = Windows.of(recordings, 1, 1, 12_000)
     residuals, earlier = (where.states(k + 1) - stepped(model, where.states(k), where.inputs(k)) for k in (0, -1))
     finite: Mask = np.asarray((np.isfinite(residuals) & np.isfinite(earlier)).all(axis=1))
     where, residuals, earlier = where[finite], residuals[finite], earlier[finite]
@@ -78,7 +78,7 @@ def residual_shares(model: Model, recorded: RecordedSteps, seed: int) -> tuple[R
             *(name, unit, math.sqrt(sizes[i]), share(affine[:, i], sizes[i]), share(rest[:, i], sizes[i])),
             *(share(history[:, i], left[i]), math.sqrt(left[i])),
         )
-        for i, (name, unit) in enumerate(recorded.recordings.states.items())
+        for i, (name, unit) in enumerate(recordings.states.items())
     )
 
 
@@ -116,20 +116,20 @@ class Suggestion(ShortRepr):
     sentence: str
 
 
-def suggestions(model: Model, recorded: RecordedSteps) -> tuple[Suggestion, ...]:
+def suggestions(model: Model, recordings: Recordings) -> tuple[Suggestion, ...]:
     """Return the change of timing with which the model predicts held-out recordings clearly better, if there is one.
 
     Of two, only the better one is returned, because one mistake can look like another one.
     """
-    changes = filter(None, (_time_step(model, recorded), _delay(model, recorded)))
+    changes = filter(None, (_time_step(model, recordings), _delay(model, recordings)))
     return tuple(sorted(changes, key=lambda change: change.ratio)[:1])
 
 
-def _delay(model: Model, recorded: RecordedSteps) -> Suggestion | None:
+def _delay(model: Model, recordings: Recordings) -> Suggestion | None:
     """Suggest a delay if the model, or an affine model of the recordings themselves, predicts better with it."""
     first, last = -3, 10  # delays in steps that are tried
-    where = recorded.windows(last + 1, 1 - first, 8000)
-    if not recorded.recordings.inputs or not len(where):
+    where = Windows.of(recordings, last + 1, 1 - first, 8000)
+    if not recordings.inputs or not len(where):
         return None
     x, reached, groups = where.states(), where.states(1), where.groups
     sizes = np.sqrt(((reached - x) ** 2).mean(axis=0))
@@ -157,7 +157,7 @@ def _delay(model: Model, recorded: RecordedSteps) -> Suggestion | None:
         if change is None or by_model[0].mean() <= fitted[change[0]].mean():
             return None
     shift, ratio = change
-    delay = shift * recorded.recordings.dt
+    delay = shift * recordings.dt
     when = (
         f"if the inputs act {abs(delay):.3g} s ({abs(shift):g} steps) {'after' if shift > 0 else 'before'} the time at "
         "which they are taken here"
@@ -172,9 +172,9 @@ def _delay(model: Model, recorded: RecordedSteps) -> Suggestion | None:
     return Suggestion("delay", delay, ratio, sentence)
 
 
-def _time_step(model: Model, recorded: RecordedSteps) -> Suggestion | None:
+def _time_step(model: Model, recordings: Recordings) -> Suggestion | None:
     multiples = (2, 3, 4, 5, 10)
-    where = recorded.windows(0, max(multiples), 8000)
+    where = Windows.of(recordings, 0, max(multiples), 8000)
     if not len(where):
         return None
 
@@ -193,10 +193,10 @@ def _time_step(model: Model, recorded: RecordedSteps) -> Suggestion | None:
     if change is None:
         return None
     factor, ratio = change
-    dt = factor * recorded.recordings.dt
+    dt = factor * recordings.dt
     sentence = (
         f"the error relative to the motion falls to {100 * ratio:.0f} % if one step of the model takes {dt:g} s "
-        f"instead of {recorded.recordings.dt:g} s: check the time step of the model, or give dt = {dt:g}"
+        f"instead of {recordings.dt:g} s: check the time step of the model, or give dt = {dt:g}"
     )
     return Suggestion("time step", dt, ratio, sentence)
 

@@ -22,7 +22,7 @@ from ctxval.data.sampling import Break
 from ctxval.errors import InputError
 from ctxval.learning import DynamicsStudy
 from ctxval.learning.closed_loops import loop_pairs
-from ctxval.studies.replay.accuracy import RecordedSteps, Region, StepError, regions, step_errors
+from ctxval.studies.replay.accuracy import Region, StepError, regions, step_errors
 from ctxval.studies.replay.causes import (
     EXPLAINS,
     Fault,
@@ -214,7 +214,7 @@ def replay(
     require_time_step(model, recordings.dt, "the recording")
     new = unseen(model, recordings)
     used = new or list(range(len(recordings.runs)))
-    recorded = RecordedSteps(recordings, used)
+    recorded = replace(recordings, runs=tuple(recordings.runs[number] for number in used))
     with single_threaded():
         errors = step_errors(model, recorded, sorted(set(steps)))
         where = regions(model, recorded)
