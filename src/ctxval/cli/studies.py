@@ -76,7 +76,7 @@ def compare(
         except Exception as error:  # it must not hide the decisions, for which executions were paid
             err.say(f"no picture: {reason_of(error)}")
     paths = {name: str(campaign.store.path) for name, campaign in campaigns.items()}
-    return {**comparison.to_dict(), "stores": paths, "failures": failures, "files": files}
+    return {**comparison.to_json(), "stores": paths, "failures": failures, "files": files}
 
 
 def _candidates(texts: Sequence[str], folder: Path, seed: int, options: dict[str, Any]) -> dict[str, Campaign]:
@@ -181,7 +181,7 @@ def refine_model(
     files = [] if out_ is None or not number else write_refined(out_, refinement, function.step)
     if files:
         out.say(f"the model of round {number} is in {' and '.join(files)}")
-    return {**refinement.to_dict(), "files": files}, base.FALSIFIED if refinement.answer == "falsified" else 0
+    return {**refinement.to_json(), "files": files}, base.FALSIFIED if refinement.answer == "falsified" else 0
 
 
 def _method(name: str, fit: str | None, function: StepFunction) -> Method | None:
@@ -268,7 +268,7 @@ def safe(
     failures = base.failures_of(campaign.failed)
     base.print_failures(failures)
     out.say(f"store: {path}")
-    summary = {**report.to_dict(), "drawn": drawn and vars(drawn), "budget": total, "failures": failures}
+    summary = {**report.to_json(), "drawn": drawn and vars(drawn), "budget": total, "failures": failures}
     return {**summary, "store": str(path)}, base.FALSIFIED if report.answer == "falsified" else 0
 
 

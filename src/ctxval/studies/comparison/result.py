@@ -141,7 +141,7 @@ class Comparison:
         """Return the ranking in one line, such as ``gp < fnn < linear``; ``?`` joins those that are not told apart."""
         return " < ".join(" ? ".join(group) for group in self.ranking(question))
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, Any]:
         """Return everything in types that JSON has: an infinite end of an interval is None."""
         plain = asdict(self)
         for pair in plain["pairs"]:

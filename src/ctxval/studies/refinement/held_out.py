@@ -244,7 +244,7 @@ class MeasuredResidual(ShortRepr):
                 parts.append(f"{name} > {low:.3g}")
         return ", ".join(parts) or "everywhere"
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, Any]:
         """Return all numbers as plain values; an end that is infinite is None."""
 
         def plain(region: ResidualRegion) -> dict[str, Any]:

@@ -82,7 +82,7 @@ class SafetyReport(ShortRepr):
     confidence: float  #: the confidence of the certificate
     units: str  #: the unit of all distances
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, Any]:
         """Return everything as plain values."""
         plain = {name: value for name, value in vars(self).items() if name not in ("spec", "certificate", "tightened")}
         return {

@@ -167,7 +167,7 @@ class Disturbance(ShortRepr):
     discarded: int  #: the number k of those that were discarded
     largest: Array  #: the largest residuals of all draws, ``(n,)``, for comparison
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, Any]:
         """Return plain values."""
         return {**vars(self), "half_widths": self.half_widths.tolist(), "largest": self.largest.tolist()}
 
