@@ -27,6 +27,10 @@ from ctxval.data.recordings import Recording, Recordings
 from ctxval.learning import PosteriorSettings, learn_posterior
 from ctxval.studies.replay.accuracy import Windows, squared, stepped
 
+EXPLAINS = 0.5  # least share of the error with which a fault is named as its cause
+
+FaultKind = Literal["turn", "frozen", "spike", "file"]
+
 
 @dataclass(frozen=True)
 class ResidualShare(ShortRepr):
@@ -245,17 +249,11 @@ def _chosen(
     return values[row], ratio
 
 
-EXPLAINS = 0.5  # least share of the error with which a fault is named as its cause
-
-
-FaultKind = Literal["turn", "frozen", "spike", "file"]
-
-
 @dataclass(frozen=True)
 class Fault(ShortRepr):
     """A fault of recordings, and its part in the one-step error of a model."""
 
-    kind: FaultKind
+    kind: FaultKind  #: an angle that jumps by a turn, a frozen sensor, a spike, or a file that differs from all others
     state: str  #: the state concerned; empty for a file
     source: str  #: the first file concerned, and the number of steps
     steps: int
@@ -395,6 +393,5 @@ def _affine_ratio(rest: Sequence[Trajectory], others: Sequence[Trajectory]) -> t
 
 
 def _regression(runs: Sequence[Trajectory]) -> tuple[Array, Array]:
-    pairs = np.concatenate([np.concatenate([run.states[:-1], run.inputs], axis=1) for run in runs])
-    changes = np.concatenate([np.diff(run.states, axis=0) for run in runs])
-    return np.column_stack([np.ones(len(pairs)), pairs]), changes
+    where = Windows.of(runs, 0, 1, sum(run.horizon for run in runs))
+    return np.column_stack([np.ones(len(where)), where.pairs()]), where.states(1) - where.states()
