@@ -155,13 +155,8 @@ def refine_model(
     if budget is None:
         budget = opened.campaign.executions + budget_of(opened.experiment, settings)
 
-    def open_round(
-        validation: Validation, store: Path | None, model_file: Path | None, certificate: CertificateOptions
-    ) -> Campaign:
+    def open_round(validation: Validation, store: Path, model_file: Path, certificate: CertificateOptions) -> Campaign:
         """Return the campaign of a round, whose store names the experiment and the file of the model."""
-        if model_file is None or store is None:  # the model cannot be read again, so other commands cannot load it
-            search, name = settings.search.build(settings.folder), opened.experiment.name
-            return Campaign(validation, search=search, store=store, seed=settings.seed, name=name)
         known = {"refined": model_file.resolve(), "confidence": certificate.confidence}
         experiment = replace(opened.experiment, validation=validation, truth=None)
         return settings.model_copy(update=known).campaign(experiment, store)

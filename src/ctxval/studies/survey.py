@@ -100,7 +100,7 @@ class Survey(ShortRepr):
 
     def to_json(self) -> dict[str, Any]:
         """Return all results as plain values."""
-        about: dict[str, Any] = plain_numbers(
+        return plain_numbers(
             {
                 "sources": self.sources,
                 "fields": list(map(asdict, self.fields)),
@@ -114,7 +114,6 @@ class Survey(ShortRepr):
                 "statement": self.statement,
             }
         )
-        return about
 
 
 def survey(

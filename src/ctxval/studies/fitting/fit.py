@@ -110,10 +110,7 @@ class FitReport(ShortRepr):
         parts = {"learned_from": self.learned_from, "held_out": self.held_out}
         sizes = {name: {"recordings": len(part.runs), "steps": part.steps} for name, part in parts.items()}
         about = {"dt": self.held_out.dt, "notes": self.held_out.notes}
-        report: dict[str, Any] = plain_numbers(
-            {"fitted": fitted, "failed": list(map(asdict, self.failed)), **sizes, **about}
-        )
-        return report
+        return plain_numbers({"fitted": fitted, "failed": list(map(asdict, self.failed)), **sizes, **about})
 
 
 def fit(

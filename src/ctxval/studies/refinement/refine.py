@@ -36,7 +36,7 @@ from ctxval.studies.refinement.held_out import Records, measure_residual
 from ctxval.studies.refinement.methods import Learned, Method, method_of
 from ctxval.studies.refinement.rounds import Refinement, Round, SameControllers
 
-OpensRound = Callable[[Validation, Path | None, Path | None, CertificateOptions], Campaign]
+OpensRound = Callable[[Validation, Path, Path, CertificateOptions], Campaign]
 """A function that makes the campaign of a round, from its validation, its store, the file of its model and options."""
 
 
@@ -73,7 +73,7 @@ def refine(
             function ``fit(data) -> model`` that always returns the same model for the same data.
         certificate: the kind and options of the certificates, with the confidence ``1 - alpha``; ``auto`` by default.
         on_trial: called with each trial that has ended.
-        open_round: makes the campaign of a round; by default, like the given campaign.
+        open_round: makes the campaign of a round whose model and store are files; by default, like the given campaign.
         progress: whether to show the progress on standard error; None to show it at a terminal and in a notebook.
         execution: ``workers``, ``executor`` and ``timeout`` of :meth:`ctxval.Campaign.run`.
     """
@@ -84,13 +84,15 @@ def refine(
         )
     chosen, options = method_of(method, seed=campaign.seed), certificate or CertificateOptions()
 
-    def same_settings(validation: Validation, store: Path | None, *_: object) -> Campaign:
+    def opened(validation: Validation, store: Path | None, file: Path | None, options: CertificateOptions) -> Campaign:
+        if open_round is not None and store is not None and file is not None:
+            return open_round(validation, store, file, options)
         search = copy.deepcopy(campaign.search)
         return Campaign(validation, search=search, store=store, seed=campaign.seed, name=campaign.name)
 
     execution |= {"on_trial": on_trial, "progress": progress}
     with progress_shown(progress):
-        return _Loop(campaign, float(threshold), budget, chosen, options, open_round or same_settings, execution).run()
+        return _Loop(campaign, float(threshold), budget, chosen, options, opened, execution).run()
 
 
 @dataclass(eq=False)
@@ -102,7 +104,7 @@ class _Loop:
     budget: int
     method: Method
     options: CertificateOptions
-    open_round: OpensRound
+    open_round: Callable[[Validation, Path | None, Path | None, CertificateOptions], Campaign]
     execution: dict[str, Any]
 
     def __post_init__(self) -> None:

@@ -175,8 +175,7 @@ class ReplayReport(ShortRepr):
     def to_json(self) -> dict[str, Any]:
         """Return all results as plain values; numbers that are not finite are None."""
         errors = [{**asdict(error), "relative": error.relative} for error in self.errors]
-        report: dict[str, Any] = plain_numbers({**asdict(self), "errors": errors})
-        return report
+        return plain_numbers({**asdict(self), "errors": errors})
 
 
 def replay(
@@ -256,9 +255,9 @@ def unseen(model: Model, recordings: Recordings) -> list[int]:
     return [k for k, steps in enumerate(recorded) if sum(step in known for step in steps) <= len(steps) / 2]
 
 
-def plain_numbers(value: Any) -> Any:
+def plain_numbers(value: dict[str, Any]) -> dict[str, Any]:
     """Return plain values for JSON; numbers that are not finite are None."""
-    return json.loads(json.dumps(value), parse_constant=lambda _: None)
+    return dict(json.loads(json.dumps(value), parse_constant=lambda _: None))
 
 
 # What follows, in sentences
