@@ -51,7 +51,18 @@ def find_causes(campaign: Campaign, *, most: int = 2) -> CauseReport:
     validation = campaign.validation
     trials = executed_trials(campaign.store, campaign.trials)
     trials.sort(key=lambda pair: -(pair[0].distance or 0.0))
-    failed = [] if validation.outputs is not None else _usable(campaign)[:_FAILED]
+    failed = list[tuple[Trial, Trajectory]]()
+    for trial in campaign.failed if validation.outputs is None else ():
+        promised, run = campaign.trajectories(trial)
+        if promised is None or run is None:
+            continue
+        # What was recorded until the system left the surroundings of what M promised.
+        far = np.abs(run.states - promised.states[0]) > _AWAY * np.ptp(promised.states, axis=0).clip(1e-12)
+        near = np.flatnonzero(far.any(axis=1))
+        steps = min([run.horizon, *(near[:1] - 1)])
+        if steps >= _STEPS:
+            failed.append((trial, run.first(steps)))
+    failed = failed[:_FAILED]
     trials = failed + trials[: 8 - len(failed)]  # those with the largest distances
     if len(trials) < 2:
         raise InputError(f"causes need at least 2 executions with trajectories in the store, got {len(trials)}.")
@@ -67,21 +78,6 @@ def find_causes(campaign: Campaign, *, most: int = 2) -> CauseReport:
         plans = [validation.plan(validation.space.from_unit(point)) for point, _ in executed]
         executions = list(map(ExecutedTask, plans, (run for _, run in executed), states))
         return _Study(validation, executions, len(failed)).report(most)
-
-
-def _usable(campaign: Campaign) -> list[tuple[Trial, Trajectory]]:
-    """Return the failed trials with what was recorded until they left the surroundings of what M promised."""
-    usable = []
-    for trial in campaign.failed:
-        promised, run = campaign.trajectories(trial)
-        if promised is None or run is None:
-            continue
-        far = np.abs(run.states - promised.states[0]) > _AWAY * np.ptp(promised.states, axis=0).clip(1e-12)
-        near = np.flatnonzero(far.any(axis=1))
-        steps = min([run.horizon, *(near[:1] - 1)])
-        if steps >= _STEPS:
-            usable.append((trial, run.first(steps)))
-    return usable
 
 
 class _Study:
