@@ -21,7 +21,6 @@ from ctxval.cli import base
 from ctxval.cli.base import command, err, named_values, out, print_table
 from ctxval.cli.config.settings import Settings, read_settings
 from ctxval.cli.config.stored_settings import budget_of, limit_of
-from ctxval.cli.hand import web_server
 from ctxval.cli.stores import print_envelope
 from ctxval.core.trajectory import Transitions
 from ctxval.core.trial import designs_sentence
@@ -194,7 +193,7 @@ def _live_page(wanted: bool, served: ServedCampaign, settings: Settings) -> Iter
     if not wanted:
         yield None
         return
-    web, search = web_server(), None
+    web, search = require_extra("ctxval.web.server", "web", "the page needs"), None
     if not settings.explores:
         ending = served.budget, served.threshold, settings.within
         search = IntervalSearch(served.campaign.recorder, served.certificate, *ending)

@@ -192,7 +192,6 @@ class ParameterFit(ShortRepr, _Replacement):
     #: the function; None for that of the first model, which must then be a ``Parametric``
     step: ParametricStep | None = None
     vectorized: bool = False  #: whether ``step`` takes whole batches
-    seed: int = 0  #: seed of the starting points
     name: str = field(default="parameters", init=False)
     makes = Parametric
 
@@ -207,7 +206,7 @@ class ParameterFit(ShortRepr, _Replacement):
                     "the method 'parameters' needs the function step (--step), because the model is not a Parametric."
                 )
             step, vectorized = model.function, model.vectorized
-        return fit_parameters(step, self.bounds, data, vectorized=vectorized, seed=self.seed)
+        return fit_parameters(step, self.bounds, data, vectorized=vectorized)
 
 
 @checked
