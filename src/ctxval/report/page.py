@@ -28,16 +28,8 @@ from ctxval.report.context import ReportContext
 from ctxval.report.distance_model import distance_of
 from ctxval.report.findings import WORDS, Finding
 from ctxval.report.markup import UNCUT, element, joined, number, paragraph, quantity, text
+from ctxval.report.sections import repeat
 from ctxval.report.sections.distances import convergence, distances
-from ctxval.report.sections.repeat import (
-    appendix,
-    command_snippet,
-    for_the_file,
-    identity,
-    python_snippet,
-    repeat,
-    repeating_command,
-)
 from ctxval.report.sections.trials import trials
 from ctxval.report.sections.verdict import basis, lights, verdict
 
@@ -71,8 +63,8 @@ SECTIONS: tuple[Section, ...] = (
     _Part("Distance over the tasks", distances),
     _Part("Trials", trials),
     _Part("Convergence", convergence),
-    _Part("To repeat it", repeat),
-    _Part("For the file", for_the_file),
+    _Part("To repeat it", repeat.repeat),
+    _Part("For the file", repeat.for_the_file),
 )
 """The sections of every report, in their order."""
 
@@ -181,14 +173,14 @@ def to_json(context: ReportContext) -> dict[str, Any]:
                     "trial": trial.number,
                     "task": trial.parameters,
                     "distance": distance_of(trial),
-                    "python": python_snippet(context, trial),
-                    "command": command_snippet(context, trial),
+                    "python": repeat.python_snippet(context, trial),
+                    "command": repeat.command_snippet(context, trial),
                 }
                 for trial in context.worst_tasks()
             ],
-            "command": repeating_command(context) or None,
-            "identity": identity(context),
-            "appendix": [entry._asdict() for entry in appendix(context)],
+            "command": repeat.repeating_command(context) or None,
+            "identity": repeat.identity(context),
+            "appendix": [entry._asdict() for entry in repeat.appendix(context)],
         }
         plain: dict[str, Any] = json.loads(json.dumps(describe(report, depth=12), allow_nan=False))
     return plain
@@ -240,7 +232,7 @@ def markdown(context: ReportContext) -> str:
         rows.append(f"| {' | '.join(map(markdown_text, cells))} |")
     entries = [
         f"- **{markdown_text(entry.term)}** ({entry.standard}): {markdown_text(entry.content, UNCUT)}"
-        for entry in appendix(context)
+        for entry in repeat.appendix(context)
     ]
 
     def items(findings: list[Finding]) -> list[str]:

@@ -22,16 +22,11 @@ from ctxval.data.sampling import Break
 from ctxval.errors import InputError
 from ctxval.learning import DynamicsStudy
 from ctxval.learning.closed_loops import loop_pairs
+from ctxval.studies.replay import causes
 from ctxval.studies.replay.accuracy import Region, StepError, regions, step_errors
-from ctxval.studies.replay.causes import (
-    EXPLAINS,
-    Fault,
-    ResidualShare,
-    Suggestion,
-    faults,
-    residual_shares,
-    suggestions,
-)
+from ctxval.studies.replay.causes import Fault, ResidualShare, Suggestion
+
+STEPS = (1, 5, 20, 100)  #: numbers of steps after which errors are computed, unless others are given
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,9 +132,6 @@ def _informative(drawn: Array, count: int) -> tuple[Rows, Array]:
     return np.array(chosen, dtype=np.intp), np.array(shares)
 
 
-STEPS = (1, 5, 20, 100)  #: numbers of steps after which errors are computed, unless others are given
-
-
 @dataclass(frozen=True)
 class RecordedData(ShortRepr):
     """The recordings that were compared with the model."""
@@ -217,10 +209,10 @@ def replay(
     with single_threaded():
         errors = step_errors(model, recorded, sorted(set(steps)))
         where = regions(model, recorded)
-        residuals = residual_shares(model, recorded, seed)
-        wrong = faults(model, recordings, used)
+        residuals = causes.residual_shares(model, recorded, seed)
+        wrong = causes.faults(model, recordings, used)
         # What is wrong with the recordings must not look like a mistake of timing.
-        changes = () if any(fault.explains for fault in wrong) else suggestions(model, recorded)
+        changes = () if any(fault.explains for fault in wrong) else causes.suggestions(model, recorded)
     tasks = None
     if validation is not None:
         logged = [run.trajectory for run in recordings.runs]
@@ -315,19 +307,19 @@ def _insights(report: ReplayReport, used: int) -> Iterator[str]:
 def _causes(residual: ResidualShare) -> Iterator[str]:
     """Yield the causes of the residual of a state: an explanation is named if it is at least half of it."""
     left = f"{residual.rest:.3g} {residual.unit}".rstrip()
-    if residual.explained >= EXPLAINS:
+    if residual.explained >= causes.EXPLAINS:
         how = "an affine function" if residual.linear > 0.9 * residual.explained else "a function"
         yield (
             f"{100 * residual.explained:.0f} % of the residual of {residual.state} is {how} of state and input: a "
             f"better model can be learned from these recordings, with {left} of one-step error left"
         )
-    elif residual.history < EXPLAINS:
+    elif residual.history < causes.EXPLAINS:
         yield (
             f"no cause explains half of the residual of {residual.state}: state and input explain "
             f"{100 * residual.explained:.0f} % of it, and the step before {100 * residual.history:.0f} % of the rest; "
             f"what is left, {left}, may be noise, or something that is not recorded"
         )
-    if residual.history >= EXPLAINS and residual.rest > 0.05 * residual.rms:
+    if residual.history >= causes.EXPLAINS and residual.rest > 0.05 * residual.rms:
         yield (
             f"the step before explains {100 * residual.history:.0f} % of what state and input leave of the residual of "
             f"{residual.state}: the system has a state that is not recorded, a delay, or filtered measurements; "
