@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ctxval.paper.reproduce.revision import AUTO, measured_with
+from ctxval.paper.reproduce.jobs import AUTO, measured_with
 from study_compare import BUDGETS, CONFIDENCE, PAPER, PLAIN, STORED
 
 PAGE = Path(__file__).parents[1] / "docs" / "comparison.md"

@@ -20,7 +20,7 @@ import study_global_search
 from calibration_page import table
 from ctxval._util.arrays import Array
 from ctxval._util.json_lines import JsonLines
-from ctxval.paper.reproduce.revision import AUTO, measured_with
+from ctxval.paper.reproduce.jobs import AUTO, measured_with
 from peers import run
 from peers.page import first_within as within_of
 from search_ablations_part import (

@@ -27,7 +27,7 @@ from ctxval._util.arrays import Array
 from ctxval._util.json_lines import JsonLines
 from ctxval.certificates.difference import PairedDifferences, mean_difference
 from ctxval.paper.cases import arm
-from ctxval.paper.reproduce.revision import AUTO, provenance
+from ctxval.paper.reproduce.jobs import AUTO, provenance
 
 STORED = JsonLines(Path(__file__).parent / "results" / "compare.jsonl", ("case", "question", "seed"))
 

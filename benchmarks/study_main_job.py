@@ -8,9 +8,8 @@ import numpy as np
 
 from ctxval._util.arrays import Array
 from ctxval.paper.reproduce import FULL
-from ctxval.paper.reproduce.jobs import Results
+from ctxval.paper.reproduce.jobs import Results, measured_with
 from ctxval.paper.reproduce.pendulum import Techniques
-from ctxval.paper.reproduce.revision import measured_with
 from ctxval.paper.reproduce.study import TECHNIQUES
 
 ROOT = Path(__file__).parents[1]

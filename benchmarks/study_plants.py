@@ -11,7 +11,7 @@ from functools import partial
 from pathlib import Path
 
 from ctxval._util.json_lines import JsonLines
-from ctxval.paper.reproduce.revision import AUTO, provenance
+from ctxval.paper.reproduce.jobs import AUTO, provenance
 from named_searches import search_named
 from plants import PLANTS
 from plants.truths import TRUTHS, require_known, truth

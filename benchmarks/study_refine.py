@@ -23,7 +23,7 @@ from ctxval._util.arrays import Array
 from ctxval._util.json_lines import JsonLines
 from ctxval.certificates import CertificateOptions
 from ctxval.paper.cases import pendulum
-from ctxval.paper.reproduce.revision import AUTO, measured_with, provenance
+from ctxval.paper.reproduce.jobs import AUTO, measured_with, provenance
 from ctxval.studies.refinement import Method, ParameterFit, Records
 
 ROOT = Path(__file__).parents[1]

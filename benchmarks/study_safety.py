@@ -87,7 +87,7 @@ def campaign(name: str, seed: int, margin: float | None) -> dict[str, Any]:
     made = Campaign(SYSTEMS[name](margin), seed=seed)
     made.run(BUDGET, margin, certificate=options, explore=False, progress=False)
     report = assess(made, options, progress=False)
-    found = {key: value for key, value in report.to_dict().items() if isinstance(value, float | int | str | None)}
+    found = {key: value for key, value in report.to_json().items() if isinstance(value, float | int | str | None)}
     wrong = None
     if report.d_b_bound is not None:
         of_model, of_system, _ = robustness(made.validation, made.validation.space.iid(TRUTH, np.random.default_rng(6)))

@@ -47,7 +47,7 @@ from ctxval.certificates import CertificateOptions
 from ctxval.core.plan import Plan
 from ctxval.core.trial import Trial
 from ctxval.paper.cases.linear import Feedback, LinearSystem, Settings, draw
-from ctxval.paper.reproduce.revision import AUTO, provenance
+from ctxval.paper.reproduce.jobs import AUTO, provenance
 from dynamics_systems import PartlySeen, RandomFunction
 from study_auto import ROOT, results_of
 from study_auto import experiment as of_search_study

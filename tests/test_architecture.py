@@ -149,7 +149,7 @@ def test_the_help_loads_no_command_and_nothing_that_computes() -> None:
     assert not loaded & {"numpy", "scipy", "starlette", "pydantic", "jinja2"}
     ours = {name.removeprefix("ctxval.") for name in loaded if name.startswith("ctxval.")}
     assert {room(name) for name in ours} == {"_util", "cli"}
-    assert {name for name in ours if room(name) == "cli"} == {"cli", "cli.commands", "cli.screen"}
+    assert {name for name in ours if room(name) == "cli"} == {"cli", "cli.commands"}
 
 
 def test_tasks_validations_and_stores_are_there_without_the_parts_of_scipy() -> None:

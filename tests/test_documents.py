@@ -155,7 +155,7 @@ def test_the_glossary_explains_what_refine_says() -> None:
         parameters=(FittedParameter("mass", 1.0, 0.9, 1.1),),
     )
     explained = re.findall(r"`([^`]+)`", (ROOT / "docs" / "glossary.md").read_text())
-    assert keys(found.to_dict()) - {"x", "v", "u", "goal"} <= set(explained)
+    assert keys(found.to_json()) - {"x", "v", "u", "goal"} <= set(explained)
 
 
 def test_the_glossary_explains_what_a_watch_says() -> None:
@@ -176,7 +176,7 @@ def test_the_glossary_explains_what_is_said_of_safety() -> None:
 def test_the_glossary_explains_what_why_says() -> None:
     model = make_validation().model
     shifted = make_validation(systems.Simulated(lambda x, u: model.step(x, u + 0.3), vectorized=True), model)
-    said = keys(find_causes(Campaign(shifted, search=searches.by_name("random")).run(2), most=1).to_dict())
+    said = keys(find_causes(Campaign(shifted, search=searches.by_name("random")).run(2), most=1).to_json())
     explained = re.findall(r"`([^`]+)`", (ROOT / "docs" / "glossary.md").read_text())
     assert said - {"goal"} | {"store", "task", "gap", "other"} <= set(explained)
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from calibration_page import table
 from ctxval._util.arrays import Array
-from ctxval.paper.reproduce.revision import AUTO, measured_with
+from ctxval.paper.reproduce.jobs import AUTO, measured_with
 from peers import overhead, run
 from peers.functions import CASES, SEEDS
 from peers.methods import METHODS

@@ -12,7 +12,7 @@ import functools
 from typing import Any
 
 from ctxval._util.json_lines import JsonLines
-from ctxval.paper.reproduce.revision import AUTO, provenance
+from ctxval.paper.reproduce.jobs import AUTO, provenance
 from peers.functions import CASES, SEEDS, Function, function
 from peers.methods import METHODS
 from peers.recorder import Finished, Maximise, Recorder

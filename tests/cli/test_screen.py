@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 from conftest import make_validation
 from ctxval import Campaign, searches
 from ctxval.cli import app
-from ctxval.cli.screen import Screen
+from ctxval.cli.commands import Screen
 
 HOSTILE = "\x1b[2J\x9b1m\u202e[bold]C:\\rig\\[axis 3] :warning: \\[/bold] 100\\"
 SHOWN = r"\x1b[2J\x9b1m\u202e[bold]C:\rig\[axis 3] :warning: \[/bold] 100" + "\\"

@@ -112,6 +112,17 @@ def test_a_system_that_is_executed_is_validated_anew_in_another_store(folder: Pa
 
 
 @pytest.mark.slow
+def test_the_next_command_has_the_options_of_the_campaign(folder: Path, invoke: Invoke) -> None:
+    run = calling("run", "watched_cart:experiment")
+    made = run("--option", "mass=1.05", "--seed", "3", "--explore", "--budget", "6", "--store", "option.sqlite")
+    assert made.exit_code in (0, 1), made.stderr
+    expired = calling("watch", "option.sqlite")("heavier.csv", "--threshold", "0.25")
+    assert expired.exit_code == 1, expired.stderr
+    options = "--seed 3 --budget 6 --threshold 0.25 --explore --option mass=1.05"
+    assert f"next: ctxval run watched_cart:experiment {options} --store option.changed.sqlite" in expired.stdout
+
+
+@pytest.mark.slow
 def test_a_trajectory_with_its_task_and_recordings_without(folder: Path, invoke: Invoke) -> None:
     one = report(invoke("same0.csv", "--set", "goal=-1.5", "--json"))
     names = [each["name"] for each in one["watch"]["channels"] if each["later"] != [None]]

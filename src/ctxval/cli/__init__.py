@@ -1,7 +1,6 @@
 """The command line: a thin skin over the public interface."""
 
-from ctxval.cli.commands import app
-from ctxval.cli.screen import print_anything
+from ctxval.cli.commands import app, print_anything
 
 __all__ = ["app", "main"]
 

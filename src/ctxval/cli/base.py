@@ -29,8 +29,7 @@ from ctxval.campaign.storage.disks import StoreWarning
 from ctxval.certificates import KINDS
 from ctxval.certificates.bounds import as_text
 from ctxval.certificates.verdict import Verdict
-from ctxval.cli.commands import TEXTS, app
-from ctxval.cli.screen import Screen, line
+from ctxval.cli.commands import TEXTS, Screen, app, line
 from ctxval.core.experiment import UnitsWarning
 from ctxval.core.plan import DistanceWarning
 from ctxval.core.trial import Trial
@@ -143,20 +142,17 @@ def _run(function: Callable[[], Any], as_json: bool, stated: set[str]) -> None:
     if failure is not None:
         err.say(*([] if status == INTERRUPTED else [ERROR]), failure)
         if as_json:
-            _print_failure(failure)
+            try:
+                print(dumps({"error": failure}), flush=True)
+            except OSError as error:
+                # What is still buffered must not fail again at the exit of the interpreter, which would change the
+                # status.
+                with suppress(io.UnsupportedOperation, OSError, ValueError):
+                    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+                if isinstance(error, BrokenPipeError):
+                    raise typer.Exit(CUT_OFF) from None
     if status:
         raise typer.Exit(status)
-
-
-def _print_failure(sentence: str) -> None:
-    try:
-        print(dumps({"error": sentence}), flush=True)
-    except OSError as error:
-        # What is still buffered must not fail again at the exit of the interpreter, which would change the status.
-        with suppress(io.UnsupportedOperation, OSError, ValueError):
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        if isinstance(error, BrokenPipeError):
-            raise typer.Exit(CUT_OFF) from None
 
 
 @contextmanager

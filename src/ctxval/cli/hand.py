@@ -206,7 +206,7 @@ def serve(
     threshold: float | None = None,
     budget: int | None = None,
 ) -> Any:
-    web = web_server()
+    web = require_extra("ctxval.web.server", "web", "the page needs")
     settings = trusted_settings(Store.existing(store), experiment=allowed.experiment, trust=allowed.trust)
 
     def first() -> ServedCampaign:
@@ -235,7 +235,3 @@ def _served(opened: Opened, threshold: float | None, budget: int | None) -> Serv
     if limit is not None:
         opened.campaign.state_threshold(limit)
     return ServedCampaign(experiment, opened.campaign, limit, settings.certificate_options, total)
-
-
-def web_server() -> Any:
-    return require_extra("ctxval.web.server", "web", "the page needs")

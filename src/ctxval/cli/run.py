@@ -21,8 +21,7 @@ from ctxval.cli import base
 from ctxval.cli.base import command, err, named_values, out, print_table
 from ctxval.cli.config.settings import Settings, read_settings
 from ctxval.cli.config.stored_settings import budget_of, limit_of
-from ctxval.cli.hand import web_server
-from ctxval.cli.stores import page_path, print_envelope
+from ctxval.cli.stores import print_envelope
 from ctxval.core.trajectory import Transitions
 from ctxval.core.trial import designs_sentence
 from ctxval.errors import CertificateError, InputError
@@ -137,7 +136,7 @@ def run(
             report["error_percent"] = missed
         result = {"verdict": None if verdict is None else verdict.to_json(), "budget": total}
         if with_report:
-            page = page_path(path)
+            page = path.with_suffix(".report.html")
             # An earlier run may have written the same report.
             current = page.is_file() and campaign.store.computed(base.RUN) == {**result, "report": str(page)}
             try:
@@ -194,7 +193,7 @@ def _live_page(wanted: bool, served: ServedCampaign, settings: Settings) -> Iter
     if not wanted:
         yield None
         return
-    web, search = web_server(), None
+    web, search = require_extra("ctxval.web.server", "web", "the page needs"), None
     if not settings.explores:
         ending = served.budget, served.threshold, settings.within
         search = IntervalSearch(served.campaign.recorder, served.certificate, *ending)

@@ -1,4 +1,4 @@
-"""``ctxval compare`` and ``ctxval refine``: which of several models is better, and how one becomes better."""
+"""``ctxval compare``, ``refine`` and ``safe``: the better one of several models, a better one, and safe tasks."""
 
 from __future__ import annotations
 
@@ -8,20 +8,24 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from ctxval._util.checked import PositiveFloat, PositiveInt, require
 from ctxval._util.files import write_text
-from ctxval._util.texts import reason_of
+from ctxval._util.representation import task_text
+from ctxval._util.texts import enumerated, reason_of
 from ctxval.campaign import plot
 from ctxval.campaign.campaign import Campaign
+from ctxval.campaign.storage.store import Store
 from ctxval.certificates import CertificateOptions
 from ctxval.certificates.options import CONFIDENCE
 from ctxval.cli import base
-from ctxval.cli.base import Allowed, command, err, named_values, out, print_columns, require_outputs
+from ctxval.cli.base import Allowed, command, err, named_values, notes, out, print_columns, print_table, require_outputs
 from ctxval.cli.config.references import reference, require_function
 from ctxval.cli.config.settings import Settings, read_settings
 from ctxval.cli.config.stored_settings import budget_of, limit_of, open_target
 from ctxval.cli.recordings import StepFunction, print_parameters, require_model_file
 from ctxval.core.validation import Validation
-from ctxval.errors import InputError
+from ctxval.errors import CtxvalError, InputError
+from ctxval.specs import ReachAvoid
 from ctxval.studies.comparison import compare as run_comparison
 from ctxval.studies.comparison.candidates import require_comparable
 from ctxval.studies.comparison.compare import BUDGET, store_name
@@ -30,6 +34,8 @@ from ctxval.studies.fitting.model_file import require_file_of
 from ctxval.studies.refinement import CauseRepair, Method, ParameterFit, Refinement, refine
 from ctxval.studies.refinement.methods import NAMES, UserFit, method_of
 from ctxval.studies.refinement.rounds import write_refined
+from ctxval.studies.safety import DrawnTasks, SafetyReport, assess, draw_tasks, require_safe_tasks
+from ctxval.studies.safety.draws import require_box
 
 
 @command()
@@ -70,7 +76,7 @@ def compare(
         except Exception as error:  # it must not hide the decisions, for which executions were paid
             err.say(f"no picture: {reason_of(error)}")
     paths = {name: str(campaign.store.path) for name, campaign in campaigns.items()}
-    return {**comparison.to_dict(), "stores": paths, "failures": failures, "files": files}
+    return {**comparison.to_json(), "stores": paths, "failures": failures, "files": files}
 
 
 def _candidates(texts: Sequence[str], folder: Path, seed: int, options: dict[str, Any]) -> dict[str, Campaign]:
@@ -149,13 +155,8 @@ def refine_model(
     if budget is None:
         budget = opened.campaign.executions + budget_of(opened.experiment, settings)
 
-    def open_round(
-        validation: Validation, store: Path | None, model_file: Path | None, certificate: CertificateOptions
-    ) -> Campaign:
+    def open_round(validation: Validation, store: Path, model_file: Path, certificate: CertificateOptions) -> Campaign:
         """Return the campaign of a round, whose store names the experiment and the file of the model."""
-        if model_file is None or store is None:  # the model cannot be read again, so other commands cannot load it
-            search, name = settings.search.build(settings.folder), opened.experiment.name
-            return Campaign(validation, search=search, store=store, seed=settings.seed, name=name)
         known = {"refined": model_file.resolve(), "confidence": certificate.confidence}
         experiment = replace(opened.experiment, validation=validation, truth=None)
         return settings.model_copy(update=known).campaign(experiment, store)
@@ -175,7 +176,7 @@ def refine_model(
     files = [] if out_ is None or not number else write_refined(out_, refinement, function.step)
     if files:
         out.say(f"the model of round {number} is in {' and '.join(files)}")
-    return {**refinement.to_dict(), "files": files}, base.FALSIFIED if refinement.answer == "falsified" else 0
+    return {**refinement.to_json(), "files": files}, base.FALSIFIED if refinement.answer == "falsified" else 0
 
 
 def _method(name: str, fit: str | None, function: StepFunction) -> Method | None:
@@ -211,3 +212,111 @@ def _print_refinement(refinement: Refinement) -> None:
         for row in residual.text.splitlines():
             out.say(row)
         out.say(f"measured for {residual.range_text}; it is not guaranteed, and nothing is known outside.", wrap=True)
+
+
+@command()
+def safe(
+    target: str,
+    margin: float | None = None,
+    budget: int | None = None,
+    confidence: float | None = None,
+    audit: int | None = None,
+    seed: int | None = None,
+    store: Path | None = None,
+    workers: int | None = None,
+    timeout: float | None = None,
+    accept_change: str | None = None,
+) -> Any:
+    require("margin", PositiveFloat | None, margin)
+    require("audit", PositiveInt | None, audit)
+    given = read_settings(target, {"budget": budget, "confidence": confidence, "seed": seed})
+    if given.spec is None:
+        raise InputError(f"{target} has no table [spec] with sets to avoid or to reach.")
+    table = given.spec if margin is None else given.spec.model_copy(update={"margin": margin})
+    asked: dict[str, Any] = {"spec": table, "judge": "spec", "threshold": table.margin, "explore": False}
+    if given.certificate.kind == "auto":  # a Gaussian process of a distance with kinks would be no evidence
+        asked["certificate"] = given.certificate.model_copy(update={"kind": "dynamics"})
+    settings = given.model_copy(update=asked)
+    experiment = settings.load()
+    usual = settings.store_path(experiment.name)
+    # It is not the store of a campaign of the experiment's own distance.
+    path = usual.with_name(f"{usual.stem}.safe{usual.suffix}") if store is None else store
+    if audit is not None:
+        require_box(experiment.validation)
+    share = require_safe_tasks(experiment.validation)
+    campaign = settings.campaign(
+        experiment, path, accept_change=accept_change, remeasure=_has_another_margin(path, settings)
+    )
+    total, certificate = budget_of(experiment, settings), settings.certificate_options
+    units, wanted = experiment.units, f"{100 * share:.0f} % of the drawn tasks satisfy the specification on the model"
+    if table.margin is not None:
+        wanted += f" with the margin {table.margin:g} {units}".rstrip()
+    out.say((experiment.name, "bold"), f": {wanted}", wrap=True)
+    certificate.kind.require_usable(certificate.confidence, total)
+    campaign.run(total, table.margin, certificate=certificate, explore=False, workers=workers, timeout=timeout)
+    report, drawn = assess(campaign, certificate), None
+    if audit is not None:
+        least = report.d_b if report.d_b_bound is None else report.d_b_bound
+        beside = path.with_name(f"{path.stem}.draws-above-{least:.6g}{path.suffix}")
+        drawn = draw_tasks(campaign, least, audit, store=beside, confidence=certificate.confidence)
+    _print_safety(report, drawn)
+    failures = base.failures_of(campaign.failed)
+    base.print_failures(failures)
+    out.say(f"store: {path}")
+    summary = {**report.to_json(), "drawn": drawn and vars(drawn), "budget": total, "failures": failures}
+    return {**summary, "store": str(path)}, base.FALSIFIED if report.answer == "falsified" else 0
+
+
+def _has_another_margin(path: Path, settings: Settings) -> bool:
+    """Return whether a store was made for another margin, so that its distances are computed again."""
+    if not path.exists() or not path.stat().st_size:
+        return False
+    try:
+        kept = Store.existing(path).settings().get("spec")
+    except CtxvalError:  # the campaign says it
+        return False
+    known, wanted = kept.get("margin") if isinstance(kept, dict) else None, settings.spec and settings.spec.margin
+    if not isinstance(kept, dict) or known == wanted:
+        return False
+    notes.say(f"{path} was made for another margin: the distances of its executions are computed again.")
+    return True
+
+
+def _print_safety(report: SafetyReport, drawn: DrawnTasks | None) -> None:
+    units = report.units
+
+    def of(value: float | None, before: str = "") -> str:
+        return "unknown" if value is None else f"{before}{value:.4g} {units}".rstrip()
+
+    if report.answer is not None and report.margin is not None:
+        colour = {"validated": "green", "falsified": "red", "undecided": "yellow"}[report.answer]
+        out.say((report.answer.upper(), f"bold {colour}"), f": margin {of(report.margin)}")
+    out.say(report.statement[0].upper() + report.statement[1:], wrap=True)
+    executed, predicted = "largest executed", "predicted to be at most"
+    certified = "not certified" if report.d_b_bound is None else f"certified at most {of(report.d_b_bound)}"
+    rows = {
+        "largest deviation": f"{executed} {of(report.d_a)}, {predicted} {of(report.d_a_bound)}",
+        "largest margin of an unsafe task": f"{executed} {of(report.d_b)}, {certified}",
+    }
+    if report.share_by_deviation is not None:
+        rows["safe if no deviation is larger"] = f"{100 * report.share_by_deviation:.1f} %, which is not certified"
+    if report.tightened is not None:
+        if report.tightened.avoid:
+            rows["avoid on the model"] = enumerated([repr(part) for part in report.tightened.avoid], 6)
+        if report.tightened.reach is not None:
+            rows["reach on the model"] = repr(report.tightened.reach)
+    elif report.d_b_bound is not None and isinstance(report.spec, ReachAvoid):
+        rows["sets on the model"] = "nothing is left of a set that grows or shrinks by the bound"
+    if drawn is not None:
+        rows["independent draws"] = (
+            f"{drawn.unsafe} of {drawn.draws} tasks with a margin above {of(drawn.margin)} are unsafe: at most "
+            f"{100 * drawn.share:.3g} % of them, with {100 * drawn.confidence:g} % confidence"
+        )
+    rows["between recorded times"] = f"the system moves by up to {of(report.between)}, which is not seen"
+    rows["executions"] = str(report.executions)
+    print_table(rows)
+    for task in report.counterexamples[:5]:
+        where = task_text(task.parameters)
+        out.say(f"unsafe: {where}: {of(task.on_model)} on the model, {of(task.on_system)} on the system", wrap=True)
+    if len(report.counterexamples) > 5:
+        out.say(f"and {len(report.counterexamples) - 5} other unsafe tasks.")

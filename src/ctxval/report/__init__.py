@@ -17,8 +17,7 @@ from ctxval.report.charts import Axis, Chart
 from ctxval.report.context import ReportContext, context_of_campaign, context_of_store
 from ctxval.report.findings import Finding
 from ctxval.report.markup import bullets, element, heading, joined, paragraph, table
-from ctxval.report.page import SECTIONS, Section, page, write_page
-from ctxval.report.twins import junit, markdown, to_json
+from ctxval.report.page import SECTIONS, Section, junit, markdown, page, to_json, write_page
 
 __all__ = [
     "SECTIONS",

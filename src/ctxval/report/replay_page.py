@@ -11,6 +11,7 @@ from markupsafe import Markup
 from ctxval._util.files import write_text
 from ctxval._util.representation import counted
 from ctxval._util.texts import visible
+from ctxval.core.labels import labels_of
 from ctxval.report.charts import SMALL, Axis, Chart, small_charts
 from ctxval.report.markup import bar, bullets, details, joined, number, paragraph, percent, quantity, sentence, table
 from ctxval.report.page import framed, now
@@ -66,7 +67,7 @@ def _regions(report: ReplayReport) -> Markup:
         return paragraph("There are too few recorded steps to divide them into regions.")
     names = list(dict.fromkeys(region.variable for region in report.regions))
     rows = [
-        (_named(region.variable, region.unit), f"{number(region.low)} to {number(region.high)}", region.count,
+        (*labels_of({region.variable: region.unit}), f"{number(region.low)} to {number(region.high)}", region.count,
          region.ratio)
         for region in report.regions
     ]  # fmt: skip
@@ -144,8 +145,8 @@ def _recordings(report: ReplayReport) -> Markup:
         ("Steps", data.steps),
         ("Time step", quantity(data.dt, "s")),
         ("Duration", quantity(data.steps * data.dt, "s")),
-        ("States", ", ".join(_named(*state) for state in data.states.items())),
-        ("Inputs", ", ".join(_named(*input_) for input_ in data.inputs.items()) or "none"),
+        ("States", ", ".join(labels_of(data.states))),
+        ("Inputs", ", ".join(labels_of(data.inputs)) or "none"),
         ("Recordings that the model was learned from", data.seen),
     ]
     folded = [("source", list(data.sources)), ("split", [str(gap) for gap in data.breaks])]
@@ -159,17 +160,14 @@ def _recordings(report: ReplayReport) -> Markup:
     return joined(parts)
 
 
-def _named(name: str, unit: str) -> str:
-    return f"{name} [{unit}]" if unit else name
-
-
 def _error_chart(errors: Sequence[StepError]) -> Chart:
     steps = np.array([float(error.steps) for error in errors])
     rms, low, high, change = (
         np.array([getattr(error, k) for error in errors]) for k in ("rms", "lowest", "highest", "change")
     )
     first = errors[0]
-    x, y = Axis.over("steps", steps, room=0.03), Axis.over(_named(first.state, first.unit), high, rms, zero=True)
+    (label,) = labels_of({first.state: first.unit})
+    x, y = Axis.over("steps", steps, room=0.03), Axis.over(label, high, rms, zero=True)
     chart = Chart(f"Error of {first.state} after a number of steps", x, y, **SMALL)
     chart.whiskers(steps, low, high, "model").line(steps, rms, "model", "error, with its range over the recordings")
     # Far above the error, the change would only make the error invisible.
@@ -183,7 +181,7 @@ def _region_chart(report: ReplayReport, name: str) -> Chart:
     across = np.repeat([parts[0].low, *(region.high for region in parts)], 2)[1:-1]
     up = np.repeat([region.ratio for region in parts], 2)
     everywhere = [region.ratio for region in report.regions]
-    x = Axis.over(_named(name, parts[0].unit), across, room=0.02)
+    x = Axis.over(*labels_of({name: parts[0].unit}), across, room=0.02)
     y = Axis.over("error / average", everywhere, [1.2], zero=True)
     chart = Chart(f"One-step error over {name}", x, y, **SMALL)
     chart.line(x.ends, [1.0, 1.0], "reference", "average")

@@ -25,7 +25,7 @@ from ctxval.errors import InputError
 from ctxval.studies.fitting import FitReport, fit
 from ctxval.studies.fitting.fit import FittedModel
 from ctxval.studies.replay import ReplayReport, replay
-from ctxval.studies.replay.accuracy import RecordedSteps, step_errors
+from ctxval.studies.replay.accuracy import step_errors
 from ctxval.studies.replay.report import plain_numbers, unseen
 
 Role = Literal["state", "input", ""]
@@ -100,7 +100,7 @@ class Survey(ShortRepr):
 
     def to_json(self) -> dict[str, Any]:
         """Return all results as plain values."""
-        about: dict[str, Any] = plain_numbers(
+        return plain_numbers(
             {
                 "sources": self.sources,
                 "fields": list(map(asdict, self.fields)),
@@ -114,7 +114,6 @@ class Survey(ShortRepr):
                 "statement": self.statement,
             }
         )
-        return about
 
 
 def survey(
@@ -273,7 +272,7 @@ def _reach(model: Model, recordings: Recordings, whole: int) -> tuple[int, int]:
     held = unseen(model, recordings) or range(len(recordings.runs))
     grid = sorted({min(whole, round(1.5**k)) for k in range(40) if 1.5**k <= 2 * whole} | {whole})
     with single_threaded():
-        errors = step_errors(model, RecordedSteps(recordings, held), grid)
+        errors = step_errors(model, replace(recordings, runs=tuple(recordings.runs[number] for number in held)), grid)
     close, most = 0, 0
     for count in sorted({error.steps for error in errors}):
         most = count

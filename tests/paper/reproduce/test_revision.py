@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ctxval.paper.reproduce import revision
-from ctxval.paper.reproduce.revision import AUTO, libraries, measured_with, provenance, source_digest
+from ctxval.paper.reproduce import jobs
+from ctxval.paper.reproduce.jobs import AUTO, libraries, measured_with, provenance, source_digest
 
 
 @pytest.fixture
@@ -16,7 +16,7 @@ def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     for folder in AUTO:
         (tmp_path / folder).mkdir()
         (tmp_path / folder / "one.py").write_text('"""Text."""\n\nGAIN = 1.0\n')
-    monkeypatch.setattr(revision, "_PACKAGE", tmp_path)
+    monkeypatch.setattr(jobs, "_PACKAGE", tmp_path)
     source_digest.cache_clear()
     yield tmp_path
     source_digest.cache_clear()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -115,7 +114,7 @@ def test_a_fault_outside_of_the_dictionary_is_none_of_these() -> None:
 def test_a_report_is_plain_values_and_its_python_makes_the_model() -> None:
     weak = slide(no_force)
     report = find_causes(campaign(lambda x, u: weak(x, u + 0.3)), most=1)
-    stored = json.loads(report.to_json())
+    stored = report.to_json()
     assert (stored["answer"], stored["sentence"]) == ("named", report.sentence)
     assert report.python is not None
     made: dict[str, Any] = {"model": models.Linear([[1.0, DT], [0.0, 1.0]], [[0.5 * DT**2], [DT]])}
@@ -190,7 +189,7 @@ def test_executions_that_begin_elsewhere_are_not_explained_by_the_dynamics() -> 
     report = report_of(0.1, 0.1, 0.1)
     assert [(cause.name, cause.sizes) for cause in report.causes] == [("sensor offset", pytest.approx((0.1,)))]
     assert "The sensor of position reads 0.1 m too much, or all executions began there." in report.sentence
-    assert json.loads(report.to_json())["began_elsewhere"]
+    assert report.to_json()["began_elsewhere"]
     report = report_of(0.1, -0.2, 0.15)
     assert report.causes == ()
     assert "M predicts the executions from where they began, and that is not where their tasks begin" in report.sentence

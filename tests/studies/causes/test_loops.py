@@ -12,7 +12,7 @@ from ctxval.core.controller import Controller
 from ctxval.core.model import Model
 from ctxval.studies import causes
 from ctxval.studies.causes import Repaired
-from ctxval.studies.causes.loops import ClosedLoops, ExecutedTask
+from ctxval.studies.causes.find import ClosedLoops, ExecutedTask
 
 DT, NOISE = 0.05, np.array([2e-3, 1e-2])
 MODEL = models.Linear([[1.0, DT], [0.0, 1.0]], [[0.5 * DT**2], [DT]])

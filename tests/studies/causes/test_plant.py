@@ -7,7 +7,7 @@ import pytest
 
 from ctxval import Array, models, systems
 from ctxval.core.model import Model
-from ctxval.studies.causes.plant import Joint, Plant, plant_of
+from ctxval.studies.causes.cause import Joint, Plant, plant_of
 
 DT = 0.02
 

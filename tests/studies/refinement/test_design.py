@@ -9,8 +9,8 @@ import pytest
 
 from ctxval import Transitions, Validation, controllers, models
 from ctxval.studies.refinement import ResidualCorrection
-from ctxval.studies.refinement.design import same_controllers, with_best_jacobian
 from ctxval.studies.refinement.held_out import Records
+from ctxval.studies.refinement.refine import same_controllers, with_best_jacobian
 from rig_refine import FIRST, campaign, make_cart
 
 

@@ -145,6 +145,6 @@ def test_residuals_of_zero_have_one_region() -> None:
     found = measure_residual(zero, {"a": "", "b": ""}, {"c": ""})
     assert len(found.regions) == 1
     assert "everywhere" in found.text
-    plain = found.to_dict()
+    plain = found.to_json()
     assert plain["guaranteed"] is False
     assert plain["regions"][0]["range"]["a"] == [None, None]

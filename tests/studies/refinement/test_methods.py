@@ -59,7 +59,7 @@ def test_what_a_model_explains_is_not_corrected() -> None:
 @pytest.mark.parametrize("noise", [0.0, NOISE])
 def test_the_correction_is_used_that_errs_less_on_held_out_executions(noise: float) -> None:
     records = Records(runs(noise))
-    exact, averaged = exact_correction(FIRST, records, 300), averaged_correction(FIRST, records)
+    exact, averaged = exact_correction(FIRST, records), averaged_correction(FIRST, records)
     learned = ResidualCorrection().learn(FIRST, records)
     used = averaged if noise else exact
     assert used is not None

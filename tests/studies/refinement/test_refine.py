@@ -152,7 +152,7 @@ def test_a_refinement_is_resumed_from_its_files_with_the_same_choices(found: Ref
     assert store.with_name("a.round-1.sqlite").exists()
     again = refined(store)
     assert again.executions == found.executions
-    assert json.loads(again.to_json()) == json.loads(found.to_json())
+    assert again.to_json() == found.to_json()
 
 
 def content(store: Path) -> list[tuple[Any, ...]]:
@@ -309,7 +309,7 @@ def test_a_spent_budget_ends_the_refinement_before_a_model_is_learned() -> None:
     found = ctxval.refine(campaign().run(1), THRESHOLD, 1)
     assert (found.ended, len(found.rounds)) == ("the budget of 1 executions is spent", 1)
     assert found.residual is None
-    assert found.to_dict()["residual"] is None
+    assert found.to_json()["residual"] is None
 
 
 def test_what_is_no_campaign_or_no_threshold_is_refused() -> None:

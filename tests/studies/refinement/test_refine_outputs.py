@@ -32,7 +32,7 @@ def test_a_model_without_friction_is_refined_from_angles_alone(tmp_path: Path) -
     again = refined(tmp_path / "a.sqlite")
     assert again.accuracy == found.accuracy
     assert again.residual is not None
-    assert again.residual.to_dict() == found.residual.to_dict()
+    assert again.residual.to_json() == found.residual.to_json()
 
 
 def test_a_model_whose_derivatives_are_not_finite_is_refused() -> None:

@@ -11,7 +11,7 @@ from ctxval import Trajectory
 from ctxval.data import Recording, Recordings
 from ctxval.models import Linear
 from ctxval.studies.replay import replay
-from ctxval.studies.replay.faults import faults
+from ctxval.studies.replay.causes import faults
 
 DT, STEPS = 0.02, 400
 

@@ -13,9 +13,9 @@ from ctxval.data import LogMapping, MemoryTable, Recordings, recordings_of
 from ctxval.errors import InputError, ModelError
 from ctxval.paper.cases import by_name
 from ctxval.studies.replay import Suggestion, replay
-from ctxval.studies.replay.accuracy import RecordedSteps, normalised, root_mean_square, step_errors
+from ctxval.studies.replay.accuracy import normalised, root_mean_square, step_errors
 from ctxval.studies.replay.causes import suggestions
-from ctxval.studies.replay.untested import _informative
+from ctxval.studies.replay.report import _informative
 from rig_logs import DT, run
 
 A, B = [[1.0, DT], [0.0, 1.0 - 0.3 * DT]], [[0.0], [DT]]
@@ -40,8 +40,7 @@ RECORDED = recorded(RUNS)
 
 def timing(model: Any, recordings: Recordings) -> tuple[tuple[Suggestion, ...], float]:
     """Return what a replay suggests, and the largest one-step error relative to the change."""
-    steps = RecordedSteps(recordings, range(len(recordings.runs)))
-    return suggestions(model, steps), max(error.relative for error in step_errors(model, steps, [1]))
+    return suggestions(model, recordings), max(error.relative for error in step_errors(model, recordings, [1]))
 
 
 def delayed(one: Trajectory, steps: int) -> Trajectory:

@@ -67,7 +67,7 @@ def test_the_draws_of_a_campaign_count_and_its_other_executions_give_the_scales(
         "of the tasks have a step with a disturbance outside of W (20 independent draws, 0 discarded)"
         in found.statement
     )
-    assert found.to_dict()["half_widths"] == found.half_widths.tolist()
+    assert found.to_json()["half_widths"] == found.half_widths.tolist()
 
 
 def test_what_cannot_be_certified_is_refused() -> None:

@@ -54,7 +54,7 @@ def test_a_campaign_certifies_the_margin_that_the_drift_needs() -> None:
     assert all(task.on_system <= 0 < task.on_model for task in found.counterexamples)
     assert found.tightened is not None
     assert found.tightened.avoid[0].low[0] == pytest.approx(-found.d_b_bound)
-    assert json.loads(json.dumps(describe(found.to_dict(), 10)))["d_b"] == found.d_b
+    assert json.loads(json.dumps(describe(found.to_json(), 10)))["d_b"] == found.d_b
     assert "is safe on S at its recorded times" in found.statement
     assert 0 < found.between <= DT * (FASTEST + FASTER * FASTEST**2) + 1e-9  # nothing is seen between two records
 

@@ -9,9 +9,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from ctxval.errors import InputError, UnknownNameError
-from ctxval.paper.reproduce.jobs import Job, Results
+from ctxval.paper.reproduce.jobs import Job, Results, measured_with
 from ctxval.paper.reproduce.pendulum import ConvergedGP, FourFrameworks, Techniques, Trajectories
-from ctxval.paper.reproduce.revision import measured_with
 from ctxval.paper.reproduce.study import FULL, QUICK, Scale, Study
 from ctxval.paper.reproduce.systems import ArmModels, ArmSamples, DubinsMedians, LinearComplexity
 

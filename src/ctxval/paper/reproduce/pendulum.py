@@ -10,27 +10,10 @@ from ctxval import cases, plot
 from ctxval._util.arrays import Array
 from ctxval.core.trajectory import Trajectory
 from ctxval.gp.surrogate import fit_surrogate
+from ctxval.paper.reproduce import study
 from ctxval.paper.reproduce.frameworks import PAPERS_GOAL, closed_loops
 from ctxval.paper.reproduce.jobs import INFORMED, Job, Results, distances_of
-from ctxval.paper.reproduce.study import (
-    BLACK,
-    BLUE,
-    GREEN,
-    GREY,
-    ORANGE,
-    PINK,
-    TECHNIQUES,
-    Claim,
-    Columns,
-    Scale,
-    Study,
-    agreement,
-    draw_quartiles,
-    first,
-    ranged,
-    running_estimate,
-    spread,
-)
+from ctxval.paper.reproduce.study import TECHNIQUES, Claim, Columns, Scale, Study, agreement, ranged, spread
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -59,10 +42,10 @@ class FourFrameworks(Study):
         profile = results[self.jobs(scale)[SHOWN]]
         goals = np.array(profile["goals"])
         for label, values, colour, line in (
-            ("OLDT: open loop, trajectories", np.full(len(goals), profile["oldt"][0]), GREEN, "-."),
-            ("OLCD: open loop, final states", np.full(len(goals), profile["olcd"][0]), PINK, ":"),
-            ("CCDT: closed loop, trajectories", profile["ccdt"], ORANGE, "--"),
-            ("CuSTOM: closed loop, final states", profile["custom"], BLUE, "-"),
+            ("OLDT: open loop, trajectories", np.full(len(goals), profile["oldt"][0]), study.GREEN, "-."),
+            ("OLCD: open loop, final states", np.full(len(goals), profile["olcd"][0]), study.PINK, ":"),
+            ("CCDT: closed loop, trajectories", profile["ccdt"], study.ORANGE, "--"),
+            ("CuSTOM: closed loop, final states", profile["custom"], study.BLUE, "-"),
         ):
             axes.semilogy(goals, np.maximum(values, 1e-3), color=colour, linestyle=line, linewidth=1.8, label=label)
 
@@ -203,15 +186,15 @@ class Techniques(Study):
         for seed in scale.seeds:
             truth = results[Job("truth", "pendulum", seed)]["distance"]
             distances = distances_of(results[self._job(search, seed)])
-            rows.append(100 * (1 - running_estimate(distances, search) / truth))
+            rows.append(100 * (1 - study.running_estimate(distances, search) / truth))
         return np.array(rows)
 
     def fill(self, axes: Axes, results: Results, scale: Scale) -> None:
-        draw_quartiles(axes, {name: np.maximum(self.errors(results, scale, name), 1e-3) for name in TECHNIQUES})
+        study.draw_quartiles(axes, {name: np.maximum(self.errors(results, scale, name), 1e-3) for name in TECHNIQUES})
         axes.set_yscale("log")
-        axes.axvline(5.5, color=GREY, linewidth=1)
-        axes.annotate("five common first samples", (5.7, 60), fontsize=7, color=BLACK)
-        axes.axhline(1, color=GREY, linewidth=0.8, linestyle=":")
+        axes.axvline(5.5, color=study.GREY, linewidth=1)
+        axes.annotate("five common first samples", (5.7, 60), fontsize=7, color=study.BLACK)
+        axes.axhline(1, color=study.GREY, linewidth=0.8, linestyle=":")
         axes.set_ylim(1e-3, 110)
 
     def data(self, results: Results, scale: Scale) -> Columns:
@@ -226,10 +209,10 @@ class Techniques(Study):
         names = (*TECHNIQUES, *INFORMED)
         errors = {name: self.errors(results, scale, name) for name in names}
         ucb, sc, sd = (np.median(errors[name], axis=0) for name in TECHNIQUES)
-        within = {name: [first(row <= 1.0) - _COMMON for row in errors[name]] for name in ("gp-ucb", *INFORMED)}
+        within = {name: [study.first(row <= 1.0) - _COMMON for row in errors[name]] for name in ("gp-ucb", *INFORMED)}
         median = {name: spread(counts)[0] for name, counts in within.items()}
         beyond = {name: ranged(counts, 1).replace(".0", "") for name, counts in within.items()}
-        near = first(sc <= _NEAR)
+        near = study.first(sc <= _NEAR)
         as_near = int((errors["random"][:, -1] <= ucb[19]).sum())
         profiles = [results[job]["custom"] for job in FourFrameworks().jobs(scale)[: scale.trials]]
         broad = 100 * np.median([np.mean(np.array(d) >= (1 - _NEAR / 100) * max(d)) for d in profiles])
@@ -296,14 +279,16 @@ class ConvergedGP(Study):
         x, y = np.ravel(results[self.campaign]["points"]), np.array(results[self.campaign]["distances"])
         goals, truth, mean, deviation = (np.array(column) for column in self.data(results, scale).values())
         low, high = mean - 1.96 * deviation, mean + 1.96 * deviation
-        axes.fill_between(goals, low, high, color=GREY, alpha=0.5, linewidth=0, label="95 % band of the GP")
-        axes.plot(goals, mean, color=BLUE, linewidth=1.8, label="GP mean")
+        axes.fill_between(goals, low, high, color=study.GREY, alpha=0.5, linewidth=0, label="95 % band of the GP")
+        axes.plot(goals, mean, color=study.BLUE, linewidth=1.8, label="GP mean")
         axes.plot(goals, truth, color="#D55E00", linestyle="--", linewidth=1.6, label="true distance")
-        marks: dict[str, Any] = {"marker": "o", "linestyle": "", "markeredgecolor": BLACK, "markersize": 5}
+        marks: dict[str, Any] = {"marker": "o", "linestyle": "", "markeredgecolor": study.BLACK, "markersize": 5}
         axes.plot(x[:5], y[:5], **marks, color="white", label="first samples")
-        axes.plot(x[5:], y[5:], **marks, color=BLACK, label="acquired samples")
+        axes.plot(x[5:], y[5:], **marks, color=study.BLACK, label="acquired samples")
         best = y.argmax()
-        axes.plot(x[best], y[best], "*", color=ORANGE, markeredgecolor=BLACK, markersize=14, label="maximum found")
+        axes.plot(
+            x[best], y[best], "*", color=study.ORANGE, markeredgecolor=study.BLACK, markersize=14, label="maximum found"
+        )
         axes.grid(False)
 
     def data(self, results: Results, scale: Scale) -> Columns:

@@ -9,12 +9,9 @@ import numpy as np
 from ctxval._util.arrays import Array
 from ctxval.core.soundness import MISSED
 from ctxval.paper.cases import arm, dubins
+from ctxval.paper.reproduce import study
 from ctxval.paper.reproduce.jobs import Job, Result, Results, distances_of
 from ctxval.paper.reproduce.study import (
-    BLACK,
-    BLUE,
-    GREEN,
-    ORANGE,
     TECHNIQUES,
     Claim,
     Columns,
@@ -23,11 +20,6 @@ from ctxval.paper.reproduce.study import (
     Scale,
     Study,
     agreement,
-    counted,
-    draw_quartiles,
-    executions_within,
-    ranged,
-    running_estimate,
     spread,
 )
 
@@ -39,9 +31,9 @@ _ARM, _CAR = 60, 100  # executions of the active searches
 
 # The paper's three models: label, colour, line, marker.
 MODELS = {
-    "gp": ("Gaussian process", BLUE, "-", "o"),
-    "fnn": ("feedforward network", ORANGE, "--", "s"),
-    "linear": ("linear", GREEN, ":", "^"),
+    "gp": ("Gaussian process", study.BLUE, "-", "o"),
+    "fnn": ("feedforward network", study.ORANGE, "--", "s"),
+    "linear": ("linear", study.GREEN, ":", "^"),
 }
 
 
@@ -65,11 +57,11 @@ class ArmSamples(ExecutionsWithin):
 
     def claims(self, results: Results, scale: Scale) -> list[Claim]:
         ucb, sc = (spread(self.executions(results, scale, search)[-2]) for search in ("gp-ucb", "random"))  # 2 %
+        median, low, high = (study.counted(value, _ARM) for value in ucb)
         return [
             Claim(
                 "CuSTOM is within 2 % of d* in under 50 executions, far ahead of the baselines",
-                f"median {counted(ucb[0], _ARM)} (from {counted(ucb[1], _ARM)} to {counted(ucb[2], _ARM)}); "
-                f"SC {counted(sc[0], _RANDOM)}",
+                f"median {median} (from {low} to {high}); SC {study.counted(sc[0], _RANDOM)}",
                 agreement(ucb[0] < 50 and sc[0] > ucb[0], sc[0] > ucb[0]),
                 "the distance of the network, piecewise linear inside, has many kinks and narrow peaks; with the other "
                 "two models it takes fewer",
@@ -95,7 +87,7 @@ class ArmModels(Study):
 
     def fill(self, axes: Axes, results: Results, scale: Scale) -> None:
         for model, (label, colour, line, marker) in MODELS.items():
-            estimates = running_estimate(distances_of(results[self._job("search", model, 0)]), "gp-ucb")
+            estimates = study.running_estimate(distances_of(results[self._job("search", model, 0)]), "gp-ucb")
             counts = np.arange(1, len(estimates) + 1)
             axes.plot(counts, estimates, color=colour, linestyle=line, marker=marker, markevery=6, label=label)
             truth = results[self._job("truth", model, 0)]["distance"]
@@ -123,7 +115,7 @@ class ArmModels(Study):
         missed, near = [spread(missed_by[m])[0] for m in MODELS], MISSED * float(np.ptp(arm.Settings().z))
         within = {
             m: [
-                executions_within(distances_of(results[self._job("search", m, s)]), "gp-ucb", worst[m][s], 2.0)
+                study.executions_within(distances_of(results[self._job("search", m, s)]), "gp-ucb", worst[m][s], 2.0)
                 for s in seeds
             ]
             for m in MODELS
@@ -132,7 +124,7 @@ class ArmModels(Study):
             Claim(
                 "CuSTOM finds d* within a few samples for every model",
                 "within 2 % after "
-                + ", ".join(f"{counted(spread(within[m])[0], _ARM)} ({MODELS[m][0]})" for m in MODELS),
+                + ", ".join(f"{study.counted(spread(within[m])[0], _ARM)} ({MODELS[m][0]})" for m in MODELS),
                 agreement(max(spread(row)[0] for row in within.values()) < 50, spread(within["gp"])[0] < 50),
             ),
             _order("by d*, the distance between M and S", "the GP is the best model, the linear one the worst", worst),
@@ -185,12 +177,12 @@ class DubinsMedians(Study):
     def estimates(self, results: Results, scale: Scale, search: str) -> Array:
         """Return the estimates of d*, shape ``(trials, budget)``."""
         jobs = [self._job(search, seed) for seed in scale.seeds]
-        return np.array([running_estimate(distances_of(results[job]), search) for job in jobs])
+        return np.array([study.running_estimate(distances_of(results[job]), search) for job in jobs])
 
     def fill(self, axes: Axes, results: Results, scale: Scale) -> None:
-        draw_quartiles(axes, {search: self.estimates(results, scale, search) for search in TECHNIQUES})
+        study.draw_quartiles(axes, {search: self.estimates(results, scale, search) for search in TECHNIQUES})
         best = np.median([results[Job("truth", "dubins", seed)]["distance"] for seed in scale.seeds])
-        axes.axhline(float(best), color=BLACK, linewidth=1, linestyle="-.", label="best-known value (median)")
+        axes.axhline(float(best), color=study.BLACK, linewidth=1, linestyle="-.", label="best-known value (median)")
 
     def data(self, results: Results, scale: Scale) -> Columns:
         columns: Columns = {"executions": range(1, _RANDOM + 1)}
@@ -218,7 +210,7 @@ class DubinsMedians(Study):
         return [
             Claim(
                 "CuSTOM is at its maximum in 100 samples",
-                f"after {_CAR} executions GP-UCB is at {ranged(share, 0)} % of the best-known value",
+                f"after {_CAR} executions GP-UCB is at {study.ranged(share, 0)} % of the best-known value",
                 agreement(spread(share)[0] > 95, spread(share)[0] > 80),
                 "its maximum is not the maximum: a large search finds more",
             ),
@@ -242,8 +234,9 @@ class DubinsMedians(Study):
             ),
             Claim(
                 "the model itself performs its tasks (Remark 1, Aspect 1)",
-                f"the mean distance from the reference is {ranged(model, 2)} m on the model and {ranged(system, 2)} m "
-                f"on the system (median over {_TASKS} random tasks), against {spread(size)[0]:.2f} m straight ahead",
+                f"the mean distance from the reference is {study.ranged(model, 2)} m on the model and "
+                f"{study.ranged(system, 2)} m on the system (median over {_TASKS} random tasks), against "
+                f"{spread(size)[0]:.2f} m straight ahead",
                 agreement(float(missed.max()) < MISSED, float(missed.min()) < MISSED),
                 "the reference has the heading 0, which is not that of its waves, so that LQR trades one for the other",
             ),
@@ -270,7 +263,7 @@ class LinearComplexity(ExecutionsWithin):
             for search in TECHNIQUES
         }
         texts = [
-            f"{TECHNIQUES[search][0]}: " + ", ".join(counted(value, self.budget(search, scale)) for value in row)
+            f"{TECHNIQUES[search][0]}: " + ", ".join(study.counted(value, self.budget(search, scale)) for value in row)
             for search, row in medians.items()
         ]
         ucb, sc = medians["gp-ucb"], medians["random"]

@@ -102,11 +102,19 @@ def repeating_command(context: ReportContext) -> str:
 def command_of(context: ReportContext, budget: int | None = None, *others: str) -> str:
     """Return the command that runs the campaign; empty if no command made the store."""
     settings = context.settings
-    if not settings:
-        return ""
+    return run_command(settings, budget or settings.get("budget") or context.budget, *others) if settings else ""
+
+
+def run_command(settings: Mapping[str, Any], budget: int | None, *others: str, target: str = "") -> str:
+    """Return the command that runs a campaign with settings as a store keeps them.
+
+    Args:
+        others: options that are not among the settings, with their values.
+        target: the experiment, if it must be named otherwise than in the settings.
+    """
     file = settings.get("file")
     named = None if file else settings.get("experiment")
-    words = ["ctxval", "run", str(file or named or f"{settings.get('name') or 'experiment'}.toml")]
+    words = ["ctxval", "run", str(target or file or named or f"{settings.get('name') or 'experiment'}.toml")]
     # A store may hold anything.
     tables = {name: table for name, table in settings.items() if isinstance(table, Mapping)}
     search, certificate, options = (tables.get(name, {}) for name in ("search", "certificate", "options"))
@@ -114,7 +122,7 @@ def command_of(context: ReportContext, budget: int | None = None, *others: str) 
     values = {
         "--search": (search.get("name"), DEFAULT_SEARCH if named else None),
         "--seed": (settings.get("seed"), 0 if named else None),
-        "--budget": (budget or settings.get("budget") or context.budget, None),
+        "--budget": (budget, None),
         "--threshold": (settings.get("threshold"), None),
         "--confidence": (settings.get("confidence"), CONFIDENCE),
         "--resolution": (certificate.get("resolution"), RESOLUTION),

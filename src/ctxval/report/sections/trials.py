@@ -49,13 +49,19 @@ def trials(context: ReportContext) -> Markup:
     tasks = zip(shown, context.tasks_of(shown), strict=True)
     rows = [_row(trial, task, trial.number in lines.kept) for trial, task in tasks]
     caption = f"Trials, the largest distance first{'' if len(shown) == len(context.trials) else f' ({_ROWS} of them)'}"
+    worst = context.worst_tasks(recorded=True)
+    drawn = [heading(f"The {counted(len(worst), 'worst task')}")]
+    for trial in worst:
+        head = f"Trial {trial.number}: {quantity(trial.distance, context.labels.units)} at {task_of(context, trial)}"
+        drawn.append(details(head, small_charts(_signals(context, trial.number)), opened=trial is worst[0]))
+    without = paragraph("No trajectories are recorded, so the worst tasks cannot be drawn.")
     return joined(
         [
             *([paragraph(" ".join(notes))] if notes else []),
             table(caption, headers, rows, "sortable", id_="trials", label="Table of trials", scroll="scroll tall"),
             element("div", id="trial", aria_live="polite", class_="needs-script"),
             element("script", escaped, type="application/json", id="trial-data"),
-            *_worst(context),
+            *(drawn if worst else [without]),
         ]
     )
 
@@ -70,17 +76,6 @@ def _row(trial: Trial, task: list[float | str], recorded: bool) -> Markup:
         exact = repr(float(value)) if isinstance(value, int | float) else None
         cells.append(element("td", cell(value), data_value=exact))
     return element("tr", *cells)
-
-
-def _worst(context: ReportContext) -> list[Markup]:
-    worst = context.worst_tasks(recorded=True)
-    if not worst:
-        return [paragraph("No trajectories are recorded, so the worst tasks cannot be drawn.")]
-    parts = [heading(f"The {counted(len(worst), 'worst task')}")]
-    for trial in worst:
-        head = f"Trial {trial.number}: {quantity(trial.distance, context.labels.units)} at {task_of(context, trial)}"
-        parts.append(details(head, small_charts(_signals(context, trial.number)), opened=trial is worst[0]))
-    return parts
 
 
 def task_of(context: ReportContext, trial: Trial) -> str:

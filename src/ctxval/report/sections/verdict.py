@@ -14,7 +14,7 @@ from ctxval.report.distance_model import distance_of
 from ctxval.report.findings import WORDS, Finding
 from ctxval.report.markup import UNCUT, bullets, element, heading, joined, paragraph, percent, quantity, table, text
 from ctxval.report.sections.distances import distance_along, distances_in_order, envelope
-from ctxval.report.sections.repeat import command_of, path_of
+from ctxval.report.sections.repeat import command_of, command_snippet, path_of
 from ctxval.report.sections.trials import task_of
 
 # A shape for each verdict and each light, because colours alone tell nothing in grey print.
@@ -77,8 +77,7 @@ def _next(context: ReportContext) -> tuple[str, str]:
         return f"{advice} {better}", shlex.join(["ctxval", "refine", path])
     by_hand = any(trial.told for trial in context.trials)
     if context.failed:
-        number = context.failed[0].number
-        again = shlex.join(["ctxval", "ask", path, "--again", str(number)])
+        number, again = context.failed[0].number, command_snippet(context, context.failed[0])
         if not by_hand:
             budget = context.executions + len(context.failed)
             again = command_of(context, budget, "--again-failed", "what was changed", "--store", path)

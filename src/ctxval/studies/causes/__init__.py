@@ -1,6 +1,6 @@
 """Why a model fails: the causes of its error, with their sizes in physical units."""
 
-from ctxval.studies.causes.cause import Cause, Repaired
+from ctxval.studies.causes.cause import Cause, Joint, Repaired
 from ctxval.studies.causes.find import find_causes
 from ctxval.studies.causes.mechanics import (
     Bias,
@@ -15,7 +15,6 @@ from ctxval.studies.causes.mechanics import (
     TimeStep,
     Viscous,
 )
-from ctxval.studies.causes.plant import Joint
 from ctxval.studies.causes.report import CauseReport
 from ctxval.studies.causes.signals import (
     Backlash,

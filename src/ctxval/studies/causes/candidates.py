@@ -12,8 +12,7 @@ from ctxval._util.arrays import Array
 from ctxval._util.representation import ShortRepr
 from ctxval.models import MuJoCo
 from ctxval.studies.causes import mechanics, signals
-from ctxval.studies.causes.cause import Cause
-from ctxval.studies.causes.plant import Joint, Plant
+from ctxval.studies.causes.cause import Cause, Joint, Plant
 
 
 @dataclass(frozen=True)

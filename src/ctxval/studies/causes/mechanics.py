@@ -11,8 +11,7 @@ import numpy as np
 from ctxval._util.arrays import Array
 from ctxval.core.model import Model
 from ctxval.models import MuJoCo
-from ctxval.studies.causes.cause import Cause
-from ctxval.studies.causes.plant import Joint, Plant
+from ctxval.studies.causes.cause import Cause, Joint, Plant
 
 
 @dataclass(frozen=True)

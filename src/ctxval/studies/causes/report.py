@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 
-from ctxval._util.describe import describe
 from ctxval._util.representation import ShortRepr, call, line, lines, task_text
-from ctxval.studies.causes.cause import Cause, Repaired
+from ctxval.studies.causes.cause import Cause, Plant, Repaired
 from ctxval.studies.causes.evidence import Explanation
-from ctxval.studies.causes.plant import Plant
 
 _APART = 0.1  # share of the largest distance from M which starts elsewhere must cause, to be remarked
 
@@ -173,8 +170,10 @@ class CauseReport(ShortRepr):
         changes = (cause.mjcf(self.plant) for cause in self.causes)
         return tuple(each for each in changes if each is not None)
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, Any]:
         """Return everything as plain values."""
+        about = ("tried", "executions", "failed", "began_elsewhere")
+        shares = ("spreads", "share", "structure", "uncertainty", "uncertain_structure", "distance")
         return {
             "answer": "named" if self.named else "none of these",
             "sentence": self.sentence,
@@ -186,21 +185,13 @@ class CauseReport(ShortRepr):
                         {"name": cause.name, "sizes": list(cause.sizes), "python": cause.python()}
                         for cause in each.causes
                     ],
-                    "spreads": list(each.spreads),
-                    "share": each.share,
-                    "structure": each.structure,
-                    "uncertainty": each.uncertainty,
-                    "uncertain_structure": each.uncertain_structure,
-                    "distance": each.distance,
+                    **{name: getattr(each, name) for name in shares},
                     "criterion": each.explanation.criterion,
                     "residual_left": each.explanation.left,
                 }
                 for each in self.explained
             ],
-            "tried": self.tried,
-            "executions": self.executions,
-            "failed": self.failed,
-            "began_elsewhere": self.began_elsewhere,
+            **{name: getattr(self, name) for name in about},
             "distance_before": self.before,
             "distance_after": self.after,
             "distance_from_tasks": self.from_tasks,
@@ -208,10 +199,6 @@ class CauseReport(ShortRepr):
             "python": self.python,
             "mjcf": list(self.mjcf),
         }
-
-    def to_json(self) -> str:
-        """Return :meth:`to_dict` as a text in JSON."""
-        return json.dumps(describe(self.to_dict(), depth=12), indent=1)
 
     def __repr__(self) -> str:
         return lines(call(self, executions=self.executions, tried=self.tried), line(self.sentence))

@@ -10,8 +10,7 @@ import numpy as np
 
 from ctxval._util.arrays import Array
 from ctxval.learning.actuators import Actuator
-from ctxval.studies.causes.cause import Cause
-from ctxval.studies.causes.plant import Plant
+from ctxval.studies.causes.cause import Cause, Plant
 
 
 def _at(values: Array, index: int | list[int] | None, size: float, elsewhere: float = 0.0) -> Array:

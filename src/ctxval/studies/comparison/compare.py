@@ -89,7 +89,7 @@ def compare(
     questions: tuple[Question, ...] = both if question == "both" else (question,)
     each = 1 - (1 - confidence) / len(questions)
     executions = Executions(made, largest_possible, on_trial or (lambda name, trial: None))
-    worst, mean = WorstQuestion(executions, each, budget, stochastic), MeanQuestion(executions, each, seed)
+    worst, mean = WorstQuestion(executions, each, budget), MeanQuestion(executions, each, seed)
     executions.require_possible()
     with progress_shown(progress), ExitStack() as stack:
         for candidate in made:
@@ -106,7 +106,7 @@ def compare(
         executions.count,
         budget,
         made[0].campaign.validation.labels.units,
-        tuple(_assumptions(questions, worst)),
+        tuple(_assumptions(questions, worst, stochastic)),
     )
 
 
@@ -151,7 +151,7 @@ def _result(candidate: Candidate, worst: WorstQuestion, mean: MeanQuestion) -> C
     )
 
 
-def _assumptions(questions: tuple[Question, ...], worst: WorstQuestion) -> Iterator[str]:
+def _assumptions(questions: tuple[Question, ...], worst: WorstQuestion, stochastic: bool) -> Iterator[str]:
     yield "the candidates were fixed before the comparison, and the system does not change during it"
     if "worst" in questions:
         yield (
@@ -171,5 +171,5 @@ def _assumptions(questions: tuple[Question, ...], worst: WorstQuestion) -> Itera
             "corrected differences are symmetric about their mean, and asymptotic otherwise: rare large distances "
             "that were not drawn can make them wrong"
         )
-    if worst.stochastic:
+    if stochastic:
         yield "executions of one task may differ, and the questions are about expected distances of tasks"

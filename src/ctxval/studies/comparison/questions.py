@@ -40,7 +40,6 @@ class WorstQuestion:
     executions: Executions
     confidence: float
     budget: int
-    stochastic: bool = False
 
     def __post_init__(self) -> None:
         self.candidates = self.executions.candidates

@@ -72,13 +72,6 @@ class PairResult:
         return self.second if self.smaller == self.first else self.first
 
     @property
-    def answer(self) -> str:
-        """The answer in a few words."""
-        if self.smaller is None:
-            return f"{self.first} or {self.second}: undecided"
-        return f"{self.smaller} has a smaller {WORDS[self.question]} than {self.larger}"
-
-    @property
     def cells(self) -> tuple[str, ...]:
         """The row of the table of pairs; the difference is that of the smaller one minus the other one."""
         names = self.smaller or f"{self.first} ? {self.second}", self.larger if self.smaller else "undecided"
@@ -141,7 +134,7 @@ class Comparison:
         """Return the ranking in one line, such as ``gp < fnn < linear``; ``?`` joins those that are not told apart."""
         return " < ".join(" ? ".join(group) for group in self.ranking(question))
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, Any]:
         """Return everything in types that JSON has: an infinite end of an interval is None."""
         plain = asdict(self)
         for pair in plain["pairs"]:

@@ -19,7 +19,7 @@ from ctxval.data.recordings import Recordings
 from ctxval.errors import InputError, ModelError, UnknownNameError
 from ctxval.models import FeedforwardReLU, GaussianProcessModel, Linear, Parametric
 from ctxval.models.parametric import ParametricStep
-from ctxval.studies.replay.accuracy import RecordedSteps, StepError, step_errors, stepped
+from ctxval.studies.replay.accuracy import StepError, step_errors, stepped
 from ctxval.studies.replay.report import plain_numbers
 
 Kind = Literal["linear", "network", "gaussian-process", "parameters", "given"]
@@ -110,10 +110,7 @@ class FitReport(ShortRepr):
         parts = {"learned_from": self.learned_from, "held_out": self.held_out}
         sizes = {name: {"recordings": len(part.runs), "steps": part.steps} for name, part in parts.items()}
         about = {"dt": self.held_out.dt, "notes": self.held_out.notes}
-        report: dict[str, Any] = plain_numbers(
-            {"fitted": fitted, "failed": list(map(asdict, self.failed)), **sizes, **about}
-        )
-        return report
+        return plain_numbers({"fitted": fitted, "failed": list(map(asdict, self.failed)), **sizes, **about})
 
 
 def fit(
@@ -149,12 +146,11 @@ def fit(
         as_bounds(bounds)
     learned_from, held_out = split(recordings, hold_out, seed)
     data, _ = learned_from.transitions()
-    recorded = RecordedSteps(held_out, range(len(held_out.runs)))
     fitted, failed = list[FittedModel](), list[FailedFit]()
 
     def add(kind: Kind, model: Model, parameters: tuple[FittedParameter, ...] = ()) -> None:
         notes = [identifiability(data, [*recordings.states, *recordings.inputs])] if kind == "linear" else []
-        errors = step_errors(model, recorded, sorted(set(steps)))
+        errors = step_errors(model, held_out, sorted(set(steps)))
         fitted.append(FittedModel(kind, model, errors, parameters, tuple(notes)))
 
     with single_threaded():

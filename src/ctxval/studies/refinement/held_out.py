@@ -18,8 +18,9 @@ from ctxval._util.texts import aligned
 from ctxval.core.labels import labels_of
 from ctxval.core.model import Model
 from ctxval.core.trajectory import Trajectory, Transitions
-from ctxval.errors import CtxvalError, InputError
+from ctxval.errors import CtxvalError, InputError, ModelError
 from ctxval.studies.fitting.fit import part_of
+from ctxval.studies.replay.accuracy import Windows, predicted
 
 _LATER = 10  # steps after which the errors choose corrections
 
@@ -171,16 +172,12 @@ def _compared(data: Transitions, runs: Sequence[Trajectory], model: Model, befor
 
 def _errors_later(model: Model, runs: Sequence[Trajectory], n: int) -> Array:
     """Return the errors ``(K, n)`` of a model after ten steps with recorded inputs, from each state that has these."""
-    long = [run for run in runs if run.horizon >= _LATER]
-    if not long:
+    if not any(run.horizon >= _LATER for run in runs):
         return np.zeros((0, n))
-    x, after = (np.concatenate([run.states[part] for run in long]) for part in (slice(-_LATER), slice(_LATER, None)))
-    with suppress(Exception):  # users' models, at states that were not recorded
-        for k in range(_LATER):
-            u = np.concatenate([run.inputs[k : run.horizon - _LATER + 1 + k] for run in long])
-            x = np.asarray(model.step(x, u))
-        return np.asarray(after - x)
-    return np.full_like(after, np.nan)
+    where = Windows.of(runs, 0, _LATER, sum(run.horizon for run in runs))
+    with suppress(ModelError):  # users' models, at states that were not recorded
+        return -predicted(model, where, _LATER)[0]
+    return np.full((len(where), n), np.nan)
 
 
 def _joined(parts: list[HeldOut]) -> HeldOut:
@@ -247,7 +244,7 @@ class MeasuredResidual(ShortRepr):
                 parts.append(f"{name} > {low:.3g}")
         return ", ".join(parts) or "everywhere"
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, Any]:
         """Return all numbers as plain values; an end that is infinite is None."""
 
         def plain(region: ResidualRegion) -> dict[str, Any]:

@@ -19,7 +19,7 @@ from ctxval.campaign.campaign import Campaign
 from ctxval.core.model import Model, Step, as_model
 from ctxval.core.trajectory import Transitions
 from ctxval.errors import CtxvalError, InputError, ModelError, UnknownNameError
-from ctxval.learning import DynamicsPosterior, PosteriorSettings, learn_posterior
+from ctxval.learning import PosteriorSettings, learn_posterior
 from ctxval.learning.histories import History, Record, Structure
 from ctxval.learning.innovations import fit_lagged
 from ctxval.learning.residual_data import NEGLIGIBLE
@@ -78,12 +78,11 @@ class ResidualCorrection(ShortRepr, Method):
     """The first model with a correction: the mean of Gaussian processes of its residual.
 
     A state is corrected only if this lowers the error on executions that are held out. Outside the range of the
-    records the correction fades, so that the model is as before. It is conditioned on at most ``centres`` transitions.
+    records the correction fades, so that the model is as before. It is conditioned on at most 300 transitions.
     If this leaves much of the error, as with noise, it is compared with a process of low rank that is conditioned on
     all transitions.
     """
 
-    centres: int = _CENTRES
     name: str = field(default="residual", init=False)
     makes = Corrected
 
@@ -95,8 +94,7 @@ class ResidualCorrection(ShortRepr, Method):
 
             return held_out(corrected, model, records)
 
-        exact = functools.partial(exact_correction, centres=self.centres)
-        correction: Callable[[Model, Records], Correction | None] = exact
+        correction = exact_correction
         errors = left_by(correction)
         if errors.left > 0.1:  # much of the error
             averaged = left_by(averaged_correction)
@@ -194,7 +192,6 @@ class ParameterFit(ShortRepr, _Replacement):
     #: the function; None for that of the first model, which must then be a ``Parametric``
     step: ParametricStep | None = None
     vectorized: bool = False  #: whether ``step`` takes whole batches
-    seed: int = 0  #: seed of the starting points
     name: str = field(default="parameters", init=False)
     makes = Parametric
 
@@ -209,7 +206,7 @@ class ParameterFit(ShortRepr, _Replacement):
                     "the method 'parameters' needs the function step (--step), because the model is not a Parametric."
                 )
             step, vectorized = model.function, model.vectorized
-        return fit_parameters(step, self.bounds, data, vectorized=vectorized, seed=self.seed)
+        return fit_parameters(step, self.bounds, data, vectorized=vectorized)
 
 
 @checked
@@ -251,19 +248,16 @@ def method_of(method: str | Method | Callable[[Transitions], Any], *, seed: int 
 # Corrections: the mean of the residual dynamics, exact or averaged
 
 
-def exact_correction(model: Model, records: Records, centres: int) -> Correction | None:
+def exact_correction(model: Model, records: Records) -> Correction | None:
     """Return the mean of Gaussian processes of the residual, conditioned on transitions that represent the others.
 
     Returns None if M explains the records.
     """
     # Matern 5/2 that does not grow with the inputs.
-    settings = PosteriorSettings(hyperparameters=1, centres=centres, families=((2.5, 0.0),), of_steps=False)
+    settings = PosteriorSettings(hyperparameters=1, centres=_CENTRES, families=((2.5, 0.0),), of_steps=False)
     posterior = learn_posterior(model, records.transitions, records.sources, settings=settings)
-    return None if posterior is None else correction_of(posterior)
-
-
-def correction_of(posterior: DynamicsPosterior) -> Correction:
-    """Return a learned residual as a correction, with the box of the records that it was learned from."""
+    if posterior is None:
+        return None
     # At least 24 centres are kept, if they predict the others with a relative error of 0.005: design on the model is
     # then faster.
     data, mean = posterior.data, posterior.with_few_centres(24, 0.005)

@@ -4,33 +4,39 @@ from __future__ import annotations
 
 import copy
 import functools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from ctxval._util.arrays import Array, single_threaded
 from ctxval._util.checked import PositiveFloat, PositiveInt, checked
 from ctxval._util.progress import progress_shown, stage
 from ctxval.campaign.campaign import Campaign
 from ctxval.campaign.history import executed_trials
 from ctxval.certificates import CertificateOptions
 from ctxval.certificates.verdict import Verdict, counterexample
-from ctxval.core.model import Model, Step
+from ctxval.core.model import Model, Step, linearize
+from ctxval.core.plan import gives_inputs
+from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory, Transitions
 from ctxval.core.trial import Trial
 from ctxval.core.validation import Validation
 from ctxval.errors import CtxvalError, InputError
 from ctxval.learning.extended import estimates_by_loops_on_model, with_states_of_model
+from ctxval.learning.recorded import closed_loops_on_model
 from ctxval.learning.state_estimates import StateEstimates
-from ctxval.models import Refined, read_refined, write_model
+from ctxval.models import Corrected, Linear, Refined, read_refined, write_model
 from ctxval.models.corrected import before_refinement
 from ctxval.models.saved import is_savable, read_note
-from ctxval.studies.refinement.design import same_controllers, with_best_jacobian
 from ctxval.studies.refinement.held_out import Records, measure_residual
 from ctxval.studies.refinement.methods import Learned, Method, method_of
-from ctxval.studies.refinement.rounds import Refinement, Round
+from ctxval.studies.refinement.rounds import Refinement, Round, SameControllers
 
-OpensRound = Callable[[Validation, Path | None, Path | None, CertificateOptions], Campaign]
+OpensRound = Callable[[Validation, Path, Path, CertificateOptions], Campaign]
 """A function that makes the campaign of a round, from its validation, its store, the file of its model and options."""
 
 
@@ -67,7 +73,7 @@ def refine(
             function ``fit(data) -> model`` that always returns the same model for the same data.
         certificate: the kind and options of the certificates, with the confidence ``1 - alpha``; ``auto`` by default.
         on_trial: called with each trial that has ended.
-        open_round: makes the campaign of a round; by default, like the given campaign.
+        open_round: makes the campaign of a round whose model and store are files; by default, like the given campaign.
         progress: whether to show the progress on standard error; None to show it at a terminal and in a notebook.
         execution: ``workers``, ``executor`` and ``timeout`` of :meth:`ctxval.Campaign.run`.
     """
@@ -78,13 +84,15 @@ def refine(
         )
     chosen, options = method_of(method, seed=campaign.seed), certificate or CertificateOptions()
 
-    def same_settings(validation: Validation, store: Path | None, *_: object) -> Campaign:
+    def opened(validation: Validation, store: Path | None, file: Path | None, options: CertificateOptions) -> Campaign:
+        if open_round is not None and store is not None and file is not None:
+            return open_round(validation, store, file, options)
         search = copy.deepcopy(campaign.search)
         return Campaign(validation, search=search, store=store, seed=campaign.seed, name=campaign.name)
 
     execution |= {"on_trial": on_trial, "progress": progress}
     with progress_shown(progress):
-        return _Loop(campaign, float(threshold), budget, chosen, options, open_round or same_settings, execution).run()
+        return _Loop(campaign, float(threshold), budget, chosen, options, opened, execution).run()
 
 
 @dataclass(eq=False)
@@ -96,7 +104,7 @@ class _Loop:
     budget: int
     method: Method
     options: CertificateOptions
-    open_round: OpensRound
+    open_round: Callable[[Validation, Path | None, Path | None, CertificateOptions], Campaign]
     execution: dict[str, Any]
 
     def __post_init__(self) -> None:
@@ -256,3 +264,89 @@ def confidence_of_round(confidence: float, number: int) -> float:
     The shares sum up to alpha, so all rounds together are wrong with probability at most alpha.
     """
     return 1 - (1 - confidence) / (number * (number + 1))
+
+
+# Which Jacobian controllers are designed with, and whose controllers on executed tasks have not changed
+
+
+def with_best_jacobian(validation: Validation, refined: Refined) -> tuple[Refined, str | None]:
+    """Return a refined model with the Jacobian whose controllers complete the tasks best on the refined model itself.
+
+    A synthesizer that linearises once, such as LQR, needs a linear model that is good on the whole task. If M is
+    linear, it is such a model, and the Jacobian of a nonlinear M' at one point may be none. It is used only if random
+    tasks have a clearly smaller cost on M' with it. Nothing is executed.
+    """
+    model = refined.model
+    if not isinstance(model, Corrected) or not isinstance(model.model, Linear):
+        return refined, None
+    if not _linearises_once(validation, model.model):
+        return refined, None
+    other = Corrected(model.model, model.correction, linearised="model", data=model.data)
+    kept = Refined(other, refined.data, refined.before)
+    costs = [_typical_cost(validation.with_model(either)) for either in (refined, kept)]
+    if costs[0] <= 0.95 * costs[1]:  # clearly
+        return refined, None
+    return kept, (
+        "controllers are designed with the Jacobian of the model before, and the prediction is corrected: the "
+        "synthesizer linearises once, and the tasks are not completed clearly better on the refined model with its own "
+        f"Jacobian (their cost is {costs[0]:.3g} with it, and {costs[1]:.3g} without)"
+    )
+
+
+def _linearises_once(validation: Validation, model: Linear) -> bool:
+    """Return whether the design of one controller asks for the Jacobian of M at one or two points."""
+
+    class Counted:
+        points = 0
+
+        def step(self, x: Array, u: Array) -> Array:
+            return model.step(x, u)
+
+        def jacobian(self, x: Array, u: Array) -> tuple[Array, Array]:
+            batch = x.shape[:-1]
+            self.points += int(np.prod(batch))
+            A, B = linearize(model, x, u)
+            return np.broadcast_to(A, (*batch, *A.shape[-2:])), np.broadcast_to(B, (*batch, *B.shape[-2:]))
+
+    counted = Counted()
+    with suppress(CtxvalError):
+        validation.with_model(counted).plan(validation.space.from_unit(np.full(validation.space.dimension, 0.5)))
+        return 1 <= counted.points <= 2
+    return False
+
+
+def _typical_cost(validation: Validation) -> float:
+    """Return the median cost of random tasks on a model; infinity if their controllers cannot be designed."""
+    space, rng = validation.space, np.random.default_rng(0)
+    # Users' tasks, synthesizers and costs may raise anything, on tasks that may never be executed.
+    with suppress(Exception), single_threaded():
+        loops = closed_loops_on_model(validation)
+        if loops is None or loops.states.ndim == 2:  # designs cannot be made in a batch
+            plans = map(validation.plan, space.from_unit(rng.random((8, space.dimension))))
+            return float(np.median([_cost(validation, plan.task, plan.model_trajectory) for plan in plans]))
+        points = space.from_unit(rng.random((len(loops.states), space.dimension)))
+        costs = _cost(validation, validation.task_at(space.parameters(points)), loops)
+        return float(np.median(costs)) if np.isfinite(costs).all() else np.inf
+    return np.inf
+
+
+def _cost(validation: Validation, task: Task, loops: Trajectory) -> Array:
+    """Return the cost of closed loops: that of the synthesizer, or else the squared deviation from the reference."""
+    deviations = np.moveaxis(loops.states - task.reference, -2, 0)
+    value = getattr(getattr(validation.synthesizer, "cost", None), "value", None)
+    if callable(value):
+        return np.asarray(value(deviations, np.moveaxis(loops.inputs, -2, 0)))
+    sizes = np.maximum(np.abs(loops.states).reshape(-1, loops.states.shape[-1]).std(axis=0), 1e-12)
+    return np.asarray(((deviations / sizes) ** 2).sum(axis=(0, -1)))
+
+
+def same_controllers(validation: Validation, executed: Sequence[tuple[Trial, Trajectory]]) -> SameControllers:
+    """Return on how many executed tasks the controllers of a refined model are those that were executed."""
+    distances, recent = list[float](), executed[-32:]
+    for trial, recorded in recent:
+        with suppress(Exception):  # users' parts may raise anything: what cannot be compared differs
+            plan = validation.plan(validation.space.from_unit(trial.unit_point))
+            if gives_inputs(plan, recorded, 1e-6):  # a share of the largest magnitude of each input
+                distance = validation.accept(plan, recorded).distance
+                distances += [] if distance is None else [distance]
+    return SameControllers(len(recent), len(distances), max(distances, default=None))

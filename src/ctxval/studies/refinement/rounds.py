@@ -19,8 +19,20 @@ from ctxval.errors import InputError
 from ctxval.models import Refined
 from ctxval.studies.fitting import FittedParameter
 from ctxval.studies.fitting.model_file import write_model_file
-from ctxval.studies.refinement.design import SameControllers
 from ctxval.studies.refinement.held_out import MeasuredResidual
+
+
+@dataclass(frozen=True)
+class SameControllers:
+    """Executed tasks of earlier rounds on which the refined model has the controller that was executed.
+
+    The distance of the refined model on such a task is known without another execution, if the system is
+    deterministic. The model has learned from them, so they can falsify it, and they never count for it.
+    """
+
+    tasks: int = 0  #: number of executed tasks that were compared, and of those with numerically the same controller
+    same: int = 0
+    worst: float | None = None  #: the largest distance of the refined model on the latter; None if there are none
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +76,7 @@ class Round(ShortRepr):
         worst = "-" if self.worst is None else f"{self.worst:.4g}"
         return str(self.number), self.method, str(self.executions), worst, self.verdict.answer
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, Any]:
         """Return plain values."""
         worst, certificate = self.campaign.worst, self.verdict.certificate
         return {
@@ -156,7 +168,7 @@ class Refinement:
         """The rounds as a table of plain text."""
         return aligned([self.head, *(item.cells for item in self.rounds)])
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, Any]:
         """Return everything but the models as plain values."""
         names = ("threshold", "confidence", "units", "budget", "executions", "ended", "statement")
         errors = {name: {"before": before, "after": after} for name, (before, after) in self.accuracy.items()}
@@ -165,15 +177,11 @@ class Refinement:
             **{name: getattr(self, name) for name in names},
             "distance_before": self.rounds[0].worst,
             "distance_after": self.last.worst,
-            "rounds": [item.to_dict() for item in self.rounds],
+            "rounds": [item.to_json() for item in self.rounds],
             "one_step_error": errors,
             "parameters": [vars(parameter) for parameter in self.parameters],
-            "residual": self.residual and self.residual.to_dict(),
+            "residual": self.residual and self.residual.to_json(),
         }
-
-    def to_json(self) -> str:
-        """Return :meth:`to_dict` as a text in JSON."""
-        return json.dumps(describe(self.to_dict(), depth=12), indent=1)
 
     def __repr__(self) -> str:
         head = call(self, Shown(self.answer), threshold=self.threshold, executions=self.executions)
@@ -193,7 +201,7 @@ def write_refined(path: str | Path, refinement: Refinement, step: str | None = N
     if refinement.residual is None:
         return written
     names = ("verdict", "threshold", "units", "statement", "residual")
-    about = {"made_by": MADE_BY, "model": target.name, **{name: refinement.to_dict()[name] for name in names}}
+    about = {"made_by": MADE_BY, "model": target.name, **{name: refinement.to_json()[name] for name in names}}
     remark = (
         f"{MADE_BY}. Residual S(x, u) - M(x, u) of one step, measured on executions that the model was not learned "
         f"from, and not guaranteed.\nMeasured for {refinement.residual.range_text}.\nA robust controller must assume "

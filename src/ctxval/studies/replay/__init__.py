@@ -2,8 +2,7 @@
 
 from ctxval.studies.replay.accuracy import Region, StepError
 from ctxval.studies.replay.causes import ResidualShare, Suggestion
-from ctxval.studies.replay.report import RecordedData, ReplayReport, replay
-from ctxval.studies.replay.untested import PredictedTask, PredictedTasks
+from ctxval.studies.replay.report import PredictedTask, PredictedTasks, RecordedData, ReplayReport, replay
 
 __all__ = [
     "PredictedTask",

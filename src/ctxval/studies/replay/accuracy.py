@@ -11,6 +11,7 @@ import numpy as np
 from ctxval._util.arrays import Array, Mask, Rows
 from ctxval._util.representation import ShortRepr
 from ctxval.core.model import Model
+from ctxval.core.trajectory import Trajectory
 from ctxval.data.recordings import Recordings
 from ctxval.errors import CtxvalError, ModelError
 
@@ -54,54 +55,48 @@ class Region(ShortRepr):
     ratio: float  #: this error, divided by that over all steps
 
 
-class RecordedSteps:
-    """The steps of some recordings.
-
-    If there is only one recording, it is divided into five parts of equal length, which take the place of recordings.
-    """
-
-    def __init__(self, recordings: Recordings, used: Sequence[int]) -> None:
-        self.recordings = recordings
-        runs = [recordings.runs[number].trajectory for number in used]
-        self.states = np.concatenate([run.states for run in runs])
-        self.inputs = np.concatenate([run.inputs for run in runs])
-        self._horizons = [run.horizon for run in runs]
-
-    def windows(self, before: int, after: int, most: int = 40_000) -> Windows:
-        """Return places with so many recorded steps before and after them; of too many, every second, third, ..."""
-        parts, first = [], 0
-        for number, horizon in enumerate(self._horizons):
-            at = np.arange(before, horizon - after + 1)
-            group = np.full(len(at), number) if len(self._horizons) > 1 else (5 * at) // (horizon + 1)
-            parts.append((first + number + at, first + at, group))
-            first += horizon
-        rows, of_inputs, groups = (np.concatenate(part).astype(np.intp) for part in zip(*parts, strict=True))
-        every = max(1, -(-len(rows) // most))
-        return Windows(self, rows[::every], of_inputs[::every], groups[::every])
-
-
 @dataclass(frozen=True, eq=False)
 class Windows:
-    """Places in recordings: their rows among all states and inputs, and the parts that they lie in, shapes ``(N,)``."""
+    """Places in recordings with recorded steps before and after them."""
 
-    recorded: RecordedSteps
-    of_states: Rows
+    all_states: Array  #: of all recordings, one after the other, shapes ``(M, n)`` and ``(M', m)``
+    all_inputs: Array
+    of_states: Rows  #: the rows of the places among these, and the parts of the recordings that they lie in, ``(N,)``
     of_inputs: Rows
     groups: Rows
+
+    @staticmethod
+    def of(recorded: Recordings | Sequence[Trajectory], before: int, after: int, most: int = 40_000) -> Windows:
+        """Return places with so many recorded steps before and after them; of too many, every second, third, ...
+
+        If there is only one recording, it is divided into five parts of equal length.
+        """
+        runs = [run.trajectory for run in recorded.runs] if isinstance(recorded, Recordings) else recorded
+        parts, first = [], 0
+        for number, run in enumerate(runs):
+            at = np.arange(before, run.horizon - after + 1)
+            group = np.full(len(at), number) if len(runs) > 1 else (5 * at) // (run.horizon + 1)
+            parts.append((first + number + at, first + at, group))
+            first += run.horizon
+        rows, of_inputs, groups = (np.concatenate(part).astype(np.intp) for part in zip(*parts, strict=True))
+        states, inputs = (np.concatenate([getattr(run, name) for run in runs]) for name in ("states", "inputs"))
+        every = max(1, -(-len(rows) // most))
+        return Windows(states, inputs, rows[::every], of_inputs[::every], groups[::every])
 
     def __len__(self) -> int:
         return len(self.groups)
 
     def __getitem__(self, chosen: Mask) -> Windows:
-        return Windows(self.recorded, self.of_states[chosen], self.of_inputs[chosen], self.groups[chosen])
+        rows = (each[chosen] for each in (self.of_states, self.of_inputs, self.groups))
+        return Windows(self.all_states, self.all_inputs, *rows)
 
     def states(self, shift: int = 0) -> Array:
         """Return the recorded states so many steps later, shape ``(N, n)``."""
-        return np.asarray(self.recorded.states[self.of_states + shift])
+        return np.asarray(self.all_states[self.of_states + shift])
 
     def inputs(self, shift: int = 0) -> Array:
         """Return the recorded inputs so many steps later, shape ``(N, m)``."""
-        return np.asarray(self.recorded.inputs[self.of_inputs + shift])
+        return np.asarray(self.all_inputs[self.of_inputs + shift])
 
     def pairs(self, shift: int = 0) -> Array:
         """Return the recorded states and inputs so many steps later, shape ``(N, n + m)``."""
@@ -156,11 +151,11 @@ def root_mean_square(values: Array) -> Array:
     return np.asarray(np.sqrt(squares[finite].mean(axis=0)))
 
 
-def step_errors(model: Model, recorded: RecordedSteps, steps: Sequence[int]) -> tuple[StepError, ...]:
+def step_errors(model: Model, recordings: Recordings, steps: Sequence[int]) -> tuple[StepError, ...]:
     """Return the errors of all states after numbers of steps for which a recording is long enough."""
     results: list[StepError] = []
     for count in steps:
-        where = recorded.windows(0, count, min(40_000, max(200, 400_000 // count)))
+        where = Windows.of(recordings, 0, count, min(40_000, max(200, 400_000 // count)))
         if not len(where):
             continue
         errors, changes = predicted(model, where, count)
@@ -173,7 +168,7 @@ def step_errors(model: Model, recorded: RecordedSteps, steps: Sequence[int]) -> 
         typical = [np.median(sizes, axis=0), np.quantile(sizes, 0.95, axis=0), sizes.max(axis=0)]
         columns = np.stack([rms, *spread, *typical, change], axis=1).tolist()
         diverged = float(1 - finite.mean())
-        for (name, unit), numbers in zip(recorded.recordings.states.items(), columns, strict=True):
+        for (name, unit), numbers in zip(recordings.states.items(), columns, strict=True):
             results.append(StepError(name, unit, count, *[*numbers, len(finite), diverged]))
     return tuple(results)
 
@@ -190,16 +185,16 @@ def normalised(errors: Array, changes: Array) -> Array:
     return np.asarray(np.sqrt(((errors[:, moving] / sizes[moving]) ** 2).mean(axis=1)))
 
 
-def regions(model: Model, recorded: RecordedSteps) -> tuple[Region, ...]:
+def regions(model: Model, recordings: Recordings) -> tuple[Region, ...]:
     """Return the one-step error in five ranges of each state and input that have equally many steps."""
-    where = recorded.windows(0, 1)
+    where = Windows.of(recordings, 0, 1)
     error = normalised(*predicted(model, where, 1)) if len(where) else np.empty(0)
     known = np.isfinite(error)
     if not known.any():
         return ()
     overall = float(np.sqrt((error[known] ** 2).mean()))
     values = where.pairs()[known]
-    labels = recorded.recordings.states | recorded.recordings.inputs
+    labels = recordings.states | recordings.inputs
     results: list[Region] = []
     for (name, unit), column in zip(labels.items(), values.T, strict=True):
         edges = np.unique(np.quantile(column, np.linspace(0, 1, 6)))

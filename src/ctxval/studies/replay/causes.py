@@ -1,23 +1,35 @@
-"""Causes of the error of a model: what state and input explain of it, and mistakes of timing.
+"""Causes of the error of a model: what state and input explain of it, mistakes of timing, and faults of recordings.
 
 A change of timing is suggested only if the errors on recordings that did not choose it clearly fall.
+
+A fault (an angle that jumps by a turn, a frozen sensor, a spike, an odd file) is found in the recordings alone. Its
+share is that of the model's squared one-step error that lies in the steps concerned, so it explains the error only if
+the share is large. A file that differs from all others is named in any case, because a model that was learned from it
+errs everywhere.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Literal
 
 import numpy as np
 
 from ctxval._util.arrays import Array, Mask, Rows, single_threaded
-from ctxval._util.representation import ShortRepr
+from ctxval._util.representation import ShortRepr, counted
+from ctxval.core.labels import labels_of
 from ctxval.core.model import Model
-from ctxval.core.trajectory import Transitions
+from ctxval.core.trajectory import Trajectory, Transitions
+from ctxval.data.recordings import Recording, Recordings
 from ctxval.learning import PosteriorSettings, learn_posterior
-from ctxval.studies.replay.accuracy import RecordedSteps, Windows, squared, stepped
+from ctxval.studies.replay.accuracy import Windows, squared, stepped
+
+EXPLAINS = 0.5  # least share of the error with which a fault is named as its cause
+
+FaultKind = Literal["turn", "frozen", "spike", "file"]
 
 
 @dataclass(frozen=True)
@@ -36,9 +48,9 @@ class ResidualShare(ShortRepr):
     rest: float  #: root mean square of what state and input do not explain
 
 
-def residual_shares(model: Model, recorded: RecordedSteps, seed: int) -> tuple[ResidualShare, ...]:
+def residual_shares(model: Model, recordings: Recordings, seed: int) -> tuple[ResidualShare, ...]:
     """Return how much of the residual of each state can be explained; none if there are too few recorded steps."""
-    where = recorded.windows(1, 1, 12_000)
+    where = Windows.of(recordings, 1, 1, 12_000)
     residuals, earlier = (where.states(k + 1) - stepped(model, where.states(k), where.inputs(k)) for k in (0, -1))
     finite: Mask = np.asarray((np.isfinite(residuals) & np.isfinite(earlier)).all(axis=1))
     where, residuals, earlier = where[finite], residuals[finite], earlier[finite]
@@ -70,7 +82,7 @@ def residual_shares(model: Model, recorded: RecordedSteps, seed: int) -> tuple[R
             *(name, unit, math.sqrt(sizes[i]), share(affine[:, i], sizes[i]), share(rest[:, i], sizes[i])),
             *(share(history[:, i], left[i]), math.sqrt(left[i])),
         )
-        for i, (name, unit) in enumerate(recorded.recordings.states.items())
+        for i, (name, unit) in enumerate(recordings.states.items())
     )
 
 
@@ -108,20 +120,20 @@ class Suggestion(ShortRepr):
     sentence: str
 
 
-def suggestions(model: Model, recorded: RecordedSteps) -> tuple[Suggestion, ...]:
+def suggestions(model: Model, recordings: Recordings) -> tuple[Suggestion, ...]:
     """Return the change of timing with which the model predicts held-out recordings clearly better, if there is one.
 
     Of two, only the better one is returned, because one mistake can look like another one.
     """
-    changes = filter(None, (_time_step(model, recorded), _delay(model, recorded)))
+    changes = filter(None, (_time_step(model, recordings), _delay(model, recordings)))
     return tuple(sorted(changes, key=lambda change: change.ratio)[:1])
 
 
-def _delay(model: Model, recorded: RecordedSteps) -> Suggestion | None:
+def _delay(model: Model, recordings: Recordings) -> Suggestion | None:
     """Suggest a delay if the model, or an affine model of the recordings themselves, predicts better with it."""
     first, last = -3, 10  # delays in steps that are tried
-    where = recorded.windows(last + 1, 1 - first, 8000)
-    if not recorded.recordings.inputs or not len(where):
+    where = Windows.of(recordings, last + 1, 1 - first, 8000)
+    if not recordings.inputs or not len(where):
         return None
     x, reached, groups = where.states(), where.states(1), where.groups
     sizes = np.sqrt(((reached - x) ** 2).mean(axis=0))
@@ -149,7 +161,7 @@ def _delay(model: Model, recorded: RecordedSteps) -> Suggestion | None:
         if change is None or by_model[0].mean() <= fitted[change[0]].mean():
             return None
     shift, ratio = change
-    delay = shift * recorded.recordings.dt
+    delay = shift * recordings.dt
     when = (
         f"if the inputs act {abs(delay):.3g} s ({abs(shift):g} steps) {'after' if shift > 0 else 'before'} the time at "
         "which they are taken here"
@@ -164,9 +176,9 @@ def _delay(model: Model, recorded: RecordedSteps) -> Suggestion | None:
     return Suggestion("delay", delay, ratio, sentence)
 
 
-def _time_step(model: Model, recorded: RecordedSteps) -> Suggestion | None:
+def _time_step(model: Model, recordings: Recordings) -> Suggestion | None:
     multiples = (2, 3, 4, 5, 10)
-    where = recorded.windows(0, max(multiples), 8000)
+    where = Windows.of(recordings, 0, max(multiples), 8000)
     if not len(where):
         return None
 
@@ -185,10 +197,10 @@ def _time_step(model: Model, recorded: RecordedSteps) -> Suggestion | None:
     if change is None:
         return None
     factor, ratio = change
-    dt = factor * recorded.recordings.dt
+    dt = factor * recordings.dt
     sentence = (
         f"the error relative to the motion falls to {100 * ratio:.0f} % if one step of the model takes {dt:g} s "
-        f"instead of {recorded.recordings.dt:g} s: check the time step of the model, or give dt = {dt:g}"
+        f"instead of {recordings.dt:g} s: check the time step of the model, or give dt = {dt:g}"
     )
     return Suggestion("time step", dt, ratio, sentence)
 
@@ -235,3 +247,151 @@ def _chosen(
     if ratio > clear or (table[row] < base).mean() < 0.8:  # in most recordings
         return None
     return values[row], ratio
+
+
+@dataclass(frozen=True)
+class Fault(ShortRepr):
+    """A fault of recordings, and its part in the one-step error of a model."""
+
+    kind: FaultKind  #: an angle that jumps by a turn, a frozen sensor, a spike, or a file that differs from all others
+    state: str  #: the state concerned; empty for a file
+    source: str  #: the first file concerned, and the number of steps
+    steps: int
+    share: float  #: their share of the model's squared one-step error, of states in units of their typical changes
+    sentence: str  #: what it is, and what would help
+
+    @property
+    def explains(self) -> bool:
+        """Whether it is named as a cause of the error."""
+        return self.share >= EXPLAINS or self.kind == "file"
+
+
+def faults(model: Model, recordings: Recordings, used: Sequence[int]) -> tuple[Fault, ...]:
+    """Return the faults of some recordings, that with the largest share of the model's error first."""
+    runs = [recordings.runs[number] for number in used]
+    whole = [run.trajectory for run in runs]
+    changes = np.concatenate([np.diff(run.states, axis=0) for run in whole])
+    sizes = np.maximum(np.sqrt((changes**2).mean(axis=0)), 1e-300)
+    errors = [squared(stepped(model, run.states[:-1], run.inputs) - run.states[1:], sizes) for run in whole]
+    total = max(float(sum(error.sum() for error in errors)), 1e-300)
+    results = []
+    for number, (name, unit) in enumerate(recordings.states.items()):
+        columns = [run.states[:, number] for run in whole]
+        others = [np.delete(run.states, number, axis=1) for run in whole]
+        kinds: dict[FaultKind, list[Mask]] = {
+            "turn": _turns(columns), "frozen": _frozen(columns, others), "spike": _spikes(columns)
+        }  # fmt: skip
+        for kind, marked in kinds.items():
+            count = int(sum(mask.sum() for mask in marked))
+            if not count:
+                continue
+            share = sum(float(error[mask].sum()) for error, mask in zip(errors, marked, strict=True)) / total
+            first = next(k for k, mask in enumerate(marked) if mask.any())
+            at = runs[first].start + recordings.dt * int(np.argmax(marked[first]))
+            where, (state,) = f"{runs[first].source}, {at:.4g} s", labels_of({name: unit})
+            what = {
+                "turn": f"{state} jumps by a whole turn in {counted(count, 'step')} (first at {where}): state angle = "
+                "true for its field in the mapping",
+                "frozen": f"{state} keeps exactly one value for {count * recordings.dt:.3g} s while other states move "
+                f"(first at {where}): a frozen sensor; leave this part out",
+                "spike": f"{state} has values far from those before and after them, around {counted(count, 'step')} "
+                f"(first at {where}): leave them out, or mark them as missing",
+            }[kind]
+            sentence = f"{what}; {100 * share:.0f} % of the squared one-step error lies there"
+            results.append(Fault(kind, name, runs[first].source, count, share, sentence))
+    by_run = dict(zip(used, (float(error.sum()) / total for error in errors), strict=True))
+    results += _files(recordings.runs, by_run)
+    return tuple(sorted(results, key=lambda fault: -fault.share))
+
+
+def _turns(columns: Sequence[Array]) -> list[Mask]:
+    """Return the steps of each recording in which a state jumps by a turn and otherwise hardly changes."""
+    steps = [np.diff(column) for column in columns]
+    every, span = np.abs(np.concatenate(steps)), float(np.ptp(np.concatenate(columns)))
+    for turn in (2 * np.pi, 360.0):
+        jumps = [np.abs(np.abs(step) - turn) < 0.25 * turn for step in steps]
+        others = every[np.abs(every - turn) >= 0.25 * turn]
+        if any(jump.any() for jump in jumps) and span <= 1.05 * turn and others.max(initial=0.0) < 0.4 * turn:
+            return jumps
+    return [np.zeros(len(step), dtype=bool) for step in steps]
+
+
+def _frozen(columns: Sequence[Array], others: Sequence[Array]) -> list[Mask]:
+    """Return the steps of each recording that touch a long run of equal values, while other states move."""
+    marked = [np.zeros(len(column) - 1, dtype=bool) for column in columns]
+    if not others[0].shape[1]:
+        return marked
+    segments = [list(pairwise([0, *(np.flatnonzero(np.diff(column)) + 1).tolist(), len(column)])) for column in columns]
+    lengths = np.array([last - first for each in segments for first, last in each])
+    usual = float(np.quantile(lengths, 0.9))
+    spread = np.maximum(np.concatenate(others).std(axis=0), 1e-300)
+    for mask, each, beside in zip(marked, segments, others, strict=True):
+        for first, last in each:
+            if last - first >= max(10, 8 * usual) and (beside[first:last].std(axis=0) > 0.1 * spread).any():
+                mask[max(first - 1, 0) : last] = True
+    return marked
+
+
+def _spikes(columns: Sequence[Array]) -> list[Mask]:
+    """Return the steps before and after single values far from their neighbours, which are near each other."""
+    away = [np.abs(column[1:-1] - 0.5 * (column[:-2] + column[2:])) for column in columns]
+    every = np.concatenate(away)
+    low, high = np.quantile(np.concatenate(columns), [0.01, 0.99])
+    # A corner of a signal that moves fast is no spike.
+    limit = max(10 * float(np.quantile(every, 0.9)), 0.05 * float(high - low)) if len(every) else 0.0
+    marked = []
+    for column, far in zip(columns, away, strict=True):
+        mask = np.zeros(len(column) - 1, dtype=bool)
+        if limit > 0:
+            alone = np.flatnonzero((far > limit) & (np.abs(column[2:] - column[:-2]) < 0.3 * far))
+            mask[alone] = mask[alone + 1] = True
+        marked.append(mask)
+    return marked
+
+
+def _files(runs: Sequence[Recording], shares: Mapping[int, float]) -> Iterator[Fault]:
+    """Yield the file that differs from all others: an affine model of these errs far more in it than in them.
+
+    The shares are those of runs in the model's error.
+    """
+    of = {source: [k for k, run in enumerate(runs) if run.source == source] for source in (run.source for run in runs)}
+    if len(of) < 3:
+        return
+    ratios = {}
+    for source, inside in of.items():
+        rest = [run.trajectory for k, run in enumerate(runs) if k not in inside]
+        ratios[source] = _affine_ratio(rest, [runs[k].trajectory for k in inside])
+    source, (ratio, relative) = max(ratios.items(), key=lambda item: item[1][0])
+    if ratio < 3 or relative < 0.1:
+        return
+    share = sum(shares.get(k, 0.0) for k in of[source])
+    steps = sum(runs[k].trajectory.horizon for k in of[source])
+    sentence = (
+        f"{source} differs from the other files: an affine model that is fitted to them errs {ratio:.0f} times as much "
+        f"in it, by {100 * relative:.0f} % of its change; leave it out, or look at its columns and units"
+    )
+    yield Fault("file", "", source, steps, share, sentence)
+
+
+def _affine_ratio(rest: Sequence[Trajectory], others: Sequence[Trajectory]) -> tuple[float, float]:
+    """Return how much more an affine model of some runs errs in others, and this error as a share of their change.
+
+    It is the smaller one of the ratio of medians and that of root mean squares: a part of a file with another fault
+    does not make it another file, nor does a file in which more moves.
+    """
+    Z, changes = _regression(rest)
+    weights = np.linalg.lstsq(Z, changes, rcond=1e-10)[0]
+    inside = np.abs(Z @ weights - changes)
+    Z, changes = _regression(others)
+    outside, size = np.abs(Z @ weights - changes), np.sqrt((changes**2).mean(axis=0))
+    ratios, shares = [], []
+    for of in (lambda errors: np.median(errors, axis=0), lambda errors: np.sqrt((errors**2).mean(axis=0))):
+        ratios.append(of(outside) / np.maximum(of(inside), 1e-300))
+        shares.append(of(outside) / np.maximum(size, 1e-300))
+    worst = int(np.min(ratios, axis=0).argmax())
+    return float(np.min(ratios, axis=0)[worst]), float(np.min(shares, axis=0)[worst])
+
+
+def _regression(runs: Sequence[Trajectory]) -> tuple[Array, Array]:
+    where = Windows.of(runs, 0, 1, sum(run.horizon for run in runs))
+    return np.column_stack([np.ones(len(where)), where.pairs()]), where.states(1) - where.states()

@@ -1,9 +1,16 @@
 """What is safe: in which tasks a system satisfies a specification, because its model does so with a margin."""
 
 from ctxval.studies.safety.assessment import SafetyReport, UnsafeTask, assess, judged_by, require_safe_tasks
-from ctxval.studies.safety.disturbance import Disturbance, disturbance_set, largest_residuals
-from ctxval.studies.safety.draws import DrawnTasks, draw_tasks
-from ctxval.studies.safety.tube import Tube, tube, tube_of
+from ctxval.studies.safety.draws import (
+    Disturbance,
+    DrawnTasks,
+    Tube,
+    disturbance_set,
+    draw_tasks,
+    largest_residuals,
+    tube,
+    tube_of,
+)
 
 __all__ = [
     "Disturbance",

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from ctxval._util.checked import NonNegativeInt, PositiveInt, checked
+from ctxval._util.checked import PositiveInt, checked
 from ctxval._util.progress import progress_shown, stage
 from ctxval._util.representation import ShortRepr, Shown, call, lines
 from ctxval._util.texts import parted
@@ -82,7 +82,7 @@ class SafetyReport(ShortRepr):
     confidence: float  #: the confidence of the certificate
     units: str  #: the unit of all distances
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_json(self) -> dict[str, Any]:
         """Return everything as plain values."""
         plain = {name: value for name, value in vars(self).items() if name not in ("spec", "certificate", "tightened")}
         return {
@@ -129,8 +129,7 @@ def judged_by(experiment: Experiment, distance: UnsafeMargin) -> Experiment:
     return replace(experiment, validation=validation, threshold=distance.margin, truth=None, units=units)
 
 
-@checked
-def require_safe_tasks(validation: Validation, tasks: PositiveInt = 512, seed: NonNegativeInt = 0) -> float:
+def require_safe_tasks(validation: Validation) -> float:
     """Return the share of drawn tasks that M satisfies with the margin; S is not executed.
 
     An InputError says that there is none, so that nothing could be certified.
@@ -138,9 +137,9 @@ def require_safe_tasks(validation: Validation, tasks: PositiveInt = 512, seed: N
     distance, planner, space = spec_distance(validation), LoopPlanner(validation), validation.space
     plan = validation.plan(0.5 * (space.low + space.high))
     distance.spec.robustness(plan.model_trajectory, plan.task)  # refuses sets of other dimensions
-    unit = space.members if space.members is not None else space.unit_draws(tasks, np.random.default_rng([seed, 1]))
+    unit = space.members if space.members is not None else space.unit_draws(512, np.random.default_rng([0, 1]))
     least = distance.margin or 0.0
-    share = float((on_model(planner, distance.spec, unit[: tasks if planner.batched else 100]) > least).mean())
+    share = float((on_model(planner, distance.spec, unit[: 512 if planner.batched else 100]) > least).mean())
     if not share:
         what = f"with a margin of {least:g}" if least else "at all"
         raise InputError(
