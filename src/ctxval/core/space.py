@@ -131,7 +131,7 @@ class TaskSpace:
     def positions(self) -> tuple[slice, ...]:
         """The columns of the parameters that are positions in space, two or three components in a unit of length.
 
-        They are vectors, or neighbouring numbers whose names differ in an axis alone, such as ``goal_x`` and ``goal_y``.
+        They are vectors, or neighbouring numbers whose names differ in an axis alone: ``goal_x`` and ``goal_y``.
         """
         groups, last = list[slice](), ""
         for name, at in self._columns.items():

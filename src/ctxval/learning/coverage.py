@@ -177,9 +177,9 @@ def position_states(
 ) -> list[list[int]]:
     """Return, of each position that is a task parameter, the two states that are its coordinates on the ground.
 
-    In each task, these states begin at the position, or have it as their goal; states may have another unit, origin or
-    direction than the parameter. Of three coordinates, the first two are taken: posts and walls stand on the ground, and
-    runs do not enter all of a volume in a few executions.
+    In each task, these states begin at the position, or have it as their goal, in any unit, origin and direction. Of
+    three coordinates, the first two are taken: posts and walls stand on the ground, and runs do not enter all of a
+    volume in a few executions.
 
     Args:
         points: the tasks in the order of their planning, points of the unit cube ``(q, d)``.
