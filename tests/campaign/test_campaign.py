@@ -11,7 +11,7 @@ import pytest
 from scipy.stats import kstest
 
 from conftest import interrupt_at_once, make_validation
-from ctxval import Campaign, Task, TaskSpace, Trajectory, Validation, controllers, distances, models, searches
+from ctxval import Campaign, Task, TaskSpace, Trajectory, Validation, controllers, distances, models, searches, systems
 from ctxval._util.arrays import Array
 from ctxval.certificates import RESOLUTION, CertificateOptions, Posterior, farthest_task
 from ctxval.core.trial import Trial
@@ -204,6 +204,28 @@ def test_what_fails_each_time_for_one_reason_costs_three_executions(validation: 
         assert campaign.executions == executions
     some = gp_ucb(make_validation(system=FaultyRig(validation.system, dict.fromkeys((0, 1, 3, 4, 5), "raise"))))
     assert some.run(8).executions == 8
+
+
+def test_what_begins_to_fail_for_one_reason_costs_six_executions(validation: Validation) -> None:
+    faults = dict.fromkeys([*range(2, 13), *range(14, 30)], "raise")
+    campaign = gp_ucb(make_validation(system=FaultyRig(validation.system, faults)))
+    for executions in (8, 20):  # running again tries as many more, counted from the last one that did not fail
+        with pytest.raises(CampaignError, match="the last 6 executions failed for one reason, so no more is executed"):
+            campaign.run(30)
+        assert campaign.executions == executions
+
+
+def test_a_run_that_breaks_off_each_time_for_one_reason_costs_six_executions(validation: Validation) -> None:
+    def step(x: Array, u: Array) -> Array:
+        if abs(x[0] - np.pi) > 0.01:
+            raise RuntimeError("the bus died")
+        return validation.model.step(x, u)
+
+    campaign = gp_ucb(make_validation(system=systems.Simulated(step)))
+    with pytest.raises(CampaignError, match=r"last 6 executions failed for one reason.*the bus died.*--again-failed"):
+        campaign.run(30)
+    assert campaign.executions == 6
+    assert len(campaign.trajectories(campaign.trials[0])[1].states) > 1  # type: ignore[union-attr]
 
 
 def test_an_emergency_stop_falsifies_if_the_steps_before_it_exceed_the_threshold(tmp_path: Path) -> None:

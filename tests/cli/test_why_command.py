@@ -83,7 +83,7 @@ def test_the_report_says_the_cause_on_its_first_screen(folder: Path, invoke: Inv
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
-        (["one.sqlite"], "causes need at least 2 executions with trajectories in the store, got 1"),
+        (["one.sqlite"], "trajectories in the store, got 1; `ctxval run` with --envelope goes on"),
         (["nowhere.sqlite"], "nowhere.sqlite"),
     ],
 )

@@ -84,7 +84,7 @@ def test_a_step_must_return_the_pair_of_inputs_and_memory(returned: Any) -> None
 
 
 def test_inputs_of_a_wrong_shape_are_refused_as_without_memory() -> None:
-    with pytest.raises(ShapeError, match=r"the controller must return inputs of shape \('m',\), got \(\)"):
+    with pytest.raises(ShapeError, match=r"the controller must return inputs of shape \(m,\), got \(\)"):
         rollout(CART.step, Returns((1.0, None)), TASK)
 
 

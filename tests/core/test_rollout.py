@@ -108,7 +108,7 @@ def test_a_first_input_of_the_wrong_shape_is_refused_with_both_shapes(output: ob
     task = Task([np.zeros(4), 0.0], horizon=2, dt=0.1)
     with pytest.raises(ShapeError) as caught:
         rollout(PENDULUM, lambda t, x: output, task)
-    assert "(4, 'm')" in str(caught.value)
+    assert "(4, m)" in str(caught.value)
     assert f"got {shape}" in str(caught.value)
 
 

@@ -117,6 +117,16 @@ def test_vectors_of_lengths_are_positions() -> None:
     assert space.positions == (slice(1, 3), slice(5, 8))
 
 
+def test_neighbouring_numbers_that_differ_in_an_axis_are_a_position() -> None:
+    ends = (0, 1, "m")
+    space = TaskSpace(load=(0, 1, "kg"), start_x=ends, start_y=ends, x=ends, y=ends, z=ends, x1=ends, x2=ends)
+    assert space.positions == (slice(1, 3), slice(3, 6))
+    assert TaskSpace(goal=ends, start=ends).positions == ()
+    assert TaskSpace(x=(0, 1), y=(0, 1)).positions == ()
+    assert TaskSpace(x=ends, y=(0, 1, "mm")).positions == ()
+    assert TaskSpace(x=ends, load=(0, 1, "kg"), y=ends).positions == ()
+
+
 def test_points_outside_the_unit_cube_are_clipped_to_the_box(space: TaskSpace) -> None:
     np.testing.assert_array_equal(space.from_unit([-1.0, 2.0, 0.5, 3.0]), [-3, 1, 15, 2])
 

@@ -431,6 +431,11 @@ def test_a_distance_that_is_no_finite_number_of_at_least_zero_is_refused_with_th
         make(distance=lambda model, system, task: value).outcome(POINT)
 
 
+def test_a_distance_that_is_an_array_is_refused_without_its_numbers() -> None:
+    with pytest.raises(DistanceError, match=r"got an array \(61,\) for the task"):
+        make(distance=lambda model, system, task: np.ones(61)).outcome(POINT)
+
+
 @pytest.mark.parametrize("batched", [True, False])
 def test_a_distance_that_raises_is_named_with_its_reason(batched: bool) -> None:
     system = make().system

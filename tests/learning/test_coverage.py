@@ -221,6 +221,19 @@ def test_coordinates_of_a_position_are_states_that_begin_at_it_or_have_it_as_goa
     assert position_states(validation.space, planned, points, goals=False) == [[2, 1]]
 
 
+def test_coordinates_of_a_position_may_have_another_unit_origin_and_direction() -> None:
+    validation = make_planner(states=4).validation.with_parts(
+        space=TaskSpace(start=([-500.0, -500.0], [500.0, 500.0], "mm"), height=(0, 1, "m")),
+        task=lambda p: Task(
+            np.stack([0 * p.height, p.height, 0.3 - p.start[..., 1] / 1000, p.start[..., 0] / 1000], axis=-1),
+            horizon=5, dt=0.1,
+        ),
+    )  # fmt: skip
+    points = np.random.default_rng(0).random((5, 3))
+    planned = LoopPlanner(validation).plan(points)
+    assert position_states(validation.space, planned, points) == [[3, 2]]
+
+
 def test_where_an_execution_moves_in_one_step_there_is_no_pocket() -> None:
     visited = np.column_stack([np.linspace(-1, 1, 400), np.zeros(400)])
     found = largest_pocket(visited, [trajectory([-1.0, 0.0], [1.0, 0.0])], ["x [m]", "y [m]"])

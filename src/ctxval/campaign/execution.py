@@ -21,6 +21,7 @@ from ctxval.core.trial import CONVERGED, Trial
 from ctxval.errors import CampaignError, CtxvalError, ExecutionError, InputError, StoreError
 
 _ALIKE = 3  # executions that fail alike, after which a campaign stops if there are no others
+_IN_A_ROW = 6  # the same, if earlier ones did not fail
 
 
 class ExecutionLoop:
@@ -61,6 +62,7 @@ class ExecutionLoop:
         self.running: dict[int, OpenTrial] = {}
         self.losses: Counter[int] = Counter()
         self.failures: Counter[int] = Counter()
+        self.in_a_row: list[Trial] = []  # that failed after the last one that did not
         self.stopped: BaseException | None = None
 
     def run(self) -> None:
@@ -160,6 +162,8 @@ class ExecutionLoop:
                 ended.append(self.recorder.close(trial, execution))
             except CtxvalError as error:
                 self.stopped = self.stopped or error
+        for trial in ended:
+            self.in_a_row = [*self.in_a_row, trial] if trial.state == "failed" else []
         self.stopped = self.stopped or self._one_reason()
         for trial in ended:
             if is_heard():
@@ -168,25 +172,25 @@ class ExecutionLoop:
                 self.on_trial(trial)
 
     def _one_reason(self) -> CampaignError | None:
-        """Return an error if all executions failed for one reason, before any step was recorded, and more would follow.
+        """Return an error if executions fail for one reason, and more would follow; numbers in the reason may differ.
 
-        The numbers in the reason may differ.
+        They are all executions if none moved, or the last ones in a row of this call: who runs again goes on.
         """
-        trials = self.recorder.trials
-        if any(trial.executed and trial.state != "failed" for trial in trials):
+        failed = ended = [trial for trial in self.recorder.trials if trial.executed]
+        which, fewest, numbers = "all", _ALIKE, [trial.number for trial in ended]
+        if any(trial.state != "failed" for trial in ended) or self.recorder.store.trajectories(numbers, "system"):
+            failed, which, fewest = self.in_a_row, "the last", _IN_A_ROW
+        if len(failed) < fewest or (self.budget is not None and len(ended) >= self.budget):
             return None
-        ended = [trial for trial in trials if trial.executed]
-        if len(ended) < _ALIKE or (self.budget is not None and len(ended) >= self.budget):
-            return None
-        if len({re.sub(r"[-+.\d]+", "", trial.failure or "") for trial in ended}) > 1:
-            return None
-        if self.recorder.store.trajectories([trial.number for trial in ended], "system"):
-            return None  # the system moved, and a loop that diverges is one of its properties
-        reason = (ended[-1].failure or "").rstrip(".")
-        return CampaignError(
-            f"all {len(ended)} executions failed for one reason, so no more is executed: {reason}. Correct the "
-            "experiment (`ctxval check` with --execute tries one task), or run again to go on."
-        )
+        reasons = {re.sub(r"[-+.\d]+", "", trial.failure or "") for trial in failed}
+        if len(reasons) > 1 or reasons.pop().startswith("diverged"):
+            return None  # a loop that diverges is a property of the system
+        reason = (failed[-1].failure or "").rstrip(".")
+        remedy = "Correct the experiment (`ctxval check` with --execute tries one task)"
+        if which != "all":
+            remedy = 'Remove the cause and execute them again with --again-failed "..." (again= in Python)'
+        what = f"{which} {len(failed)} executions failed for one reason, so no more is executed: {reason}."
+        return CampaignError(f"{what} {remedy}, or run again to go on.")
 
     def _measured(self, opened: OpenTrial, execution: Execution) -> Execution | None:
         """Return an execution with its distance; None if it is to be repeated."""

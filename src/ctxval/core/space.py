@@ -54,6 +54,11 @@ class Parameters:
 _LENGTHS = ("m", "mm", "cm", "km", "in", "ft")
 
 
+def _is_next_axis(first: str, second: str) -> bool:
+    different = [a + b for a, b in zip(first.lower(), second.lower(), strict=False) if a != b]
+    return len(first) == len(second) and different in (["xy"], ["xz"], ["yz"])
+
+
 class TaskSpace:
     """A named box of task parameters.
 
@@ -124,9 +129,24 @@ class TaskSpace:
 
     @property
     def positions(self) -> tuple[slice, ...]:
-        """The columns of the parameters that are positions in space: two or three components in a unit of length."""
-        lengths = [at for name, at in self._columns.items() if self.units[name] in _LENGTHS]
-        return tuple(at for at in lengths if isinstance(at, slice) and at.stop - at.start in (2, 3))
+        """The columns of the parameters that are positions in space, two or three components in a unit of length.
+
+        They are vectors, or neighbouring numbers whose names differ in an axis alone: ``goal_x`` and ``goal_y``.
+        """
+        groups, last = list[slice](), ""
+        for name, at in self._columns.items():
+            if self.units[name] not in _LENGTHS:
+                last = ""
+            elif isinstance(at, slice):
+                groups.append(at)
+                last = ""
+            elif last and self.units[last] == self.units[name] and _is_next_axis(last, name):
+                groups[-1] = slice(groups[-1].start, at + 1)
+                last = name
+            else:
+                groups.append(slice(at, at + 1))
+                last = name
+        return tuple(at for at in groups if at.stop - at.start in (2, 3))
 
     def values_of(self, name: str, points: Array) -> Any:
         """Return the values of a parameter in points ``(..., d)`` of the space, ``(...)`` or ``(..., k)``."""

@@ -237,8 +237,8 @@ class Validation:
 
     def _measured(self, point: Array, value: Array) -> float:
         if value.shape != () or not np.isfinite(value) or value < 0:
-            where = self.space.describe_point(point)
-            raise DistanceError(f"the distance must be one finite number >= 0, got {value} for the task {where}.")
+            where, got = self.space.describe_point(point), value if value.shape == () else f"an array {value.shape}"
+            raise DistanceError(f"the distance must be one finite number >= 0, got {got} for the task {where}.")
         return float(value)
 
     def outcome(self, point: ArrayLike) -> Outcome:

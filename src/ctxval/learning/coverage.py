@@ -7,7 +7,7 @@ has entered: a post could stand there.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import combinations, product
+from itertools import chain, combinations, product
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -177,8 +177,9 @@ def position_states(
 ) -> list[list[int]]:
     """Return, of each position that is a task parameter, the two states that are its coordinates on the ground.
 
-    In each task, these states begin at the position, or have it as their goal. Of three coordinates, the first two are
-    taken: posts and walls stand on the ground, and runs do not enter all of a volume in a few executions.
+    In each task, these states begin at the position, or have it as their goal, in any unit, origin and direction. Of
+    three coordinates, the first two are taken: posts and walls stand on the ground, and runs do not enter all of a
+    volume in a few executions.
 
     Args:
         points: the tasks in the order of their planning, points of the unit cube ``(q, d)``.
@@ -187,14 +188,18 @@ def position_states(
     values = space.from_unit(points[np.concatenate([each.rows for each in planned])])
     known = ("initial_state", "goal") if goals else ("initial_state",)
     ends = [np.concatenate([np.atleast_2d(getattr(each.task, end)) for each in planned]) for end in known]
+
+    def standardised(columns: Array) -> Array:
+        centred = columns - columns.mean(axis=0)
+        return np.asarray(centred / np.maximum(np.linalg.norm(centred, axis=0), 1e-300))
+
     groups = list[list[int]]()
     for at in space.positions:
-        same = [
-            [k for end in ends for k in np.flatnonzero((np.abs(end - column[:, None]) <= 1e-9).all(axis=0)).tolist()]
-            for column in values[:, at].T
-        ]
+        # States and parameters that are coordinates of one axis have a correlation of 1 or -1.
+        fits = [np.abs(standardised(values[:, at]).T @ standardised(end)) > 1 - 1e-9 for end in ends]
+        same = [[*chain.from_iterable(map(np.flatnonzero, states))] for states in zip(*fits, strict=True)]
         if all(same):
-            groups.append([states[0] for states in same][:2])
+            groups.append([int(states[0]) for states in same][:2])
     return groups
 
 

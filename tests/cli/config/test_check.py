@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from conftest import make_validation
-from ctxval import Experiment, Parameters, Task, cases
+from ctxval import Experiment, Parameters, Task, TaskSpace, cases
 from ctxval.cli.config.check import check_experiment
 from rig_thorough import more
 
@@ -48,3 +48,11 @@ def test_a_task_of_a_batch_may_differ_by_rounding_alone(error: float, state: str
     validation.task = task
     found = check_experiment(Experiment("x", validation))
     assert [finding.state for finding in found if finding.check == "batches"] == [state]
+
+
+@pytest.mark.parametrize(("unit", "expected"), [((), True), (("m",), False)])
+def test_it_says_what_a_unit_of_length_is_good_for(unit: tuple[str, ...], expected: bool) -> None:
+    validation = make_validation()
+    validation.space = TaskSpace(goal=(-3.0, 3.0, *unit), side=(0.0, 1.0, *unit))
+    (finding,) = [each for each in check_experiment(Experiment("x", validation)) if each.check == "space"]
+    assert (finding.state == "noted") == ("places of positions are tested" in finding.text) == expected

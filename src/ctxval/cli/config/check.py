@@ -88,6 +88,8 @@ def _space(validation: Validation) -> Findings:
         return
     without = [name for name, label in zip(space.names, space.labels, strict=True) if name == label]
     missing = f"; no unit for {', '.join(without)}" if without else ""
+    if len(without) > 1:
+        missing += " (if it is one of length, the places of positions are tested before a validation)"
     text = f"{space.dimension} task parameters: {', '.join(space.labels)}{missing}"
     yield "noted" if without else "ok", text
 

@@ -193,7 +193,10 @@ def find_causes(campaign: Campaign, *, most: int = 2) -> CauseReport:
     failed = failed[:_FAILED]
     trials = failed + trials[: 8 - len(failed)]  # those with the largest distances
     if len(trials) < 2:
-        raise InputError(f"causes need at least 2 executions with trajectories in the store, got {len(trials)}.")
+        raise InputError(
+            f"causes need at least 2 executions with trajectories in the store, got {len(trials)}; `ctxval run` with "
+            "--envelope goes on after the model is falsified."
+        )
     executed = [(trial.unit_point, run) for trial, run in trials]
     with single_threaded():
         states = [run for _, run in executed]

@@ -20,6 +20,10 @@ def _at(values: Array, index: int | list[int] | None, size: float, elsewhere: fl
     return sizes
 
 
+def _duration(seconds: float) -> str:
+    return f"{seconds:.3g} s" if seconds >= 1 else f"{1e3 * seconds:.3g} ms"
+
+
 def _exchanged(values: Array, first: Sequence[int], second: Sequence[int]) -> Array:
     order = np.arange(values.shape[-1])
     order[[*first, *second]] = [*second, *first]
@@ -131,7 +135,7 @@ class Delay(Cause):
         return actuator.follow(np.zeros_like(u), commanded), commanded
 
     def text(self, plant: Plant) -> str:
-        return f"commands arrive {1e3 * plant.dt * self.sizes[0]:.3g} ms late ({self.sizes[0]:.3g} steps)"
+        return f"commands arrive {_duration(plant.dt * self.sizes[0])} late ({self.sizes[0]:.3g} steps)"
 
 
 @dataclass(frozen=True)
@@ -148,7 +152,7 @@ class Lag(Cause):
         return u + left * lag * (1 - np.exp(-1 / lag)), u + left * np.exp(-1 / lag)
 
     def text(self, plant: Plant) -> str:
-        return f"the actuators follow with a time constant of {1e3 * plant.dt * self.sizes[0]:.3g} ms"
+        return f"the actuators follow with a time constant of {_duration(plant.dt * self.sizes[0])}"
 
 
 @dataclass(frozen=True)
