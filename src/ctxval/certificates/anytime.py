@@ -49,12 +49,15 @@ class AnytimeAudit(CertificateKind):
 
     def certify(self, sample: Sample, confidence: float = 0.95) -> Certificate:
         """Refuse: the bound is on the volume above a threshold, and none is given."""
-        raise CertificateError("an anytime audit bounds the volume above a threshold, so it needs one (--threshold).")
+        return self.certify_against(sample, None, confidence)[0]
 
     def certify_against(
-        self, sample: Sample, threshold: float, confidence: float = 0.95
+        self, sample: Sample, threshold: float | None, confidence: float = 0.95
     ) -> tuple[Certificate, Forecast | None]:
         """Return :func:`certify_anytime` of the trials; nothing is forecast."""
+        if threshold is None:
+            what = "an anytime audit bounds the volume above a threshold"
+            raise CertificateError(f"{what}, so it needs one (--threshold).")
         return certify_anytime(sample, threshold, confidence), None
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from ctxval._util.checked import NonNegativeInt, PositiveFloat, Probability
 from ctxval._util.registry import part
-from ctxval.certificates.base import Certificate, CertificateKind, certified
+from ctxval.certificates.base import Certificate, CertificateKind
 from ctxval.certificates.covering import RESOLUTION
 from ctxval.certificates.dynamics import Dynamics
 from ctxval.certificates.dynamics_diagnostics import FEWEST
@@ -63,20 +63,20 @@ class Automatic(CertificateKind):
         usual = self.resolution == RESOLUTION and sample.learned is not None
         uses_dynamics = usual and len(sample) >= FEWEST and not sample.failed
         if sample.suite is not None and (not sample.not_executed or not uses_dynamics):
-            return certified(WholeSuite(), sample, threshold, confidence)
+            return WholeSuite().certify(sample, confidence), None
         by_dynamics = None
         if uses_dynamics:
             with suppress(CertificateError):
                 dynamics = Dynamics(tests=self.tests, quantile=self.quantile)
-                by_dynamics = certified(dynamics, sample, threshold, confidence)
+                by_dynamics = dynamics.certify_against(sample, threshold, confidence)
         if by_dynamics is not None:
             is_noisy = by_dynamics[0].details.get("quantile") is not None
             if is_noisy or _decides(by_dynamics[0], threshold):
                 return by_dynamics  # the posterior bound of the distance is about systems without noise
         if sample.suite is not None:
-            return by_dynamics or certified(WholeSuite(), sample, threshold, confidence)
+            return by_dynamics or (WholeSuite().certify(sample, confidence), None)
         try:
-            certificate, expected = certified(self.posterior, sample, threshold, confidence)
+            certificate, expected = self.posterior.certify_against(sample, threshold, confidence)
         except CertificateError:
             if by_dynamics is None:
                 raise

@@ -137,9 +137,9 @@ class CertificateKind(ShortRepr, ABC):
         """Return the certificate of trials; a CertificateError if they or the options do not allow one."""
 
     def certify_against(
-        self, sample: Sample, threshold: float, confidence: float = 0.95
+        self, sample: Sample, threshold: float | None, confidence: float = 0.95
     ) -> tuple[Certificate, Forecast | None]:
-        """Return a certificate that is precise enough for a threshold, and a forecast of executions if there is one."""
+        """Return a certificate, precise enough for a threshold if there is one, and a forecast if one can be made."""
         return self.certify(sample, confidence), None
 
     def require_audit_helps(self, origins: Iterable[Origin]) -> None:
@@ -189,24 +189,11 @@ class KindRegistry(Registry[CertificateKind]):
             raise InputError(f"the certificate {name!r} calls itself {kind.name!r}.")
         return kind
 
-    def of(self, certificate: Certificate) -> type[CertificateKind]:
-        """Return the kind of a certificate; the base class :class:`CertificateKind` if the kind is not known."""
-        return self.find(certificate.kind) if certificate.kind in self else CertificateKind
-
 
 def _required(kind: Any) -> type[CertificateKind]:
     if isinstance(kind, type) and issubclass(kind, CertificateKind) and isinstance(getattr(kind, "name", None), str):
         return kind
     raise InputError(f"a kind of certificate must be a subclass of CertificateKind with a name, got {kind!r}.")
-
-
-def certified(
-    kind: CertificateKind, sample: Sample, threshold: float | None, confidence: float
-) -> tuple[Certificate, Forecast | None]:
-    """Return a certificate, precise enough for a threshold if there is one, and a forecast."""
-    if threshold is None:
-        return kind.certify(sample, confidence), None
-    return kind.certify_against(sample, threshold, confidence)
 
 
 KINDS = KindRegistry()

@@ -117,13 +117,13 @@ def representative(sample: Sample) -> Sample:
     return sample.rows(kept_rows(sample.points, sample.distances, MOST, MOST + 1).tolist())
 
 
-def settle_maxima(sample: Sample, threshold: float, confidence: float, *, seed: int = 0) -> Maxima:
+def settle_maxima(sample: Sample, threshold: float, confidence: float) -> Maxima:
     """Return draws of d*, up to four times as many while the threshold is within two standard errors of the bound."""
-    pooled = draw_maxima(sample, seed=seed)
+    pooled = draw_maxima(sample)
     chains = [pooled]
     while len(chains) < _MOST and abs(pooled.upper(confidence) - threshold) < ERRORS * pooled.error(confidence):
         more = range(len(chains), 2 * len(chains))
-        chains += [draw_maxima(sample, seed=1_000_003 * chain + seed) for chain in more]
+        chains += [draw_maxima(sample, seed=1_000_003 * chain) for chain in more]
         draws, points = (np.concatenate([getattr(chain, name) for chain in chains]) for name in ("draws", "points"))
         before = np.cumsum([0, *(len(chain.conditioned) for chain in chains[:-1])])
         owners = np.concatenate([chain.owners + first for chain, first in zip(chains, before, strict=True)])

@@ -14,8 +14,8 @@ has no meaning, so each of them is predicted from all others. Its standardised e
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
-from typing import Any, ClassVar
+from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 from scipy.special import ndtri, stdtr
@@ -58,12 +58,14 @@ class Posterior(CertificateKind):
 
     def certify(self, sample: Sample, confidence: float = 0.95) -> Certificate:
         """Return :func:`certify_posterior` of the trials."""
-        return certify_posterior(sample, confidence, resolution=self.resolution)
+        return self.certify_against(sample, None, confidence)[0]
 
     def certify_against(
-        self, sample: Sample, threshold: float, confidence: float = 0.95
+        self, sample: Sample, threshold: float | None, confidence: float = 0.95
     ) -> tuple[Certificate, Forecast | None]:
         """Return the certificate from enough draws for the threshold, and a forecast if its bound is above that."""
+        if threshold is None:
+            return certify_posterior(sample, confidence, resolution=self.resolution), None
         _require_covered(sample, self.resolution)
         drawn = settle_maxima(sample, threshold, confidence)
         certificate = certify_posterior(sample, confidence, resolution=self.resolution, found=drawn)
@@ -78,7 +80,6 @@ def certify_posterior(
     confidence: Probability = 0.95,
     *,
     resolution: PositiveFloat = RESOLUTION,
-    seed: int = 0,
     found: Maxima | None = None,
 ) -> Certificate:
     """Return the bound that d* stays below with the confidence, under the prior and given the trials.
@@ -87,7 +88,7 @@ def certify_posterior(
     """
     used = representative(sample)
     _require_covered(sample, resolution)
-    drawn = draw_maxima(sample, seed=seed) if found is None else found
+    drawn = draw_maxima(sample) if found is None else found
     stochastic = drawn.stochastic
     upper, error = drawn.upper(confidence), drawn.error(confidence)
     unordered, d = np.array([origin == "manual" for origin in used.origins]), sample.points.shape[1]
@@ -128,7 +129,7 @@ def certify_posterior(
             "kernels": {"matern-3/2": rough, "matern-5/2": 1 - rough},
             "logarithm": float(np.mean([np.isfinite(process.warp.offset) for process in drawn.conditioned])),
             "length_scales": np.median(np.exp([each.log_scales for each in hyperparameters]), axis=0).tolist(),
-            "diagnosis": diagnosis.to_json(),
+            "diagnosis": {name: value for name, value in vars(diagnosis).items() if name != "doubt"},
             "failures": sample.failures,
         },
         doubt=both_outcomes(sample, stochastic=stochastic) or diagnosis.doubt,
@@ -146,7 +147,7 @@ def _require_covered(sample: Sample, resolution: float) -> None:
         )
 
 
-def instantaneous_bound(sample: Sample, beta: float = 2.0) -> dict[str, float] | None:
+def instantaneous_bound(sample: Sample) -> dict[str, float] | None:
     """Return the largest UCB of the paper's GP with estimated hyperparameters, and its gap to the best distance found.
 
     It is below d* about as often as above. It is None if fewer than two distances are known.
@@ -155,6 +156,7 @@ def instantaneous_bound(sample: Sample, beta: float = 2.0) -> dict[str, float] |
         surrogate = fit_surrogate(sample.points, sample.distances)
     except InputError:
         return None
+    beta = 2.0
     bound = UpperConfidenceBound(surrogate.process, beta)
     best_first = sample.points[np.argsort(-sample.distances, kind="stable")]
     point = maximise(bound, sample.points.shape[1], best_first, np.random.default_rng(0))
@@ -175,10 +177,6 @@ class Diagnosis(ShortRepr):
     left_out: float  #: root mean square of the standardised leave-one-out errors; about 1 if the process fits the data
     farthest: float  #: largest distance from a task to its nearest trial, in diagonals of the task space
     doubt: str | None  #: why the bound is withdrawn, in one sentence; None if it is not
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the numbers, ready for JSON."""
-        return {name: value for name, value in asdict(self).items() if name != "doubt"}
 
 
 def diagnose(

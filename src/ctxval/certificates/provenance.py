@@ -66,11 +66,22 @@ class Provenance(ShortRepr):
             return part if isinstance(part, dict) else {}
 
         validation = table(description, "validation")
-        described, refined = table(validation, "space"), table(validation, "model").get("type") == "Refined"
+        described = table(validation, "space")
         distribution = described.get(DISTRIBUTION)
+        remarks = [withdrawals.REFINED] if table(validation, "model").get("type") == "Refined" else []
+        for change in changes:
+            if change.what == "accepted":
+                different = "; ".join(change.content.get("differences", [])[:1]) or "nothing that is described"
+                trials = change.content.get("trials", "some")
+                remarks.append(withdrawals.ACCEPTED.format(trials=trials, why=change.why, differences=different))
+            elif change.what == "remeasured":
+                remarks.append(withdrawals.MEASURED_ANEW.format(why=change.why))
+            elif change.what == "replaced":
+                numbers = ", ".join(change.content.get("before", {}))
+                remarks.append(withdrawals.REPLACED.format(numbers=numbers, why=change.why))
         return cls(
             space=_space_of(described),
-            remarks=(*([withdrawals.REFINED] if refined else []), *remarks_on(changes)),
+            remarks=tuple(remarks),
             distribution=None if distribution is None else distribution_text(distribution),
             thresholds=thresholds,
             beside=tuple(beside),
@@ -119,22 +130,6 @@ class Provenance(ShortRepr):
         """Return trials as a certificate sees them, with what is known here."""
         suite = None if self.space is None else self.space.members
         return replace(Sample.of(trials, self.learned), distribution=self.distribution, suite=suite)
-
-
-def remarks_on(changes: Iterable[Change]) -> tuple[str, ...]:
-    """Return sentences on later changes of a store, for a certificate's assumptions."""
-    remarks = []
-    for change in changes:
-        if change.what == "accepted":
-            different = "; ".join(change.content.get("differences", [])[:1]) or "nothing that is described"
-            trials = change.content.get("trials", "some")
-            remarks.append(withdrawals.ACCEPTED.format(trials=trials, why=change.why, differences=different))
-        elif change.what == "remeasured":
-            remarks.append(withdrawals.MEASURED_ANEW.format(why=change.why))
-        elif change.what == "replaced":
-            numbers = ", ".join(change.content.get("before", {}))
-            remarks.append(withdrawals.REPLACED.format(numbers=numbers, why=change.why))
-    return tuple(remarks)
 
 
 def _space_of(described: Mapping[str, Any]) -> TaskSpace | None:

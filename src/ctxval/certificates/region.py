@@ -54,10 +54,10 @@ class Region(CertificateKind):
 
     def certify(self, sample: Sample, confidence: float = 0.95) -> Certificate:
         """Return :func:`certify_region` of the trials, without a threshold."""
-        return certify_region(sample, None, confidence, self)
+        return self.certify_against(sample, None, confidence)[0]
 
     def certify_against(
-        self, sample: Sample, threshold: float, confidence: float = 0.95
+        self, sample: Sample, threshold: float | None, confidence: float = 0.95
     ) -> tuple[Certificate, Forecast | None]:
         """Return :func:`certify_region` of the trials; nothing is forecast."""
         return certify_region(sample, threshold, confidence, self), None

@@ -8,13 +8,13 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ctxval._util.checked import PositiveFloat, checked
+from ctxval._util.checked import PositiveFloat, checked, require
 from ctxval._util.representation import ShortRepr, call, line, lines, shown, table
-from ctxval.certificates.base import KINDS, Certificate, CertificateKind, certified
+from ctxval.certificates.base import KINDS, Certificate, CertificateKind
 from ctxval.certificates.bets import bets_against
 from ctxval.certificates.bounds import NO_UNITS, Quantities
 from ctxval.certificates.forecast import Forecast
-from ctxval.certificates.options import CONFIDENCE, CertificateOptions, require_confidence, require_volume
+from ctxval.certificates.options import CONFIDENCE, CertificateOptions, Confidence, Volume
 from ctxval.certificates.provenance import Provenance
 from ctxval.certificates.sample import without_success
 from ctxval.certificates.sentences import verdicts as sentences
@@ -115,18 +115,19 @@ def judge_by(
     trials: Sequence[Trial],
     threshold: PositiveFloat,
     *,
-    volume: float = 0.0,
+    volume: Volume = 0.0,
     provenance: Provenance | None = None,
 ) -> Verdict:
     """Return the verdict by a certificate of any kind; only bounds on d* validate if the acceptable ``volume`` is 0."""
     tau, known = float(threshold), provenance or Provenance()
-    require_confidence(certificate.confidence)
-    kind, quantities = KINDS.of(certificate), known.quantities
+    require("confidence", Confidence, certificate.confidence)
+    kind = KINDS.find(certificate.kind) if certificate.kind in KINDS else CertificateKind
+    quantities = known.quantities
     quantile = certificate.details.get("quantile") or quantile_of(kind)
     falsified = counterexample(trials, tau, quantities, certificate.confidence, quantile)
     if falsified is not None:
         return replace(falsified, certificate=certificate)
-    if not certificate.covers(tau, require_volume(volume)):
+    if not certificate.covers(tau, volume):
         why_not = sentences.undecided(certificate, tau, volume, quantities)
         return Verdict("undecided", tau, why_not, certificate=certificate)
     conditions = kind.rests_on(certificate, known.space)
@@ -179,7 +180,7 @@ def _certified(
         require_suite(kind)
     # No statement may count draws whose number depended on their distances.
     sample = sample if kind.sorts_draws else sample.with_countable_draws()
-    certificate, expected = certified(kind, sample, threshold, options.confidence)
+    certificate, expected = kind.certify_against(sample, threshold, options.confidence)
     return replace(certificate, assumptions=(*certificate.assumptions, *known.remarks)), expected
 
 
