@@ -240,9 +240,9 @@ def test_a_confidence_beyond_the_draws_is_undecided_and_one_that_is_none_is_refu
     assert verdict.answer == "undecided"
     assert "needs more than" in verdict.reason
     for tau, confidence in ((50.0, 1.5), (0.5, 0.0)):
-        with pytest.raises(InputError, match="from 0.5 to below 1"):
+        with pytest.raises(InputError, match=r"from 0\.5 to below 1"):
             judge(trials(), tau, posterior(confidence))
-        with pytest.raises(InputError, match="from 0.5 to below 1"):
+        with pytest.raises(InputError, match=r"from 0\.5 to below 1"):
             StoppingRule(tau, posterior(confidence)).decide(trials(), 0)
 
 

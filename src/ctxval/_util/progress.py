@@ -83,10 +83,6 @@ def also_listening(listener: Listener) -> AbstractContextManager[None]:
     return listening(both)
 
 
-def ignore(_: Progress) -> None:
-    """Listen, and do nothing: nobody else is told."""
-
-
 def mute() -> None:
     """Let nobody listen from now on, as in a forked process, whose listener is that of its parent."""
     _innermost.set(None)
@@ -133,10 +129,10 @@ def progress_shown(wanted: bool | None = None, console: Console | None = None) -
     if is_heard() and wanted is not False:
         yield
         return
-    if wanted is None:
-        wanted = is_screen()
+    if wanted is None:  # people see what is printed at once at a terminal and in a notebook
+        wanted = bool(sys.stderr is not None and sys.stderr.isatty()) or "ipykernel" in sys.modules
     if not wanted:
-        with listening(ignore):
+        with listening(lambda _: None):  # so that nothing inside shows it either
             yield
         return
     from rich.console import Console  # slow to load, and needed by few programs
@@ -144,11 +140,6 @@ def progress_shown(wanted: bool | None = None, console: Console | None = None) -
     screen = Console(stderr=True, markup=False, emoji=False, highlight=False) if console is None else console
     with listening(OnScreen(screen) if screen.is_terminal or screen.is_jupyter else InLog(screen)):
         yield
-
-
-def is_screen() -> bool:
-    """Return whether people see what is printed at once: at a terminal or in a notebook."""
-    return bool(sys.stderr is not None and sys.stderr.isatty()) or "ipykernel" in sys.modules
 
 
 class InLog:

@@ -152,11 +152,16 @@ class Store(Database):
 
     def _pairs(self, table: str) -> dict[str, Any]:
         bounded = (f"CASE WHEN length({cell}) <= {rows.MOST_CHARACTERS} THEN {cell} END" for cell in ("key", "value"))
-        with self._rows(f"SELECT {', '.join(bounded)} FROM {table} ORDER BY rowid") as pairs:
+        pairs: dict[str, Any] = {}
+        with self._rows(f"SELECT {', '.join(bounded)} FROM {table} ORDER BY rowid") as content:
             try:
-                return rows.read_pairs(pairs)
+                for key, value in content:
+                    if not isinstance(key, str) or key in pairs:
+                        raise InputError(f"a key must be a text that occurs once, got {key!r}.")
+                    pairs[key] = rows.read_json(value, finite=False)
             except InputError as error:
                 raise self._damaged(f"the {table} in it cannot be read") from error
+        return pairs
 
     # The history
 
@@ -222,12 +227,11 @@ class Store(Database):
             self._require_unchanged(changes)
             self._update(trial, "AND state = 'open'")
 
-    def close_trial(self, trial: Trial, system_trajectory: Trajectory | None, *, changes: int | None = None) -> None:
-        """Store the result of an open trial; of two results for one trial, the first is stored."""
-        self.close_trials([(trial, system_trajectory)], changes=changes)
-
     def close_trials(self, ended: Iterable[tuple[Trial, Trajectory | None]], *, changes: int | None = None) -> None:
-        """Store the results of open trials with their trajectories of the system in one transaction: all, or none."""
+        """Store the results of open trials with their trajectories of the system in one transaction: all, or none.
+
+        Of two results for one trial, the first is stored.
+        """
         with self._transaction():
             self._require_unchanged(changes)
             for trial, system_trajectory in ended:
