@@ -15,13 +15,14 @@ from ctxval.certificates import (
     CertificateKind,
     CertificateOptions,
     Neighbour,
+    Posterior,
     Provenance,
     Sample,
     certify_audit,
     certify_posterior,
     certify_scenario,
 )
-from ctxval.certificates.covering import resolved_volume
+from ctxval.certificates.covering import RESOLUTION, resolved_volume
 from ctxval.certificates.sentences.withdrawals import REFINED
 from ctxval.certificates.stopping import StoppingRule
 from ctxval.certificates.verdict import counterexample, judge, judge_by
@@ -31,7 +32,10 @@ from ctxval.errors import InputError
 pytestmark = pytest.mark.usefixtures("few_draws")
 
 WORST = 1.0
-posterior = CertificateOptions.posterior
+
+
+def posterior(confidence: float = 0.95, resolution: float = RESOLUTION) -> CertificateOptions:
+    return CertificateOptions(Posterior(resolution), confidence)
 
 
 def trial(
@@ -243,7 +247,7 @@ def test_a_confidence_beyond_the_draws_is_undecided_and_one_that_is_none_is_refu
         with pytest.raises(InputError, match=r"from 0\.5 to below 1"):
             judge(trials(), tau, posterior(confidence))
         with pytest.raises(InputError, match=r"from 0\.5 to below 1"):
-            StoppingRule(tau, posterior(confidence)).decide(trials(), 0)
+            StoppingRule(tau, confidence).decide(trials(), 0)
 
 
 def repeated(executed: Trial) -> Trial:
@@ -260,7 +264,7 @@ def test_decided_is_what_the_verdict_is_not_undecided_of(stochastic: bool) -> No
     best = max(t.distance or 0.0 for t in known)
     for threshold in (0.9 * best, 1.02 * upper, best + 0.2 * (upper - best)):
         verdict = judge(known, threshold, posterior())
-        assert StoppingRule(threshold, posterior()).decide(known, 0).decided == (verdict.answer != "undecided")
+        assert StoppingRule(threshold).decide(known, 0).decided == (verdict.answer != "undecided")
 
 
 @pytest.mark.slow
@@ -299,7 +303,7 @@ def test_a_resolution_that_is_no_positive_number_is_refused_before_anything_is_s
         with pytest.raises(InputError, match="resolution must be a positive number"):
             judge(trials_of, 1.0, posterior(resolution=resolution))
         with pytest.raises(InputError, match="resolution must be a positive number"):
-            StoppingRule(1.0, posterior(resolution=resolution)).decide(trials_of, 5)
+            StoppingRule(1.0, resolution=resolution).decide(trials_of, 5)
 
 
 def test_a_failure_that_was_made_good_counts_no_more() -> None:
@@ -337,7 +341,7 @@ def test_a_confidence_below_a_half_is_refused(confidence: float) -> None:
     with pytest.raises(InputError, match="wrong more often than right"):
         judge(trials(), 50.0, posterior(confidence))
     with pytest.raises(InputError, match="wrong more often than right"):
-        StoppingRule(50.0, posterior(confidence)).decide(trials(), 0)
+        StoppingRule(50.0, confidence).decide(trials(), 0)
     with pytest.raises(InputError, match="wrong more often than right"):
         judge_by(replace(certificate(1.0), confidence=confidence), trials(), 50.0)
 

@@ -165,7 +165,7 @@ class IntervalSearch:
             chosen = sum(trial.origin not in DRAWN for trial in trials)
             patient = chosen < 16 or self._lacks_tests_alone(evidence) or unentered_pocket(evidence) is not None
             # In few dimensions, executions soon cover the tasks, and the posterior bound of the distance may decide.
-            if not patient or covering(known, kind.posterior.resolution, 0) is not None:
+            if not patient or covering(known, kind.resolution, 0) is not None:
                 choice = self._by_distance()
                 if not patient or choice is None:
                     return choice
@@ -231,10 +231,9 @@ class IntervalSearch:
     def _by_distance(self) -> Choice | None:
         kind = self.options.kind
         # No distance is known, all are 0, or each task of a suite is executed.
-        if isinstance(kind, Dynamics) or not self.limit > 0 or self._suite is not None:
+        if not isinstance(kind, Automatic | Posterior) or not self.limit > 0 or self._suite is not None:
             return Choice(planned_draws=0)
-        posterior = kind.posterior if isinstance(kind, Automatic) else kind
-        rule = StoppingRule(self.limit, replace(self.options, kind=posterior))
+        rule = StoppingRule(self.limit, self.options.confidence, kind.resolution)
         now = rule.decide(self.recorder.trials, self.budget - self.recorder.executions)
         if not now.decided:
             return Choice(now.next_point, "covering", planned_draws=0)

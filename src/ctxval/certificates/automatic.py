@@ -48,11 +48,6 @@ class Automatic(CertificateKind):
     #: the share of the executions of each task that the bound is about, if they differ by noise
     quantile: Probability = QUANTILE
 
-    @property
-    def posterior(self) -> Posterior:
-        """The posterior bound with these options."""
-        return Posterior(self.resolution)
-
     def certify(self, sample: Sample, confidence: float = 0.95) -> Certificate:
         """Return the dynamics bound or, if it is withdrawn or refused, the posterior bound."""
         return self.certify_against(sample, None, confidence)[0]
@@ -76,7 +71,7 @@ class Automatic(CertificateKind):
         if sample.suite is not None:
             return by_dynamics or (WholeSuite().certify(sample, confidence), None)
         try:
-            certificate, expected = self.posterior.certify_against(sample, threshold, confidence)
+            certificate, expected = Posterior(self.resolution).certify_against(sample, threshold, confidence)
         except CertificateError:
             if by_dynamics is None:
                 raise

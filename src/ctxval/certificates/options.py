@@ -10,7 +10,6 @@ from ctxval._util.representation import ShortRepr
 from ctxval.certificates.automatic import Automatic
 from ctxval.certificates.base import CertificateKind
 from ctxval.certificates.covering import RESOLUTION
-from ctxval.certificates.posterior import Posterior
 from ctxval.errors import InputError
 
 CONFIDENCE = 0.95  # default of a verdict
@@ -44,11 +43,6 @@ class CertificateOptions(ShortRepr):
     confidence: Confidence = CONFIDENCE  #: confidence level of the certificate, at least 0.5
     #: the share of the task space that may exceed the threshold, at most 0.5; if it is 0, only bounds on d* validate
     volume: Volume = 0.0
-
-    @classmethod
-    def posterior(cls, confidence: float = CONFIDENCE, *, resolution: float = RESOLUTION) -> CertificateOptions:
-        """Return options with the posterior bound; the resolution is that of :class:`Posterior`."""
-        return cls(Posterior(resolution), confidence)
 
     @classmethod
     def or_automatic(

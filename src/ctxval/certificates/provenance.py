@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,6 @@ from ctxval._util.representation import ShortRepr
 from ctxval.certificates.base import Certificate
 from ctxval.certificates.bounds import Quantities
 from ctxval.certificates.dynamics_evidence import LearnedDistance
-from ctxval.certificates.sample import Sample
 from ctxval.certificates.sentences import verdicts as sentences
 from ctxval.certificates.sentences import withdrawals
 from ctxval.core.space import DISTRIBUTION, TaskSpace
@@ -125,11 +124,6 @@ class Provenance(ShortRepr):
     def stated(self) -> tuple[str, ...]:
         """The remarks that are the user's word, on which a validation rests."""
         return tuple(remark for remark in self.remarks if remark != withdrawals.REFINED)
-
-    def sample(self, trials: Sequence[Trial]) -> Sample:
-        """Return trials as a certificate sees them, with what is known here."""
-        suite = None if self.space is None else self.space.members
-        return replace(Sample.of(trials, self.learned), distribution=self.distribution, suite=suite)
 
 
 def _space_of(described: Mapping[str, Any]) -> TaskSpace | None:

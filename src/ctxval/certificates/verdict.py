@@ -16,7 +16,7 @@ from ctxval.certificates.bounds import NO_UNITS, Quantities
 from ctxval.certificates.forecast import Forecast
 from ctxval.certificates.options import CONFIDENCE, CertificateOptions, Confidence, Volume
 from ctxval.certificates.provenance import Provenance
-from ctxval.certificates.sample import without_success
+from ctxval.certificates.sample import Sample, without_success
 from ctxval.certificates.sentences import verdicts as sentences
 from ctxval.core.quantiles import QUANTILE
 from ctxval.core.trial import Trial, designs_sentence
@@ -175,7 +175,9 @@ def _certified(
     trials: Sequence[Trial], options: CertificateOptions, known: Provenance, threshold: float | None
 ) -> tuple[Certificate, Forecast | None]:
     """Return a certificate, for a threshold if there is one, and a forecast. Most kinds see countable draws only."""
-    kind, sample = options.kind, known.sample(trials)
+    suite = None if known.space is None else known.space.members
+    sample = replace(Sample.of(trials, known.learned), distribution=known.distribution, suite=suite)
+    kind = options.kind
     if sample.suite is not None:
         require_suite(kind)
     # No statement may count draws whose number depended on their distances.

@@ -128,11 +128,9 @@ class Store(Database):
             stated = self.thresholds()
             if stated is not None and all(each.threshold != threshold for each in stated):
                 known = self._execute("SELECT count(*) FROM trials WHERE state = 'completed'").fetchone()[0]
-                self._write_thresholds((*stated, StatedThreshold(float(threshold), int(known), now())))
-
-    def _write_thresholds(self, stated: Sequence[StatedThreshold]) -> None:
-        _, text = rows.pair_of(_THRESHOLDS, [asdict(each) for each in stated])
-        self._execute("UPDATE experiment SET value = ? WHERE key = ?", (text, _THRESHOLDS))
+                stated = (*stated, StatedThreshold(float(threshold), int(known), now()))
+                key, text = rows.pair_of(_THRESHOLDS, [asdict(each) for each in stated])
+                self._execute("UPDATE experiment SET value = ? WHERE key = ?", (text, key))
 
     def keep_settings(self, settings: dict[str, Any]) -> None:
         """Store the settings that make the experiment again, for commands that get only the store."""
@@ -193,7 +191,8 @@ class Store(Database):
             self._write_description(description)
             self._insert_change(change)
             if change.why == REDEFINED:
-                self._write_thresholds(())  # they were thresholds of another distance
+                # They were thresholds of another distance.
+                self._execute("UPDATE experiment SET value = '[]' WHERE key = ?", (_THRESHOLDS,))
         return True
 
     def _require_unchanged(self, changes: int | None) -> None:
