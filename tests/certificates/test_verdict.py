@@ -18,9 +18,7 @@ from ctxval.certificates import (
     Posterior,
     Provenance,
     Sample,
-    certify_audit,
-    certify_posterior,
-    certify_scenario,
+    Scenario,
 )
 from ctxval.certificates.covering import RESOLUTION, resolved_volume
 from ctxval.certificates.sentences.withdrawals import REFINED
@@ -176,7 +174,7 @@ def test_a_volume_is_left_out_only_where_that_is_accepted() -> None:
 
 def test_scenario_and_audit_bounds_judge_too() -> None:
     drawn = [trial(k, x, 0.5 * x, "iid") for k, x in enumerate(np.linspace(0, 1, 60).tolist())]
-    for made in (certify_scenario(Sample.of(drawn), 0.9), certify_audit(Sample.of(drawn), 0.9)):
+    for made in (Scenario().certify(Sample.of(drawn), 0.9), Audit().certify(Sample.of(drawn), 0.9)):
         assert judge_by(made, drawn, 0.6).answer == "undecided"
         assert judge_by(made, drawn, 0.6, volume=0.05).answer == "validated"
         assert judge_by(made, drawn, 0.4, volume=0.05).answer == "falsified"
@@ -202,7 +200,7 @@ def test_a_counterexample_needs_no_certificate_and_no_model() -> None:
 @pytest.mark.slow
 def test_undecided_says_what_more_would_take() -> None:
     known = trials(5)
-    upper = certify_posterior(Sample.of(known)).upper_bound
+    upper = Posterior().certify(Sample.of(known)).upper_bound
     tau = 0.5 * (upper + max(t.distance or 0.0 for t in known))
     verdict = judge(known, tau)
     assert verdict.answer == "undecided"
@@ -260,7 +258,7 @@ def repeated(executed: Trial) -> Trial:
 @pytest.mark.thorough
 def test_decided_is_what_the_verdict_is_not_undecided_of(stochastic: bool) -> None:
     known = [*trials(6), *([repeated(trials(6)[2])] if stochastic else [])]
-    upper = certify_posterior(Sample.of(known), 0.95).upper_bound
+    upper = Posterior().certify(Sample.of(known), 0.95).upper_bound
     best = max(t.distance or 0.0 for t in known)
     for threshold in (0.9 * best, 1.02 * upper, best + 0.2 * (upper - best)):
         verdict = judge(known, threshold, posterior())
@@ -387,7 +385,7 @@ def test_a_validation_names_what_it_rests_on() -> None:
     assert "single executions may exceed it" in noisy.rests_on
     assert judge(trials(), 0.5).rests_on is None
     drawn = [trial(k, x, 0.5 * x, "iid") for k, x in enumerate(np.linspace(0, 1, 60).tolist())]
-    audited = judge_by(certify_audit(Sample.of(drawn), 0.9), drawn, 0.6, volume=0.05)
+    audited = judge_by(Audit().certify(Sample.of(drawn), 0.9), drawn, 0.6, volume=0.05)
     assert audited.rests_on is not None
     assert "from which M was not learned (how large the distance is in the 3.77 % that are left out" in audited.rests_on
 

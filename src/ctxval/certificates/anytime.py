@@ -51,49 +51,50 @@ class AnytimeAudit(CertificateKind):
         """Refuse: the bound is on the volume above a threshold, and none is given."""
         return self.certify_against(sample, None, confidence)[0]
 
+    @checked
     def certify_against(
-        self, sample: Sample, threshold: float | None, confidence: float = 0.95
+        self, sample: Sample, threshold: PositiveFloat | None, confidence: Probability = 0.95
     ) -> tuple[Certificate, Forecast | None]:
-        """Return :func:`certify_anytime` of the trials; nothing is forecast."""
+        """Bound the volume above a threshold that was fixed before the draws were known; nothing is forecast.
+
+        A draw without a distance violates it.
+        """
         if threshold is None:
             what = "an anytime audit bounds the volume above a threshold"
             raise CertificateError(f"{what}, so it needs one (--threshold).")
-        return certify_anytime(sample, threshold, confidence), None
-
-
-@checked
-def certify_anytime(sample: Sample, threshold: PositiveFloat, confidence: Probability = 0.95) -> Certificate:
-    """Bound the volume above a threshold, fixed before the draws were known; a draw without a distance violates it."""
-    drawn = sample.only("iid")
-    if not len(drawn):
-        raise CertificateError("an anytime audit needs independent draws of tasks, and there is none; use --audit N.")
-    violating = ~(drawn.distances <= threshold)  # also where no distance is known
-    volume = anytime_volume(violating, 1 - confidence)
-    return Certificate(
-        kind="anytime",
-        statement=share_above(
-            *(sample, volume, confidence, f"{threshold:.6g}", len(drawn)),
-            " or fail, however often this was looked at and continued",
-        ),
-        upper_bound=float(threshold),
-        confidence=confidence,
-        volume=volume,
-        trials=len(drawn),
-        assumptions=(
-            f"the audited tasks are independent and {distributed(sample)}",
-            f"the threshold {threshold:.6g} was fixed before any of them was known",
-            *ABOUT_DRAWS,
-            *sample.remarks,
-            ONE_CAMPAIGN,
-        ),
-        details={
-            "violations": int(violating.sum()),
-            "largest_drawn": drawn.best if np.isfinite(drawn.best) else None,
-            "failed": drawn.failed,
-            "failures": sample.failures,
-        },
-        distribution=sample.distribution,
-    )
+        drawn = sample.only("iid")
+        if not len(drawn):
+            raise CertificateError(
+                "an anytime audit needs independent draws of tasks, and there is none; use --audit N."
+            )
+        violating = ~(drawn.distances <= threshold)  # also where no distance is known
+        volume = anytime_volume(violating, 1 - confidence)
+        certificate = Certificate(
+            kind=self.name,
+            statement=share_above(
+                *(sample, volume, confidence, f"{threshold:.6g}", len(drawn)),
+                " or fail, however often this was looked at and continued",
+            ),
+            upper_bound=float(threshold),
+            confidence=confidence,
+            volume=volume,
+            trials=len(drawn),
+            assumptions=(
+                f"the audited tasks are independent and {distributed(sample)}",
+                f"the threshold {threshold:.6g} was fixed before any of them was known",
+                *ABOUT_DRAWS,
+                *sample.remarks,
+                ONE_CAMPAIGN,
+            ),
+            details={
+                "violations": int(violating.sum()),
+                "largest_drawn": drawn.best if np.isfinite(drawn.best) else None,
+                "failed": drawn.failed,
+                "failures": sample.failures,
+            },
+            distribution=sample.distribution,
+        )
+        return certificate, None
 
 
 def anytime_volume(violating: Mask, beta: float) -> float:

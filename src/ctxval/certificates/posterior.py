@@ -57,93 +57,75 @@ class Posterior(CertificateKind):
     resolution: PositiveFloat = RESOLUTION
 
     def certify(self, sample: Sample, confidence: float = 0.95) -> Certificate:
-        """Return :func:`certify_posterior` of the trials."""
+        """Return the bound that d* stays below with the confidence, under the prior and given the trials."""
         return self.certify_against(sample, None, confidence)[0]
 
     def certify_against(
         self, sample: Sample, threshold: float | None, confidence: float = 0.95
     ) -> tuple[Certificate, Forecast | None]:
         """Return the certificate from enough draws for the threshold, and a forecast if its bound is above that."""
-        if threshold is None:
-            return certify_posterior(sample, confidence, resolution=self.resolution), None
-        _require_covered(sample, self.resolution)
-        drawn = settle_maxima(sample, threshold, confidence)
-        certificate = certify_posterior(sample, confidence, resolution=self.resolution, found=drawn)
-        if certificate.doubt is not None or certificate.upper_bound <= threshold:
+        # Many trials that do not cover the tasks are refused before the draws, which take long.
+        if len(sample) > MOST and (farthest := farthest_task(sample.points)) > self.resolution:
+            raise CertificateError(
+                f"some task is {farthest:.2g} of the task space's diagonal away from each of {len(sample)} trials, "
+                f"more than the resolution of {self.resolution:g}, so the bound would be withdrawn and is not "
+                "computed; an audit bounds how many tasks are worse."
+            )
+        drawn = draw_maxima(sample) if threshold is None else settle_maxima(sample, threshold, confidence)
+        certificate = self.certify_drawn(sample, drawn, confidence)
+        if threshold is None or certificate.doubt is not None or certificate.upper_bound <= threshold:
             return certificate, None  # a process that the trials contradict predicts nothing
         return certificate, forecast(representative(sample), drawn, threshold, confidence)
 
-
-@checked
-def certify_posterior(
-    sample: Sample,
-    confidence: Probability = 0.95,
-    *,
-    resolution: PositiveFloat = RESOLUTION,
-    found: Maxima | None = None,
-) -> Certificate:
-    """Return the bound that d* stays below with the confidence, under the prior and given the trials.
-
-    ``resolution`` is that of :class:`Posterior`; ``found`` are draws of d* from the same trials, made before.
-    """
-    used = representative(sample)
-    _require_covered(sample, resolution)
-    drawn = draw_maxima(sample) if found is None else found
-    stochastic = drawn.stochastic
-    upper, error = drawn.upper(confidence), drawn.error(confidence)
-    unordered, d = np.array([origin == "manual" for origin in used.origins]), sample.points.shape[1]
-    diagnosis = diagnose(
-        drawn.conditioned,
-        used.points,
-        used.numbers,
-        unordered=unordered,
-        resolution=resolution,
-        covered=sample.points,
-    )
-    hyperparameters = [process.hyperparameters for process in drawn.conditioned]
-    rough = float(np.mean([each.nu == 1.5 for each in hyperparameters]))
-    return Certificate(
-        kind="posterior",
-        statement=posterior_statement(upper, error, confidence, stochastic=stochastic),
-        upper_bound=upper,
-        confidence=confidence,
-        volume=0.0,
-        trials=len(sample),
-        assumptions=(
-            *posterior_assumptions(sample, len(used), resolution, stochastic=stochastic),
-            *sample.remarks,
-            ONE_CAMPAIGN,
-        ),
-        details={
-            "best": sample.best,
-            "gap": upper - sample.best,
-            "error": error,
-            "draws": len(drawn.draws),
-            "stochastic": stochastic,
-            "resolution": {
-                "diagonals": resolution,
-                "of_each_range": resolution * float(np.sqrt(d)),
-                "of_the_space": resolved_volume(resolution, d),
+    @checked
+    def certify_drawn(self, sample: Sample, drawn: Maxima, confidence: Probability = 0.95) -> Certificate:
+        """Return the certificate from draws of d*, which were made from the same trials."""
+        used = representative(sample)
+        stochastic = drawn.stochastic
+        upper, error = drawn.upper(confidence), drawn.error(confidence)
+        unordered, d = np.array([origin == "manual" for origin in used.origins]), sample.points.shape[1]
+        diagnosis = diagnose(
+            drawn.conditioned,
+            used.points,
+            used.numbers,
+            unordered=unordered,
+            resolution=self.resolution,
+            covered=sample.points,
+        )
+        hyperparameters = [process.hyperparameters for process in drawn.conditioned]
+        rough = float(np.mean([each.nu == 1.5 for each in hyperparameters]))
+        return Certificate(
+            kind=self.name,
+            statement=posterior_statement(upper, error, confidence, stochastic=stochastic),
+            upper_bound=upper,
+            confidence=confidence,
+            volume=0.0,
+            trials=len(sample),
+            assumptions=(
+                *posterior_assumptions(sample, len(used), self.resolution, stochastic=stochastic),
+                *sample.remarks,
+                ONE_CAMPAIGN,
+            ),
+            details={
+                "best": sample.best,
+                "gap": upper - sample.best,
+                "error": error,
+                "draws": len(drawn.draws),
+                "stochastic": stochastic,
+                "resolution": {
+                    "diagonals": self.resolution,
+                    "of_each_range": self.resolution * float(np.sqrt(d)),
+                    "of_the_space": resolved_volume(self.resolution, d),
+                },
+                "instantaneous": instantaneous_bound(used),
+                "kernels": {"matern-3/2": rough, "matern-5/2": 1 - rough},
+                "logarithm": float(np.mean([np.isfinite(process.warp.offset) for process in drawn.conditioned])),
+                "length_scales": np.median(np.exp([each.log_scales for each in hyperparameters]), axis=0).tolist(),
+                "diagnosis": {name: value for name, value in vars(diagnosis).items() if name != "doubt"},
+                "failures": sample.failures,
             },
-            "instantaneous": instantaneous_bound(used),
-            "kernels": {"matern-3/2": rough, "matern-5/2": 1 - rough},
-            "logarithm": float(np.mean([np.isfinite(process.warp.offset) for process in drawn.conditioned])),
-            "length_scales": np.median(np.exp([each.log_scales for each in hyperparameters]), axis=0).tolist(),
-            "diagnosis": {name: value for name, value in vars(diagnosis).items() if name != "doubt"},
-            "failures": sample.failures,
-        },
-        doubt=both_outcomes(sample, stochastic=stochastic) or diagnosis.doubt,
-        error=error,
-    )
-
-
-def _require_covered(sample: Sample, resolution: float) -> None:
-    """Refuse many trials that do not cover the tasks before the draws, which take long."""
-    if len(sample) > MOST and (farthest := farthest_task(sample.points)) > resolution:
-        raise CertificateError(
-            f"some task is {farthest:.2g} of the task space's diagonal away from each of {len(sample)} trials, more "
-            f"than the resolution of {resolution:g}, so the bound would be withdrawn and is not computed; an audit "
-            "bounds how many tasks are worse."
+            doubt=both_outcomes(sample, stochastic=stochastic) or diagnosis.doubt,
+            error=error,
         )
 
 
