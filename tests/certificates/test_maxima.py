@@ -70,8 +70,6 @@ def test_the_rank_is_that_of_exchangeable_draws() -> None:
 @pytest.mark.parametrize("confidence", [0.0, 1.0, -0.1, 1.5, np.nan])
 def test_a_confidence_that_is_no_probability_is_refused(confidence: float) -> None:
     with pytest.raises(InputError, match="strictly between 0 and 1"):
-        drawn([1.0, 2.0]).upper(confidence)
-    with pytest.raises(InputError, match="strictly between 0 and 1"):
         Posterior().certify(sample(), confidence)
 
 

@@ -59,15 +59,14 @@ class Provenance(ShortRepr):
         beside: Iterable[Neighbour] = (),
     ) -> Provenance:
         """Return the provenance from what a store says of its experiment, and from the stores beside it."""
-
-        def table(of: Mapping[str, Any], name: str) -> Mapping[str, Any]:
-            part = of.get(name)
-            return part if isinstance(part, dict) else {}
-
-        validation = table(description, "validation")
-        described = table(validation, "space")
+        described, remarks = dict[str, Any](), list[str]()
+        match description:
+            case {"validation": {"space": dict(space)}}:
+                described = space
+        match description:
+            case {"validation": {"model": {"type": "Refined"}}}:
+                remarks.append(withdrawals.REFINED)
         distribution = described.get(DISTRIBUTION)
-        remarks = [withdrawals.REFINED] if table(validation, "model").get("type") == "Refined" else []
         for change in changes:
             if change.what == "accepted":
                 different = "; ".join(change.content.get("differences", [])[:1]) or "nothing that is described"
