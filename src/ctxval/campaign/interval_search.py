@@ -46,7 +46,7 @@ from ctxval.certificates.posterior import Posterior
 from ctxval.certificates.prediction_tests import DRAWN, MANY, TESTS
 from ctxval.certificates.sample import SAME
 from ctxval.certificates.suite import WholeSuite
-from ctxval.certificates.verdict import counterexample, quantile_of, require_suite
+from ctxval.certificates.verdict import counterexample, require_suite
 from ctxval.core.trial import Trial
 from ctxval.errors import CertificateError, InputError
 from ctxval.learning.worst_case import is_kinked
@@ -74,7 +74,7 @@ class IntervalSearch:
         if self.threshold is None and isinstance(self.options.kind, AnytimeAudit):
             raise InputError("an anytime audit ends by its threshold; state one, or run another certificate.")
         self.options.kind.require_usable(self.options.confidence, self.budget)
-        self.recorder.dynamics.use_quantile(quantile_of(self.options.kind))
+        self.recorder.dynamics.use_quantile(self.options.kind.quantile)
 
     @property
     def limit(self) -> float:
@@ -111,7 +111,7 @@ class IntervalSearch:
         """Whether the executed distances falsify the limit; of a noisy system, one above it may not suffice."""
         kind, confidence = self.options.kind, self.options.confidence
         known = Quantities(space=self.recorder.validation.space)
-        return counterexample(self.recorder.trials, self.limit, known, confidence, quantile_of(kind)) is not None
+        return counterexample(self.recorder.trials, self.limit, known, confidence, kind.quantile) is not None
 
     def choose(self) -> Choice | None:
         """Return the next task; None if the interval decides, or no task of a suite is left."""
@@ -183,7 +183,7 @@ class IntervalSearch:
 
     def _against_noise(self) -> Choice | None:
         """Return a task whose execution tells whether noise explains a distance above the limit, if there is one."""
-        trials, quantile = self.recorder.trials, quantile_of(self.options.kind)
+        trials, quantile = self.recorder.trials, self.options.kind.quantile
         bets = bets_against(trials, self.limit, quantile)
         if self._suite is not None or not self.predicts or (bets is not None and bets.falsify(self.options.confidence)):
             return None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field, fields
@@ -13,6 +14,7 @@ from ctxval._util.version import VERSION
 from ctxval.certificates.bounds import ERRORS, as_text, at_most, with_error
 from ctxval.certificates.sample import Sample
 from ctxval.certificates.sentences import verdicts as sentences
+from ctxval.core.quantiles import QUANTILE
 from ctxval.core.space import TaskSpace
 from ctxval.core.trial import Origin
 from ctxval.errors import CertificateError, InputError, UnknownNameError
@@ -40,6 +42,12 @@ class Certificate:
     version: str = VERSION  #: the version of ctxval that computed it
     #: the distribution of tasks as a text, which ``volume`` is a share of; None if it is uniform
     distribution: str | None = None
+
+    @property
+    def bound(self) -> float | None:
+        """The bound on d*; None if it is withdrawn, is infinite, or leaves out a volume."""
+        usable = self.doubt is None and not self.volume and math.isfinite(self.upper_bound)
+        return self.upper_bound if usable else None
 
     def covers(self, threshold: float, volume: float = 0.0) -> bool:
         """Return whether it bounds the distance by the threshold, except on at most this share of the task space.
@@ -120,6 +128,9 @@ class CertificateKind(ShortRepr, ABC):
 
     takes_suites: ClassVar[bool] = False
     """Whether it certifies suites of tasks, of which each is executed once and none is drawn at random."""
+
+    quantile = QUANTILE
+    """The share of the executions of each task that a threshold is about, if they differ by noise."""
 
     @classmethod
     def options(cls) -> tuple[str, ...]:

@@ -6,8 +6,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
 
-import numpy as np
-
 from ctxval._util.checked import PositiveFloat, checked, require
 from ctxval._util.representation import ShortRepr, call, line, lines, shown, table
 from ctxval.certificates.base import KINDS, Certificate, CertificateKind
@@ -46,8 +44,8 @@ class Verdict:
 
     @property
     def bound(self) -> float | None:
-        """The bound on d* of its certificate; None if there is none, it is withdrawn, or it leaves out a volume."""
-        return usable_bound(self.certificate)
+        """The bound on d* of its certificate; None if there is none."""
+        return None if self.certificate is None else self.certificate.bound
 
     def __str__(self) -> str:
         return f"{self.answer}: {self.reason}" + (f" {self.rests_on}" if self.rests_on else "")
@@ -69,18 +67,6 @@ class Verdict:
         """Return the answer and its reasons, ready for JSON; the certificate has its own."""
         names = ("reason", "rests_on", "threshold", "next_task")
         return {"verdict": self.answer, **{name: getattr(self, name) for name in names}}
-
-
-def quantile_of(kind: object) -> float:
-    """Return the share of the executions of a task that a threshold is about, for a kind of certificate."""
-    return float(getattr(kind, "quantile", QUANTILE))
-
-
-def usable_bound(certificate: Certificate | None) -> float | None:
-    """Return the bound on d* of a certificate; None if there is none, it is withdrawn, or it leaves out a volume."""
-    if certificate is None or certificate.doubt is not None or certificate.volume:
-        return None
-    return certificate.upper_bound if np.isfinite(certificate.upper_bound) else None
 
 
 @checked
@@ -123,7 +109,7 @@ def judge_by(
     require("confidence", Confidence, certificate.confidence)
     kind = KINDS.find(certificate.kind) if certificate.kind in KINDS else CertificateKind
     quantities = known.quantities
-    quantile = certificate.details.get("quantile") or quantile_of(kind)
+    quantile = certificate.details.get("quantile") or kind.quantile
     falsified = counterexample(trials, tau, quantities, certificate.confidence, quantile)
     if falsified is not None:
         return replace(falsified, certificate=certificate)
@@ -154,7 +140,7 @@ def judge(
         provenance: what is known besides the trials.
     """
     known, chosen = provenance or Provenance(), options or CertificateOptions()
-    quantile = quantile_of(chosen.kind)
+    quantile = chosen.kind.quantile
     verdict = counterexample(trials, threshold, known.quantities, chosen.confidence, quantile)
     if verdict is None:
         try:
@@ -230,7 +216,7 @@ def assess(
     known, kind = provenance or Provenance(), options.kind
     falsified = None
     if threshold is not None:
-        falsified = counterexample(trials, threshold, known.quantities, options.confidence, quantile_of(kind))
+        falsified = counterexample(trials, threshold, known.quantities, options.confidence, kind.quantile)
     if threshold is not None and falsified is None:
         verdict = judge(trials, threshold, options, known)
         if verdict.certificate is None:
