@@ -153,11 +153,11 @@ class CertificateKind(ShortRepr, ABC):
         """Return a certificate, precise enough for a threshold if there is one, and a forecast if one can be made."""
         return self.certify(sample, confidence), None
 
-    def require_audit_helps(self, origins: Iterable[Origin]) -> None:
-        """Raise a CertificateError if independent draws beside trials of these origins could never be certified."""
+    def require_usable(self, confidence: float, executions: int, beside: Iterable[Origin] = ()) -> None:
+        """Raise a CertificateError if so many trials could never be certified, before they are paid for.
 
-    def require_usable(self, confidence: float, executions: int) -> None:
-        """Raise a CertificateError if so many trials could never be certified, before they are paid for."""
+        There may be others ``beside`` them, of these origins.
+        """
 
     @classmethod
     def rests_on(cls, certificate: Certificate, space: TaskSpace | None = None) -> list[str]:

@@ -14,6 +14,7 @@ predictions, and by far more if one of these predictions failed.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass, replace
 from typing import ClassVar
 
@@ -47,6 +48,7 @@ from ctxval.certificates.sentences.statements import (
     two_distances,
 )
 from ctxval.core.quantiles import QUANTILE
+from ctxval.core.trial import Origin
 from ctxval.errors import CertificateError
 
 MOST_DRAWS = 400  # posterior samples of the dynamics, which limit the confidence
@@ -66,7 +68,7 @@ class Dynamics(CertificateKind):
     #: the share of the executions of each task that the bound is about, if they differ by noise
     quantile: Probability = QUANTILE
 
-    def require_usable(self, confidence: float, executions: int) -> None:
+    def require_usable(self, confidence: float, executions: int, beside: Iterable[Origin] = ()) -> None:
         """Refuse a confidence that needs too many draws of the dynamics."""
         rank_within(confidence, MOST_DRAWS)
 

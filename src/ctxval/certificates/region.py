@@ -16,6 +16,7 @@ of M, j and the confidence. The volume above tau is at most eps and this bound t
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -30,6 +31,7 @@ from ctxval.certificates.forecast import Forecast
 from ctxval.certificates.sample import Sample, advice_to_remeasure, require_learned
 from ctxval.certificates.scenario import countable_draws, require_more, volume_bound
 from ctxval.certificates.sentences.statements import ABOUT_DRAWS, FROZEN, ONE_CAMPAIGN, how_drawn, margin_and_map
+from ctxval.core.trial import Origin
 from ctxval.errors import CertificateError
 
 _OF_MAP = 0.05
@@ -126,7 +128,7 @@ class Region(CertificateKind):
         )
         return certificate, None
 
-    def require_usable(self, confidence: float, executions: int) -> None:
+    def require_usable(self, confidence: float, executions: int, beside: Iterable[Origin] = ()) -> None:
         """Require more trials than are discarded."""
         require_more(executions, self.discard, "draws")
 

@@ -110,17 +110,14 @@ class Scenario(CertificateKind):
             distribution=sample.distribution,
         )
 
-    def require_audit_helps(self, origins: Iterable[Origin]) -> None:
-        """Refuse trials that are no independent draws, and require the number to discard."""
-        self._require_discard()
-        if any(origin != "iid" for origin in origins):
+    def require_usable(self, confidence: float, executions: int, beside: Iterable[Origin] = ()) -> None:
+        """Require independent draws alone, the number to discard, and more trials than that."""
+        discarded = self._require_discard()
+        if any(origin != "iid" for origin in beside):
             raise CertificateError(
                 f"a {self.name} bound takes independent draws alone, but there are others; say --kind audit."
             )
-
-    def require_usable(self, confidence: float, executions: int) -> None:
-        """Require the number to discard, and more trials than that."""
-        require_more(executions, self._require_discard())
+        require_more(executions, discarded)
 
     def _require_discard(self) -> int:
         return 0
