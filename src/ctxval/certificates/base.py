@@ -195,8 +195,8 @@ class KindRegistry(Registry[CertificateKind]):
 
     def find(self, name: str) -> type[CertificateKind]:
         """Return the kind of a name."""
-        kind = _required(super().find(name))
-        if kind.name != name:
+        kind: type[CertificateKind] = super().find(name)
+        if name not in self._exported and _required(kind).name != name:  # that of an installed package
             raise InputError(f"the certificate {name!r} calls itself {kind.name!r}.")
         return kind
 
