@@ -6,7 +6,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field, fields
-from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 from ctxval._util.registry import Registry
 from ctxval._util.representation import ShortRepr, Shown, call, line, lines, table
@@ -165,49 +165,21 @@ class CertificateKind(ShortRepr, ABC):
         return sentences.conditions(certificate, space)
 
 
-Kind = TypeVar("Kind", bound=type[CertificateKind])
-
-
 class KindRegistry(Registry[CertificateKind]):
-    """Kinds of certificates by name: built-in ones, those of installed packages, and those registered by a decorator.
-
-    A registered kind is the user's own code, so :meth:`is_data` returns False for it.
-    """
-
-    def __init__(self) -> None:
-        super().__init__("certificate", "ctxval.certificates", method="certify")
-        self._registered: set[str] = set()
-
-    def register(self, kind: Kind) -> Kind:
-        """Add a kind; a decorator of its class. A cell that is run again replaces its own class."""
-        name = _required(kind).name
-        known = self._exported.get(name, kind)
-        if (known.__module__, known.__qualname__) != (kind.__module__, kind.__qualname__):
-            raise InputError(f"there is a kind of certificate called {name!r} already: {known.__qualname__}.")
-        if name in self._registered or name not in self._exported:
-            self._registered.add(name)
-            self._exported[name] = kind
-        return kind
-
-    def is_data(self, name: Any) -> bool:
-        """Return whether a kind with plain arguments runs no code of a user."""
-        return name not in self._registered and super().is_data(name)
+    """Kinds of certificates by name: built-in ones, and those of installed packages."""
 
     def find(self, name: str) -> type[CertificateKind]:
         """Return the kind of a name."""
-        kind: type[CertificateKind] = super().find(name)
-        if name not in self._exported and _required(kind).name != name:  # that of an installed package
-            raise InputError(f"the certificate {name!r} calls itself {kind.name!r}.")
-        return kind
+        kind: Any = super().find(name)
+        if name not in self._exported:
+            if not isinstance(kind, type) or not issubclass(kind, CertificateKind):
+                raise InputError(f"a kind of certificate must be a subclass of CertificateKind, got {kind!r}.")
+            if getattr(kind, "name", None) != name:
+                raise InputError(f"the certificate {name!r} calls itself {getattr(kind, 'name', None)!r}.")
+        return kind  # type: ignore[no-any-return]
 
 
-def _required(kind: Any) -> type[CertificateKind]:
-    if isinstance(kind, type) and issubclass(kind, CertificateKind) and isinstance(getattr(kind, "name", None), str):
-        return kind
-    raise InputError(f"a kind of certificate must be a subclass of CertificateKind with a name, got {kind!r}.")
-
-
-KINDS = KindRegistry()
+KINDS = KindRegistry("certificate", "ctxval.certificates", method="certify")
 """Kinds of certificates by name."""
 
 

@@ -103,20 +103,24 @@ def judge_by(
     *,
     volume: Volume = 0.0,
     provenance: Provenance | None = None,
+    kind: CertificateKind | None = None,
 ) -> Verdict:
-    """Return the verdict by a certificate of any kind; only bounds on d* validate if the acceptable ``volume`` is 0."""
+    """Return the verdict by a certificate; only bounds on d* validate if the acceptable ``volume`` is 0.
+
+    Its kind says what a validation rests on; by default, it is found by its name.
+    """
     tau, known = float(threshold), provenance or Provenance()
     require("confidence", Confidence, certificate.confidence)
-    kind = KINDS.find(certificate.kind) if certificate.kind in KINDS else CertificateKind
+    by_name = KINDS.find(certificate.kind) if certificate.kind in KINDS else CertificateKind
     quantities = known.quantities
-    quantile = certificate.details.get("quantile") or kind.quantile
+    quantile = certificate.details.get("quantile") or (kind or by_name).quantile
     falsified = counterexample(trials, tau, quantities, certificate.confidence, quantile)
     if falsified is not None:
         return replace(falsified, certificate=certificate)
     if not certificate.covers(tau, volume):
         why_not = sentences.undecided(certificate, tau, volume, quantities)
         return Verdict("undecided", tau, why_not, certificate=certificate)
-    conditions = kind.rests_on(certificate, known.space)
+    conditions = (kind or by_name).rests_on(certificate, known.space)
     alone = known.alone(tau, trials)
     rests_on = sentences.rests_on(conditions, certificate, tau, quantities, known.stated, alone)
     looked = known.looked(certificate, tau, trials, volume)
@@ -145,7 +149,7 @@ def judge(
     if verdict is None:
         try:
             certificate, expected = _certified(trials, chosen, known, threshold)
-            verdict = judge_by(certificate, trials, threshold, volume=chosen.volume, provenance=known)
+            verdict = judge_by(certificate, trials, threshold, volume=chosen.volume, provenance=known, kind=chosen.kind)
             verdict = replace(verdict, expected=expected)
         except CertificateError as error:
             verdict = Verdict("undecided", float(threshold), str(error))
