@@ -44,7 +44,7 @@ class AnytimeAudit(CertificateKind):
 
     name: ClassVar[str] = "anytime"
     bounds_maximum: ClassVar[bool] = False
-    needs_threshold: ClassVar[bool] = True
+    uses_threshold: ClassVar[bool] = True
     sorts_draws: ClassVar[bool] = True  # all of them count, whenever they end
 
     def certify(self, sample: Sample, confidence: float = 0.95) -> Certificate:

@@ -113,11 +113,8 @@ class CertificateKind(ShortRepr, ABC):
     bounds_maximum: ClassVar[bool] = True
     """Whether it bounds d* itself. If not, it leaves out a share of the task space, which the user must accept."""
 
-    needs_threshold: ClassVar[bool] = False
-    """Whether its statement is about a threshold, so that there is none without one."""
-
     uses_threshold: ClassVar[bool] = False
-    """Whether its statement is about a threshold if there is one, and about the distance alone if there is none."""
+    """Whether its statement is about a threshold, if there is one."""
 
     needs_model: ClassVar[bool] = False
     """Whether it uses what the experiment's model predicts, so that the experiment must be loaded."""

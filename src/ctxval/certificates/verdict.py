@@ -226,7 +226,7 @@ def assess(
         if verdict.certificate is None:
             raise CertificateError(verdict.reason)
         return Assessment(kind.name, verdict.certificate, verdict)
-    limit = threshold if kind.needs_threshold or kind.uses_threshold else None
+    limit = threshold if kind.uses_threshold else None
     try:
         certificate, _ = _certified(trials, options, known, limit)
     except CertificateError as error:
