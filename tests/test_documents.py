@@ -113,9 +113,9 @@ def test_the_glossary_explains_what_certificates_and_trials_say() -> None:
     sample = Sample(points, np.sin(5 * points[:, 0]) + 2, origins, ["completed"] * 8, learned=learned)
     certificates = [
         Audit().certify(sample),
-        AnytimeAudit().certify_against(sample, 3.0)[0],
+        AnytimeAudit().certify(replace(sample, threshold=3.0)),
         certify_dynamics(sample, evidence()),
-        Region().certify_against(sample, 3.0)[0],
+        Region().certify(replace(sample, threshold=3.0)),
         WholeSuite().certify(replace(sample, suite=points)),
         Posterior().certify_drawn(sample, draw_maxima(sample, draws=4, paths=2), 0.5),
     ]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -21,7 +22,7 @@ from ctxval.errors import CertificateError
 
 
 def anytime(sample: Sample, threshold: float) -> Certificate:
-    return AnytimeAudit().certify_against(sample, threshold)[0]
+    return AnytimeAudit().certify(replace(sample, threshold=threshold))
 
 
 def draws(distances: list[float]) -> Sample:

@@ -281,4 +281,4 @@ def test_a_bound_of_many_trials_says_that_it_uses_some_of_them() -> None:
 
 def test_many_trials_that_do_not_cover_the_tasks_are_refused_before_the_draws() -> None:
     with pytest.raises(CertificateError, match=r"away from each of 400 trials.*is not computed"):
-        Posterior().certify_against(sample(400, 5), 10.0)
+        Posterior().certify(sample(400, 5))

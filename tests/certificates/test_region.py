@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -31,7 +32,7 @@ SLOPE = Predicted(lambda points: points[:, 0])
 def region(
     sample: Sample, threshold: float | None = None, confidence: float = 0.95, options: Region | None = None
 ) -> Certificate:
-    return (options or Region()).certify_against(sample, threshold, confidence)[0]
+    return (options or Region()).certify(replace(sample, threshold=threshold), confidence)
 
 
 def draws(distances: list[float], learned: Predicted | None = FLAT, planned: list[int | None] | None = None) -> Sample:

@@ -126,7 +126,8 @@ class IntervalSearch:
         if isinstance(kind, AnytimeAudit):
             # The next independent draw of an anytime audit, which may end whenever its bound suffices.
             if any(trial.origin == "iid" for trial in self._ended):
-                certificate, _ = kind.certify_against(Sample.of(self._ended), self.limit, self.options.confidence)
+                sample = replace(Sample.of(self._ended), threshold=self.limit)
+                certificate = kind.certify(sample, self.options.confidence)
                 if certificate.covers(self.limit, self.options.volume):
                     return None
             return Choice(self.recorder.draw(), "iid", planned_draws=0)

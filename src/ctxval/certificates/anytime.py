@@ -25,10 +25,9 @@ from scipy.optimize import brentq
 from scipy.special import betainc, betaln
 
 from ctxval._util.arrays import Array, Mask
-from ctxval._util.checked import PositiveFloat, Probability, checked
+from ctxval._util.checked import Probability, checked
 from ctxval._util.registry import part
 from ctxval.certificates.base import Certificate, CertificateKind
-from ctxval.certificates.forecast import Forecast
 from ctxval.certificates.sample import Sample
 from ctxval.certificates.sentences.statements import ABOUT_DRAWS, ONE_CAMPAIGN, distributed, share_above
 from ctxval.errors import CertificateError
@@ -47,21 +46,16 @@ class AnytimeAudit(CertificateKind):
     uses_threshold: ClassVar[bool] = True
     sorts_draws: ClassVar[bool] = True  # all of them count, whenever they end
 
-    def certify(self, sample: Sample, confidence: float = 0.95) -> Certificate:
-        """Refuse: the bound is on the volume above a threshold, and none is given."""
-        return self.certify_against(sample, None, confidence)[0]
-
     @checked
-    def certify_against(
-        self, sample: Sample, threshold: PositiveFloat | None, confidence: Probability = 0.95
-    ) -> tuple[Certificate, Forecast | None]:
-        """Bound the volume above a threshold that was fixed before the draws were known; nothing is forecast.
+    def certify(self, sample: Sample, confidence: Probability = 0.95) -> Certificate:
+        """Bound the volume above the threshold of the sample, which was fixed before the draws were known.
 
         A draw without a distance violates it.
         """
-        if threshold is None:
+        if sample.threshold is None:
             what = "an anytime audit bounds the volume above a threshold"
             raise CertificateError(f"{what}, so it needs one (--threshold).")
+        threshold = float(sample.threshold)
         drawn = sample.only("iid")
         if not len(drawn):
             raise CertificateError(
@@ -69,13 +63,13 @@ class AnytimeAudit(CertificateKind):
             )
         violating = ~(drawn.distances <= threshold)  # also where no distance is known
         volume = anytime_volume(violating, 1 - confidence)
-        certificate = Certificate(
+        return Certificate(
             kind=self.name,
             statement=share_above(
                 *(sample, volume, confidence, f"{threshold:.6g}", len(drawn)),
                 " or fail, however often this was looked at and continued",
             ),
-            upper_bound=float(threshold),
+            upper_bound=threshold,
             confidence=confidence,
             volume=volume,
             trials=len(drawn),
@@ -94,7 +88,6 @@ class AnytimeAudit(CertificateKind):
             },
             distribution=sample.distribution,
         )
-        return certificate, None
 
 
 def anytime_volume(violating: Mask, beta: float) -> float:

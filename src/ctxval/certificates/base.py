@@ -42,6 +42,8 @@ class Certificate:
     version: str = VERSION  #: the version of ctxval that computed it
     #: the distribution of tasks as a text, which ``volume`` is a share of; None if it is uniform
     distribution: str | None = None
+    #: a forecast of further executions, for the threshold of its sample; None if it decides, or can predict nothing
+    expected: Forecast | None = None
 
     @property
     def bound(self) -> float | None:
@@ -57,8 +59,8 @@ class Certificate:
         return self.doubt is None and self.volume <= volume and self.upper_bound + ERRORS * self.error <= threshold
 
     def to_json(self) -> dict[str, Any]:
-        """Return all attributes, ready for JSON."""
-        return asdict(self)
+        """Return all attributes but the forecast, ready for JSON."""
+        return {name: value for name, value in asdict(self).items() if name != "expected"}
 
     @property
     def numbers(self) -> dict[str, Any]:
@@ -142,13 +144,10 @@ class CertificateKind(ShortRepr, ABC):
 
     @abstractmethod
     def certify(self, sample: Sample, confidence: float = 0.95) -> Certificate:
-        """Return the certificate of trials; a CertificateError if they or the options do not allow one."""
+        """Return the certificate of trials, precise enough for the threshold of the sample if there is one.
 
-    def certify_against(
-        self, sample: Sample, threshold: float | None, confidence: float = 0.95
-    ) -> tuple[Certificate, Forecast | None]:
-        """Return a certificate, precise enough for a threshold if there is one, and a forecast if one can be made."""
-        return self.certify(sample, confidence), None
+        A CertificateError is raised if the trials or the options do not allow one.
+        """
 
     def require_usable(self, confidence: float, executions: int, beside: Iterable[Origin] = ()) -> None:
         """Raise a CertificateError if so many trials could never be certified, before they are paid for.

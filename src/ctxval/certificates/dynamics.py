@@ -73,13 +73,11 @@ class Dynamics(CertificateKind):
         rank_within(confidence, MOST_DRAWS)
 
     def certify(self, sample: Sample, confidence: float = 0.95) -> Certificate:
-        """Return :func:`certify_dynamics` of the trials and of what is learned from their trajectories."""
-        return self.certify_against(sample, None, confidence)[0]
+        """Return :func:`certify_dynamics` of the trials and of what is learned from their trajectories.
 
-    def certify_against(
-        self, sample: Sample, threshold: float | None, confidence: float = 0.95
-    ) -> tuple[Certificate, Forecast | None]:
-        """Return the certificate and, if it does not keep the threshold, the fewest executions that can decide."""
+        If it does not keep the threshold, it forecasts the fewest executions that can decide.
+        """
+        threshold = sample.threshold
         learned = require_learned(sample, self.name)
         unknown = [sample.numbers[row] for row in np.flatnonzero(np.isnan(sample.distances)).tolist()]
         if unknown:
@@ -101,12 +99,13 @@ class Dynamics(CertificateKind):
         evidence = replace(evidence, tests=self.tests)
         certificate = certify_dynamics(sample, evidence, confidence)
         if threshold is None or certificate.covers(threshold):
-            return certificate, None
+            return certificate
         bound = bound_of(evidence, sample.best, confidence)
         if raised(evidence, bound) > threshold and certificate.doubt == tests_missing(evidence):
             certificate = replace(certificate, doubt=None)  # missing tests matter only to a bound that suffices
         kept = float((evidence.maxima <= threshold).mean())
-        return certificate, Forecast(fewest_missing(evidence, sample.best, bound), kept, 1 - kept, fewest=True)
+        expected = Forecast(fewest_missing(evidence, sample.best, bound), kept, 1 - kept, fewest=True)
+        return replace(certificate, expected=expected)
 
 
 def draws_for(confidence: float) -> int:

@@ -14,7 +14,7 @@ has no meaning, so each of them is predicted from all others. Its standardised e
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
@@ -26,7 +26,7 @@ from ctxval._util.registry import part
 from ctxval._util.representation import ShortRepr
 from ctxval.certificates.base import Certificate, CertificateKind
 from ctxval.certificates.covering import RESOLUTION, bare_corners, covering, farthest_task, resolved_volume
-from ctxval.certificates.forecast import Forecast, forecast
+from ctxval.certificates.forecast import forecast
 from ctxval.certificates.maxima import MOST, Maxima, draw_maxima, representative, settle_maxima
 from ctxval.certificates.sample import Sample
 from ctxval.certificates.sentences import withdrawals
@@ -57,13 +57,11 @@ class Posterior(CertificateKind):
     resolution: PositiveFloat = RESOLUTION
 
     def certify(self, sample: Sample, confidence: float = 0.95) -> Certificate:
-        """Return the bound that d* stays below with the confidence, under the prior and given the trials."""
-        return self.certify_against(sample, None, confidence)[0]
+        """Return the bound that d* stays below with the confidence, under the prior and given the trials.
 
-    def certify_against(
-        self, sample: Sample, threshold: float | None, confidence: float = 0.95
-    ) -> tuple[Certificate, Forecast | None]:
-        """Return the certificate from enough draws for the threshold, and a forecast if its bound is above that."""
+        There are enough draws for the threshold, and a forecast if the bound is above that.
+        """
+        threshold = sample.threshold
         # Many trials that do not cover the tasks are refused before the draws, which take long.
         if len(sample) > MOST and (farthest := farthest_task(sample.points)) > self.resolution:
             raise CertificateError(
@@ -74,8 +72,8 @@ class Posterior(CertificateKind):
         drawn = draw_maxima(sample) if threshold is None else settle_maxima(sample, threshold, confidence)
         certificate = self.certify_drawn(sample, drawn, confidence)
         if threshold is None or certificate.doubt is not None or certificate.upper_bound <= threshold:
-            return certificate, None  # a process that the trials contradict predicts nothing
-        return certificate, forecast(representative(sample), drawn, threshold, confidence)
+            return certificate  # a process that the trials contradict predicts nothing
+        return replace(certificate, expected=forecast(representative(sample), drawn, threshold, confidence))
 
     @checked
     def certify_drawn(self, sample: Sample, drawn: Maxima, confidence: Probability = 0.95) -> Certificate:

@@ -23,11 +23,10 @@ from typing import ClassVar
 import numpy as np
 
 from ctxval._util.arrays import Array
-from ctxval._util.checked import NonNegativeInt, PositiveFloat, PositiveInt, Probability, checked
+from ctxval._util.checked import NonNegativeInt, PositiveInt, Probability, checked
 from ctxval._util.registry import part
 from ctxval.certificates.base import Certificate, CertificateKind
 from ctxval.certificates.bounds import at_most, of_tasks
-from ctxval.certificates.forecast import Forecast
 from ctxval.certificates.sample import Sample, advice_to_remeasure, require_learned
 from ctxval.certificates.scenario import countable_draws, require_more, volume_bound
 from ctxval.certificates.sentences.statements import ABOUT_DRAWS, FROZEN, ONE_CAMPAIGN, how_drawn, margin_and_map
@@ -54,22 +53,17 @@ class Region(CertificateKind):
     #: number M of tasks that are predicted to estimate the share of the tasks that keep the threshold
     predictions: PositiveInt = 1000
 
-    def certify(self, sample: Sample, confidence: float = 0.95) -> Certificate:
-        """Return the certificate of the trials, without a threshold."""
-        return self.certify_against(sample, None, confidence)[0]
-
     @checked
-    def certify_against(
-        self, sample: Sample, threshold: PositiveFloat | None, confidence: Probability = 0.95
-    ) -> tuple[Certificate, Forecast | None]:
+    def certify(self, sample: Sample, confidence: Probability = 0.95) -> Certificate:
         """Bound the distance by a prediction plus a margin from independent draws, but for a share of the tasks.
 
         With a threshold, the bound is the threshold, and the volume left out is that of the draws plus that of the
         tasks at which the prediction plus the margin exceeds the threshold. Without one, the bound is the largest
-        predicted one. Nothing is forecast.
+        predicted one.
 
         More draws than are discarded must have a distance and a prediction; else a CertificateError is raised.
         """
+        threshold = sample.threshold
         beta = 1 - confidence
         learned, drawn = require_learned(sample, "region"), countable_draws(sample, "a region bound")
         before = min(drawn.numbers)  # the prediction is learned from the trials before the draws
@@ -94,7 +88,7 @@ class Region(CertificateKind):
         if threshold is not None:
             tasks = f"{100 * share:.4g} ± {at_most(100 * error, 2)} % {of_tasks(sample.distribution)}"
             kept = f"this prediction keeps {limit:.6g} on {tasks} (an estimate from {count} predicted tasks)"
-        certificate = Certificate(
+        return Certificate(
             kind=self.name,
             statement=margin_and_map(sample, margin, volume, total, confidence, at_most(limit), kept),
             upper_bound=limit,
@@ -126,7 +120,6 @@ class Region(CertificateKind):
             },
             distribution=sample.distribution,
         )
-        return certificate, None
 
     def require_usable(self, confidence: float, executions: int, beside: Iterable[Origin] = ()) -> None:
         """Require more trials than are discarded."""

@@ -119,7 +119,7 @@ def judge_by(
         return replace(falsified, certificate=certificate)
     if not certificate.covers(tau, volume):
         why_not = sentences.undecided(certificate, tau, volume, quantities)
-        return Verdict("undecided", tau, why_not, certificate=certificate)
+        return Verdict("undecided", tau, why_not, certificate=certificate, expected=certificate.expected)
     conditions = (kind or by_name).rests_on(certificate, known.space)
     alone = known.alone(tau, trials)
     rests_on = sentences.rests_on(conditions, certificate, tau, quantities, known.stated, alone)
@@ -148,9 +148,8 @@ def judge(
     verdict = counterexample(trials, threshold, known.quantities, chosen.confidence, quantile)
     if verdict is None:
         try:
-            certificate, expected = _certified(trials, chosen, known, threshold)
+            certificate = _certified(trials, chosen, known, threshold)
             verdict = judge_by(certificate, trials, threshold, volume=chosen.volume, provenance=known, kind=chosen.kind)
-            verdict = replace(verdict, expected=expected)
         except CertificateError as error:
             verdict = Verdict("undecided", float(threshold), str(error))
     parts = [verdict.reason.removesuffix("."), verdict.expected, designs_sentence(trials)]
@@ -163,17 +162,19 @@ def judge(
 
 def _certified(
     trials: Sequence[Trial], options: CertificateOptions, known: Provenance, threshold: float | None
-) -> tuple[Certificate, Forecast | None]:
-    """Return a certificate, for a threshold if there is one, and a forecast. Most kinds see countable draws only."""
+) -> Certificate:
+    """Return a certificate, for a threshold if there is one. Most kinds see countable draws only."""
     suite = None if known.space is None else known.space.members
-    sample = replace(Sample.of(trials, known.learned), distribution=known.distribution, suite=suite)
+    sample = replace(
+        Sample.of(trials, known.learned), distribution=known.distribution, suite=suite, threshold=threshold
+    )
     kind = options.kind
     if sample.suite is not None:
         require_suite(kind)
     # No statement may count draws whose number depended on their distances.
     sample = sample if kind.sorts_draws else sample.with_countable_draws()
-    certificate, expected = kind.certify_against(sample, threshold, options.confidence)
-    return replace(certificate, assumptions=(*certificate.assumptions, *known.remarks)), expected
+    certificate = kind.certify(sample, options.confidence)
+    return replace(certificate, assumptions=(*certificate.assumptions, *known.remarks))
 
 
 def require_suite(kind: CertificateKind) -> None:
@@ -228,7 +229,7 @@ def assess(
         return Assessment(kind.name, verdict.certificate, verdict)
     limit = threshold if kind.uses_threshold else None
     try:
-        certificate, _ = _certified(trials, options, known, limit)
+        certificate = _certified(trials, options, known, limit)
     except CertificateError as error:
         if falsified is None:
             raise
