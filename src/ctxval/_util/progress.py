@@ -126,10 +126,11 @@ _DELAY = 0.4  # seconds before a stage is shown; most end sooner
 @contextmanager
 def progress_shown(wanted: bool | None = None, console: Console | None = None) -> Iterator[None]:
     """Show the progress of everything within this context on standard error."""
-    if is_heard() and wanted is not False:
+    if _innermost.get() is not None and wanted is not False:
         yield
         return
-    if wanted is None:  # people see what is printed at once at a terminal and in a notebook
+    if wanted is None:
+        # People see what is printed at once at a terminal or in a notebook.
         wanted = bool(sys.stderr is not None and sys.stderr.isatty()) or "ipykernel" in sys.modules
     if not wanted:
         with listening(lambda _: None):  # so that nothing inside shows it either
