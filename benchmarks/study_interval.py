@@ -17,7 +17,6 @@ from ctxval import Campaign
 from ctxval._util.arrays import single_threaded
 from ctxval._util.json_lines import JsonLines
 from ctxval.campaign.dynamics import NEAR
-from ctxval.certificates.verdict import usable_bound
 from ctxval.errors import CertificateError
 from dynamics_reporting import REPORTING
 from dynamics_truths import truth
@@ -33,7 +32,7 @@ def study(one: tuple[int, str]) -> dict[str, Any]:
     with single_threaded():
         campaign = Campaign(REPORTING[entry](seed).validation, seed=seed).run(BUDGET)
         try:
-            bound = usable_bound(campaign.certify())
+            bound = campaign.certify().bound
         except CertificateError:
             bound = None
     points = np.array([trial.unit_point for trial in campaign.trials])

@@ -3,7 +3,7 @@
 import numpy as np
 
 from ctxval import Campaign, Task, TaskSpace, Transitions, Validation, controllers, distances, models, searches, systems
-from ctxval.certificates import Sample, certify_audit
+from ctxval.certificates import Audit, Sample
 
 DT = 0.1  # s
 DRAWS = 59  # fixed beforehand: so many bound the tasks that are worse than all of them to 5 % with confidence 95 %
@@ -32,7 +32,7 @@ def audited(model):
 
 def report(title, campaign):
     """Print what the audit proves, and return its certificate."""
-    certificate = certify_audit(Sample.of(campaign.trials))
+    certificate = Audit().certify(Sample.of(campaign.trials))
     print(f"{title}: the largest gap in {campaign.executions} random tasks is {certificate.upper_bound:.2g} m.")
     print(f"  {certificate.statement}")
     return certificate

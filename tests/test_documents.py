@@ -16,17 +16,17 @@ from ctxval import Campaign, refine, searches, systems
 from ctxval.campaign.dynamics import PREDICTION
 from ctxval.certificates import (
     KINDS,
+    AnytimeAudit,
+    Audit,
     CheckedPrediction,
     DynamicsEvidence,
+    Posterior,
+    Region,
     Sample,
     StateInputCoverage,
     StateInputGap,
     WholeSuite,
-    certify_anytime,
-    certify_audit,
     certify_dynamics,
-    certify_posterior,
-    certify_region,
     draw_maxima,
 )
 from ctxval.certificates.expiry import Statistic, WatchedChannel, WatchState
@@ -112,12 +112,12 @@ def test_the_glossary_explains_what_certificates_and_trials_say() -> None:
     learned = Predicted(lambda p: p[:, 0])
     sample = Sample(points, np.sin(5 * points[:, 0]) + 2, origins, ["completed"] * 8, learned=learned)
     certificates = [
-        certify_audit(sample),
-        certify_anytime(sample, 3.0),
+        Audit().certify(sample),
+        AnytimeAudit().certify(replace(sample, threshold=3.0)),
         certify_dynamics(sample, evidence()),
-        certify_region(sample, 3.0),
+        Region().certify(replace(sample, threshold=3.0)),
         WholeSuite().certify(replace(sample, suite=points)),
-        certify_posterior(sample, 0.5, found=draw_maxima(sample, draws=4, paths=2)),
+        Posterior().certify_drawn(sample, draw_maxima(sample, draws=4, paths=2), 0.5),
     ]
     used = set().union(*(keys(certificate.to_json()) for certificate in certificates))
     used |= keys({PREDICTION: ExecutionPrediction(1, (0.5,), 0.1, (1,), ((0.0,),), ((0.1,),), 0.0).to_json()})

@@ -210,7 +210,7 @@ RECORDED = Transitions(DATA.x, DATA.u, nonlinear(DATA.x, DATA.u))
 CHECKED = certificates.CheckedPrediction(3, 0.5, 0.52, 0.53, 0.5)
 GAP = certificates.StateInputGap(0.1, ("u[0]",), {"x[0]": 1.0, "u[0]": 3.0})
 COVERED = certificates.StateInputCoverage(GAP, GAP, None, {"x[0]": 0.1, "u[0]": 0.2}, np.zeros(2), 1024)
-BY_POSTERIOR = certificates.CertificateOptions.posterior()
+BY_POSTERIOR = certificates.CertificateOptions(certificates.Posterior())
 
 LOG = data.MemoryTable(
     "run.csv", {"t": 0.1 * np.arange(41), "x": np.sin(np.arange(82)).reshape(41, 2), "u": np.ones(40)}
@@ -361,7 +361,7 @@ EXAMPLES: dict[str, Callable[[], object]] = {
     "certificates.Audit": certificates.Audit,
     "certificates.Automatic": certificates.Automatic,
     "certificates.Certificate": lambda: CERTIFICATE,
-    "certificates.CertificateOptions": certificates.CertificateOptions.posterior,
+    "certificates.CertificateOptions": lambda: BY_POSTERIOR,
     "certificates.CheckedPrediction": lambda: CHECKED,
     "certificates.Dynamics": certificates.Dynamics,
     "certificates.DynamicsEvidence": evidence,
@@ -374,7 +374,7 @@ EXAMPLES: dict[str, Callable[[], object]] = {
     "certificates.StateInputGap": lambda: GAP,
     "certificates.UntriedParameter": lambda: certificates.UntriedParameter("load", 0.4, np.zeros(2)),
     "certificates.StoppingDecision": lambda: certificates.StoppingDecision(next_point=np.zeros(3)),
-    "certificates.StoppingRule": lambda: certificates.StoppingRule(0.5, BY_POSTERIOR),
+    "certificates.StoppingRule": lambda: certificates.StoppingRule(0.5),
     "certificates.Diagnosis": diagnosis,
     "certificates.Forecast": lambda: certificates.Forecast(12, 0.75, 0.25),
     "certificates.MadeGood": lambda: certificates.MadeGood(3, 7, "fuse replaced"),
@@ -382,7 +382,7 @@ EXAMPLES: dict[str, Callable[[], object]] = {
     "certificates.Region": certificates.Region,
     "certificates.Sample": sample,
     "certificates.Verdict": lambda: certificates.judge(
-        campaign().trials, 0.01, certificates.CertificateOptions.posterior()
+        campaign().trials, 0.01, certificates.CertificateOptions(certificates.Posterior())
     ),
     "data.Break": lambda: data.Break("run.csv", 0.5, 0.2, "angle", "has no value in row 7"),
     "data.Channel": lambda: data.Channel("angle", "rad", False, np.arange(9.0), np.arange(9.0)),

@@ -11,7 +11,7 @@ import json
 import os
 import sqlite3
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -85,10 +85,11 @@ class Marked(Store):
 class Full(Marked):
     """A store whose disk is full when the third execution has ended."""
 
-    def close_trial(self, trial: Trial, system_trajectory: Trajectory | None, *, changes: int | None = None) -> None:
-        if trial.number == 2:
+    def close_trials(self, ended: Iterable[tuple[Trial, Trajectory | None]], *, changes: int | None = None) -> None:
+        known = list(ended)
+        if any(trial.number == 2 for trial, _ in known):
             raise StoreAccessError(f"{self.path} cannot be written: the disk is full.")
-        super().close_trial(trial, system_trajectory, changes=changes)
+        super().close_trials(known, changes=changes)
 
 
 def content(connection: sqlite3.Connection) -> str:

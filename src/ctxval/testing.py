@@ -289,7 +289,7 @@ def _certified(
     kind: CertificateKind, sample: Sample, threshold: float, confidence: float
 ) -> Certificate | CertificateError:
     try:
-        certificate, _ = kind.certify_against(sample, threshold, confidence)
+        certificate = kind.certify(replace(sample, threshold=threshold), confidence)
     except CertificateError as refusal:
         return refusal
     _require(isinstance(certificate, Certificate), f"certify must return a Certificate, got {certificate!r}")

@@ -162,7 +162,7 @@ def test_long_values_are_shortened_in_a_difference() -> None:
 
 
 def test_small_weights_are_told_apart() -> None:
-    assert first_difference(1e-10, 9e-10, "R") is not None
+    assert first_difference({"R": 1e-10}, {"R": 9e-10}) is not None
 
 
 @pytest.mark.parametrize(

@@ -387,20 +387,17 @@ class Acts(RuleBasedStateMachine):
         """Interrupt an act in its transaction: it must not have happened."""
         store = self.terminals[who].store
 
-        class Cut:
-            def execute(self, statement: str, *values: Any) -> Any:
-                if statement == "COMMIT":
-                    raise KeyboardInterrupt
-                return connection.execute(statement, *values)
+        execute = store._execute
 
-            def __getattr__(self, name: str) -> Any:
-                return getattr(connection, name)
+        def cut(statement: str, *values: Any) -> Any:
+            if statement == "COMMIT":
+                raise KeyboardInterrupt
+            return execute(statement, *values)
 
-        connection = store._connection
-        store._connection = Cut()  # type: ignore[assignment]
+        store._execute = cut
         with pytest.raises(KeyboardInterrupt):
             act()
-        store._connection = connection
+        store._execute = execute
         self.die(who)
 
     @invariant()

@@ -20,7 +20,7 @@ import pytest
 import rig_cluster
 from conftest import make_validation
 from ctxval import Campaign, Store, Task, Trajectory, Trial, controllers, searches
-from ctxval._util.progress import ignore, is_heard, listening
+from ctxval._util.progress import is_heard, listening
 from ctxval.campaign.choices import Choice
 from ctxval.campaign.trials import TrialRecorder
 from ctxval.campaign.workers import ProcessPool
@@ -63,7 +63,7 @@ class Heard:
 
 
 def test_the_work_of_a_worker_is_not_shown_as_that_of_the_campaign() -> None:
-    with listening(ignore):
+    with listening(lambda _: None):
         assert not run_of(Heard(), 2, workers=2).failed
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,10 +15,14 @@ from typer.testing import CliRunner
 
 from conftest import make_validation
 from ctxval import Campaign, searches
-from ctxval.certificates import AnytimeAudit, CertificateOptions, Sample, certify_anytime, volume_bound
+from ctxval.certificates import AnytimeAudit, Certificate, CertificateOptions, Sample, volume_bound
 from ctxval.certificates.anytime import _NO_VIOLATION, anytime_volume, log_e_value
 from ctxval.cli import app
 from ctxval.errors import CertificateError
+
+
+def anytime(sample: Sample, threshold: float) -> Certificate:
+    return AnytimeAudit().certify(replace(sample, threshold=threshold))
 
 
 def draws(distances: list[float]) -> Sample:
@@ -79,18 +84,18 @@ def test_the_volume_is_where_the_e_value_reaches_the_level(n: int, violations: i
 
 def test_failures_count_as_violations() -> None:
     good, bad = draws([0.1] * 60), draws([0.1] * 59 + [math.nan])
-    assert certify_anytime(bad, 0.5).volume >= certify_anytime(good, 0.5).volume
+    assert anytime(bad, 0.5).volume >= anytime(good, 0.5).volume
     early = draws([math.nan] + [0.1] * 59)
-    assert certify_anytime(early, 0.5).volume > certify_anytime(good, 0.5).volume
-    assert certify_anytime(early, 0.5).details["violations"] == certify_anytime(early, 0.5).details["failed"] == 1
+    assert anytime(early, 0.5).volume > anytime(good, 0.5).volume
+    assert anytime(early, 0.5).details["violations"] == anytime(early, 0.5).details["failed"] == 1
 
 
 def test_only_independent_draws_count() -> None:
     sample = draws([0.1] * 30)
     mixed = Sample(sample.points, sample.distances, ["iid"] * 20 + ["acquisition"] * 10, sample.states)
-    assert certify_anytime(mixed, 0.5).trials == 20
+    assert anytime(mixed, 0.5).trials == 20
     with pytest.raises(CertificateError, match="needs independent draws of tasks"):
-        certify_anytime(Sample(sample.points, sample.distances, ["acquisition"] * 30, sample.states), 0.5)
+        anytime(Sample(sample.points, sample.distances, ["acquisition"] * 30, sample.states), 0.5)
     with pytest.raises(CertificateError, match=r"needs one \(--threshold\)"):
         AnytimeAudit().certify(sample)
 

@@ -120,11 +120,12 @@ def test_a_prediction_that_failed_matters_by_the_margin_to_the_threshold() -> No
 
 def test_an_undecided_verdict_says_how_many_executions_are_needed_and_what_the_samples_say() -> None:
     fewer = replace(sample(), learned=Learned(replace(GOOD, predictions=GOOD.predictions[:1])))
-    certificate, expected = Dynamics(tests=0).certify_against(fewer, 1.2)
+    certificate = Dynamics(tests=0).certify(replace(fewer, threshold=1.2))
     assert certificate.doubt is not None
-    assert expected == Forecast(2, 1.0, 0.0, fewest=True)
-    assert "at least 2 more executions are needed to validate it, and 100 % of the posterior samples" in str(expected)
-    assert Dynamics(tests=0).certify_against(sample(), 1.2)[1] is None
+    assert certificate.expected == Forecast(2, 1.0, 0.0, fewest=True)
+    needed = "at least 2 more executions are needed to validate it, and 100 % of the posterior samples"
+    assert needed in str(certificate.expected)
+    assert Dynamics(tests=0).certify(replace(sample(), threshold=1.2)).expected is None
 
 
 def test_a_draw_that_diverges_leaves_no_bound() -> None:

@@ -203,7 +203,7 @@ def test_the_onnx_file_computes_the_same(tmp_path: Path) -> None:
         np.testing.assert_array_equal(trusted, known.trusted(tasks))
         np.testing.assert_allclose(bounds, known.bound(tasks), rtol=1e-9)
     with pytest.raises(InputError, match=r"there is no function to write: no task is trusted\."):
-        withdrawn(SPACE, 0.6, 0.95, "why").to_onnx(tmp_path / "e.onnx")
+        withdrawn(SPACE, 0.6, 0.95, "why").save(tmp_path / "e.onnx")
 
 
 def test_boundary_tasks_lie_next_to_the_boundary() -> None:

@@ -9,7 +9,6 @@ from ctxval.certificates import (
     Maxima,
     Posterior,
     Sample,
-    certify_posterior,
     draw_maxima,
     settle_maxima,
 )
@@ -71,9 +70,7 @@ def test_the_rank_is_that_of_exchangeable_draws() -> None:
 @pytest.mark.parametrize("confidence", [0.0, 1.0, -0.1, 1.5, np.nan])
 def test_a_confidence_that_is_no_probability_is_refused(confidence: float) -> None:
     with pytest.raises(InputError, match="strictly between 0 and 1"):
-        drawn([1.0, 2.0]).upper(confidence)
-    with pytest.raises(InputError, match="strictly between 0 and 1"):
-        certify_posterior(sample(), confidence)
+        Posterior().certify(sample(), confidence)
 
 
 # The draws
@@ -87,7 +84,7 @@ def test_no_bound_is_below_the_largest_distance_that_was_executed(d: int) -> Non
     assert maxima.draws[0] >= trials.best
     assert (np.diff(maxima.draws) >= 0).all()
     assert ((maxima.points >= 0) & (maxima.points <= 1)).all()
-    assert certify_posterior(trials, 0.01, found=maxima).upper_bound >= trials.best
+    assert Posterior().certify_drawn(trials, maxima, 0.01).upper_bound >= trials.best
 
 
 def test_units_do_not_matter() -> None:
@@ -149,7 +146,7 @@ def test_noise_widens_what_is_expected_and_may_stay_below_the_largest_value_seen
     mean = 3 + 0.5 * np.sin(3 * X[:, 0])
     noisy = Sample(X, mean + 0.5 * rng.normal(size=40), ["iid"] * 40, ["completed"] * 40)
     maxima = quick(noisy, stochastic=True)
-    certificate = certify_posterior(noisy, 0.9, found=maxima)
+    certificate = Posterior().certify_drawn(noisy, maxima, 0.9)
     assert 3.5 < certificate.upper_bound < noisy.best
     assert "expected distance" in certificate.statement
     assert any("noise" in line for line in certificate.assumptions)
@@ -276,7 +273,7 @@ def test_many_trials_are_represented_by_the_largest_and_well_spread_ones() -> No
 
 def test_a_bound_of_many_trials_says_that_it_uses_some_of_them() -> None:
     many = sample(400)
-    certificate = certify_posterior(many, 0.9, found=quick(many))
+    certificate = Posterior().certify_drawn(many, quick(many), 0.9)
     assert certificate.trials == 400
     assert "conditioned on 160 of the 400 trials" in " ".join(certificate.assumptions)
     assert certificate.upper_bound >= many.best
@@ -284,4 +281,4 @@ def test_a_bound_of_many_trials_says_that_it_uses_some_of_them() -> None:
 
 def test_many_trials_that_do_not_cover_the_tasks_are_refused_before_the_draws() -> None:
     with pytest.raises(CertificateError, match=r"away from each of 400 trials.*is not computed"):
-        Posterior().certify_against(sample(400, 5), 10.0)
+        Posterior().certify(sample(400, 5))

@@ -37,11 +37,12 @@ RECIPE = '''
 from dataclasses import dataclass
 from typing import ClassVar
 
-from ctxval.certificates import KINDS, Certificate, CertificateKind, Sample, farthest_task
+from ctxval import part
+from ctxval.certificates import Certificate, CertificateKind, Sample, farthest_task
 from ctxval.errors import CertificateError
 
 
-@KINDS.register
+@part("lipschitz")
 @dataclass(frozen=True)
 class Lipschitz(CertificateKind):
     """No task is worse than the worst one known by more than the slope over the largest gap between trials.
@@ -74,13 +75,13 @@ class Lipschitz(CertificateKind):
 
 @pytest.fixture
 def recipe(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    """Import the file of the recipe, and forget the kind afterwards."""
-    monkeypatch.setattr(KINDS, "_registered", set(KINDS._registered))
-    monkeypatch.setattr(KINDS, "_exported", dict(KINDS._exported))
+    """Import the file of the recipe as if the package exported the kind, and forget it afterwards."""
     (tmp_path / "lipschitz.py").write_text(RECIPE)
     monkeypatch.syspath_prepend(str(tmp_path))
     monkeypatch.delitem(sys.modules, "lipschitz", raising=False)
-    return importlib.import_module("lipschitz")
+    module = importlib.import_module("lipschitz")
+    monkeypatch.setattr(KINDS, "_exported", {**KINDS._exported, "lipschitz": module.Lipschitz})
+    return module
 
 
 def test_the_recipe_is_short() -> None:
@@ -219,3 +220,26 @@ def test_the_command_line_and_files_know_the_new_kind(
     for wrong in ({"slop": 2.0}, {"slope": "steep"}, {"discard": 2}):
         with pytest.raises(ValidationError):
             CertificateTable.model_validate({**stated, **wrong})
+
+
+@dataclass(frozen=True)
+class Trusting(CertificateKind):
+    """Nothing is worse than what was executed."""
+
+    name: ClassVar[str] = "trusting"
+
+    def certify(self, sample: Sample, confidence: float = 0.95) -> Certificate:
+        """Return the largest distance found."""
+        return Certificate(self.name, "", sample.best, confidence, 0.0, len(sample), ())
+
+    @classmethod
+    def rests_on(cls, certificate: Certificate, space: object = None) -> list[str]:
+        """Return what a validation by it rests on."""
+        return ["your trust"]
+
+
+def test_a_kind_that_is_not_found_by_name_says_what_a_validation_rests_on() -> None:
+    known = [Trial(0, "manual", "completed", np.array([0.5]), {"p": 0.5}, 1, True, 0.1)]
+    verdict = judge(known, 1.0, CertificateOptions(Trusting()))
+    assert verdict.answer == "validated"
+    assert "It rests on your trust" in str(verdict)

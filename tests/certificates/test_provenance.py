@@ -4,7 +4,6 @@ import numpy as np
 
 from ctxval import TaskSpace
 from ctxval.certificates import Provenance
-from ctxval.certificates.provenance import remarks_on
 from ctxval.core.trial import Change
 
 
@@ -13,7 +12,7 @@ def test_what_was_changed_in_a_store_is_remarked() -> None:
         Change("accepted", "gripper replaced", {"differences": ["x was 1 and is now 2", "y is new"], "trials": 7}),
         Change("remeasured", "another norm", {"before": {}}),
     ]
-    assert remarks_on(changes) == (
+    assert Provenance.of({}, changes).remarks == (
         "what was changed after 7 trials makes no difference to them, as you state: 'gripper replaced' (x was 1 and is "
         "now 2)",
         "the distances are those measured anew: 'another norm'",

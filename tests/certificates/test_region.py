@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,11 +13,11 @@ from hypothesis import strategies as st
 from conftest import Predicted, make_validation
 from ctxval import Campaign, searches
 from ctxval.certificates import (
+    Audit,
+    Certificate,
     CertificateOptions,
     Region,
     Sample,
-    certify_audit,
-    certify_region,
     judge_by,
     volume_bound,
 )
@@ -26,6 +27,12 @@ from rig_thorough import more
 CAMPAIGNS = 100_000
 FLAT = Predicted(lambda points: np.full(len(points), 0.5))
 SLOPE = Predicted(lambda points: points[:, 0])
+
+
+def region(
+    sample: Sample, threshold: float | None = None, confidence: float = 0.95, options: Region | None = None
+) -> Certificate:
+    return (options or Region()).certify(replace(sample, threshold=threshold), confidence)
 
 
 def draws(distances: list[float], learned: Predicted | None = FLAT, planned: list[int | None] | None = None) -> Sample:
@@ -98,28 +105,26 @@ def _share_above(limit: np.ndarray, error: float) -> np.ndarray:
 
 def test_with_a_prediction_of_nothing_it_is_the_scenario_bound() -> None:
     distances = np.random.default_rng(1).random(60).tolist()
-    found = certify_region(draws(distances, Predicted(lambda points: np.zeros(len(points)))))
+    found = region(draws(distances, Predicted(lambda points: np.zeros(len(points)))))
     assert found.details["margin"] == max(distances)
     assert found.details["volume_of_draws"] == pytest.approx(volume_bound(60, 0, 0.95 * 0.05))
     assert found.upper_bound == max(distances)
-    assert found.volume > certify_audit(draws(distances)).volume
+    assert found.volume > Audit().certify(draws(distances)).volume
 
 
 @given(st.lists(st.floats(0.0, 5.0), min_size=5, max_size=40), st.floats(0.01, 0.5), st.floats(-3.0, 3.0))
 def test_a_constant_error_of_the_prediction_is_made_good_by_the_margin(
     distances: list[float], beta: float, shift: float
 ) -> None:
-    found = certify_region(draws(distances), confidence=1 - beta)
-    moved = certify_region(
-        draws(distances, Predicted(lambda points: np.full(len(points), 0.5 + shift))), confidence=1 - beta
-    )
+    found = region(draws(distances), confidence=1 - beta)
+    moved = region(draws(distances, Predicted(lambda points: np.full(len(points), 0.5 + shift))), confidence=1 - beta)
     assert moved.upper_bound == pytest.approx(found.upper_bound, abs=1e-9)
     assert moved.volume == found.volume
 
 
 @given(st.lists(st.floats(0.0, 5.0), min_size=6, max_size=40), st.integers(0, 3), st.floats(0.1, 5.0))
 def test_discarding_lowers_the_margin_and_widens_the_volume(distances: list[float], k: int, threshold: float) -> None:
-    one, other = (certify_region(draws(distances, SLOPE), threshold, options=Region(discard=j)) for j in (k, k + 1))
+    one, other = (region(draws(distances, SLOPE), threshold, options=Region(discard=j)) for j in (k, k + 1))
     assert other.details["margin"] <= one.details["margin"]
     assert other.details["volume_of_draws"] >= one.details["volume_of_draws"]
     assert other.details["share_kept"] >= one.details["share_kept"]
@@ -127,15 +132,15 @@ def test_discarding_lowers_the_margin_and_widens_the_volume(distances: list[floa
 
 @given(st.lists(st.floats(0.0, 1.0), min_size=6, max_size=40), st.floats(0.1, 3.0))
 def test_a_higher_threshold_is_kept_on_a_larger_map(distances: list[float], threshold: float) -> None:
-    low, high = (certify_region(draws(distances, SLOPE), tau) for tau in (threshold, 1.1 * threshold))
+    low, high = (region(draws(distances, SLOPE), tau) for tau in (threshold, 1.1 * threshold))
     assert high.details["share_kept"] >= low.details["share_kept"]
     assert high.volume <= low.volume
 
 
 def test_the_share_of_the_map_is_estimated_with_its_error() -> None:
     sample = draws([0.0, *np.random.default_rng(2).random(59)], Predicted(lambda points: 2 * points[:, 0]))
-    margin = certify_region(sample).details["margin"]
-    found = certify_region(sample, 1.2, options=Region(predictions=4000))
+    margin = region(sample).details["margin"]
+    found = region(sample, 1.2, options=Region(predictions=4000))
     exact = np.clip((1.2 - margin) / 2, 0, 1)
     assert abs(found.details["share_kept"] - exact) < 4 * found.details["share_error"]
     assert found.details["share_error"] == pytest.approx(np.sqrt(exact * (1 - exact) / 4000), rel=0.1)
@@ -150,15 +155,15 @@ def test_failures_and_tasks_without_a_prediction_count_as_violations() -> None:
     with pytest.raises(
         CertificateError, match="1 of 30 draws have no distance and 0 have no prediction, more than the 0"
     ):
-        certify_region(failed)
-    assert certify_region(failed, options=Region(discard=1)).details["margin"] == pytest.approx(-0.3)
+        region(failed)
+    assert region(failed, options=Region(discard=1)).details["margin"] == pytest.approx(-0.3)
     partly = Predicted(lambda points: np.where(points[:, 0] < 0.9, 0.5, np.nan))
     sample = draws([0.2] * 30, partly)
     missing = int((sample.points[:, 0] >= 0.9).sum())
     assert missing > 0
     with pytest.raises(CertificateError, match=f"{missing} have no prediction"):
-        certify_region(sample)
-    found = certify_region(sample, 1.0, options=Region(discard=missing))
+        region(sample)
+    found = region(sample, 1.0, options=Region(discard=missing))
     assert found.details["unpredicted_draws"] == missing
     assert found.details["unpredicted_tasks"] == found.details["predictions"] - 1000 * found.details["share_kept"]
 
@@ -172,14 +177,14 @@ def test_what_cannot_be_certified_says_why() -> None:
         (draws([0.1] * 5, planned=[0] * 5), Region(), "ended with the verdict"),
     ):
         with pytest.raises(CertificateError, match=message):
-            certify_region(sample, options=options)
+            region(sample, options=options)
     with pytest.raises(CertificateError, match="a region bound needs independent draws"):
-        certify_region(Sample(np.zeros((2, 1)), np.ones(2), ["manual"] * 2, ["completed"] * 2, learned=FLAT))
+        region(Sample(np.zeros((2, 1)), np.ones(2), ["manual"] * 2, ["completed"] * 2, learned=FLAT))
 
 
 def test_only_the_draws_of_the_last_decision_count_and_the_prediction_is_older() -> None:
     learned = Predicted(lambda points: np.full(len(points), 0.5))
-    found = certify_region(draws([0.1] * 50, learned, planned=[20] * 20 + [50] * 30))
+    found = region(draws([0.1] * 50, learned, planned=[20] * 20 + [50] * 30))
     assert found.trials == 30
     assert set(learned.asked) == {20}
     assert found.details["learned_before"] == 20
@@ -189,12 +194,12 @@ def test_only_the_draws_of_the_last_decision_count_and_the_prediction_is_older()
 
 def test_it_validates_only_if_the_whole_volume_is_accepted() -> None:
     sample = draws([0.1] * 70, SLOPE)
-    found = certify_region(sample, 2.0)
+    found = region(sample, 2.0)
     assert found.upper_bound == 2.0
     assert 0.04 < found.details["volume_of_draws"] < found.volume < 0.05
     assert not found.covers(2.0)
     assert found.covers(2.0, 0.05)
-    partly = certify_region(sample, 0.8)
+    partly = region(sample, 0.8)
     assert partly.volume > 1 - 0.8
     verdict = judge_by(partly, [], 0.8, volume=0.05)
     assert verdict.answer == "undecided"
@@ -202,9 +207,9 @@ def test_it_validates_only_if_the_whole_volume_is_accepted() -> None:
 
 
 def test_a_margin_below_zero_is_said_in_words() -> None:
-    text = certify_region(draws([0.1] * 30)).statement
+    text = region(draws([0.1] * 30)).statement
     assert "the distance is below the predicted one by at least 0.4, except on at most" in text
-    over = certify_region(draws([0.7] * 30), 0.65).statement
+    over = region(draws([0.7] * 30), 0.65).statement
     assert "the distance exceeds the predicted one by at most 0.2, except on" in over
     assert "keeps 0.65 on 0 ± 0.1 % of the tasks (an estimate from 1000 predicted tasks)" in over
 

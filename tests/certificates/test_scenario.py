@@ -8,10 +8,11 @@ from hypothesis import strategies as st
 from conftest import make_validation
 from ctxval import Campaign, Trial, searches
 from ctxval.certificates import (
+    Audit,
     Certificate,
     Sample,
-    certify_audit,
-    certify_scenario,
+    SamplingDiscarding,
+    Scenario,
     samples_needed,
     tail,
     volume_bound,
@@ -22,6 +23,11 @@ from rig_thorough import more
 DRAWS = 100_000
 betas = st.floats(1e-6, 0.5)
 volumes = st.floats(1e-3, 0.5)
+
+
+def scenario(sample: Sample, confidence: float = 0.95, discarded: int = 0) -> Certificate:
+    kind = SamplingDiscarding(discarded) if discarded else Scenario()
+    return kind.certify(sample, confidence)
 
 
 def sample(distances: list[float], origin: str = "iid") -> Sample:
@@ -77,13 +83,13 @@ def test_the_stated_confidence_is_the_measured_coverage(discarded: int) -> None:
     rng = np.random.default_rng(discarded)
     held, runs, n = 0, 4000, 40
     for _ in range(runs):
-        certificate = certify_scenario(sample(rng.random(n).tolist()), 0.9, discarded)
+        certificate = scenario(sample(rng.random(n).tolist()), 0.9, discarded)
         held += 1 - certificate.upper_bound <= certificate.volume
     assert abs(held / runs - 0.9) < 4.5 * np.sqrt(0.09 / runs)
 
 
 def test_a_certificate_says_everything() -> None:
-    certificate = certify_scenario(sample([0.1, 0.4, 0.2]), 0.95)
+    certificate = scenario(sample([0.1, 0.4, 0.2]), 0.95)
     assert isinstance(certificate, Certificate)
     assert certificate.upper_bound == 0.4
     assert certificate.volume == pytest.approx(1 - 0.05 ** (1 / 3))
@@ -97,20 +103,20 @@ def test_a_certificate_says_everything() -> None:
 
 def test_a_failed_execution_counts_as_a_violation() -> None:
     with pytest.raises(CertificateError, match="count as violations"):
-        certify_scenario(sample([0.1, np.nan, 0.3]))
-    assert certify_scenario(sample([0.1, np.nan, 0.3]), discarded=1).upper_bound == 0.3
+        scenario(sample([0.1, np.nan, 0.3]))
+    assert scenario(sample([0.1, np.nan, 0.3]), discarded=1).upper_bound == 0.3
 
 
 @pytest.mark.parametrize("origin", ["acquisition", "initial", "manual"])
 def test_adaptive_trials_are_refused(origin: str) -> None:
     with pytest.raises(CertificateError, match="independent draws alone"):
-        certify_scenario(sample([0.1, 0.2], origin))
+        scenario(sample([0.1, 0.2], origin))
 
 
 @pytest.mark.parametrize(("confidence", "discarded"), [(0.0, 0), (1.0, 0), (1.5, 0), (0.9, -1), (0.9, 2)])
 def test_nonsense_is_refused(confidence: float, discarded: int) -> None:
     with pytest.raises((CertificateError, InputError)):
-        certify_scenario(sample([0.1, 0.2]), confidence, discarded)
+        scenario(sample([0.1, 0.2]), confidence, discarded)
 
 
 def test_open_trials_and_unequal_parts_are_refused() -> None:
@@ -131,7 +137,7 @@ def mixed(adaptive: list[float], drawn: list[float]) -> Sample:
 
 
 def test_an_audit_bounds_the_volume_above_the_worst_of_all_trials() -> None:
-    certificate = certify_audit(mixed([0.9, 0.2], [0.1, 0.3, 0.5]), 0.9)
+    certificate = Audit().certify(mixed([0.9, 0.2], [0.1, 0.3, 0.5]), 0.9)
     assert certificate.upper_bound == 0.9
     assert certificate.volume == pytest.approx(1 - 0.1 ** (1 / 3))
     assert certificate.trials == 3
@@ -144,9 +150,9 @@ def test_an_audit_bounds_the_volume_above_the_worst_of_all_trials() -> None:
         "failed": 0,
         "failures": {"failed": [], "unmeasured": [], "made_good": []},
     }
-    assert certify_audit(mixed([0.4, np.nan], [0.1, 0.5])).details["failed"] == 1
-    assert certify_audit(mixed([0.4, np.nan], [0.1, 0.5, 0.6])).details["exceeding"] == 2
-    assert certify_audit(mixed([], [0.1, 0.5])).details["exceeding"] is None
+    assert Audit().certify(mixed([0.4, np.nan], [0.1, 0.5])).details["failed"] == 1
+    assert Audit().certify(mixed([0.4, np.nan], [0.1, 0.5, 0.6])).details["exceeding"] == 2
+    assert Audit().certify(mixed([], [0.1, 0.5])).details["exceeding"] is None
     assert not certificate.covers(1.0)  # it is no bound on d*
     assert certificate.covers(1.0, volume=0.6)
 
@@ -163,7 +169,7 @@ def test_the_audits_statement_holds_after_adaptive_search(head_start: str) -> No
         # A search that went on after the audit, from what it showed.
         "after looking": audited + (1 - audited) * 0.5 * rng.random(DRAWS),
     }[head_start]
-    volume = certify_audit(mixed([0.5], [0.1] * n), confidence).volume
+    volume = Audit().certify(mixed([0.5], [0.1] * n), confidence).volume
     held = (1 - np.maximum(audited, searched) <= volume).mean()
     allowed = 4.5 * np.sqrt(confidence * (1 - confidence) / DRAWS)
     assert held > confidence - allowed
@@ -172,19 +178,21 @@ def test_the_audits_statement_holds_after_adaptive_search(head_start: str) -> No
 
 @given(st.integers(1, 300), betas)
 def test_more_audited_draws_never_widen_and_more_confidence_never_tightens(n: int, beta: float) -> None:
-    certificates = [certify_audit(mixed([0.5], [0.1] * m), 1 - b) for m, b in ((n, beta), (n + 1, beta), (n, beta / 2))]
+    certificates = [
+        Audit().certify(mixed([0.5], [0.1] * m), 1 - b) for m, b in ((n, beta), (n + 1, beta), (n, beta / 2))
+    ]
     assert certificates[1].volume <= certificates[0].volume <= certificates[2].volume
 
 
 def test_an_audit_without_draws_or_with_a_failed_one_is_refused() -> None:
     with pytest.raises(CertificateError, match="there is none"):
-        certify_audit(mixed([0.5, 0.2], []))
+        Audit().certify(mixed([0.5, 0.2], []))
     with pytest.raises(CertificateError, match="count as violations"):
-        certify_audit(mixed([0.5], [0.2, np.nan]))
+        Audit().certify(mixed([0.5], [0.2, np.nan]))
 
 
 def test_a_search_that_failed_does_not_spoil_an_audit() -> None:
-    assert certify_audit(mixed([0.5, np.nan], [0.2, 0.3])).upper_bound == 0.5
+    assert Audit().certify(mixed([0.5, np.nan], [0.2, 0.3])).upper_bound == 0.5
 
 
 def test_to_discard_as_many_as_failed_would_be_more_often_wrong_than_stated() -> None:
@@ -209,33 +217,33 @@ def planned(counts: list[int | None], origin: str = "iid") -> Sample:
 @pytest.mark.parametrize("discarded", [0, 2])
 def test_draws_that_ended_with_the_verdict_are_refused(discarded: int) -> None:
     with pytest.raises(CertificateError, match="ended with the verdict"):
-        certify_scenario(planned([0] * 30), 0.95, discarded)
+        scenario(planned([0] * 30), 0.95, discarded)
     with pytest.raises(CertificateError, match="none counts; certify --audit N"):
-        certify_audit(planned([0] * 30), 0.95)
+        Audit().certify(planned([0] * 30), 0.95)
 
 
 @pytest.mark.parametrize("discarded", [0, 2])
 def test_a_number_of_draws_that_was_raised_after_looking_is_refused(discarded: int) -> None:
     with pytest.raises(CertificateError, match="changed from 20 to 40 after the first were known"):
-        certify_scenario(planned([20] * 20 + [40] * 20), 0.95, discarded)
-    assert certify_scenario(planned([40] * 40), 0.95, discarded).trials == 40
+        scenario(planned([20] * 20 + [40] * 20), 0.95, discarded)
+    assert scenario(planned([40] * 40), 0.95, discarded).trials == 40
 
 
 @pytest.mark.parametrize("counts", [[None] * 10 + [20] * 20, [20] * 20 + [None] * 10])
 def test_imported_draws_do_not_stand_beside_counted_ones(counts: list[int | None]) -> None:
     with pytest.raises(CertificateError, match="10 of the draws were imported"):
-        certify_scenario(planned(counts), 0.95)
-    assert certify_scenario(planned([None] * 30), 0.95).trials == 30  # imported alone, they are the user's word
+        scenario(planned(counts), 0.95)
+    assert scenario(planned([None] * 30), 0.95).trials == 30  # imported alone, they are the user's word
 
 
 def test_an_audit_that_was_extended_counts_the_draws_that_were_decided_on_last() -> None:
-    certificate = certify_audit(planned([20] * 20 + [60] * 40), 0.95)
+    certificate = Audit().certify(planned([20] * 20 + [60] * 40), 0.95)
     assert certificate.trials == 40
     assert certificate.volume == pytest.approx(volume_bound(40, 0, 0.05))
     assert certificate.upper_bound == 0.5
     assert certificate.details["not_counted"] == 20
     assert any("20 other independent draws do not count" in sentence for sentence in certificate.assumptions)
-    assert certify_audit(planned([0] * 10 + [30] * 20), 0.95).trials == 20
+    assert Audit().certify(planned([0] * 10 + [30] * 20), 0.95).trials == 20
 
 
 def test_the_statement_on_an_extended_audit_holds_as_often_as_stated() -> None:
@@ -250,7 +258,7 @@ def test_the_statement_on_an_extended_audit_holds_as_often_as_stated() -> None:
 
 
 def test_what_is_known_of_the_number_of_draws_is_said() -> None:
-    for certified in (certify_scenario, certify_audit):
+    for certified in (Scenario().certify, Audit().certify):
         unknown = " ".join(certified(planned([None] * 20)).assumptions)
         assert "their number was chosen before they were executed (the store does not know when)" in unknown
         known = " ".join(certified(planned([20] * 20)).assumptions)
@@ -261,15 +269,15 @@ def test_what_is_known_of_the_number_of_draws_is_said() -> None:
 
 
 def test_draws_say_nothing_of_a_model_that_was_learned_from_them() -> None:
-    for certified in (certify_scenario, certify_audit):
+    for certified in (Scenario().certify, Audit().certify):
         assert "M was not learned from these tasks" in " ".join(certified(planned([20] * 20)).assumptions)
 
 
 def test_failures_are_listed() -> None:
-    certificate = certify_scenario(sample([0.1, np.nan, 0.3]), discarded=1)
+    certificate = scenario(sample([0.1, np.nan, 0.3]), discarded=1)
     assert certificate.details["failures"]["failed"] == [1]
     assert "trial 1 failed, and no distance is known there" in certificate.assumptions
-    audited = certify_audit(mixed([0.4, np.nan], [0.1, 0.5]))
+    audited = Audit().certify(mixed([0.4, np.nan], [0.1, 0.5]))
     assert audited.details["failures"]["failed"] == [1]
     assert "trial 1 failed, and no distance is known there" in audited.assumptions
 
@@ -278,7 +286,7 @@ def test_an_unmeasured_draw_is_a_violation_that_can_be_measured() -> None:
     trials = Sample(
         np.zeros((3, 1)), np.array([0.1, np.nan, 0.2]), ["iid"] * 3, ["completed", "unmeasured", "completed"]
     )
-    for certified in (certify_scenario, certify_audit):
+    for certified in (Scenario().certify, Audit().certify):
         with pytest.raises(CertificateError, match=r"Trial 1 was executed.*`ctxval remeasure STORE`"):
             certified(trials)
 
@@ -295,7 +303,7 @@ def test_an_audit_that_was_stopped_says_how_many_draws_were_planned() -> None:
 
     with pytest.raises(KeyboardInterrupt):
         campaign.audit(20, stop)
-    said = certify_audit(Sample.of(campaign.trials)).assumptions[0]
+    said = Audit().certify(Sample.of(campaign.trials)).assumptions[0]
     assert "although 20 were planned and 4 are known" in said
-    whole = certify_audit(Sample.of(campaign.audit(20).trials)).assumptions[0]
+    whole = Audit().certify(Sample.of(campaign.audit(20).trials)).assumptions[0]
     assert whole.endswith("their number was chosen before they were executed")

@@ -15,13 +15,12 @@ from ctxval.certificates import (
     CertificateKind,
     CertificateOptions,
     Neighbour,
+    Posterior,
     Provenance,
     Sample,
-    certify_audit,
-    certify_posterior,
-    certify_scenario,
+    Scenario,
 )
-from ctxval.certificates.covering import resolved_volume
+from ctxval.certificates.covering import RESOLUTION, resolved_volume
 from ctxval.certificates.sentences.withdrawals import REFINED
 from ctxval.certificates.stopping import StoppingRule
 from ctxval.certificates.verdict import counterexample, judge, judge_by
@@ -31,7 +30,10 @@ from ctxval.errors import InputError
 pytestmark = pytest.mark.usefixtures("few_draws")
 
 WORST = 1.0
-posterior = CertificateOptions.posterior
+
+
+def posterior(confidence: float = 0.95, resolution: float = RESOLUTION) -> CertificateOptions:
+    return CertificateOptions(Posterior(resolution), confidence)
 
 
 def trial(
@@ -172,7 +174,7 @@ def test_a_volume_is_left_out_only_where_that_is_accepted() -> None:
 
 def test_scenario_and_audit_bounds_judge_too() -> None:
     drawn = [trial(k, x, 0.5 * x, "iid") for k, x in enumerate(np.linspace(0, 1, 60).tolist())]
-    for made in (certify_scenario(Sample.of(drawn), 0.9), certify_audit(Sample.of(drawn), 0.9)):
+    for made in (Scenario().certify(Sample.of(drawn), 0.9), Audit().certify(Sample.of(drawn), 0.9)):
         assert judge_by(made, drawn, 0.6).answer == "undecided"
         assert judge_by(made, drawn, 0.6, volume=0.05).answer == "validated"
         assert judge_by(made, drawn, 0.4, volume=0.05).answer == "falsified"
@@ -198,7 +200,7 @@ def test_a_counterexample_needs_no_certificate_and_no_model() -> None:
 @pytest.mark.slow
 def test_undecided_says_what_more_would_take() -> None:
     known = trials(5)
-    upper = certify_posterior(Sample.of(known)).upper_bound
+    upper = Posterior().certify(Sample.of(known)).upper_bound
     tau = 0.5 * (upper + max(t.distance or 0.0 for t in known))
     verdict = judge(known, tau)
     assert verdict.answer == "undecided"
@@ -240,10 +242,10 @@ def test_a_confidence_beyond_the_draws_is_undecided_and_one_that_is_none_is_refu
     assert verdict.answer == "undecided"
     assert "needs more than" in verdict.reason
     for tau, confidence in ((50.0, 1.5), (0.5, 0.0)):
-        with pytest.raises(InputError, match="strictly between 0 and 1"):
+        with pytest.raises(InputError, match=r"from 0\.5 to below 1"):
             judge(trials(), tau, posterior(confidence))
-        with pytest.raises(InputError, match="strictly between 0 and 1"):
-            StoppingRule(tau, posterior(confidence)).decide(trials(), 0)
+        with pytest.raises(InputError, match=r"from 0\.5 to below 1"):
+            StoppingRule(tau, confidence).decide(trials(), 0)
 
 
 def repeated(executed: Trial) -> Trial:
@@ -256,11 +258,11 @@ def repeated(executed: Trial) -> Trial:
 @pytest.mark.thorough
 def test_decided_is_what_the_verdict_is_not_undecided_of(stochastic: bool) -> None:
     known = [*trials(6), *([repeated(trials(6)[2])] if stochastic else [])]
-    upper = certify_posterior(Sample.of(known), 0.95).upper_bound
+    upper = Posterior().certify(Sample.of(known), 0.95).upper_bound
     best = max(t.distance or 0.0 for t in known)
     for threshold in (0.9 * best, 1.02 * upper, best + 0.2 * (upper - best)):
         verdict = judge(known, threshold, posterior())
-        assert StoppingRule(threshold, posterior()).decide(known, 0).decided == (verdict.answer != "undecided")
+        assert StoppingRule(threshold).decide(known, 0).decided == (verdict.answer != "undecided")
 
 
 @pytest.mark.slow
@@ -299,7 +301,7 @@ def test_a_resolution_that_is_no_positive_number_is_refused_before_anything_is_s
         with pytest.raises(InputError, match="resolution must be a positive number"):
             judge(trials_of, 1.0, posterior(resolution=resolution))
         with pytest.raises(InputError, match="resolution must be a positive number"):
-            StoppingRule(1.0, posterior(resolution=resolution)).decide(trials_of, 5)
+            StoppingRule(1.0, resolution=resolution).decide(trials_of, 5)
 
 
 def test_a_failure_that_was_made_good_counts_no_more() -> None:
@@ -337,7 +339,7 @@ def test_a_confidence_below_a_half_is_refused(confidence: float) -> None:
     with pytest.raises(InputError, match="wrong more often than right"):
         judge(trials(), 50.0, posterior(confidence))
     with pytest.raises(InputError, match="wrong more often than right"):
-        StoppingRule(50.0, posterior(confidence)).decide(trials(), 0)
+        StoppingRule(50.0, confidence).decide(trials(), 0)
     with pytest.raises(InputError, match="wrong more often than right"):
         judge_by(replace(certificate(1.0), confidence=confidence), trials(), 50.0)
 
@@ -383,7 +385,7 @@ def test_a_validation_names_what_it_rests_on() -> None:
     assert "single executions may exceed it" in noisy.rests_on
     assert judge(trials(), 0.5).rests_on is None
     drawn = [trial(k, x, 0.5 * x, "iid") for k, x in enumerate(np.linspace(0, 1, 60).tolist())]
-    audited = judge_by(certify_audit(Sample.of(drawn), 0.9), drawn, 0.6, volume=0.05)
+    audited = judge_by(Audit().certify(Sample.of(drawn), 0.9), drawn, 0.6, volume=0.05)
     assert audited.rests_on is not None
     assert "from which M was not learned (how large the distance is in the 3.77 % that are left out" in audited.rests_on
 

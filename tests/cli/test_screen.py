@@ -109,7 +109,7 @@ def test_what_users_code_raises_is_one_sentence(store: Path) -> None:
 def test_a_long_text_of_an_old_store_is_printed_short(store: Path) -> None:
     campaign = Campaign(make_validation(horizon=2), search=searches.Random(), store="b.sqlite")
     opened = campaign.ask()
-    campaign.store.close_trial(replace(opened.trial, state="failed", failure="x" * 10**7), None)
+    campaign.store.close_trials([(replace(opened.trial, state="failed", failure="x" * 10**7), None)])
     campaign.store.close()
     assert len(printed("status", "b.sqlite")) < 5_000
     assert len(printed("status", "b.sqlite", "--json")) < 5_000

@@ -149,7 +149,6 @@ def test_all_files_of_a_folder_are_read_in_the_order_of_their_names(tmp_path: Pa
     transitions, sources = found.transitions()
     assert (len(transitions), found.steps) == (33, 33)
     assert sources.tolist() == [0] * 10 + [1] * 11 + [2] * 12
-    assert found.transitions([2])[1].tolist() == [2] * 12
 
 
 def test_a_batch_of_trajectories_in_one_npz_file_is_several_recordings(tmp_path: Path) -> None:

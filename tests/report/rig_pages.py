@@ -74,9 +74,9 @@ def hostile_store(path: Path) -> Store:
         store.add([(trial, model, None)])
         states = np.full((4, 2), 1e200 if number == 0 else float(number))
         ended = replace(trial, state="completed", executed=True, distance=value)
-        store.close_trial(ended, Trajectory(np.arange(4.0), states, np.zeros((3, 1))))
+        store.close_trials([(ended, Trajectory(np.arange(4.0), states, np.zeros((3, 1))))])
     last = Trial(4, "manual", "open", np.array([0.9, 0.5]), {HOSTILE: 0.9, "plain": 0.5})
     store.add([(last, model, None)])
-    store.close_trial(replace(last, state="failed", executed=True, failure=HOSTILE), None)
+    store.close_trials([(replace(last, state="failed", executed=True, failure=HOSTILE), None)])
     store.keep_settings({"experiment": HOSTILE, "search": {"name": HOSTILE}, "options": {HOSTILE: HOSTILE}, "seed": 0})
     return store

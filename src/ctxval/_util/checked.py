@@ -11,7 +11,8 @@ import inspect
 import reprlib
 import sys
 import types
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
+from contextlib import suppress
 from typing import Annotated, Any, Literal, NamedTuple, TypeVar, Union, get_args, get_origin
 
 import numpy as np
@@ -61,7 +62,17 @@ def checked(made: Checkable) -> Checkable:
 
     @functools.cache
     def annotations() -> dict[str, Any]:
-        return dict(_resolved(function, made))
+        """Return those of parameters; those of the fields of a dataclass are read where the field is defined."""
+        variadic = {inspect.Parameter.VAR_KEYWORD, inspect.Parameter.VAR_POSITIONAL}
+        plain = {name for name, parameter in signature.parameters.items() if parameter.kind not in variadic}
+        known = {}
+        for name, annotation in function.__annotations__.items():
+            homes = [cls for cls in getattr(made, "__mro__", ()) if name in vars(cls).get("__annotations__", {})]
+            place = vars(sys.modules[homes[0].__module__]) if homes else function.__globals__
+            with suppress(NameError, AttributeError, TypeError):  # an annotation for type checkers alone
+                if name in plain:
+                    known[name] = eval(annotation, dict(place)) if isinstance(annotation, str) else annotation
+        return known
 
     @functools.wraps(function)
     def call(*args: Any, **kwargs: Any) -> Any:
@@ -93,21 +104,6 @@ def require_known(kind: str, names: Iterable[str], known: Collection[str]) -> No
     for name in names:
         if name not in known:
             raise UnknownNameError.among(kind, name, known)
-
-
-def _resolved(function: Any, made: Any) -> Iterator[tuple[str, Any]]:
-    """Yield the annotations of parameters; those of the fields of a dataclass are read where the field is defined."""
-    variadic = {inspect.Parameter.VAR_KEYWORD, inspect.Parameter.VAR_POSITIONAL}
-    parameters = inspect.signature(function).parameters
-    plain = {name for name, parameter in parameters.items() if parameter.kind not in variadic}
-    for name, annotation in function.__annotations__.items():
-        homes = [cls for cls in getattr(made, "__mro__", ()) if name in vars(cls).get("__annotations__", {})]
-        place = vars(sys.modules[homes[0].__module__]) if homes else function.__globals__
-        try:
-            if name in plain:
-                yield name, eval(annotation, dict(place)) if isinstance(annotation, str) else annotation
-        except (NameError, AttributeError, TypeError):
-            continue
 
 
 def _missed(annotation: Any, value: Any) -> str:

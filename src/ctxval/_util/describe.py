@@ -82,12 +82,12 @@ def without_numbers(description: Any) -> Any:
     return {key: without_numbers(item) for key, item in description.items() if isinstance(item, str | dict)}
 
 
-def first_difference(stored: Any, present: Any, path: str = "") -> str | None:
+def first_difference(stored: Any, present: Any) -> str | None:
     """Return a sentence about the first difference of two descriptions; None if they agree.
 
     The name of a function does not matter if the digest of its source is known.
     """
-    return next((sentence for _, sentence in differences(stored, present, path)), None)
+    return next((sentence for _, sentence in differences(stored, present)), None)
 
 
 def differences(stored: Any, present: Any, path: str = "") -> Iterator[tuple[str, str]]:

@@ -225,34 +225,25 @@ class Archive:
             self._zip = zipfile.ZipFile(io.BytesIO(content))
         entries = (info for info in self._zip.infolist() if info.filename.endswith(".npy"))
         self._entries = {info.filename.removesuffix(".npy"): info for info in entries}
+        self.names = tuple(self._entries)
         self._left = most
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        return tuple(self._entries)
-
-    def __contains__(self, name: str) -> bool:
-        return name in self._entries
-
-    def shape(self, name: str) -> tuple[int, ...]:
-        return self._header(name)[0]
-
     def numbers(self, name: str) -> npt.NDArray[np.float64]:
-        shape, dtype = self._header(name)
+        shape, dtype = self.header(name)
         if dtype.kind not in "fiub" or dtype.itemsize > 8:
             raise InputError(f"its array {name} must be real numbers")
-        return np.asarray(self._array(name, 8 * math.prod(shape)), dtype=np.float64)
+        return np.asarray(self._array(name, shape, 8 * math.prod(shape)), dtype=np.float64)
 
     def text(self, name: str) -> str:
-        shape, dtype = self._header(name)
+        shape, dtype = self.header(name)
         if dtype.kind not in "US" or math.prod(shape) != 1:
             raise InputError(f"its array {name} must be one text")
         # Surrogates are replaced, because no file or terminal can hold them.
         order = {"<": "little", ">": "big"}.get(dtype.byteorder, sys.byteorder)
         encoding = "utf-8" if dtype.kind == "S" else f"utf-32-{order[0]}e"
-        return self._array(name, 2 * dtype.itemsize).tobytes().decode(encoding, "replace").rstrip("\0")
+        return self._array(name, shape, 2 * dtype.itemsize).tobytes().decode(encoding, "replace").rstrip("\0")
 
-    def _header(self, name: str) -> tuple[tuple[int, ...], np.dtype[Any]]:
+    def header(self, name: str) -> tuple[tuple[int, ...], np.dtype[Any]]:
         """Return the shape and the type of an array whose entry is as long as its header states."""
         if name not in self._entries:
             raise InputError(f"it has no array {name}")
@@ -270,11 +261,10 @@ class Archive:
                 raise InputError(f"its array {name} is not as long as its header states")
         return shape, dtype
 
-    def _array(self, name: str, size: int) -> npt.NDArray[Any]:
+    def _array(self, name: str, shape: tuple[int, ...], size: int) -> npt.NDArray[Any]:
         """Return an array whose numbers or text take so many bytes in memory."""
         if size > self._left:
-            too_large = f"of shape {self.shape(name)} is too large: {self._left} bytes may be read"
-            raise InputError(f"its array {name} {too_large}")
+            raise InputError(f"its array {name} of shape {shape} is too large: {self._left} bytes may be read")
         self._left -= size
         with _damage(), self._zip.open(self._entries[name]) as file:
             return np.asarray(np.lib.format.read_array(file, allow_pickle=False))

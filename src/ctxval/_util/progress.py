@@ -83,10 +83,6 @@ def also_listening(listener: Listener) -> AbstractContextManager[None]:
     return listening(both)
 
 
-def ignore(_: Progress) -> None:
-    """Listen, and do nothing: nobody else is told."""
-
-
 def mute() -> None:
     """Let nobody listen from now on, as in a forked process, whose listener is that of its parent."""
     _innermost.set(None)
@@ -130,13 +126,14 @@ _DELAY = 0.4  # seconds before a stage is shown; most end sooner
 @contextmanager
 def progress_shown(wanted: bool | None = None, console: Console | None = None) -> Iterator[None]:
     """Show the progress of everything within this context on standard error."""
-    if is_heard() and wanted is not False:
+    if _innermost.get() is not None and wanted is not False:
         yield
         return
     if wanted is None:
-        wanted = is_screen()
+        # People see what is printed at once at a terminal or in a notebook.
+        wanted = bool(sys.stderr is not None and sys.stderr.isatty()) or "ipykernel" in sys.modules
     if not wanted:
-        with listening(ignore):
+        with listening(lambda _: None):  # so that nothing inside shows it either
             yield
         return
     from rich.console import Console  # slow to load, and needed by few programs
@@ -144,11 +141,6 @@ def progress_shown(wanted: bool | None = None, console: Console | None = None) -
     screen = Console(stderr=True, markup=False, emoji=False, highlight=False) if console is None else console
     with listening(OnScreen(screen) if screen.is_terminal or screen.is_jupyter else InLog(screen)):
         yield
-
-
-def is_screen() -> bool:
-    """Return whether people see what is printed at once: at a terminal or in a notebook."""
-    return bool(sys.stderr is not None and sys.stderr.isatty()) or "ipykernel" in sys.modules
 
 
 class InLog:

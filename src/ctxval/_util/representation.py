@@ -191,9 +191,9 @@ def named(values: Mapping[str, Any], units: Mapping[str, str] | None = None) -> 
     return Shown(", ".join([*items, *_rest(len(values))]))
 
 
-def counted(count: int, singular: str, plural: str | None = None) -> Shown:
+def counted(count: int, singular: str) -> Shown:
     """Return how many there are, such as ``1 trial`` and ``2 trials``."""
-    return Shown(f"{count} {singular if count == 1 else plural or f'{singular}s'}")
+    return Shown(f"{count} {singular if count == 1 else f'{singular}s'}")
 
 
 def name_of(function: Any) -> Shown:

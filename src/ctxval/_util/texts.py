@@ -58,9 +58,9 @@ def visible(text: str) -> str:
     return _ACTED_UPON.sub(written_out, text)
 
 
-def quoted(value: object, longest: int = 100) -> str:
+def quoted(value: object) -> str:
     """Return a text of a file for a message: in one line, shortened, and with control characters written out."""
-    return shortened(visible(" ".join(plain(value).split())), longest)
+    return shortened(visible(" ".join(plain(value).split())), 100)
 
 
 def text_of(reason: object) -> str:

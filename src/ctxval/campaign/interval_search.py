@@ -47,7 +47,7 @@ from ctxval.certificates.posterior import Posterior
 from ctxval.certificates.prediction_tests import DRAWN, MANY, TESTS
 from ctxval.certificates.sample import SAME
 from ctxval.certificates.suite import WholeSuite
-from ctxval.certificates.verdict import counterexample, quantile_of, require_suite
+from ctxval.certificates.verdict import counterexample, require_suite
 from ctxval.core.trial import Trial
 from ctxval.errors import CertificateError, InputError
 from ctxval.learning.worst_case import is_kinked
@@ -75,7 +75,7 @@ class IntervalSearch:
         if self.threshold is None and isinstance(self.options.kind, AnytimeAudit):
             raise InputError("an anytime audit ends by its threshold; state one, or run another certificate.")
         self.options.kind.require_usable(self.options.confidence, self.budget)
-        self.recorder.dynamics.use_quantile(quantile_of(self.options.kind))
+        self.recorder.dynamics.use_quantile(self.options.kind.quantile)
 
     @property
     def limit(self) -> float:
@@ -112,7 +112,7 @@ class IntervalSearch:
         """Whether the executed distances falsify the limit; of a noisy system, one above it may not suffice."""
         kind, confidence = self.options.kind, self.options.confidence
         known = Quantities(space=self.recorder.validation.space)
-        return counterexample(self.recorder.trials, self.limit, known, confidence, quantile_of(kind)) is not None
+        return counterexample(self.recorder.trials, self.limit, known, confidence, kind.quantile) is not None
 
     def choose(self) -> Choice | None:
         """Return the next task; None if the interval decides, or no task of a suite is left."""
@@ -127,7 +127,8 @@ class IntervalSearch:
         if isinstance(kind, AnytimeAudit):
             # The next independent draw of an anytime audit, which may end whenever its bound suffices.
             if any(trial.origin == "iid" for trial in self._ended):
-                certificate, _ = kind.certify_against(Sample.of(self._ended), self.limit, self.options.confidence)
+                sample = replace(Sample.of(self._ended), threshold=self.limit)
+                certificate = kind.certify(sample, self.options.confidence)
                 if certificate.covers(self.limit, self.options.volume):
                     return None
             return Choice(self.recorder.draw(), "iid", planned_draws=0)
@@ -166,7 +167,7 @@ class IntervalSearch:
             chosen = sum(trial.origin not in DRAWN for trial in trials)
             patient = chosen < 16 or self._lacks_tests_alone(evidence) or unentered_pocket(evidence) is not None
             # In few dimensions, executions soon cover the tasks, and the posterior bound of the distance may decide.
-            if not patient or covering(known, kind.posterior.resolution, 0) is not None:
+            if not patient or covering(known, kind.resolution, 0) is not None:
                 choice = self._by_distance()
                 if not patient or choice is None:
                     return choice
@@ -184,7 +185,7 @@ class IntervalSearch:
 
     def _against_noise(self) -> Choice | None:
         """Return a task whose execution tells whether noise explains a distance above the limit, if there is one."""
-        trials, quantile = self.recorder.trials, quantile_of(self.options.kind)
+        trials, quantile = self.recorder.trials, self.options.kind.quantile
         bets = bets_against(trials, self.limit, quantile)
         if self._suite is not None or not self.predicts or (bets is not None and bets.falsify(self.options.confidence)):
             return None
@@ -235,10 +236,9 @@ class IntervalSearch:
     def _by_distance(self) -> Choice | None:
         kind = self.options.kind
         # No distance is known, all are 0, or each task of a suite is executed.
-        if isinstance(kind, Dynamics) or not self.limit > 0 or self._suite is not None:
+        if not isinstance(kind, Automatic | Posterior) or not self.limit > 0 or self._suite is not None:
             return Choice(planned_draws=0)
-        posterior = kind.posterior if isinstance(kind, Automatic) else kind
-        rule = StoppingRule(self.limit, replace(self.options, kind=posterior))
+        rule = StoppingRule(self.limit, self.options.confidence, kind.resolution)
         now = rule.decide(self.recorder.trials, self.budget - self.recorder.executions)
         if not now.decided:
             return Choice(now.next_point, "covering", planned_draws=0)

@@ -277,7 +277,7 @@ class TrialRecorder:
             self._redefine(self.validation, self.description)
         else:
             try:
-                self.store.close_trial(ended, trajectory, changes=self._changes)
+                self.store.close_trials([(ended, trajectory)], changes=self._changes)
             except (StoreError, InputError) as error:
                 raise error_with_fallback(ended, trajectory, self.store.path, error) from error
             self._closed([ended])

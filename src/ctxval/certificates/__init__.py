@@ -1,6 +1,6 @@
 """Certificates: statements about d* with their assumptions, and the verdicts that rest on them."""
 
-from ctxval.certificates.anytime import AnytimeAudit, certify_anytime
+from ctxval.certificates.anytime import AnytimeAudit
 from ctxval.certificates.automatic import Automatic
 from ctxval.certificates.base import KINDS, Certificate, CertificateKind, require_use
 from ctxval.certificates.convergence import is_validated, rate
@@ -22,16 +22,14 @@ from ctxval.certificates.expiry import WatchState
 from ctxval.certificates.forecast import Forecast, forecast
 from ctxval.certificates.maxima import Maxima, draw_maxima, settle_maxima
 from ctxval.certificates.options import CertificateOptions
-from ctxval.certificates.posterior import Diagnosis, Posterior, certify_posterior, diagnose, instantaneous_bound
+from ctxval.certificates.posterior import Diagnosis, Posterior, diagnose, instantaneous_bound
 from ctxval.certificates.provenance import Neighbour, Provenance
-from ctxval.certificates.region import Region, certify_region
+from ctxval.certificates.region import Region
 from ctxval.certificates.sample import PLANNED, MadeGood, Sample, require_learned
 from ctxval.certificates.scenario import (
     Audit,
     SamplingDiscarding,
     Scenario,
-    certify_audit,
-    certify_scenario,
     samples_needed,
     tail,
     volume_bound,
@@ -78,12 +76,7 @@ __all__ = [
     "WholeSuite",
     "assess",
     "bare_corners",
-    "certify_anytime",
-    "certify_audit",
     "certify_dynamics",
-    "certify_posterior",
-    "certify_region",
-    "certify_scenario",
     "covering",
     "diagnose",
     "draw_maxima",

@@ -25,10 +25,9 @@ from scipy.optimize import brentq
 from scipy.special import betainc, betaln
 
 from ctxval._util.arrays import Array, Mask
-from ctxval._util.checked import PositiveFloat, Probability, checked
+from ctxval._util.checked import Probability, checked
 from ctxval._util.registry import part
 from ctxval.certificates.base import Certificate, CertificateKind
-from ctxval.certificates.forecast import Forecast
 from ctxval.certificates.sample import Sample
 from ctxval.certificates.sentences.statements import ABOUT_DRAWS, ONE_CAMPAIGN, distributed, share_above
 from ctxval.errors import CertificateError
@@ -44,53 +43,51 @@ class AnytimeAudit(CertificateKind):
 
     name: ClassVar[str] = "anytime"
     bounds_maximum: ClassVar[bool] = False
-    needs_threshold: ClassVar[bool] = True
+    uses_threshold: ClassVar[bool] = True
     sorts_draws: ClassVar[bool] = True  # all of them count, whenever they end
 
-    def certify(self, sample: Sample, confidence: float = 0.95) -> Certificate:
-        """Refuse: the bound is on the volume above a threshold, and none is given."""
-        raise CertificateError("an anytime audit bounds the volume above a threshold, so it needs one (--threshold).")
+    @checked
+    def certify(self, sample: Sample, confidence: Probability = 0.95) -> Certificate:
+        """Bound the volume above the threshold of the sample, which was fixed before the draws were known.
 
-    def certify_against(
-        self, sample: Sample, threshold: float, confidence: float = 0.95
-    ) -> tuple[Certificate, Forecast | None]:
-        """Return :func:`certify_anytime` of the trials; nothing is forecast."""
-        return certify_anytime(sample, threshold, confidence), None
-
-
-@checked
-def certify_anytime(sample: Sample, threshold: PositiveFloat, confidence: Probability = 0.95) -> Certificate:
-    """Bound the volume above a threshold, fixed before the draws were known; a draw without a distance violates it."""
-    drawn = sample.only("iid")
-    if not len(drawn):
-        raise CertificateError("an anytime audit needs independent draws of tasks, and there is none; use --audit N.")
-    violating = ~(drawn.distances <= threshold)  # also where no distance is known
-    volume = anytime_volume(violating, 1 - confidence)
-    return Certificate(
-        kind="anytime",
-        statement=share_above(
-            *(sample, volume, confidence, f"{threshold:.6g}", len(drawn)),
-            " or fail, however often this was looked at and continued",
-        ),
-        upper_bound=float(threshold),
-        confidence=confidence,
-        volume=volume,
-        trials=len(drawn),
-        assumptions=(
-            f"the audited tasks are independent and {distributed(sample)}",
-            f"the threshold {threshold:.6g} was fixed before any of them was known",
-            *ABOUT_DRAWS,
-            *sample.remarks,
-            ONE_CAMPAIGN,
-        ),
-        details={
-            "violations": int(violating.sum()),
-            "largest_drawn": drawn.best if np.isfinite(drawn.best) else None,
-            "failed": drawn.failed,
-            "failures": sample.failures,
-        },
-        distribution=sample.distribution,
-    )
+        A draw without a distance violates it.
+        """
+        if sample.threshold is None:
+            what = "an anytime audit bounds the volume above a threshold"
+            raise CertificateError(f"{what}, so it needs one (--threshold).")
+        threshold = float(sample.threshold)
+        drawn = sample.only("iid")
+        if not len(drawn):
+            raise CertificateError(
+                "an anytime audit needs independent draws of tasks, and there is none; use --audit N."
+            )
+        violating = ~(drawn.distances <= threshold)  # also where no distance is known
+        volume = anytime_volume(violating, 1 - confidence)
+        return Certificate(
+            kind=self.name,
+            statement=share_above(
+                *(sample, volume, confidence, f"{threshold:.6g}", len(drawn)),
+                " or fail, however often this was looked at and continued",
+            ),
+            upper_bound=threshold,
+            confidence=confidence,
+            volume=volume,
+            trials=len(drawn),
+            assumptions=(
+                f"the audited tasks are independent and {distributed(sample)}",
+                f"the threshold {threshold:.6g} was fixed before any of them was known",
+                *ABOUT_DRAWS,
+                *sample.remarks,
+                ONE_CAMPAIGN,
+            ),
+            details={
+                "violations": int(violating.sum()),
+                "largest_drawn": drawn.best if np.isfinite(drawn.best) else None,
+                "failed": drawn.failed,
+                "failures": sample.failures,
+            },
+            distribution=sample.distribution,
+        )
 
 
 def anytime_volume(violating: Mask, beta: float) -> float:

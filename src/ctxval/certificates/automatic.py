@@ -10,11 +10,10 @@ import numpy as np
 
 from ctxval._util.checked import NonNegativeInt, PositiveFloat, Probability
 from ctxval._util.registry import part
-from ctxval.certificates.base import Certificate, CertificateKind, certified
+from ctxval.certificates.base import Certificate, CertificateKind
 from ctxval.certificates.covering import RESOLUTION
 from ctxval.certificates.dynamics import Dynamics
 from ctxval.certificates.dynamics_diagnostics import FEWEST
-from ctxval.certificates.forecast import Forecast
 from ctxval.certificates.posterior import Posterior
 from ctxval.certificates.prediction_tests import DRAWN, TESTS, shown_by_tests
 from ctxval.certificates.sample import Sample
@@ -22,8 +21,6 @@ from ctxval.certificates.sentences.verdicts import supported as supported_by
 from ctxval.certificates.suite import WholeSuite
 from ctxval.core.quantiles import QUANTILE
 from ctxval.errors import CertificateError
-
-_Outcome = tuple[Certificate, Forecast | None]
 
 
 @part("auto")
@@ -48,35 +45,29 @@ class Automatic(CertificateKind):
     #: the share of the executions of each task that the bound is about, if they differ by noise
     quantile: Probability = QUANTILE
 
-    @property
-    def posterior(self) -> Posterior:
-        """The posterior bound with these options."""
-        return Posterior(self.resolution)
-
     def certify(self, sample: Sample, confidence: float = 0.95) -> Certificate:
-        """Return the dynamics bound or, if it is withdrawn or refused, the posterior bound."""
-        return self.certify_against(sample, None, confidence)[0]
+        """Return the first certificate that keeps the threshold, or else the one that is nearer to a decision.
 
-    def certify_against(self, sample: Sample, threshold: float | None, confidence: float = 0.95) -> _Outcome:
-        """Return the first certificate that keeps the threshold, or else the one that is nearer to a decision."""
+        Without a threshold, it is the dynamics bound or, if that is withdrawn or refused, the posterior bound.
+        """
+        threshold = sample.threshold
         # A resolution of one's own asks for the posterior bound.
         usual = self.resolution == RESOLUTION and sample.learned is not None
         uses_dynamics = usual and len(sample) >= FEWEST and not sample.failed
         if sample.suite is not None and (not sample.not_executed or not uses_dynamics):
-            return certified(WholeSuite(), sample, threshold, confidence)
+            return WholeSuite().certify(sample, confidence)
         by_dynamics = None
         if uses_dynamics:
             with suppress(CertificateError):
-                dynamics = Dynamics(tests=self.tests, quantile=self.quantile)
-                by_dynamics = certified(dynamics, sample, threshold, confidence)
+                by_dynamics = Dynamics(tests=self.tests, quantile=self.quantile).certify(sample, confidence)
         if by_dynamics is not None:
-            is_noisy = by_dynamics[0].details.get("quantile") is not None
-            if is_noisy or _decides(by_dynamics[0], threshold):
+            is_noisy = by_dynamics.details.get("quantile") is not None
+            if is_noisy or _decides(by_dynamics, threshold):
                 return by_dynamics  # the posterior bound of the distance is about systems without noise
         if sample.suite is not None:
-            return by_dynamics or certified(WholeSuite(), sample, threshold, confidence)
+            return by_dynamics or WholeSuite().certify(sample, confidence)
         try:
-            certificate, expected = certified(self.posterior, sample, threshold, confidence)
+            certificate = Posterior(self.resolution).certify(sample, confidence)
         except CertificateError:
             if by_dynamics is None:
                 raise
@@ -93,12 +84,12 @@ class Automatic(CertificateKind):
         details = {**certificate.details, "tests": {**shown, "largest_error": None}}
         certificate = replace(certificate, details=details, doubt=doubt)
         if by_dynamics is None or _decides(certificate, threshold):
-            return certificate, expected
-        supported = threshold is not None and supported_by(by_dynamics[0], threshold)
-        if _decides(by_dynamics[0], None) or supported:
+            return certificate
+        supported = threshold is not None and supported_by(by_dynamics, threshold)
+        if _decides(by_dynamics, None) or supported:
             return by_dynamics
-        suspect = by_dynamics[0].details["suspect"]
-        return replace(certificate, details={**certificate.details, "suspect": suspect}), expected
+        suspect = by_dynamics.details["suspect"]
+        return replace(certificate, details={**certificate.details, "suspect": suspect})
 
     def missing_tests(self, sample: Sample) -> int:
         """Return the number of executions after which the posterior bound has seen tasks of the whole space."""

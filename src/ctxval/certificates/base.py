@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field, fields
-from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 from ctxval._util.registry import Registry
 from ctxval._util.representation import ShortRepr, Shown, call, line, lines, table
@@ -13,6 +14,7 @@ from ctxval._util.version import VERSION
 from ctxval.certificates.bounds import ERRORS, as_text, at_most, with_error
 from ctxval.certificates.sample import Sample
 from ctxval.certificates.sentences import verdicts as sentences
+from ctxval.core.quantiles import QUANTILE
 from ctxval.core.space import TaskSpace
 from ctxval.core.trial import Origin
 from ctxval.errors import CertificateError, InputError, UnknownNameError
@@ -40,6 +42,14 @@ class Certificate:
     version: str = VERSION  #: the version of ctxval that computed it
     #: the distribution of tasks as a text, which ``volume`` is a share of; None if it is uniform
     distribution: str | None = None
+    #: a forecast of further executions, for the threshold of its sample; None if it decides, or can predict nothing
+    expected: Forecast | None = None
+
+    @property
+    def bound(self) -> float | None:
+        """The bound on d*; None if it is withdrawn, is infinite, or leaves out a volume."""
+        usable = self.doubt is None and not self.volume and math.isfinite(self.upper_bound)
+        return self.upper_bound if usable else None
 
     def covers(self, threshold: float, volume: float = 0.0) -> bool:
         """Return whether it bounds the distance by the threshold, except on at most this share of the task space.
@@ -49,8 +59,8 @@ class Certificate:
         return self.doubt is None and self.volume <= volume and self.upper_bound + ERRORS * self.error <= threshold
 
     def to_json(self) -> dict[str, Any]:
-        """Return all attributes, ready for JSON."""
-        return asdict(self)
+        """Return all attributes but the forecast, ready for JSON."""
+        return {name: value for name, value in asdict(self).items() if name != "expected"}
 
     @property
     def numbers(self) -> dict[str, Any]:
@@ -105,11 +115,8 @@ class CertificateKind(ShortRepr, ABC):
     bounds_maximum: ClassVar[bool] = True
     """Whether it bounds d* itself. If not, it leaves out a share of the task space, which the user must accept."""
 
-    needs_threshold: ClassVar[bool] = False
-    """Whether its statement is about a threshold, so that there is none without one."""
-
     uses_threshold: ClassVar[bool] = False
-    """Whether its statement is about a threshold if there is one, and about the distance alone if there is none."""
+    """Whether its statement is about a threshold, if there is one."""
 
     needs_model: ClassVar[bool] = False
     """Whether it uses what the experiment's model predicts, so that the experiment must be loaded."""
@@ -120,6 +127,9 @@ class CertificateKind(ShortRepr, ABC):
 
     takes_suites: ClassVar[bool] = False
     """Whether it certifies suites of tasks, of which each is executed once and none is drawn at random."""
+
+    quantile = QUANTILE
+    """The share of the executions of each task that a threshold is about, if they differ by noise."""
 
     @classmethod
     def options(cls) -> tuple[str, ...]:
@@ -134,19 +144,16 @@ class CertificateKind(ShortRepr, ABC):
 
     @abstractmethod
     def certify(self, sample: Sample, confidence: float = 0.95) -> Certificate:
-        """Return the certificate of trials; a CertificateError if they or the options do not allow one."""
+        """Return the certificate of trials, precise enough for the threshold of the sample if there is one.
 
-    def certify_against(
-        self, sample: Sample, threshold: float, confidence: float = 0.95
-    ) -> tuple[Certificate, Forecast | None]:
-        """Return a certificate that is precise enough for a threshold, and a forecast of executions if there is one."""
-        return self.certify(sample, confidence), None
+        A CertificateError is raised if the trials or the options do not allow one.
+        """
 
-    def require_audit_helps(self, origins: Iterable[Origin]) -> None:
-        """Raise a CertificateError if independent draws beside trials of these origins could never be certified."""
+    def require_usable(self, confidence: float, executions: int, beside: Iterable[Origin] = ()) -> None:
+        """Raise a CertificateError if so many trials could never be certified, before they are paid for.
 
-    def require_usable(self, confidence: float, executions: int) -> None:
-        """Raise a CertificateError if so many trials could never be certified, before they are paid for."""
+        There may be others ``beside`` them, of these origins.
+        """
 
     @classmethod
     def rests_on(cls, certificate: Certificate, space: TaskSpace | None = None) -> list[str]:
@@ -154,62 +161,21 @@ class CertificateKind(ShortRepr, ABC):
         return sentences.conditions(certificate, space)
 
 
-Kind = TypeVar("Kind", bound=type[CertificateKind])
-
-
 class KindRegistry(Registry[CertificateKind]):
-    """Kinds of certificates by name: built-in ones, those of installed packages, and those registered by a decorator.
-
-    A registered kind is the user's own code, so :meth:`is_data` returns False for it.
-    """
-
-    def __init__(self) -> None:
-        super().__init__("certificate", "ctxval.certificates", method="certify")
-        self._registered: set[str] = set()
-
-    def register(self, kind: Kind) -> Kind:
-        """Add a kind; a decorator of its class. A cell that is run again replaces its own class."""
-        name = _required(kind).name
-        known = self._exported.get(name, kind)
-        if (known.__module__, known.__qualname__) != (kind.__module__, kind.__qualname__):
-            raise InputError(f"there is a kind of certificate called {name!r} already: {known.__qualname__}.")
-        if name in self._registered or name not in self._exported:
-            self._registered.add(name)
-            self._exported[name] = kind
-        return kind
-
-    def is_data(self, name: Any) -> bool:
-        """Return whether a kind with plain arguments runs no code of a user."""
-        return name not in self._registered and super().is_data(name)
+    """Kinds of certificates by name: built-in ones, and those of installed packages."""
 
     def find(self, name: str) -> type[CertificateKind]:
         """Return the kind of a name."""
-        kind = _required(super().find(name))
-        if kind.name != name:
-            raise InputError(f"the certificate {name!r} calls itself {kind.name!r}.")
-        return kind
-
-    def of(self, certificate: Certificate) -> type[CertificateKind]:
-        """Return the kind of a certificate; the base class :class:`CertificateKind` if the kind is not known."""
-        return self.find(certificate.kind) if certificate.kind in self else CertificateKind
-
-
-def _required(kind: Any) -> type[CertificateKind]:
-    if isinstance(kind, type) and issubclass(kind, CertificateKind) and isinstance(getattr(kind, "name", None), str):
-        return kind
-    raise InputError(f"a kind of certificate must be a subclass of CertificateKind with a name, got {kind!r}.")
+        kind: Any = super().find(name)
+        if name not in self._exported:
+            if not isinstance(kind, type) or not issubclass(kind, CertificateKind):
+                raise InputError(f"a kind of certificate must be a subclass of CertificateKind, got {kind!r}.")
+            if getattr(kind, "name", None) != name:
+                raise InputError(f"the certificate {name!r} calls itself {getattr(kind, 'name', None)!r}.")
+        return kind  # type: ignore[no-any-return]
 
 
-def certified(
-    kind: CertificateKind, sample: Sample, threshold: float | None, confidence: float
-) -> tuple[Certificate, Forecast | None]:
-    """Return a certificate, precise enough for a threshold if there is one, and a forecast."""
-    if threshold is None:
-        return kind.certify(sample, confidence), None
-    return kind.certify_against(sample, threshold, confidence)
-
-
-KINDS = KindRegistry()
+KINDS = KindRegistry("certificate", "ctxval.certificates", method="certify")
 """Kinds of certificates by name."""
 
 

@@ -14,6 +14,7 @@ predictions, and by far more if one of these predictions failed.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass, replace
 from typing import ClassVar
 
@@ -38,7 +39,7 @@ from ctxval.certificates.dynamics_diagnostics import (
 )
 from ctxval.certificates.dynamics_evidence import DynamicsEvidence
 from ctxval.certificates.forecast import Forecast
-from ctxval.certificates.prediction_tests import DRAWN, TESTS, shown_by_tests
+from ctxval.certificates.prediction_tests import TESTS, shown_by_tests
 from ctxval.certificates.sample import Sample, advice_to_remeasure, listed, require_learned
 from ctxval.certificates.sentences.statements import (
     ONE_CAMPAIGN,
@@ -48,6 +49,7 @@ from ctxval.certificates.sentences.statements import (
     two_distances,
 )
 from ctxval.core.quantiles import QUANTILE
+from ctxval.core.trial import Origin
 from ctxval.errors import CertificateError
 
 MOST_DRAWS = 400  # posterior samples of the dynamics, which limit the confidence
@@ -67,29 +69,16 @@ class Dynamics(CertificateKind):
     #: the share of the executions of each task that the bound is about, if they differ by noise
     quantile: Probability = QUANTILE
 
-    def require_usable(self, confidence: float, executions: int) -> None:
+    def require_usable(self, confidence: float, executions: int, beside: Iterable[Origin] = ()) -> None:
         """Refuse a confidence that needs too many draws of the dynamics."""
         rank_within(confidence, MOST_DRAWS)
 
     def certify(self, sample: Sample, confidence: float = 0.95) -> Certificate:
-        """Return :func:`certify_dynamics` of the trials and of what is learned from their trajectories."""
-        return certify_dynamics(sample, self._evidence(sample, confidence), confidence)
+        """Return :func:`certify_dynamics` of the trials and of what is learned from their trajectories.
 
-    def certify_against(
-        self, sample: Sample, threshold: float, confidence: float = 0.95
-    ) -> tuple[Certificate, Forecast | None]:
-        """Return the certificate and, if it does not keep the threshold, the fewest executions that can decide."""
-        evidence = self._evidence(sample, confidence)
-        bound = bound_of(evidence, sample.best, confidence)
-        certificate = certify_dynamics(sample, evidence, confidence)
-        if certificate.covers(threshold):
-            return certificate, None
-        if raised(evidence, bound) > threshold and certificate.doubt == tests_missing(evidence):
-            certificate = replace(certificate, doubt=None)  # missing tests matter only to a bound that suffices
-        kept = float((evidence.maxima <= threshold).mean())
-        return certificate, Forecast(fewest_missing(evidence, sample.best, bound), kept, 1 - kept, fewest=True)
-
-    def _evidence(self, sample: Sample, confidence: float) -> DynamicsEvidence:
+        If it does not keep the threshold, it forecasts the fewest executions that can decide.
+        """
+        threshold = sample.threshold
         learned = require_learned(sample, self.name)
         unknown = [sample.numbers[row] for row in np.flatnonzero(np.isnan(sample.distances)).tolist()]
         if unknown:
@@ -108,7 +97,16 @@ class Dynamics(CertificateKind):
                 "no dynamics can be learned: there are no recorded trajectories, or M explains all of them, or no "
                 "controller can be designed."
             )
-        return replace(evidence, tests=self.tests)
+        evidence = replace(evidence, tests=self.tests)
+        certificate = certify_dynamics(sample, evidence, confidence)
+        if threshold is None or certificate.covers(threshold):
+            return certificate
+        bound = bound_of(evidence, sample.best, confidence)
+        if raised(evidence, bound) > threshold and certificate.doubt == tests_missing(evidence):
+            certificate = replace(certificate, doubt=None)  # missing tests matter only to a bound that suffices
+        kept = float((evidence.maxima <= threshold).mean())
+        expected = Forecast(fewest_missing(evidence, sample.best, bound), kept, 1 - kept, fewest=True)
+        return replace(certificate, expected=expected)
 
 
 def draws_for(confidence: float) -> int:
@@ -128,7 +126,7 @@ def certify_dynamics(sample: Sample, evidence: DynamicsEvidence, confidence: Pro
             "be predicted. More executions narrow them."
         )
     finite, last = evidence.maxima[np.isfinite(evidence.maxima)], counted(evidence, bound)[-PREDICTIONS:]
-    tests = [test for test in tested(evidence.predictions, evidence.tests) if test.origin in DRAWN]
+    tests = tested(evidence.predictions, evidence.tests)
     drawn = [test.origin for test in tests]
     coverage, worst = evidence.coverage, failed(evidence, bound)
     doubt, differing = both_outcomes(sample, stochastic=False), sample.differing(1e-6 * bound)

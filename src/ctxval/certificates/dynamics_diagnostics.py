@@ -82,10 +82,11 @@ def counted(evidence: DynamicsEvidence, bound: float) -> list[CheckedPrediction]
 
 
 def tested(predictions: Sequence[CheckedPrediction], tests: int) -> list[CheckedPrediction]:
-    """Return the latest predictions that complete the tests, or all that were stored beforehand if none do."""
+    """Return the predictions at drawn tasks among the latest that complete the tests; among all if none do."""
     stored = [prediction for prediction in predictions if prediction.stored and prediction.point]
     first = range(len(stored) - 1, -1, -1) if tests else ()
-    return next((stored[k:] for k in first if not missing_tests(stored[k:], tests)), stored if tests else [])
+    latest = next((stored[k:] for k in first if not missing_tests(stored[k:], tests)), stored if tests else [])
+    return [test for test in latest if test.origin in DRAWN]
 
 
 def missing_tests(predictions: Sequence[CheckedPrediction], tests: int) -> int:
@@ -114,9 +115,8 @@ def failed(evidence: DynamicsEvidence, bound: float) -> CheckedPrediction | None
     Later tests outlive a test that failed only if it is explained by now.
     """
     drawn = [test for test in evidence.predictions if test.stored and test.origin in DRAWN]
-    tests = [test for test in tested(evidence.predictions, evidence.tests) if test.origin in DRAWN]
     lasting = [test for test in drawn if evidence.tests and not is_explained(test, bound)]
-    last = [*tests, *lasting, *counted(evidence, bound)[-PREDICTIONS:]]
+    last = [*tested(evidence.predictions, evidence.tests), *lasting, *counted(evidence, bound)[-PREDICTIONS:]]
     wrong = (prediction for prediction in last if not held(prediction, bound))
     return max(wrong, key=lambda prediction: prediction.error, default=None)
 

@@ -154,29 +154,21 @@ class Envelope(ShortRepr):
     def save(self, path: str | Path) -> Path:
         """Write the function ``trusted(task) -> bool, bound`` to a file ``.py``, which needs NumPy alone, or ``.onnx``.
 
+        An ONNX file, which the package onnx writes (extra ``fit``), has the input ``task`` ``(N, d)`` and the outputs
+        ``trusted`` and ``bound`` ``(N,)``.
+
         Raises:
             InputError: if the path has another suffix, nothing is trusted, or the task space is a suite.
         """
-        if Path(path).suffix == ".onnx":
-            return self.to_onnx(path)
-        if Path(path).suffix != ".py":
+        suffix = Path(path).suffix
+        if suffix not in (".py", ".onnx"):
             raise InputError(f"the envelope is written to a file such as envelope.py or .onnx, got {str(path)!r}.")
-        text = exported(self._written, self.space, self.statement, self.threshold, self.confidence)
-        return write_text(path, text)
-
-    def to_onnx(self, path: str | Path) -> Path:
-        """Write an ONNX file with the input ``task`` ``(N, d)`` and the outputs ``trusted`` and ``bound`` ``(N,)``.
-
-        The package onnx is needed to write it (extra ``fit``).
-        """
-        return write_onnx(path, self._written, self.space, self.threshold)
-
-    @property
-    def _written(self) -> Surfaces:
         if self._surfaces is None:
             reason = "the tasks of a suite are a list" if self.tasks is not None else "no task is trusted"
             raise InputError(f"there is no function to write: {reason}.")
-        return self._surfaces
+        if suffix == ".onnx":
+            return write_onnx(path, self._surfaces, self.space, self.threshold)
+        return write_text(path, exported(self._surfaces, self.space, self.statement, self.threshold, self.confidence))
 
 
 def withdrawn(space: TaskSpace, threshold: float, confidence: float, doubt: str) -> Envelope:
@@ -243,8 +235,8 @@ def _raised(
 
 def rises_of(evidence: DynamicsEvidence, threshold: float) -> list[tuple[float, CheckedPrediction]]:
     """Return the standardised excesses of tests that count and of the last other predictions, with the predictions."""
-    drawn = [test for test in tested(evidence.predictions, evidence.tests) if test.origin in DRAWN]
-    last = {each.trial: each for each in [*drawn, *counted(evidence, threshold)[-PREDICTIONS:]]}.values()
+    tests = tested(evidence.predictions, evidence.tests)
+    last = {each.trial: each for each in [*tests, *counted(evidence, threshold)[-PREDICTIONS:]]}.values()
     rises = []
     for each in last:
         if min(each.distance, each.median) <= threshold:

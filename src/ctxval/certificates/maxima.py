@@ -12,7 +12,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from ctxval._util.arrays import Array, Rows, single_threaded
-from ctxval._util.checked import Probability, checked
 from ctxval._util.progress import advance, stage
 from ctxval._util.representation import ShortRepr
 from ctxval.certificates.bounds import ERRORS, rank_within
@@ -39,14 +38,12 @@ class Maxima(ShortRepr):
     #: whether two executions of one task may differ, so that d* is the largest expected distance
     stochastic: bool = False
 
-    @checked
-    def upper(self, confidence: Probability) -> float:
+    def upper(self, confidence: float) -> float:
         """Return the bound on d* that holds with this probability; a CertificateError if that needs more draws."""
         made = f"the {len(self.draws)} draws of d* that were made"
         return float(self.draws[rank_within(confidence, len(self.draws), made) - 1])
 
-    @checked
-    def error(self, confidence: Probability) -> float:
+    def error(self, confidence: float) -> float:
         """Return the standard error of the bound over seeds of the draws, by a block bootstrap over their chain.
 
         Successive draws are correlated. If the confidence is high, few draws are above the bound and their spread may
@@ -117,13 +114,13 @@ def representative(sample: Sample) -> Sample:
     return sample.rows(kept_rows(sample.points, sample.distances, MOST, MOST + 1).tolist())
 
 
-def settle_maxima(sample: Sample, threshold: float, confidence: float, *, seed: int = 0) -> Maxima:
+def settle_maxima(sample: Sample, threshold: float, confidence: float) -> Maxima:
     """Return draws of d*, up to four times as many while the threshold is within two standard errors of the bound."""
-    pooled = draw_maxima(sample, seed=seed)
+    pooled = draw_maxima(sample)
     chains = [pooled]
     while len(chains) < _MOST and abs(pooled.upper(confidence) - threshold) < ERRORS * pooled.error(confidence):
         more = range(len(chains), 2 * len(chains))
-        chains += [draw_maxima(sample, seed=1_000_003 * chain + seed) for chain in more]
+        chains += [draw_maxima(sample, seed=1_000_003 * chain) for chain in more]
         draws, points = (np.concatenate([getattr(chain, name) for chain in chains]) for name in ("draws", "points"))
         before = np.cumsum([0, *(len(chain.conditioned) for chain in chains[:-1])])
         owners = np.concatenate([chain.owners + first for chain, first in zip(chains, before, strict=True)])

@@ -14,8 +14,8 @@ has no meaning, so each of them is predicted from all others. Its standardised e
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
-from typing import Any, ClassVar
+from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 from scipy.special import ndtri, stdtr
@@ -26,7 +26,7 @@ from ctxval._util.registry import part
 from ctxval._util.representation import ShortRepr
 from ctxval.certificates.base import Certificate, CertificateKind
 from ctxval.certificates.covering import RESOLUTION, bare_corners, covering, farthest_task, resolved_volume
-from ctxval.certificates.forecast import Forecast, forecast
+from ctxval.certificates.forecast import forecast
 from ctxval.certificates.maxima import MOST, Maxima, draw_maxima, representative, settle_maxima
 from ctxval.certificates.sample import Sample
 from ctxval.certificates.sentences import withdrawals
@@ -57,96 +57,77 @@ class Posterior(CertificateKind):
     resolution: PositiveFloat = RESOLUTION
 
     def certify(self, sample: Sample, confidence: float = 0.95) -> Certificate:
-        """Return :func:`certify_posterior` of the trials."""
-        return certify_posterior(sample, confidence, resolution=self.resolution)
+        """Return the bound that d* stays below with the confidence, under the prior and given the trials.
 
-    def certify_against(
-        self, sample: Sample, threshold: float, confidence: float = 0.95
-    ) -> tuple[Certificate, Forecast | None]:
-        """Return the certificate from enough draws for the threshold, and a forecast if its bound is above that."""
-        _require_covered(sample, self.resolution)
-        drawn = settle_maxima(sample, threshold, confidence)
-        certificate = certify_posterior(sample, confidence, resolution=self.resolution, found=drawn)
-        if certificate.doubt is not None or certificate.upper_bound <= threshold:
-            return certificate, None  # a process that the trials contradict predicts nothing
-        return certificate, forecast(representative(sample), drawn, threshold, confidence)
+        There are enough draws for the threshold, and a forecast if the bound is above that.
+        """
+        threshold = sample.threshold
+        # Many trials that do not cover the tasks are refused before the draws, which take long.
+        if len(sample) > MOST and (farthest := farthest_task(sample.points)) > self.resolution:
+            raise CertificateError(
+                f"some task is {farthest:.2g} of the task space's diagonal away from each of {len(sample)} trials, "
+                f"more than the resolution of {self.resolution:g}, so the bound would be withdrawn and is not "
+                "computed; an audit bounds how many tasks are worse."
+            )
+        drawn = draw_maxima(sample) if threshold is None else settle_maxima(sample, threshold, confidence)
+        certificate = self.certify_drawn(sample, drawn, confidence)
+        if threshold is None or certificate.doubt is not None or certificate.upper_bound <= threshold:
+            return certificate  # a process that the trials contradict predicts nothing
+        return replace(certificate, expected=forecast(representative(sample), drawn, threshold, confidence))
 
-
-@checked
-def certify_posterior(
-    sample: Sample,
-    confidence: Probability = 0.95,
-    *,
-    resolution: PositiveFloat = RESOLUTION,
-    seed: int = 0,
-    found: Maxima | None = None,
-) -> Certificate:
-    """Return the bound that d* stays below with the confidence, under the prior and given the trials.
-
-    ``resolution`` is that of :class:`Posterior`; ``found`` are draws of d* from the same trials, made before.
-    """
-    used = representative(sample)
-    _require_covered(sample, resolution)
-    drawn = draw_maxima(sample, seed=seed) if found is None else found
-    stochastic = drawn.stochastic
-    upper, error = drawn.upper(confidence), drawn.error(confidence)
-    unordered, d = np.array([origin == "manual" for origin in used.origins]), sample.points.shape[1]
-    diagnosis = diagnose(
-        drawn.conditioned,
-        used.points,
-        used.numbers,
-        unordered=unordered,
-        resolution=resolution,
-        covered=sample.points,
-    )
-    hyperparameters = [process.hyperparameters for process in drawn.conditioned]
-    rough = float(np.mean([each.nu == 1.5 for each in hyperparameters]))
-    return Certificate(
-        kind="posterior",
-        statement=posterior_statement(upper, error, confidence, stochastic=stochastic),
-        upper_bound=upper,
-        confidence=confidence,
-        volume=0.0,
-        trials=len(sample),
-        assumptions=(
-            *posterior_assumptions(sample, len(used), resolution, stochastic=stochastic),
-            *sample.remarks,
-            ONE_CAMPAIGN,
-        ),
-        details={
-            "best": sample.best,
-            "gap": upper - sample.best,
-            "error": error,
-            "draws": len(drawn.draws),
-            "stochastic": stochastic,
-            "resolution": {
-                "diagonals": resolution,
-                "of_each_range": resolution * float(np.sqrt(d)),
-                "of_the_space": resolved_volume(resolution, d),
+    @checked
+    def certify_drawn(self, sample: Sample, drawn: Maxima, confidence: Probability = 0.95) -> Certificate:
+        """Return the certificate from draws of d*, which were made from the same trials."""
+        used = representative(sample)
+        stochastic = drawn.stochastic
+        upper, error = drawn.upper(confidence), drawn.error(confidence)
+        unordered, d = np.array([origin == "manual" for origin in used.origins]), sample.points.shape[1]
+        diagnosis = diagnose(
+            drawn.conditioned,
+            used.points,
+            used.numbers,
+            unordered=unordered,
+            resolution=self.resolution,
+            covered=sample.points,
+        )
+        hyperparameters = [process.hyperparameters for process in drawn.conditioned]
+        rough = float(np.mean([each.nu == 1.5 for each in hyperparameters]))
+        return Certificate(
+            kind=self.name,
+            statement=posterior_statement(upper, error, confidence, stochastic=stochastic),
+            upper_bound=upper,
+            confidence=confidence,
+            volume=0.0,
+            trials=len(sample),
+            assumptions=(
+                *posterior_assumptions(sample, len(used), self.resolution, stochastic=stochastic),
+                *sample.remarks,
+                ONE_CAMPAIGN,
+            ),
+            details={
+                "best": sample.best,
+                "gap": upper - sample.best,
+                "error": error,
+                "draws": len(drawn.draws),
+                "stochastic": stochastic,
+                "resolution": {
+                    "diagonals": self.resolution,
+                    "of_each_range": self.resolution * float(np.sqrt(d)),
+                    "of_the_space": resolved_volume(self.resolution, d),
+                },
+                "instantaneous": instantaneous_bound(used),
+                "kernels": {"matern-3/2": rough, "matern-5/2": 1 - rough},
+                "logarithm": float(np.mean([np.isfinite(process.warp.offset) for process in drawn.conditioned])),
+                "length_scales": np.median(np.exp([each.log_scales for each in hyperparameters]), axis=0).tolist(),
+                "diagnosis": {name: value for name, value in vars(diagnosis).items() if name != "doubt"},
+                "failures": sample.failures,
             },
-            "instantaneous": instantaneous_bound(used),
-            "kernels": {"matern-3/2": rough, "matern-5/2": 1 - rough},
-            "logarithm": float(np.mean([np.isfinite(process.warp.offset) for process in drawn.conditioned])),
-            "length_scales": np.median(np.exp([each.log_scales for each in hyperparameters]), axis=0).tolist(),
-            "diagnosis": diagnosis.to_json(),
-            "failures": sample.failures,
-        },
-        doubt=both_outcomes(sample, stochastic=stochastic) or diagnosis.doubt,
-        error=error,
-    )
-
-
-def _require_covered(sample: Sample, resolution: float) -> None:
-    """Refuse many trials that do not cover the tasks before the draws, which take long."""
-    if len(sample) > MOST and (farthest := farthest_task(sample.points)) > resolution:
-        raise CertificateError(
-            f"some task is {farthest:.2g} of the task space's diagonal away from each of {len(sample)} trials, more "
-            f"than the resolution of {resolution:g}, so the bound would be withdrawn and is not computed; an audit "
-            "bounds how many tasks are worse."
+            doubt=both_outcomes(sample, stochastic=stochastic) or diagnosis.doubt,
+            error=error,
         )
 
 
-def instantaneous_bound(sample: Sample, beta: float = 2.0) -> dict[str, float] | None:
+def instantaneous_bound(sample: Sample) -> dict[str, float] | None:
     """Return the largest UCB of the paper's GP with estimated hyperparameters, and its gap to the best distance found.
 
     It is below d* about as often as above. It is None if fewer than two distances are known.
@@ -155,6 +136,7 @@ def instantaneous_bound(sample: Sample, beta: float = 2.0) -> dict[str, float] |
         surrogate = fit_surrogate(sample.points, sample.distances)
     except InputError:
         return None
+    beta = 2.0
     bound = UpperConfidenceBound(surrogate.process, beta)
     best_first = sample.points[np.argsort(-sample.distances, kind="stable")]
     point = maximise(bound, sample.points.shape[1], best_first, np.random.default_rng(0))
@@ -175,10 +157,6 @@ class Diagnosis(ShortRepr):
     left_out: float  #: root mean square of the standardised leave-one-out errors; about 1 if the process fits the data
     farthest: float  #: largest distance from a task to its nearest trial, in diagonals of the task space
     doubt: str | None  #: why the bound is withdrawn, in one sentence; None if it is not
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the numbers, ready for JSON."""
-        return {name: value for name, value in asdict(self).items() if name != "doubt"}
 
 
 def diagnose(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,6 @@ from ctxval._util.representation import ShortRepr
 from ctxval.certificates.base import Certificate
 from ctxval.certificates.bounds import Quantities
 from ctxval.certificates.dynamics_evidence import LearnedDistance
-from ctxval.certificates.sample import Sample
 from ctxval.certificates.sentences import verdicts as sentences
 from ctxval.certificates.sentences import withdrawals
 from ctxval.core.space import DISTRIBUTION, TaskSpace
@@ -60,17 +59,27 @@ class Provenance(ShortRepr):
         beside: Iterable[Neighbour] = (),
     ) -> Provenance:
         """Return the provenance from what a store says of its experiment, and from the stores beside it."""
-
-        def table(of: Mapping[str, Any], name: str) -> Mapping[str, Any]:
-            part = of.get(name)
-            return part if isinstance(part, dict) else {}
-
-        validation = table(description, "validation")
-        described, refined = table(validation, "space"), table(validation, "model").get("type") == "Refined"
+        described, remarks = dict[str, Any](), list[str]()
+        match description:
+            case {"validation": {"space": dict(space)}}:
+                described = space
+        match description:
+            case {"validation": {"model": {"type": "Refined"}}}:
+                remarks.append(withdrawals.REFINED)
         distribution = described.get(DISTRIBUTION)
+        for change in changes:
+            if change.what == "accepted":
+                different = "; ".join(change.content.get("differences", [])[:1]) or "nothing that is described"
+                trials = change.content.get("trials", "some")
+                remarks.append(withdrawals.ACCEPTED.format(trials=trials, why=change.why, differences=different))
+            elif change.what == "remeasured":
+                remarks.append(withdrawals.MEASURED_ANEW.format(why=change.why))
+            elif change.what == "replaced":
+                numbers = ", ".join(change.content.get("before", {}))
+                remarks.append(withdrawals.REPLACED.format(numbers=numbers, why=change.why))
         return cls(
             space=_space_of(described),
-            remarks=(*([withdrawals.REFINED] if refined else []), *remarks_on(changes)),
+            remarks=tuple(remarks),
             distribution=None if distribution is None else distribution_text(distribution),
             thresholds=thresholds,
             beside=tuple(beside),
@@ -114,27 +123,6 @@ class Provenance(ShortRepr):
     def stated(self) -> tuple[str, ...]:
         """The remarks that are the user's word, on which a validation rests."""
         return tuple(remark for remark in self.remarks if remark != withdrawals.REFINED)
-
-    def sample(self, trials: Sequence[Trial]) -> Sample:
-        """Return trials as a certificate sees them, with what is known here."""
-        suite = None if self.space is None else self.space.members
-        return replace(Sample.of(trials, self.learned), distribution=self.distribution, suite=suite)
-
-
-def remarks_on(changes: Iterable[Change]) -> tuple[str, ...]:
-    """Return sentences on later changes of a store, for a certificate's assumptions."""
-    remarks = []
-    for change in changes:
-        if change.what == "accepted":
-            different = "; ".join(change.content.get("differences", [])[:1]) or "nothing that is described"
-            trials = change.content.get("trials", "some")
-            remarks.append(withdrawals.ACCEPTED.format(trials=trials, why=change.why, differences=different))
-        elif change.what == "remeasured":
-            remarks.append(withdrawals.MEASURED_ANEW.format(why=change.why))
-        elif change.what == "replaced":
-            numbers = ", ".join(change.content.get("before", {}))
-            remarks.append(withdrawals.REPLACED.format(numbers=numbers, why=change.why))
-    return tuple(remarks)
 
 
 def _space_of(described: Mapping[str, Any]) -> TaskSpace | None:

@@ -16,20 +16,21 @@ of M, j and the confidence. The volume above tau is at most eps and this bound t
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
 
 from ctxval._util.arrays import Array
-from ctxval._util.checked import NonNegativeInt, PositiveFloat, PositiveInt, Probability, checked
+from ctxval._util.checked import NonNegativeInt, PositiveInt, Probability, checked
 from ctxval._util.registry import part
 from ctxval.certificates.base import Certificate, CertificateKind
 from ctxval.certificates.bounds import at_most, of_tasks
-from ctxval.certificates.forecast import Forecast
 from ctxval.certificates.sample import Sample, advice_to_remeasure, require_learned
 from ctxval.certificates.scenario import countable_draws, require_more, volume_bound
 from ctxval.certificates.sentences.statements import ABOUT_DRAWS, FROZEN, ONE_CAMPAIGN, how_drawn, margin_and_map
+from ctxval.core.trial import Origin
 from ctxval.errors import CertificateError
 
 _OF_MAP = 0.05
@@ -52,91 +53,77 @@ class Region(CertificateKind):
     #: number M of tasks that are predicted to estimate the share of the tasks that keep the threshold
     predictions: PositiveInt = 1000
 
-    def certify(self, sample: Sample, confidence: float = 0.95) -> Certificate:
-        """Return :func:`certify_region` of the trials, without a threshold."""
-        return certify_region(sample, None, confidence, self)
+    @checked
+    def certify(self, sample: Sample, confidence: Probability = 0.95) -> Certificate:
+        """Bound the distance by a prediction plus a margin from independent draws, but for a share of the tasks.
 
-    def certify_against(
-        self, sample: Sample, threshold: float, confidence: float = 0.95
-    ) -> tuple[Certificate, Forecast | None]:
-        """Return :func:`certify_region` of the trials; nothing is forecast."""
-        return certify_region(sample, threshold, confidence, self), None
+        With a threshold, the bound is the threshold, and the volume left out is that of the draws plus that of the
+        tasks at which the prediction plus the margin exceeds the threshold. Without one, the bound is the largest
+        predicted one.
 
-    def require_usable(self, confidence: float, executions: int) -> None:
+        More draws than are discarded must have a distance and a prediction; else a CertificateError is raised.
+        """
+        threshold = sample.threshold
+        beta = 1 - confidence
+        learned, drawn = require_learned(sample, "region"), countable_draws(sample, "a region bound")
+        before = min(drawn.numbers)  # the prediction is learned from the trials before the draws
+        margin, unpredicted = _margin(drawn, learned.expected(drawn.points, before), before, self.discard)
+        volume = volume_bound(len(drawn), self.discard, (1 - _OF_MAP) * beta)
+        bounds = learned.expected(learned.tasks(self.predictions, before), before) + margin
+        count, unknown = len(bounds), int(np.isnan(bounds).sum())
+        limit = float(bounds[~np.isnan(bounds)].max(initial=-np.inf)) if threshold is None else float(threshold)
+        outside = int((~(bounds <= limit)).sum())
+        if outside == count:
+            outside_volume = 1.0
+        elif threshold is not None:
+            outside_volume = volume_bound(count, outside, _OF_MAP * beta)
+        else:
+            # The tasks without a prediction, and those above the largest of the others, which the draws did not fix.
+            half = _OF_MAP * beta / 2
+            outside_volume = volume_bound(count, unknown, half) + volume_bound(count - unknown, 0, half)
+        total, share = min(1.0, volume + outside_volume), 1 - outside / count
+        smoothed = (outside + 1) / (count + 2)  # one more task on either side, so that the error is never zero
+        error = float(np.sqrt(smoothed * (1 - smoothed) / count))
+        kept = f"this prediction is at most {at_most(limit)} on each of {count} predicted tasks that it covers"
+        if threshold is not None:
+            tasks = f"{100 * share:.4g} ± {at_most(100 * error, 2)} % {of_tasks(sample.distribution)}"
+            kept = f"this prediction keeps {limit:.6g} on {tasks} (an estimate from {count} predicted tasks)"
+        return Certificate(
+            kind=self.name,
+            statement=margin_and_map(sample, margin, volume, total, confidence, at_most(limit), kept),
+            upper_bound=limit,
+            confidence=confidence,
+            volume=total,
+            trials=len(drawn),
+            assumptions=(
+                *how_drawn(sample, drawn),
+                "the number discarded was chosen before the draws were known",
+                FROZEN,
+                *ABOUT_DRAWS,
+                *sample.remarks,
+                ONE_CAMPAIGN,
+            ),
+            details={
+                "margin": margin,
+                "discarded": self.discard,
+                "volume_of_draws": volume,
+                "learned_before": before,
+                "predictions": count,
+                "share_kept": share,
+                "share_error": error,
+                "unpredicted_draws": unpredicted,
+                "unpredicted_tasks": unknown,
+                "largest_drawn": drawn.best if np.isfinite(drawn.best) else None,
+                "not_counted": len(sample.only("iid")) - len(drawn),
+                "failed": sample.failed,
+                "failures": sample.failures,
+            },
+            distribution=sample.distribution,
+        )
+
+    def require_usable(self, confidence: float, executions: int, beside: Iterable[Origin] = ()) -> None:
         """Require more trials than are discarded."""
         require_more(executions, self.discard, "draws")
-
-
-@checked
-def certify_region(
-    sample: Sample,
-    threshold: PositiveFloat | None = None,
-    confidence: Probability = 0.95,
-    options: Region | None = None,
-) -> Certificate:
-    """Bound the distance by a prediction plus a margin from independent draws, but for a share of the tasks.
-
-    With a threshold, the bound is the threshold, and the volume left out is that of the draws plus that of the tasks at
-    which the prediction plus the margin exceeds the threshold. Without one, the bound is the largest predicted one.
-
-    More draws than are discarded must have a distance and a prediction; else a CertificateError is raised.
-    """
-    chosen, beta = options or Region(), 1 - confidence
-    learned, drawn = require_learned(sample, "region"), countable_draws(sample, "a region bound")
-    before = min(drawn.numbers)  # the prediction is learned from the trials before the draws
-    margin, unpredicted = _margin(drawn, learned.expected(drawn.points, before), before, chosen.discard)
-    volume = volume_bound(len(drawn), chosen.discard, (1 - _OF_MAP) * beta)
-    bounds = learned.expected(learned.tasks(chosen.predictions, before), before) + margin
-    count, unknown = len(bounds), int(np.isnan(bounds).sum())
-    limit = float(bounds[~np.isnan(bounds)].max(initial=-np.inf)) if threshold is None else float(threshold)
-    outside = int((~(bounds <= limit)).sum())
-    if outside == count:
-        outside_volume = 1.0
-    elif threshold is not None:
-        outside_volume = volume_bound(count, outside, _OF_MAP * beta)
-    else:
-        # The tasks without a prediction, and those above the largest of the others, which the draws did not fix.
-        half = _OF_MAP * beta / 2
-        outside_volume = volume_bound(count, unknown, half) + volume_bound(count - unknown, 0, half)
-    total, share = min(1.0, volume + outside_volume), 1 - outside / count
-    smoothed = (outside + 1) / (count + 2)  # one more task on either side, so that the error is never zero
-    error = float(np.sqrt(smoothed * (1 - smoothed) / count))
-    kept = f"this prediction is at most {at_most(limit)} on each of {count} predicted tasks that it covers"
-    if threshold is not None:
-        tasks = f"{100 * share:.4g} ± {at_most(100 * error, 2)} % {of_tasks(sample.distribution)}"
-        kept = f"this prediction keeps {limit:.6g} on {tasks} (an estimate from {count} predicted tasks)"
-    return Certificate(
-        kind="region",
-        statement=margin_and_map(sample, margin, volume, total, confidence, at_most(limit), kept),
-        upper_bound=limit,
-        confidence=confidence,
-        volume=total,
-        trials=len(drawn),
-        assumptions=(
-            *how_drawn(sample, drawn),
-            "the number discarded was chosen before the draws were known",
-            FROZEN,
-            *ABOUT_DRAWS,
-            *sample.remarks,
-            ONE_CAMPAIGN,
-        ),
-        details={
-            "margin": margin,
-            "discarded": chosen.discard,
-            "volume_of_draws": volume,
-            "learned_before": before,
-            "predictions": count,
-            "share_kept": share,
-            "share_error": error,
-            "unpredicted_draws": unpredicted,
-            "unpredicted_tasks": unknown,
-            "largest_drawn": drawn.best if np.isfinite(drawn.best) else None,
-            "not_counted": len(sample.only("iid")) - len(drawn),
-            "failed": sample.failed,
-            "failures": sample.failures,
-        },
-        distribution=sample.distribution,
-    )
 
 
 def _margin(drawn: Sample, predicted: Array, before: int, discard: int) -> tuple[float, int]:

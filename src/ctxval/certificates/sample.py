@@ -49,6 +49,7 @@ class Sample(ShortRepr):
     learned: LearnedDistance | None = None
     distribution: str | None = None  #: the distribution of tasks as a text; None if it is uniform
     suite: Array | None = None  #: the tasks of a suite, points of the unit cube ``(N, d)``; None if tasks fill the box
+    threshold: float | None = None  #: the threshold that is to be decided; None if there is none
 
     def __post_init__(self) -> None:
         if not len(self.numbers):

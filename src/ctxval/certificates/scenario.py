@@ -49,21 +49,75 @@ class Scenario(CertificateKind):
     bounds_maximum: ClassVar[bool] = False
     sorts_draws: ClassVar[bool] = True
 
-    def certify(self, sample: Sample, confidence: float = 0.95) -> Certificate:
-        """Return :func:`certify_scenario` of the trials."""
-        return certify_scenario(sample, confidence, self._require_discard())
+    @checked
+    def certify(self, sample: Sample, confidence: Probability = 0.95) -> Certificate:
+        """Return a bound on the volume of the tasks whose distance exceeds the largest one left after discarding.
 
-    def require_audit_helps(self, origins: Iterable[Origin]) -> None:
-        """Refuse trials that are no independent draws, and require the number to discard."""
-        self._require_discard()
-        if any(origin != "iid" for origin in origins):
+        A failed execution counts as a violation, larger than any distance, so it must be among the discarded ones. A
+        CertificateError is raised if a trial is no independent draw, or if the number of draws depended on their
+        distances.
+        """
+        discarded = self._require_discard()
+        foreign = [origin for origin in sample.origins if origin != "iid"]
+        if foreign:
+            raise CertificateError(
+                f"a {self.name} bound takes independent draws alone, but {len(foreign)} of {len(sample)} trials were "
+                f"chosen otherwise ({', '.join(sorted(set(foreign)))}); run --search random, or say --kind audit."
+            )
+        require_more(len(sample), discarded)
+        plans = list(dict.fromkeys(sample.planned))
+        if 0 in plans:
+            raise CertificateError(
+                "the draws ended with the verdict, so their number depended on their distances, which a "
+                f"{self.name} bound does not allow; certify --audit N counts draws that are made from now on."
+            )
+        if None in plans and len(plans) > 1:
+            raise CertificateError(
+                f"{list(sample.planned).count(None)} of the draws were imported, and nobody knows on what their number "
+                f"depended, which a {self.name} bound does not allow beside counted ones; say --kind audit, which "
+                "counts the last ones alone."
+            )
+        if len(plans) > 1:
+            raise CertificateError(
+                f"the number of draws was changed from {plans[-2]} to {plans[-1]} after the first were known, which a "
+                f"{self.name} bound does not allow; say --kind audit, which counts the last ones alone."
+            )
+        if sample.failed > discarded:
+            raise CertificateError(
+                f"{violations(sample)}, more than the {discarded} discarded; nothing bounds them."
+                f"{advice_to_remeasure(sample)}"
+            )
+        ordered = np.sort(np.nan_to_num(sample.distances, nan=np.inf))
+        h = float(ordered[len(sample) - 1 - discarded])
+        volume = volume_bound(len(sample), discarded, 1 - confidence)
+        return Certificate(
+            kind=self.name,
+            statement=share_above(sample, volume, confidence, at_most(h), len(sample)),
+            upper_bound=h,
+            confidence=confidence,
+            volume=volume,
+            trials=len(sample),
+            assumptions=(
+                *how_drawn(sample, sample, "the trials"),
+                "the number discarded was chosen before the distances were known",
+                UNSEEN,
+                "each task has one distance: the system is deterministic",
+                NO_BOUND,
+                *sample.remarks,
+                ONE_CAMPAIGN,
+            ),
+            details={"discarded": discarded, "failed": sample.failed, "failures": sample.failures},
+            distribution=sample.distribution,
+        )
+
+    def require_usable(self, confidence: float, executions: int, beside: Iterable[Origin] = ()) -> None:
+        """Require independent draws alone, the number to discard, and more trials than that."""
+        discarded = self._require_discard()
+        if any(origin != "iid" for origin in beside):
             raise CertificateError(
                 f"a {self.name} bound takes independent draws alone, but there are others; say --kind audit."
             )
-
-    def require_usable(self, confidence: float, executions: int) -> None:
-        """Require the number to discard, and more trials than that."""
-        require_more(executions, self._require_discard())
+        require_more(executions, discarded)
 
     def _require_discard(self) -> int:
         return 0
@@ -113,68 +167,6 @@ def samples_needed(volume: Probability, beta: Probability, discarded: NonNegativ
     return high
 
 
-@checked
-def certify_scenario(sample: Sample, confidence: Probability = 0.95, discarded: NonNegativeInt = 0) -> Certificate:
-    """Return a bound on the volume of the tasks whose distance exceeds the largest one left after discarding k.
-
-    k must be chosen before the distances are known. A failed execution counts as a violation, larger than any distance,
-    so it must be among the discarded ones. A CertificateError is raised if a trial is no independent draw, or if the
-    number of draws depended on their distances.
-    """
-    kind = "sampling-discarding" if discarded else "scenario"
-    foreign = [origin for origin in sample.origins if origin != "iid"]
-    if foreign:
-        raise CertificateError(
-            f"a {kind} bound takes independent draws alone, but {len(foreign)} of {len(sample)} trials were chosen "
-            f"otherwise ({', '.join(sorted(set(foreign)))}); run --search random, or say --kind audit."
-        )
-    require_more(len(sample), discarded)
-    plans = list(dict.fromkeys(sample.planned))
-    if 0 in plans:
-        raise CertificateError(
-            "the draws ended with the verdict, so their number depended on their distances, which a "
-            f"{kind} bound does not allow; certify --audit N counts draws that are made from now on."
-        )
-    if None in plans and len(plans) > 1:
-        raise CertificateError(
-            f"{list(sample.planned).count(None)} of the draws were imported, and nobody knows on what their number "
-            f"depended, which a {kind} bound does not allow beside counted ones; say --kind audit, which counts the "
-            "last ones alone."
-        )
-    if len(plans) > 1:
-        raise CertificateError(
-            f"the number of draws was changed from {plans[-2]} to {plans[-1]} after the first were known, which a "
-            f"{kind} bound does not allow; say --kind audit, which counts the last ones alone."
-        )
-    if sample.failed > discarded:
-        raise CertificateError(
-            f"{violations(sample)}, more than the {discarded} discarded; nothing bounds them."
-            f"{advice_to_remeasure(sample)}"
-        )
-    ordered = np.sort(np.nan_to_num(sample.distances, nan=np.inf))
-    h = float(ordered[len(sample) - 1 - discarded])
-    volume = volume_bound(len(sample), discarded, 1 - confidence)
-    return Certificate(
-        kind=kind,
-        statement=share_above(sample, volume, confidence, at_most(h), len(sample)),
-        upper_bound=h,
-        confidence=confidence,
-        volume=volume,
-        trials=len(sample),
-        assumptions=(
-            *how_drawn(sample, sample, "the trials"),
-            "the number discarded was chosen before the distances were known",
-            UNSEEN,
-            "each task has one distance: the system is deterministic",
-            NO_BOUND,
-            *sample.remarks,
-            ONE_CAMPAIGN,
-        ),
-        details={"discarded": discarded, "failed": sample.failed, "failures": sample.failures},
-        distribution=sample.distribution,
-    )
-
-
 def require_more(n: int, discarded: int, what: str = "trials") -> None:
     """Require more trials than are discarded."""
     if not 0 <= discarded < n:
@@ -207,45 +199,40 @@ class Audit(CertificateKind):
     bounds_maximum: ClassVar[bool] = False
     sorts_draws: ClassVar[bool] = True
 
-    def certify(self, sample: Sample, confidence: float = 0.95) -> Certificate:
-        """Return :func:`certify_audit` of the trials."""
-        return certify_audit(sample, confidence)
+    @checked
+    def certify(self, sample: Sample, confidence: Probability = 0.95) -> Certificate:
+        """Return a bound on the volume of the tasks whose distance exceeds the largest one known.
 
-
-@checked
-def certify_audit(sample: Sample, confidence: Probability = 0.95) -> Certificate:
-    """Return a bound on the volume of the tasks whose distance exceeds the largest one known, from independent draws.
-
-    Let h be the largest of N independent distances. The volume of tasks above h is bounded for any distance function.
-    The largest distance of all trials is at least h, so the volume above it is not larger, however those trials were
-    chosen. Only draws count whose number was chosen before they were executed (:attr:`Sample.countable`), and none may
-    have failed.
-    """
-    drawn = countable_draws(sample, "an audit")
-    if drawn.failed:
-        raise CertificateError(
-            f"{violations(drawn)}; to audit the other tasks, start a new store whose task space excludes these tasks."
-            f"{advice_to_remeasure(drawn)}"
+        Let h be the largest of N independent distances. The volume of tasks above h is bounded for any distance
+        function. The largest distance of all trials is at least h, so the volume above it is not larger, however those
+        trials were chosen. Only draws count whose number was chosen before they were executed
+        (:attr:`Sample.countable`), and none may have failed.
+        """
+        drawn = countable_draws(sample, "an audit")
+        if drawn.failed:
+            raise CertificateError(
+                f"{violations(drawn)}; to audit the other tasks, start a new store whose task space excludes these "
+                f"tasks.{advice_to_remeasure(drawn)}"
+            )
+        volume, h = volume_bound(len(drawn), 0, 1 - confidence), sample.best
+        chosen = sample.distances[[origin != "iid" for origin in sample.origins]]
+        largest = float(np.nanmax(chosen)) if np.isfinite(chosen).any() else None
+        return Certificate(
+            kind=self.name,
+            statement=share_above(sample, volume, confidence, at_most(h), len(drawn), ", the largest one found"),
+            upper_bound=h,
+            confidence=confidence,
+            volume=volume,
+            trials=len(drawn),
+            assumptions=(*how_drawn(sample, drawn), *ABOUT_DRAWS, *sample.remarks, ONE_CAMPAIGN),
+            details={
+                "largest_found": h,
+                "largest_drawn": drawn.best,
+                "largest_chosen": largest,
+                "exceeding": None if largest is None else int((drawn.distances > largest).sum()),
+                "not_counted": len(sample.only("iid")) - len(drawn),
+                "failed": sample.failed,
+                "failures": sample.failures,
+            },
+            distribution=sample.distribution,
         )
-    volume, h = volume_bound(len(drawn), 0, 1 - confidence), sample.best
-    chosen = sample.distances[[origin != "iid" for origin in sample.origins]]
-    largest = float(np.nanmax(chosen)) if np.isfinite(chosen).any() else None
-    return Certificate(
-        kind="audit",
-        statement=share_above(sample, volume, confidence, at_most(h), len(drawn), ", the largest one found"),
-        upper_bound=h,
-        confidence=confidence,
-        volume=volume,
-        trials=len(drawn),
-        assumptions=(*how_drawn(sample, drawn), *ABOUT_DRAWS, *sample.remarks, ONE_CAMPAIGN),
-        details={
-            "largest_found": h,
-            "largest_drawn": drawn.best,
-            "largest_chosen": largest,
-            "exceeding": None if largest is None else int((drawn.distances > largest).sum()),
-            "not_counted": len(sample.only("iid")) - len(drawn),
-            "failed": sample.failed,
-            "failures": sample.failures,
-        },
-        distribution=sample.distribution,
-    )

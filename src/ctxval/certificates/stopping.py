@@ -8,22 +8,21 @@ wrong.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from typing import cast
+from dataclasses import dataclass
 
 import numpy as np
 
 from ctxval._util.arrays import Array
 from ctxval._util.checked import NonNegativeInt, PositiveFloat, checked
 from ctxval._util.representation import ShortRepr
-from ctxval.certificates.covering import covering, most_contested
+from ctxval.certificates.covering import RESOLUTION, covering, most_contested
 from ctxval.certificates.maxima import Maxima, draw_maxima, settle_maxima
-from ctxval.certificates.options import CertificateOptions
-from ctxval.certificates.posterior import Posterior, certify_posterior, instantaneous_bound
+from ctxval.certificates.options import CONFIDENCE, Confidence
+from ctxval.certificates.posterior import Posterior, instantaneous_bound
 from ctxval.certificates.sample import Sample
 from ctxval.certificates.verdict import counterexample
 from ctxval.core.trial import Trial
-from ctxval.errors import CertificateError, InputError
+from ctxval.errors import CertificateError
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,18 +43,14 @@ that allows for the error of so few draws, in the probability that d* keeps the 
 @checked
 @dataclass(frozen=True)
 class StoppingRule(ShortRepr):
-    """The rule by which a campaign stops when its verdict on a threshold is reached."""
+    """The rule by which a campaign stops when its verdict on a threshold is reached by the posterior bound."""
 
     threshold: PositiveFloat  #: tau, in the distance's units
-    #: the certificate of the verdict; it must be the posterior bound
-    options: CertificateOptions = field(default_factory=CertificateOptions.posterior)
+    confidence: Confidence = CONFIDENCE  #: that of the bound
+    resolution: PositiveFloat = RESOLUTION  #: as for the posterior bound
     #: number of trials, where the largest draws of d* lie, after the bound first keeps the threshold; it must still
     #: keep it after them. They mostly correct a bound that is too low.
     confirmations: NonNegativeInt = 2
-
-    def __post_init__(self) -> None:
-        if not isinstance(self.options.kind, Posterior):
-            raise InputError(f"this rule is for the posterior bound, got {self.options.kind.name!r}.")
 
     def decide(self, trials: Sequence[Trial], left: int) -> StoppingDecision:
         """Return whether a campaign with so many executions left stops and, if not, which task must be executed next.
@@ -66,7 +61,7 @@ class StoppingRule(ShortRepr):
             return StoppingDecision(decided=True)
         try:
             sample, points = _ended(trials), np.array([trial.unit_point for trial in trials])
-            missing = covering(points, self._posterior.resolution, left)
+            missing = covering(points, self.resolution, left)
             if missing is None or self._is_surely_too_high(sample):
                 return StoppingDecision()
             if len(missing):
@@ -77,20 +72,16 @@ class StoppingRule(ShortRepr):
                 return StoppingDecision()
             contested = None
             if left and not self._has_stood(trials[: -self.confirmations or None]):
-                highest = drawn.points[-max(1, round((1 - self.options.confidence) * len(drawn.points))) :]
-                contested = most_contested(highest, points, self._posterior.resolution)
+                highest = drawn.points[-max(1, round((1 - self.confidence) * len(drawn.points))) :]
+                contested = most_contested(highest, points, self.resolution)
             return StoppingDecision(decided=contested is None, next_point=contested)
         except CertificateError:
             return StoppingDecision()
 
-    @property
-    def _posterior(self) -> Posterior:
-        return cast(Posterior, self.options.kind)
-
     def _has_stood(self, trials: Sequence[Trial]) -> bool:
         """Return whether the earlier trials already covered the task space with a bound that kept the threshold."""
         points = np.array([trial.unit_point for trial in trials])
-        if not trials or covering(points, self._posterior.resolution, 0) is None:
+        if not trials or covering(points, self.resolution, 0) is None:
             return False
         try:
             return self._is_kept(_ended(trials))[1]
@@ -98,10 +89,9 @@ class StoppingRule(ShortRepr):
             return False
 
     def _is_kept(self, sample: Sample) -> tuple[Maxima, bool]:
-        confidence = self.options.confidence
-        drawn = settle_maxima(sample, self.threshold, confidence)
+        drawn = settle_maxima(sample, self.threshold, self.confidence)
         # Coverage is left aside: its resolution is the whole task space.
-        certificate = certify_posterior(sample, confidence, resolution=1.0, found=drawn)
+        certificate = Posterior(resolution=1.0).certify_drawn(sample, drawn, self.confidence)
         return drawn, certificate.covers(self.threshold)
 
     def _is_surely_too_high(self, sample: Sample) -> bool:
@@ -110,7 +100,7 @@ class StoppingRule(ShortRepr):
         if instantaneous is not None and instantaneous["max_ucb"] > self.threshold:
             return True
         return any(
-            draw_maxima(sample, draws=draws).probability(self.threshold) < self.options.confidence - margin
+            draw_maxima(sample, draws=draws).probability(self.threshold) < self.confidence - margin
             for draws, margin in _SCREENINGS
         )
 

@@ -6,17 +6,15 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
 
-import numpy as np
-
-from ctxval._util.checked import PositiveFloat, checked
+from ctxval._util.checked import PositiveFloat, checked, require
 from ctxval._util.representation import ShortRepr, call, line, lines, shown, table
-from ctxval.certificates.base import KINDS, Certificate, CertificateKind, certified
+from ctxval.certificates.base import KINDS, Certificate, CertificateKind
 from ctxval.certificates.bets import bets_against
 from ctxval.certificates.bounds import NO_UNITS, Quantities
 from ctxval.certificates.forecast import Forecast
-from ctxval.certificates.options import CONFIDENCE, CertificateOptions, require_confidence, require_volume
+from ctxval.certificates.options import CONFIDENCE, CertificateOptions, Confidence, Volume
 from ctxval.certificates.provenance import Provenance
-from ctxval.certificates.sample import without_success
+from ctxval.certificates.sample import Sample, without_success
 from ctxval.certificates.sentences import verdicts as sentences
 from ctxval.core.quantiles import QUANTILE
 from ctxval.core.trial import Trial, designs_sentence
@@ -46,8 +44,8 @@ class Verdict:
 
     @property
     def bound(self) -> float | None:
-        """The bound on d* of its certificate; None if there is none, it is withdrawn, or it leaves out a volume."""
-        return usable_bound(self.certificate)
+        """The bound on d* of its certificate; None if there is none."""
+        return None if self.certificate is None else self.certificate.bound
 
     def __str__(self) -> str:
         return f"{self.answer}: {self.reason}" + (f" {self.rests_on}" if self.rests_on else "")
@@ -69,18 +67,6 @@ class Verdict:
         """Return the answer and its reasons, ready for JSON; the certificate has its own."""
         names = ("reason", "rests_on", "threshold", "next_task")
         return {"verdict": self.answer, **{name: getattr(self, name) for name in names}}
-
-
-def quantile_of(kind: object) -> float:
-    """Return the share of the executions of a task that a threshold is about, for a kind of certificate."""
-    return float(getattr(kind, "quantile", QUANTILE))
-
-
-def usable_bound(certificate: Certificate | None) -> float | None:
-    """Return the bound on d* of a certificate; None if there is none, it is withdrawn, or it leaves out a volume."""
-    if certificate is None or certificate.doubt is not None or certificate.volume:
-        return None
-    return certificate.upper_bound if np.isfinite(certificate.upper_bound) else None
 
 
 @checked
@@ -115,21 +101,26 @@ def judge_by(
     trials: Sequence[Trial],
     threshold: PositiveFloat,
     *,
-    volume: float = 0.0,
+    volume: Volume = 0.0,
     provenance: Provenance | None = None,
+    kind: CertificateKind | None = None,
 ) -> Verdict:
-    """Return the verdict by a certificate of any kind; only bounds on d* validate if the acceptable ``volume`` is 0."""
+    """Return the verdict by a certificate; only bounds on d* validate if the acceptable ``volume`` is 0.
+
+    Its kind says what a validation rests on; by default, it is found by its name.
+    """
     tau, known = float(threshold), provenance or Provenance()
-    require_confidence(certificate.confidence)
-    kind, quantities = KINDS.of(certificate), known.quantities
-    quantile = certificate.details.get("quantile") or quantile_of(kind)
+    require("confidence", Confidence, certificate.confidence)
+    by_name = KINDS.find(certificate.kind) if certificate.kind in KINDS else CertificateKind
+    quantities = known.quantities
+    quantile = certificate.details.get("quantile") or (kind or by_name).quantile
     falsified = counterexample(trials, tau, quantities, certificate.confidence, quantile)
     if falsified is not None:
         return replace(falsified, certificate=certificate)
-    if not certificate.covers(tau, require_volume(volume)):
+    if not certificate.covers(tau, volume):
         why_not = sentences.undecided(certificate, tau, volume, quantities)
-        return Verdict("undecided", tau, why_not, certificate=certificate)
-    conditions = kind.rests_on(certificate, known.space)
+        return Verdict("undecided", tau, why_not, certificate=certificate, expected=certificate.expected)
+    conditions = (kind or by_name).rests_on(certificate, known.space)
     alone = known.alone(tau, trials)
     rests_on = sentences.rests_on(conditions, certificate, tau, quantities, known.stated, alone)
     looked = known.looked(certificate, tau, trials, volume)
@@ -153,13 +144,12 @@ def judge(
         provenance: what is known besides the trials.
     """
     known, chosen = provenance or Provenance(), options or CertificateOptions()
-    quantile = quantile_of(chosen.kind)
+    quantile = chosen.kind.quantile
     verdict = counterexample(trials, threshold, known.quantities, chosen.confidence, quantile)
     if verdict is None:
         try:
-            certificate, expected = _certified(trials, chosen, known, threshold)
-            verdict = judge_by(certificate, trials, threshold, volume=chosen.volume, provenance=known)
-            verdict = replace(verdict, expected=expected)
+            certificate = _certified(trials, chosen, known, threshold)
+            verdict = judge_by(certificate, trials, threshold, volume=chosen.volume, provenance=known, kind=chosen.kind)
         except CertificateError as error:
             verdict = Verdict("undecided", float(threshold), str(error))
     parts = [verdict.reason.removesuffix("."), verdict.expected, designs_sentence(trials)]
@@ -172,15 +162,19 @@ def judge(
 
 def _certified(
     trials: Sequence[Trial], options: CertificateOptions, known: Provenance, threshold: float | None
-) -> tuple[Certificate, Forecast | None]:
-    """Return a certificate, for a threshold if there is one, and a forecast. Most kinds see countable draws only."""
-    kind, sample = options.kind, known.sample(trials)
+) -> Certificate:
+    """Return a certificate, for a threshold if there is one. Most kinds see countable draws only."""
+    suite = None if known.space is None else known.space.members
+    sample = replace(
+        Sample.of(trials, known.learned), distribution=known.distribution, suite=suite, threshold=threshold
+    )
+    kind = options.kind
     if sample.suite is not None:
         require_suite(kind)
     # No statement may count draws whose number depended on their distances.
     sample = sample if kind.sorts_draws else sample.with_countable_draws()
-    certificate, expected = certified(kind, sample, threshold, options.confidence)
-    return replace(certificate, assumptions=(*certificate.assumptions, *known.remarks)), expected
+    certificate = kind.certify(sample, options.confidence)
+    return replace(certificate, assumptions=(*certificate.assumptions, *known.remarks))
 
 
 def require_suite(kind: CertificateKind) -> None:
@@ -227,15 +221,15 @@ def assess(
     known, kind = provenance or Provenance(), options.kind
     falsified = None
     if threshold is not None:
-        falsified = counterexample(trials, threshold, known.quantities, options.confidence, quantile_of(kind))
+        falsified = counterexample(trials, threshold, known.quantities, options.confidence, kind.quantile)
     if threshold is not None and falsified is None:
         verdict = judge(trials, threshold, options, known)
         if verdict.certificate is None:
             raise CertificateError(verdict.reason)
         return Assessment(kind.name, verdict.certificate, verdict)
-    limit = threshold if kind.needs_threshold or kind.uses_threshold else None
+    limit = threshold if kind.uses_threshold else None
     try:
-        certificate, _ = _certified(trials, options, known, limit)
+        certificate = _certified(trials, options, known, limit)
     except CertificateError as error:
         if falsified is None:
             raise

@@ -16,7 +16,6 @@ from ctxval._util.refusals import require_extra, reworded
 from ctxval._util.texts import reason_of
 from ctxval.campaign.interval_search import IntervalSearch
 from ctxval.campaign.storage.other_stores import other_stores
-from ctxval.certificates.verdict import usable_bound
 from ctxval.cli import base
 from ctxval.cli.base import command, err, named_values, out, print_table
 from ctxval.cli.config.settings import Settings, read_settings
@@ -120,7 +119,7 @@ def run(
             "controllers": designs_sentence(campaign.trials),
             "worst": base.worst_of(campaign.worst),
             "estimate": estimate,
-            "interval": None if campaign.worst is None else [campaign.worst.distance, usable_bound(bound)],
+            "interval": None if campaign.worst is None else [campaign.worst.distance, bound and bound.bound],
             "units": units,
             **(dict.fromkeys(("verdict", "reason", "rests_on", "threshold")) if verdict is None else verdict.to_json()),
             "certificate": None if bound is None else bound.to_json(),

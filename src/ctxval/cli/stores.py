@@ -148,7 +148,7 @@ def certify_store(store: Path, asked: Asked, allowed: Allowed, audit: int | None
         raise InputError("--volume needs --threshold: it is the share of the task space that may exceed the threshold.")
     options = asked.options(settings, kind)
     if audit is not None:
-        options.kind.require_audit_helps([trial.origin for trial in opened.trials()])
+        options.kind.require_usable(options.confidence, audit, [trial.origin for trial in opened.trials()])
     campaign = open_store(store, allowed).campaign if loads else None
     if campaign is not None and audit is not None:
         if limit is not None:

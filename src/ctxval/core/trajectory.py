@@ -141,9 +141,9 @@ class Trajectory:
         name = "these bytes" if isinstance(source, bytes) else str(source)
         try:
             arrays = Archive(source if isinstance(source, bytes) else read_bytes(source, most), most)
-            ended = arrays.text("ended") if "ended" in arrays else COMPLETE
+            ended = arrays.text("ended") if "ended" in arrays.names else COMPLETE
             names = ("times", "states", "inputs")
-            shapes = [arrays.shape(name) for name in names]
+            shapes = [arrays.header(name)[0] for name in names]
             _require_fitting(*shapes)
             if shape is not None and ended == COMPLETE and shapes[1] != shape:
                 raise ShapeError(f"the trajectory must have states of shape {shape}, got {shapes[1]}.")

@@ -61,7 +61,7 @@ def read_note(source: str | Path) -> dict[str, Any]:
     """Return the plain values that were kept beside a model; empty if there are none."""
     with reworded(f"{source} cannot be read as a model", InputError, ValueError):
         arrays = Archive(read_bytes(source))
-        about = json.loads(arrays.text("about")) if "about" in arrays else {}
+        about = json.loads(arrays.text("about")) if "about" in arrays.names else {}
     match about:
         case {"note": {} as note}:
             return dict(note)
@@ -77,10 +77,10 @@ def write_transitions(path: str | Path, data: Transitions | None) -> None:
 
 def stored_transitions(arrays: Archive) -> Transitions | None:
     """Return the recorded steps in an NPZ file with x, u and x_next; None if there are none."""
-    if "x_next" not in arrays:
+    if "x_next" not in arrays.names:
         return None
     x, u, x_next = (arrays.numbers(name) for name in _DATA)
-    return Transitions(x, u, x_next, float(arrays.numbers("dt")) if "dt" in arrays else None)
+    return Transitions(x, u, x_next, float(arrays.numbers("dt")) if "dt" in arrays.names else None)
 
 
 def _data_arrays(data: Transitions) -> dict[str, Any]:
@@ -110,7 +110,7 @@ def read_refined(source: str | Path, before: Model | None) -> SavedModel:
     with reworded(f"{source} cannot be read as a model ({known_kinds})", ValueError, TypeError, IndexError):
         arrays = Archive(read_bytes(source))
         about: Any = {"format": _FORMAT, "version": 1, "kind": "Linear"}
-        if "about" in arrays:
+        if "about" in arrays.names:
             about = json.loads(arrays.text("about"))
         plain = tuple(kind.__name__ for kind in _PLAIN)
         if not isinstance(about, dict) or (about.get("format"), about.get("version")) != (_FORMAT, 1):
@@ -138,7 +138,7 @@ def _plain_model(arrays: Archive, kind: str, data: Transitions | None, prefix: s
         return arrays.numbers(prefix + name)
 
     if kind == "Linear":
-        return Linear(numbers("A"), numbers("B"), numbers("c") if f"{prefix}c" in arrays else None, data)
+        return Linear(numbers("A"), numbers("B"), numbers("c") if f"{prefix}c" in arrays.names else None, data)
     scaling = IncrementScaling(*(numbers(field.name) for field in fields(IncrementScaling)))
     if kind == "FeedforwardReLU":
         layers = range(min(100, sum(name.startswith(f"{prefix}weights_") for name in arrays.names)))

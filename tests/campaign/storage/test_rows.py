@@ -14,7 +14,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from ctxval import Store, Trajectory, Trial
-from ctxval.campaign.storage.rows import COLUMNS, Side, checksum_of, follows, read_json, read_pairs, read_trial, row_of
+from ctxval.campaign.storage.rows import COLUMNS, Side, checksum_of, follows, read_json, read_trial, row_of
 from ctxval.errors import ForeignStoreError, InputError
 
 NAMES = [name.strip() for name in COLUMNS.split(",")]
@@ -151,24 +151,6 @@ def test_a_trial_follows_those_of_its_space() -> None:
     assert follows(Trial(1, "iid", "open", np.array([0.5, 0.5]), {}), [WHOLE])
 
 
-@pytest.mark.parametrize(
-    "rows",
-    [[("a", "1"), ("a", "2")], [(b"a", "1")], [(None, "1")], [("a", b"1")], [("a", "{")], [("a", "[" * 60 + "]" * 60)]],
-)
-def test_a_table_of_keys_must_be_one(rows: list[tuple[Any, Any]]) -> None:
-    with pytest.raises(InputError):
-        read_pairs(rows)
-
-
-def test_an_endless_table_is_left_at_the_first_key_that_comes_again() -> None:
-    def endless() -> Any:
-        while True:
-            yield "a", "1"
-
-    with pytest.raises(InputError, match="occurs once"):
-        read_pairs(endless())
-
-
 def test_json_is_json() -> None:
     assert read_json("[1, null]") == [1, None]
     assert np.isnan(read_json("NaN", finite=False))
@@ -250,7 +232,7 @@ def test_what_another_process_stores_is_seen(tmp_path: Path, monkeypatch: pytest
     store.add([(opened, trajectory(0), None)])
     reads = reads_of(store, monkeypatch)
     assert list(store.trajectories([0, 1], "system")) == [0]
-    other.close_trial(replace(opened, state="completed", executed=True, distance=1.0), trajectory(1))
+    other.close_trials([(replace(opened, state="completed", executed=True, distance=1.0), trajectory(1))])
     assert list(store.trajectories([0, 1], "system")) == [0, 1]
     assert reads == [0, 1, 1]  # the first one is the same as before
 

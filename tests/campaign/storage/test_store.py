@@ -25,7 +25,7 @@ def test_a_trial_comes_back_bit_for_bit(tmp_path: Path) -> None:
     store = Store(tmp_path / "a.sqlite")
     store.add([(trial(), TRAJECTORY, None)])
     ended = replace(trial(), state="completed", executed=True, distance=0.1 + 0.2, seconds=1.5)
-    store.close_trial(ended, TRAJECTORY)
+    store.close_trials([(ended, TRAJECTORY)])
     store.close()
     (back,) = Store(tmp_path / "a.sqlite").trials()
     np.testing.assert_array_equal(back.unit_point, ended.unit_point)
@@ -60,9 +60,9 @@ def test_trajectories_come_back_bit_for_bit_and_absent_ones_as_none() -> None:
 def test_an_ended_trial_cannot_end_again() -> None:
     store = Store()
     store.add([(trial(), TRAJECTORY, None)])
-    store.close_trial(replace(trial(), state="failed", failure="x"), None)
+    store.close_trials([(replace(trial(), state="failed", failure="x"), None)])
     with pytest.raises(InputError, match="nothing more can be told"):
-        store.close_trial(replace(trial(), state="completed", distance=1.0), TRAJECTORY)
+        store.close_trials([(replace(trial(), state="completed", distance=1.0), TRAJECTORY)])
     assert store.trials()[0].state == "failed"
 
 
@@ -177,7 +177,7 @@ def test_what_was_computed_is_kept_until_the_content_changes(tmp_path: Path) -> 
     store.keep_computed("verdict", {"bound": np.inf}, digest)
     assert Store(tmp_path / "a.sqlite").computed("verdict") == {"bound": np.inf}
     assert store.computed("other") is None
-    store.close_trial(replace(trial(), state="completed", executed=True, distance=1.0), TRAJECTORY)
+    store.close_trials([(replace(trial(), state="completed", executed=True, distance=1.0), TRAJECTORY)])
     assert store.computed("verdict") is None
     store.keep_computed("verdict", 1, digest)  # by a process that has not seen the change
     assert store.computed("verdict") is None
@@ -187,3 +187,18 @@ def test_what_was_computed_is_kept_until_the_content_changes(tmp_path: Path) -> 
         connection.execute("UPDATE computed SET value = '{'")
         connection.commit()
     assert store.computed("verdict") is None
+
+
+@pytest.mark.parametrize(
+    "rows",
+    [[("a", "1"), ("a", "2")], [(b"a", "1")], [(None, "1")], [("a", b"1")], [("a", "{")], [("a", "[" * 60 + "]" * 60)]],
+)
+def test_settings_must_be_texts_with_json_each_of_which_occurs_once(rows: list[tuple[object, object]]) -> None:
+    store = Store()
+    store._execute(
+        "CREATE TEMP TABLE settings (key, value)"
+    )  # without the constraints of a store, as in a damaged file
+    for row in rows:
+        store._execute("INSERT INTO temp.settings VALUES (?, ?)", row)
+    with pytest.raises(ForeignStoreError, match="the settings in it cannot be read"):
+        store.settings()

@@ -9,7 +9,6 @@ from collections.abc import Iterator
 from contextlib import closing, contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
 
 from ctxval._util.files import LOCKS_FILE_ITSELF, FileLock, LockedError
 from ctxval._util.progress import advance, stage
@@ -45,6 +44,7 @@ class Database:
                 schema.require_files(self.path)
             file = self.path or ":memory:"
             self._connection = sqlite3.connect(file, isolation_level=None, timeout=10.0, factory=schema.Guarded)
+            self._execute = self._connection.execute
             try:
                 self._prepare()
             except BaseException:
@@ -129,9 +129,6 @@ class Database:
                     self._execute("ROLLBACK")
                 raise
             self._execute("COMMIT")
-
-    def _execute(self, statement: str, values: tuple[Any, ...] = ()) -> sqlite3.Cursor:
-        return self._connection.execute(statement, values)
 
     @contextmanager
     def _rows(self, statement: str) -> Iterator[sqlite3.Cursor]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import sys
 import zlib
-from collections.abc import Iterable
 from dataclasses import replace
 from typing import Any, Literal, NoReturn, get_args
 
@@ -109,16 +108,6 @@ def pair_of(key: str, value: Any) -> tuple[str, str]:
     if len(text) > MOST_CHARACTERS:
         raise InputError(f"{key} must have at most {MOST_CHARACTERS} characters as JSON to be stored, got {len(text)}.")
     return key, text
-
-
-def read_pairs(rows: Iterable[tuple[Any, Any]]) -> dict[str, Any]:
-    """Return the rows of a table of keys and JSON values as a dictionary."""
-    pairs: dict[str, Any] = {}
-    for key, value in rows:
-        if not isinstance(key, str) or key in pairs:
-            raise InputError(f"a key must be a text that occurs once, got {key!r}.")
-        pairs[key] = read_json(value, finite=False)
-    return pairs
 
 
 def read_trajectory(number: int, side: str, npz: Any, checksum: Any) -> Trajectory | None:

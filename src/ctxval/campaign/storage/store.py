@@ -128,11 +128,9 @@ class Store(Database):
             stated = self.thresholds()
             if stated is not None and all(each.threshold != threshold for each in stated):
                 known = self._execute("SELECT count(*) FROM trials WHERE state = 'completed'").fetchone()[0]
-                self._write_thresholds((*stated, StatedThreshold(float(threshold), int(known), now())))
-
-    def _write_thresholds(self, stated: Sequence[StatedThreshold]) -> None:
-        _, text = rows.pair_of(_THRESHOLDS, [asdict(each) for each in stated])
-        self._execute("UPDATE experiment SET value = ? WHERE key = ?", (text, _THRESHOLDS))
+                stated = (*stated, StatedThreshold(float(threshold), int(known), now()))
+                key, text = rows.pair_of(_THRESHOLDS, [asdict(each) for each in stated])
+                self._execute("UPDATE experiment SET value = ? WHERE key = ?", (text, key))
 
     def keep_settings(self, settings: dict[str, Any]) -> None:
         """Store the settings that make the experiment again, for commands that get only the store."""
@@ -152,11 +150,16 @@ class Store(Database):
 
     def _pairs(self, table: str) -> dict[str, Any]:
         bounded = (f"CASE WHEN length({cell}) <= {rows.MOST_CHARACTERS} THEN {cell} END" for cell in ("key", "value"))
-        with self._rows(f"SELECT {', '.join(bounded)} FROM {table} ORDER BY rowid") as pairs:
+        pairs: dict[str, Any] = {}
+        with self._rows(f"SELECT {', '.join(bounded)} FROM {table} ORDER BY rowid") as content:
             try:
-                return rows.read_pairs(pairs)
+                for key, value in content:
+                    if not isinstance(key, str) or key in pairs:
+                        raise InputError(f"a key must be a text that occurs once, got {key!r}.")
+                    pairs[key] = rows.read_json(value, finite=False)
             except InputError as error:
                 raise self._damaged(f"the {table} in it cannot be read") from error
+        return pairs
 
     # The history
 
@@ -188,7 +191,8 @@ class Store(Database):
             self._write_description(description)
             self._insert_change(change)
             if change.why == REDEFINED:
-                self._write_thresholds(())  # they were thresholds of another distance
+                # They were thresholds of another distance.
+                self._execute("UPDATE experiment SET value = '[]' WHERE key = ?", (_THRESHOLDS,))
         return True
 
     def _require_unchanged(self, changes: int | None) -> None:
@@ -222,12 +226,11 @@ class Store(Database):
             self._require_unchanged(changes)
             self._update(trial, "AND state = 'open'")
 
-    def close_trial(self, trial: Trial, system_trajectory: Trajectory | None, *, changes: int | None = None) -> None:
-        """Store the result of an open trial; of two results for one trial, the first is stored."""
-        self.close_trials([(trial, system_trajectory)], changes=changes)
-
     def close_trials(self, ended: Iterable[tuple[Trial, Trajectory | None]], *, changes: int | None = None) -> None:
-        """Store the results of open trials with their trajectories of the system in one transaction: all, or none."""
+        """Store the results of open trials with their trajectories of the system in one transaction: all, or none.
+
+        Of two results for one trial, the first is stored.
+        """
         with self._transaction():
             self._require_unchanged(changes)
             for trial, system_trajectory in ended:

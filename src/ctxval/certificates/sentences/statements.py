@@ -251,8 +251,8 @@ def dynamics_assumptions(evidence: DynamicsEvidence) -> tuple[str, ...]:
 
 def condition_on_dynamics(details: Mapping[str, Any]) -> str:
     """Return the condition under which the confidence of a bound from learned dynamics holds."""
-    physical = details.get("physical") or []  # stores of earlier versions do not have it
-    state, acting = state_of(details.get("estimated")), late(details.get("actuator"))
+    physical = details["physical"]
+    state, acting = state_of(details["estimated"]), late(details["actuator"])
     acting = f" ({acting})" if acting else ""
     lags = f" of the last {details['lags'] + 1} steps" if details["lags"] else ""
     recorded = [f"{state.replace('state', 'states', 1)} and inputs{lags}{acting}"]
@@ -272,8 +272,8 @@ def condition_on_dynamics(details: Mapping[str, Any]) -> str:
 
 def conditions_on_dynamics(details: Mapping[str, Any]) -> list[str]:
     """Return what a validation by learned dynamics rests on."""
-    again, lags, estimated = details.get("differing"), details["lags"], details.get("estimated")
-    changing = f"changing neither with time nor with the task{except_for(details.get('physical') or ())}"
+    again, lags, estimated = details["differing"], details["lags"], details["estimated"]
+    changing = f"changing neither with time nor with the task{except_for(details['physical'])}"
     steps = f"the last {lags + 1} records and inputs" if lags else "the last record and input"
     complete = f"{steps} determining the next record"
     if details["quantile"] is not None:
@@ -287,7 +287,7 @@ def conditions_on_dynamics(details: Mapping[str, Any]) -> list[str]:
             complete = f"{'' if estimated else 'the '}{state_of(estimated)} being complete"
         noise = "" if again is None else f" (trials {again[0]} and {again[1]} of one task differ a little)"
         alike = f"the system being deterministic{noise}, and its dynamics {changing}"
-    acting = late(details.get("actuator"))
+    acting = late(details["actuator"])
     return [
         complete,
         *([f"the inputs {acting} in every task, as in the executions"] if acting else []),

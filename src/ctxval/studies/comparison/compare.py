@@ -10,10 +10,10 @@ from typing import Literal
 
 import numpy as np
 
-from ctxval._util.checked import NonNegativeInt, PositiveFloat, PositiveInt, Probability, checked
+from ctxval._util.checked import NonNegativeInt, PositiveFloat, PositiveInt, Probability, checked, require
 from ctxval._util.progress import advance, progress_shown, stage
 from ctxval.campaign.campaign import Campaign
-from ctxval.certificates.options import CONFIDENCE, require_confidence
+from ctxval.certificates.options import CONFIDENCE, Confidence
 from ctxval.core.experiment import Experiment
 from ctxval.core.task_distribution import distribution_text
 from ctxval.core.validation import Validation
@@ -72,7 +72,7 @@ def compare(
             f"question must be mean for a stochastic system, got {question!r}: an execution may have a larger "
             "distance than the largest expected one, so executed distances do not tell which d* is larger."
         )
-    require_confidence(confidence)
+    require("confidence", Confidence, confidence)
 
     def campaign(name: str, compared: Compared) -> Campaign:
         if isinstance(compared, Campaign):

@@ -22,7 +22,7 @@ from ctxval.campaign.history import executed_trials
 from ctxval.certificates import Certificate, CertificateOptions, Dynamics
 from ctxval.certificates.bounds import ERRORS, rank_of
 from ctxval.certificates.dynamics import draws_for
-from ctxval.certificates.verdict import Answer, usable_bound
+from ctxval.certificates.verdict import Answer
 from ctxval.core.distance import selected
 from ctxval.core.experiment import Experiment
 from ctxval.core.trajectory import Trajectory
@@ -182,7 +182,7 @@ def assess(
                 certified = campaign.certify(certificate=options)
             except CertificateError as error:
                 doubt = str(error).removesuffix(".")
-        bound = usable_bound(certified)
+        bound = None if certified is None else certified.bound
         if verdict is not None:
             bound = margin if verdict.answer == "validated" else None
             doubt = verdict.reason.removesuffix(".")
