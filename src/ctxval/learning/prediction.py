@@ -24,7 +24,7 @@ from ctxval.core.distance import ComposedDistance
 from ctxval.core.trajectory import Trajectory
 from ctxval.errors import ShapeError
 from ctxval.gp.cholesky import tenfold
-from ctxval.gp.kernels import Linear, Matern, Sum
+from ctxval.gp.kernels import Matern
 from ctxval.gp.regression import MultiOutputProcess, log_likelihood_of_outputs, most_likely
 from ctxval.learning.closed_loops import LoopPlanner, halved
 from ctxval.learning.draws import DynamicsDraws
@@ -34,7 +34,7 @@ from ctxval.searches import Prediction
 Executed = Sequence[tuple[Array, Trajectory]]
 """Points of the unit cube ``(d,)`` with the system's trajectories there."""
 
-_KERNEL = Sum(Matern(2.5, ard=True, length_scale=(0.05, 100.0), variance=(1e-6, 1e3)), Linear(variance=(1e-6, 1e3)))
+_KERNEL = Matern(2.5, ard=True, length_scale=(0.05, 100.0), variance=(1e-6, 1e3), linear=(1e-6, 1e3))
 _NOISE = 1e-8  # noise variance relative to the vectors' mean square: it keeps the covariance matrix positive definite
 _LEARNED_FROM = 200  # largest number of vectors, the latest ones, from which the hyperparameters are learned
 
