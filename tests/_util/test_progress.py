@@ -20,7 +20,6 @@ from ctxval._util.progress import (
     duration,
     expect,
     is_heard,
-    is_screen,
     listening,
     progress_shown,
     stage,
@@ -211,7 +210,6 @@ def test_text_of_users_cannot_control_the_screen() -> None:
 
 @pytest.mark.parametrize("wanted", [None, False])
 def test_nothing_is_shown_in_a_program_unless_it_is_asked_for(wanted: bool | None, capfd: Any) -> None:
-    assert not is_screen()
     with progress_shown(wanted), stage("executions", 1):
         advance(1, "done")
     assert capfd.readouterr() == ("", "")

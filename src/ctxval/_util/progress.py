@@ -134,7 +134,8 @@ def progress_shown(wanted: bool | None = None, console: Console | None = None) -
         yield
         return
     if wanted is None:
-        wanted = is_screen()
+        # People see what is printed at once at a terminal or in a notebook.
+        wanted = bool(sys.stderr is not None and sys.stderr.isatty()) or "ipykernel" in sys.modules
     if not wanted:
         with listening(ignore):
             yield
@@ -144,11 +145,6 @@ def progress_shown(wanted: bool | None = None, console: Console | None = None) -
     screen = Console(stderr=True, markup=False, emoji=False, highlight=False) if console is None else console
     with listening(OnScreen(screen) if screen.is_terminal or screen.is_jupyter else InLog(screen)):
         yield
-
-
-def is_screen() -> bool:
-    """Return whether people see what is printed at once: at a terminal or in a notebook."""
-    return bool(sys.stderr is not None and sys.stderr.isatty()) or "ipykernel" in sys.modules
 
 
 class InLog:

@@ -260,17 +260,18 @@ _TIMES = 0.01  # largest difference between the times of a recording and those o
 def require_times(trajectory: Trajectory, times: Array) -> None:
     """Check that a trajectory has these times ``(H + 1,)``, counted from its first time."""
     dt, recorded = times[1] - times[0], trajectory.times - trajectory.times[0]
+    misses = np.abs(recorded - times) if len(recorded) == len(times) else np.array([np.inf])
+    if (misses <= _TIMES * dt).all():
+        return
     period = float(np.median(np.diff(recorded)))
     advice = f"; {unit_advice(period, dt) or '--resample interpolates a recording to these times'}"
     if len(recorded) != len(times):
         got = f"{len(recorded)} with steps of {period:g} s{advice}"
         raise InputError(f"the trajectory must have {len(times)} times, {len(times) - 1} steps of {dt:g} s, got {got}.")
-    misses = np.abs(recorded - times)
-    if not (misses <= _TIMES * dt).all():
-        k = int(np.argmax(~(misses <= _TIMES * dt)))
-        first = f"time {k} must be {times[k]:g} s after the first, got {recorded[k]:g} s"
-        largest = f"The largest difference is {np.max(misses):.3g} s{advice}"
-        raise InputError(f"the trajectory must have steps of {dt:g} s: {first}. {largest}.")
+    k = int(np.argmax(~(misses <= _TIMES * dt)))
+    first = f"time {k} must be {times[k]:g} s after the first, got {recorded[k]:g} s"
+    largest = f"The largest difference is {np.max(misses):.3g} s{advice}"
+    raise InputError(f"the trajectory must have steps of {dt:g} s: {first}. {largest}.")
 
 
 def _listed(names: Sequence[str]) -> str:

@@ -16,7 +16,7 @@ from scipy.spatial.distance import cdist
 from ctxval._util.arrays import Array
 from ctxval.errors import InputError
 
-_CENTRE = 0.5  # of the unit cube, in each dimension: about it, the linear part varies
+_CENTRE = 0.5  # of the unit cube, in each dimension: about which the linear part varies
 
 Bounds = list[tuple[float, float]]
 
@@ -42,7 +42,7 @@ class Covariance(Protocol):
 class Matern(Covariance):
     """Matern kernel of smoothness 3/2, 5/2 or 9/2, and a linear one ``v_0 + v_1 (x - c)'(z - c)`` if it has bounds.
 
-    theta = log of (variance, length-scales), followed by (v_0, v_1) of the linear part; c is the middle of the unit cube.
+    theta = log of (variance, length-scales), then of v_0 and v_1; c is the middle of the unit cube.
     """
 
     nu: float = 1.5  # the paper's

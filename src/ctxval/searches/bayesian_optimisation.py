@@ -17,7 +17,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ctxval._util.arrays import Array, single_threaded
-from ctxval._util.boxes import Box
 from ctxval._util.checked import NonNegativeFloat, PositiveInt
 from ctxval._util.registry import part
 from ctxval.gp.acquisition import Acquisition, LogExpectedImprovement, UpperConfidenceBound, maximise
@@ -41,11 +40,6 @@ class _Branch:
     upper: bool
     best: float = -np.inf  # the largest value in this half since the branch began
     misses: int = 0  # number of successive executions in the branch without improvement
-
-    def box(self, dimension: int) -> Box:
-        low, high = np.zeros(dimension), np.ones(dimension)
-        (low if self.upper else high)[self.coordinate] = 0.5
-        return low, high
 
 
 @part("bayesian-optimisation")
@@ -101,7 +95,9 @@ class BayesianOptimisation(SequentialSearch):
             believed = float(process.y[int(known[rows].sum()) :].max(initial=-np.inf))
             best = _worthwhile(learned, values, float(np.nanmax(values)))
             acquisition = LogExpectedImprovement(process, max(best, believed))
-        box = None if branch is None else branch.box(self.dimension)
+        box = np.zeros(self.dimension), np.ones(self.dimension)
+        if branch is not None:
+            box[0 if branch.upper else 1][branch.coordinate] = 0.5
         known_first, away = best_first(points, values), points[~known]
         point = maximise(acquisition, self.dimension, known_first, rng, box=box, corners=True, away=away)
         return point, {
