@@ -116,7 +116,8 @@ class Execution:
         note = {key: value for key, value in (trial.note or {}).items() if key != AT_LEAST}
         if self.at_least is not None:
             note[AT_LEAST] = self.at_least
-        ended = replace(trial, state=state, executed=executed, distance=self.distance, failure=self._failure)
+        failure = self.unusable if self.failed is None else text_of(self.failed)
+        ended = replace(trial, state=state, executed=executed, distance=self.distance, failure=failure)
         return replace(ended, seconds=self.seconds, note=note or None)
 
     def is_that_of(self, trial: Trial) -> bool:
@@ -126,8 +127,4 @@ class Execution:
         else:
             # A distance that another type of processor has computed differs in its last digits.
             same = bool(np.isclose(trial.distance, self.distance, rtol=1e-9, atol=0))
-        return same and trial.failure == self._failure and trial.state != "open"
-
-    @property
-    def _failure(self) -> str | None:
-        return self.unusable if self.failed is None else text_of(self.failed)
+        return same and trial.failure == self.ended(trial).failure and trial.state != "open"

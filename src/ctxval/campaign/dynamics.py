@@ -74,6 +74,7 @@ class CampaignDynamics:
         self._store = store
         self.elsewhere: Callable[[], Sequence[Trajectory]] = tuple
         self.failure: str | None = None
+        self._parts: tuple[str, bytes] | None = None  # of the study, when it learned first
         self._learned: dict[tuple[object, ...], tuple[Sequence[Trajectory], LearnedDynamics | None, str | None]] = {}
 
     def use_quantile(self, quantile: float) -> None:
@@ -85,8 +86,8 @@ class CampaignDynamics:
     def learned(self, trials: Sequence[Trial], *, alone: bool = False) -> LearnedDynamics | None:
         """Return what the completed trials, and unless ``alone`` other recordings teach; None if it is nothing."""
         executed, others = executed_trials(self._store, trials), () if alone else self.elsewhere()
-        if not self.study.is_current:
-            self.study, self._learned = self.study.anew(), {}
+        if self._parts is not None and self._parts != self.study.state_of_parts():  # they were changed in place
+            self.study, self._learned, self._parts = self.study.anew(), {}, None
         # The other recordings are kept with what they taught, so that their identities stay theirs. A result may be
         # replaced, and then has another distance.
         key = (*((trial.number, trial.distance) for trial, _ in executed), *map(id, others))
@@ -95,6 +96,7 @@ class CampaignDynamics:
                 del self._learned[next(iter(self._learned))]
             learned, failure = None, None
             try:
+                self._parts = self._parts or self.study.state_of_parts()
                 learned = self.study.learn([(trial.unit_point, trajectory) for trial, trajectory in executed], others)
             except Exception as error:  # users' parts
                 failure = reason_of(error)

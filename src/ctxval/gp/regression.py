@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -77,12 +77,12 @@ class MultiOutputProcess:
     theta: Array
     X: Array  # (n, d)
     Y: Array  # (n, k)
-    noises: Sequence[float] = (NOISE,)  # tried in this order until the covariance matrix is positive definite
+    noise: float = NOISE  # the least noise variance; points that are too similar need more
 
     @functools.cached_property
     def factor(self) -> CholeskyFactor:
         """The Cholesky factor of ``K + noise I``."""
-        return factorise(self.kernel(self.theta, self.X, self.X), self.noises)
+        return factorise(self.kernel(self.theta, self.X, self.X), self.noise, insist=True)
 
     @functools.cached_property
     def weights(self) -> Array:

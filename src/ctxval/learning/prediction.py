@@ -23,7 +23,6 @@ from ctxval._util.progress import advance
 from ctxval.core.distance import ComposedDistance
 from ctxval.core.trajectory import Trajectory
 from ctxval.errors import ShapeError
-from ctxval.gp.cholesky import tenfold
 from ctxval.gp.kernels import Matern
 from ctxval.gp.regression import MultiOutputProcess, log_likelihood_of_outputs, most_likely
 from ctxval.learning.closed_loops import LoopPlanner, halved
@@ -143,8 +142,7 @@ def predict_composed(points: Array, vectors: Array, compose: Callable[[Array], A
         return None
     with single_threaded():
         theta = _most_likely(points[-_LEARNED_FROM:], vectors[-_LEARNED_FROM:] / scale)
-    noises = (_NOISE, *(_NOISE + more for more in tenfold(_NOISE)))  # points may be too similar for the first
-    process = MultiOutputProcess(_KERNEL, theta, points, vectors / scale, noises)
+    process = MultiOutputProcess(_KERNEL, theta, points, vectors / scale, _NOISE)
 
     def expected(at: Array) -> tuple[Array, Array]:
         """Return the values composed of the expected vectors ``(m,)``, and the relative deviation of draws ``(m,)``."""
