@@ -96,7 +96,7 @@ def test_a_suggestion_that_cannot_be_predicted_has_no_estimate() -> None:
                 raise ValueError
             return controllers.LQR([1.0, 0.1], [1e-2], [10.0, 1.0]).design(task, model)
 
-    validation = with_synthesizer(Refusing()).with_distance(distances.WholeTrajectory())
+    validation = with_synthesizer(Refusing()).with_parts(distance=distances.WholeTrajectory())
     found = ThinkingCosts.measured(validation, [np.array([3.0]), np.array([-3.0])])
     assert found.suggestion is None
     assert found.design < 1.0

@@ -174,7 +174,7 @@ class InPlace:
 
 
 def test_a_distance_that_changes_its_arrays_does_not_change_later_predictions() -> None:
-    validation = make_validation().with_distance(InPlace())
+    validation = make_validation().with_parts(distance=InPlace())
     points = np.linspace(0.1, 0.9, 4)[:, None]
     prediction = predict_distance(validation, executed(validation, points))
     assert prediction is not None

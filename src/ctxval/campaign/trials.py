@@ -141,7 +141,7 @@ class TrialRecorder:
         """Recompute the distances of all stored executions, with another distance if one is given."""
         validation, description = self.validation, self.description
         if distance is not None:
-            validation = validation.with_distance(distance)
+            validation = validation.with_parts(distance=distance)
             description = with_distance(description, described_plainly(validation.distance))
         changed = remeasure(self.store, validation, description)
         self._redefine(validation, description)

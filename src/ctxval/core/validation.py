@@ -107,14 +107,6 @@ class Validation:
         # The numbers of M are learned: its closed loops show whether it is the same.
         return {**parts, "model": without_numbers(describe(self.model))}
 
-    def with_distance(self, distance: Distance) -> Validation:
-        """Return this validation with another distance."""
-        return self.with_parts(distance=distance)
-
-    def with_model(self, model: Model | Step) -> Validation:
-        """Return this validation with another model."""
-        return self.with_parts(model=model)
-
     def on_model(self, distance: Distance, *, units: str | None = None) -> Validation:
         """Return this validation with M itself in the place of S, which is never executed (the paper's Aspect 1).
 
@@ -157,16 +149,8 @@ class Validation:
             return rollout(self.model.step, controller, task)
         return self.outputs.of(rollout(self.model.step, self.outputs.seen_by(controller), task))
 
-    def with_space(self, space: TaskSpace) -> Validation:
-        """Return this validation with another task space of the same parameters, for example with a distribution."""
-        return self.with_parts(space=space)
-
-    def with_system(self, system: System) -> Validation:
-        """Return the validation of another system with the same model, controllers and tasks."""
-        return self.with_parts(system=system)
-
     def with_parts(self, **changed: Any) -> Validation:
-        """Return this validation with other arguments."""
+        """Return this validation with other arguments, such as another ``model``, ``distance`` or ``space``."""
         return Validation(**{**vars(self), **changed})
 
     def names(self, states: int, inputs: int) -> tuple[dict[str, str], dict[str, str]]:

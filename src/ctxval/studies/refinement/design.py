@@ -47,7 +47,7 @@ def with_best_jacobian(validation: Validation, refined: Refined) -> tuple[Refine
         return refined, None
     other = Corrected(model.model, model.correction, linearised="model", data=model.data)
     kept = Refined(other, refined.data, refined.before)
-    costs = [_typical_cost(validation.with_model(either)) for either in (refined, kept)]
+    costs = [_typical_cost(validation.with_parts(model=either)) for either in (refined, kept)]
     if costs[0] <= 0.95 * costs[1]:  # clearly
         return refined, None
     return kept, (
@@ -74,7 +74,7 @@ def _linearises_once(validation: Validation, model: Linear) -> bool:
 
     counted = Counted()
     with suppress(CtxvalError):
-        validation.with_model(counted).plan(validation.space.from_unit(np.full(validation.space.dimension, 0.5)))
+        validation.with_parts(model=counted).plan(validation.space.from_unit(np.full(validation.space.dimension, 0.5)))
         return 1 <= counted.points <= 2
     return False
 

@@ -186,7 +186,7 @@ class _Loop:
                 if number == 1:
                     raise
                 return f"no better model can be learned: {str(error).removesuffix('.')}"
-        validation = self.first.validation.with_model(model)
+        validation = self.first.validation.with_parts(model=model)
         same = same_controllers(validation, list(self._executed(self.rounds)))
         if same.worst is not None and same.worst > self.threshold:
             return (
