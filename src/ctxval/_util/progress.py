@@ -130,7 +130,7 @@ _DELAY = 0.4  # seconds before a stage is shown; most end sooner
 @contextmanager
 def progress_shown(wanted: bool | None = None, console: Console | None = None) -> Iterator[None]:
     """Show the progress of everything within this context on standard error."""
-    if is_heard() and wanted is not False:
+    if _innermost.get() is not None and wanted is not False:
         yield
         return
     if wanted is None:

@@ -313,10 +313,6 @@ class CampaignDynamics:
         present = isinstance(note, dict) and note.get("experiment") == self.experiment
         return prediction_in(trial.note) if present else None
 
-    def to_note(self, prediction: ExecutionPrediction) -> dict[str, Any]:
-        """Return a prediction as it is stored, with what identifies the experiment that it belongs to."""
-        return {PREDICTION: {**prediction.to_json(), "experiment": self.experiment}}
-
 
 @dataclass(frozen=True, eq=False, repr=False)
 class LearnedFromTrials:

@@ -81,7 +81,13 @@ class Trajectory:
     def __post_init__(self) -> None:
         for name in ("times", "states", "inputs"):
             object.__setattr__(self, name, as_floats(name, getattr(self, name)))
-        _require_fitting(self.times.shape, self.states.shape, self.inputs.shape)
+        times, states, inputs = self.times.shape, self.states.shape, self.inputs.shape
+        axes = len(times) == 1 and len(states) >= 2 and len(inputs) == len(states) and states[:-2] == inputs[:-2]
+        if not axes or states[-2] != times[0] or inputs[-2] != times[0] - 1:
+            got = f"{times}, {states} and {inputs}"
+            raise ShapeError(
+                f"a trajectory needs times (H+1,), states (..., H+1, n) and inputs (..., H, m), got {got}."
+            )
 
     @property
     def horizon(self) -> int:
@@ -142,12 +148,9 @@ class Trajectory:
         try:
             arrays = Archive(source if isinstance(source, bytes) else read_bytes(source, most), most)
             ended = arrays.text("ended") if "ended" in arrays else COMPLETE
-            names = ("times", "states", "inputs")
-            shapes = [arrays.shape(name) for name in names]
-            _require_fitting(*shapes)
-            if shape is not None and ended == COMPLETE and shapes[1] != shape:
-                raise ShapeError(f"the trajectory must have states of shape {shape}, got {shapes[1]}.")
-            times, states, inputs = (arrays.numbers(name) for name in names)
+            if shape is not None and ended == COMPLETE and arrays.shape("states") != shape:
+                raise ShapeError(f"the trajectory must have states of shape {shape}, got {arrays.shape('states')}.")
+            times, states, inputs = (arrays.numbers(name) for name in ("times", "states", "inputs"))
             return Trajectory(times, states, inputs, ended)
         except ShapeError:
             raise
@@ -276,13 +279,6 @@ def require_times(trajectory: Trajectory, times: Array) -> None:
 
 def _listed(names: Sequence[str]) -> str:
     return enumerated((name[:60] for name in names), 20)
-
-
-def _require_fitting(times: tuple[int, ...], states: tuple[int, ...], inputs: tuple[int, ...]) -> None:
-    axes = len(times) == 1 and len(states) >= 2 and len(inputs) == len(states) and states[:-2] == inputs[:-2]
-    if not axes or states[-2] != times[0] or inputs[-2] != times[0] - 1:
-        got = f"{times}, {states} and {inputs}"
-        raise ShapeError(f"a trajectory needs times (H+1,), states (..., H+1, n) and inputs (..., H, m), got {got}.")
 
 
 def _chosen(table: CsvTable, letter: str, names: Sequence[str] | None) -> dict[str, float]:

@@ -128,12 +128,12 @@ class TrustRegion(SequentialSearch):
                     "doubt": candidate.doubt,
                 }
                 why_hedge = self._why_hedge()
-                return candidate.point if why_hedge is None else self._without_prediction(rng, why_hedge)
+                if why_hedge is None:
+                    return candidate.point
+                why = why_hedge
+                break
             why = doubtful or "nothing is predicted anywhere"
             prediction = None if prediction.otherwise is None else prediction.otherwise()
-        return self._without_prediction(rng, why)
-
-    def _without_prediction(self, rng: np.random.Generator, why: str) -> Array:
         point, note = self._fallback.choose(self.points, self.values, rng)
         self._last_note = {**note, "why": why}
         return point
