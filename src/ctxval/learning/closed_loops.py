@@ -21,7 +21,7 @@ from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.validation import Validation
 from ctxval.errors import DistanceError
-from ctxval.learning.draws import DisturbedDynamics, DrawnModel, DynamicsDraws
+from ctxval.learning.draws import DisturbedDynamics, DynamicsDraws
 from ctxval.learning.dynamics_posterior import DynamicsPosterior
 from ctxval.learning.noisy_draws import NoisyDraws, NoisyRuns
 
@@ -151,7 +151,7 @@ class LoopPlanner:
                 together = rollout(step, plan.controller, task.starting_at(start))
                 loops = [Trajectory(together.times, together.states[s], together.inputs[s]) for s in range(S)]
             else:
-                loops = [rollout(DrawnModel(draws[s]).step, plan.controller, task) for s in range(S)]
+                loops = [rollout(draws[s].step, plan.controller, task) for s in range(S)]
             runs.append(self._stacked(plan, loops))
         return runs
 
@@ -181,7 +181,7 @@ class LoopPlanner:
                     after = needed.step(*(part.reshape(len(needed), q, -1) for part in whole))
                     return np.asarray(after.reshape(-1, x.shape[-1])[here])
 
-                of_tasks = step if plan.task.batch_shape else draws.model_of(first).step
+                of_tasks = step if plan.task.batch_shape else draws[first].step
                 distances[0, plan.rows] = self.compared(plan, rollout(of_tasks, plan.controller, plan.task))
             advance(R * len(plan.rows), units=_UNITS)
         of_loops = distances.reshape(R, S, q).swapaxes(0, 1).reshape(S * R, q)
