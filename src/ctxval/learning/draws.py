@@ -76,9 +76,8 @@ class DisturbedDynamics(ShortRepr):
     def step(self, x: Array, u: Array) -> Array:
         """Return the next states, shapes ``(S, q, n), (S, q, m) -> (S, q, n)``; of a single way ``(..., n)``."""
         together = x if len(self) > 1 else rows_of(x)[None]
-        return np.asarray(
-            (self.mean.step(x, u).reshape(together.shape) + self.added(self.ways, together)).reshape(x.shape)
-        )
+        moved = self.mean.step(x, u).reshape(together.shape) + self.added(self.ways, together)
+        return np.asarray(moved.reshape(x.shape))
 
 
 def bounded(z: Array) -> Array:
