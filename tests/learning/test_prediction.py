@@ -22,7 +22,8 @@ MODEL = models.Linear([[1.0, 0.1], [0.0, 0.9]], [[0.0], [0.1]])
 
 
 def predict_distance(validation: Validation, runs: list[tuple[Array, Trajectory]]) -> Prediction | None:
-    return DynamicsStudy(validation).predict(runs)
+    study = DynamicsStudy(validation)
+    return study.prediction_of(study.learn(runs), runs)
 
 
 def executed(validation: Validation, points: Array) -> list[tuple[Array, Trajectory]]:
@@ -215,7 +216,7 @@ def test_parts_that_are_changed_in_place_are_seen(part: str) -> None:
     runs = executed(validation, np.random.default_rng(0).random((4, 4)))
     points = np.random.default_rng(1).random((5, 4))
     study = DynamicsStudy(validation)
-    parts, before = study.state_of_parts(), study.predict(runs)
+    parts, before = study.state_of_parts(), study.prediction_of(study.learn(runs), runs)
     assert before is not None
     first = before.expected(points)[0]
     changed: Any = getattr(validation, part)

@@ -328,18 +328,14 @@ class DynamicsStudy(ShortRepr):
         name, with_it, without_it = self._most_telling(plain)
         return None if name is None or with_it > without_it / 2 else (name, without_it / max(with_it, 1e-300))
 
-    def predict(self, executed: Executed) -> Prediction | None:
-        """Return the distances that executions predict, for a search; None if nothing can be learned.
+    def prediction_of(self, learned: LearnedDynamics | None, executed: Executed) -> Prediction | None:
+        """Return the distances that executions, and what was learned from them, predict; None if nothing is known.
 
         If the distance is composed of a short vector, such as the error of the final state, a second prediction models
         the vector as a function of p, because an error that is no function of state and input may still be a function
-        of p. The first prediction offers the second one as ``otherwise``. If there is no first prediction, the second
-        one is returned instead.
+        of p. The first prediction offers the second one as ``otherwise``. If nothing was learned, the second one is
+        returned instead.
         """
-        return self.prediction_of(self.learn(executed), executed)
-
-    def prediction_of(self, learned: LearnedDynamics | None, executed: Executed) -> Prediction | None:
-        """Return :meth:`predict` for what was learned from these executions, and possibly from other recordings."""
         with single_threaded():
             if learned is None:
                 return self._predict_vectors(executed)
