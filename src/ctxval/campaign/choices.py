@@ -15,7 +15,7 @@ from ctxval.core.plan import Plan, least_distance, recorded_before_failure
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import AT_LEAST, Origin, State, Trial
 from ctxval.core.validation import Validation
-from ctxval.errors import InputError
+from ctxval.errors import DistanceError, InputError
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,8 +107,10 @@ class Execution:
             return replace(ended, seconds=self.seconds)
         if self.failed is not None or self.distance is not None:
             return self
-        measurement = validation.accept(plan, self.trajectory, start_tolerance)
-        return replace(self, distance=measurement.distance, unusable=measurement.unusable)
+        try:
+            return replace(self, distance=validation.accept(plan, self.trajectory, start_tolerance))
+        except DistanceError as error:
+            return replace(self, unusable=text_of(error))
 
     def ended(self, trial: Trial, *, executed: bool = True) -> Trial:
         """Return a trial in the final state that this measured execution gives it."""

@@ -19,12 +19,12 @@ from ctxval._util.cores import raised_by_signal
 from ctxval._util.describe import describe, without_numbers
 from ctxval._util.progress import advance
 from ctxval._util.representation import call, lines, shown
-from ctxval._util.texts import parted, reason_of, text_of
+from ctxval._util.texts import parted, reason_of
 from ctxval.core.controller import Controller, Synthesizer, is_controller
 from ctxval.core.distance import Distance
 from ctxval.core.labels import Labels, names_of, require_names
 from ctxval.core.model import Model, Step, as_model, require_time_step
-from ctxval.core.plan import Measurement, Outcome, Plan, require_execution
+from ctxval.core.plan import Outcome, Plan, require_execution
 from ctxval.core.rollout import rollout
 from ctxval.core.space import Parameters, TaskSpace
 from ctxval.core.system import OutputsLike, Simulated, System, WithOutputs, as_outputs
@@ -197,16 +197,12 @@ class Validation:
         require_execution(plan, trajectory, self.start_tolerance if start_tolerance is None else start_tolerance)
         return trajectory
 
-    def accept(self, plan: Plan, trajectory: object, start_tolerance: float | None = None) -> Measurement:
-        """Check that a trajectory is an execution of a plan, as :meth:`require` does, and measure its distance.
+    def accept(self, plan: Plan, trajectory: object, start_tolerance: float | None = None) -> float:
+        """Check that a trajectory is an execution of a plan, as :meth:`require` does, and return its distance.
 
         This is the single check for all executions: of a system, of workers, and recordings of users.
         """
-        executed = self.require(plan, trajectory, start_tolerance)
-        try:
-            return Measurement(self.measure(plan, executed))
-        except DistanceError as error:
-            return Measurement(None, text_of(error))
+        return self.measure(plan, self.require(plan, trajectory, start_tolerance))
 
     def measure(self, plan: Plan, trajectory: Trajectory) -> float:
         """Return d(p)."""

@@ -111,6 +111,5 @@ def same_controllers(validation: Validation, executed: Sequence[tuple[Trial, Tra
         with suppress(Exception):  # users' parts may raise anything: what cannot be compared differs
             plan = validation.plan(validation.space.from_unit(trial.unit_point))
             if gives_inputs(plan, recorded, 1e-6):  # a share of the largest magnitude of each input
-                distance = validation.accept(plan, recorded).distance
-                distances += [] if distance is None else [distance]
+                distances.append(validation.accept(plan, recorded))
     return SameControllers(len(recent), len(distances), max(distances, default=None))
