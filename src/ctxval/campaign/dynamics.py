@@ -13,7 +13,7 @@ import numpy as np
 from ctxval._util.arrays import Array
 from ctxval._util.progress import stage
 from ctxval._util.texts import parted, reason_of
-from ctxval.campaign.history import executed_trials, for_known_values, largest_distance, waiting_points
+from ctxval.campaign.history import executed_trials, largest_distance, waiting_points
 from ctxval.campaign.storage.store import Store
 from ctxval.certificates.dynamics import bound_of, draws_for
 from ctxval.certificates.dynamics_diagnostics import DENSE, FEWEST, PREDICTIONS, doubt_of, failed, jumps
@@ -114,16 +114,12 @@ class CampaignDynamics:
         With ``pending``, open trials count as if they had been executed as predicted. How good a prediction is, is
         still seen from what was executed.
         """
-        trajectories = executed_trials(self._store, trials)
         learned = self.learned(trials)
-        executed = [(trial.unit_point, trajectory) for trial, trajectory in trajectories]
-        predicted = self.study.prediction_of(learned, executed)
-        if predicted is None:
-            return None
-        prediction = for_known_values(predicted, trials, [trial for trial, _ in trajectories])
-        waiting, otherwise = waiting_points(trials), prediction.otherwise
-        if not pending or not len(waiting):
+        executed = [(trial.unit_point, trajectory) for trial, trajectory in executed_trials(self._store, trials)]
+        prediction, waiting = self.study.prediction_of(learned, executed), waiting_points(trials)
+        if prediction is None or not pending or not len(waiting):
             return prediction
+        otherwise = prediction.otherwise
 
         def after() -> Prediction:
             as_if = None if learned is None else self._as_if(learned, executed, waiting)

@@ -141,11 +141,11 @@ class TrustRegion(SequentialSearch):
     # How good the prediction is
 
     def _why_not(self, prediction: Prediction, surrogate_error: Callable[[], float]) -> str | None:
-        values = self.values[np.isfinite(self.values)]
-        if not self.compare_with_surrogate or len(values) < _COMPARED_FROM:
+        known = np.flatnonzero(np.isfinite(self.values))
+        if not self.compare_with_surrogate or len(known) < _COMPARED_FROM:
             return None
-        rows = np.arange(len(values))[-_COMPARED_ON:]
-        error = _log_error(prediction.left_out(rows), values[rows])
+        latest = known[-_COMPARED_ON:]
+        error = _log_error(prediction.left_out(self.points[latest]), self.values[latest])
         if error <= 0.1 or error <= surrogate_error():  # a small error needs no comparison
             return None
         return (
