@@ -34,7 +34,7 @@ def learned_again(entry: Entry, fit: Fit, seed: int) -> Experiment:
     """Return the experiment of an entry with a model of another kind, learned from the same data."""
     found = entry(seed)
     data = found.validation.model.data  # type: ignore[attr-defined]
-    return replace(found, validation=found.validation.with_model(fit(data, seed)))
+    return replace(found, validation=found.validation.with_parts(model=fit(data, seed)))
 
 
 def _with(entry: Entry, fit: Fit, kind: str) -> Entry:

@@ -191,7 +191,7 @@ def realisations(validation: Validation, count: int) -> list[Validation]:
     noisy = validation.system
     if not isinstance(noisy, Noisy):
         return [validation]
-    return [validation.with_system(replace(noisy, realisation=row)) for row in range(count)]
+    return [validation.with_parts(system=replace(noisy, realisation=row)) for row in range(count)]
 
 
 def friction(velocity: Array, push: Array, grip: Any, dt: float) -> Array:

@@ -46,7 +46,7 @@ def arm_models(seed: int, question: str) -> dict[str, Validation]:
     if question == "worst":
         return found
     to_target = distances.GoalError(norm=2, components=arm.END_EFFECTOR)
-    return {model: validation.with_distance(to_target) for model, validation in found.items()}
+    return {model: validation.with_parts(distance=to_target) for model, validation in found.items()}
 
 
 def carts(seed: int, question: str) -> dict[str, Validation]:

@@ -180,7 +180,7 @@ def ranks(design: str, states: int, seed: int) -> dict[str, Any]:
     draws = posterior.draw(relevant, rng)
     one_each = range(settings.functions, len(draws), settings.functions)
     of_state = np.arange(RANKED), np.arange(RANKED) % states
-    residuals = np.array([(draws.model_of(s).step(x, u) - model.step(x, u))[of_state] for s in one_each])
+    residuals = np.array([(draws[s].step(x, u) - model.step(x, u))[of_state] for s in one_each])
     planned = planner.plan(tasks[:RANKED])
     loops = random_loops(truth.step, validation, tasks[:RANKED])
     with np.errstate(all="ignore"):

@@ -65,7 +65,7 @@ def run(case: str, seed: int, data: str, method: str | Method) -> dict[str, Any]
     validation = experiment.validation
     given: Any = validation.model
     if data == "none":
-        validation = validation.with_model(models.Linear(given.A, given.B, given.c))
+        validation = validation.with_parts(model=models.Linear(given.A, given.B, given.c))
     assert experiment.truth is not None
     before = experiment.truth().distance
     campaign = Campaign(validation, search=searches.by_name("auto", thinking="fast"), seed=seed)

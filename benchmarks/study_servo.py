@@ -60,7 +60,7 @@ def root_mean_square(model: Trajectory, system: Trajectory, task: Task) -> Array
 @cache
 def all_distances(model: str, rms: bool = False) -> Array:
     """Return the distances of all recordings in the order of the suite: largest deviations, or RMS deviations."""
-    chosen = validation(model).with_distance(root_mean_square) if rms else validation(model)
+    chosen = validation(model).with_parts(distance=root_mean_square) if rms else validation(model)
     return chosen.distances(chosen.space.grid(2))
 
 
@@ -123,7 +123,7 @@ def refined(run: tuple[str, int]) -> dict[str, Any]:
     (model, number), started = run, time.process_time()
     given, learned_from, others = validation(model), half(number), half(1 - number)
     with single_threaded():
-        campaign = Campaign(given.with_space(learned_from), search=searches.by_name("random"), seed=number).run(8)
+        campaign = Campaign(given.with_parts(space=learned_from), search=searches.by_name("random"), seed=number).run(8)
         assert campaign.worst is not None
         threshold = OF_EIGHT * (campaign.worst.distance or 0.0)
         # Its only execution is one of the other half, so the model of the first round has learned from eight.
@@ -132,11 +132,13 @@ def refined(run: tuple[str, int]) -> dict[str, Any]:
             threshold,
             9,
             certificate=CertificateOptions(WholeSuite()),
-            open_round=lambda made, *_: Campaign(made.with_space(others), search=searches.by_name("random"), seed=0),
+            open_round=lambda made, *_: Campaign(
+                made.with_parts(space=others), search=searches.by_name("random"), seed=0
+            ),
         )
 
     def distances(suite: TaskSuite, of: Model) -> dict[str, float]:
-        values = given.with_space(suite).with_model(of).distances(suite.from_unit(suite.members))
+        values = given.with_parts(space=suite, model=of).distances(suite.from_unit(suite.members))
         return dict(zip(suite.task_names, values.tolist(), strict=True))
 
     after = found.rounds[1].model if len(found.rounds) > 1 else None

@@ -91,7 +91,7 @@ def test_a_campaign_falsifies_m1_and_sees_only_what_it_executes(servo: ModuleTyp
             revealed.append(task.name)  # type: ignore[attr-defined]
             return given(controller, task)
 
-    campaign = Campaign(validation.with_system(Watched()), seed=0).run(16, 0.38)
+    campaign = Campaign(validation.with_parts(system=Watched()), seed=0).run(16, 0.38)
     verdict = campaign.verdict(0.38)
     assert verdict.answer == "falsified"
     assert campaign.executions <= 4

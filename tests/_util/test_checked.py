@@ -119,7 +119,7 @@ CAMPAIGN = ctxval.Campaign(VALIDATION)
         (ctxval.Campaign, {"validation": VALIDATION}),
         (ctxval.Experiment, {"name": "pendulum", "validation": VALIDATION}),
         (VALIDATION.space.grid, {"per_axis": 2}),
-        (VALIDATION.space.sobol, {"n": 2, "seed": 0}),
+        (VALIDATION.space.iid, {"n": 2, "rng": np.random.default_rng(0)}),
         (certificates.tail, {"n": 3, "discarded": 0, "volume": 0.1}),
         (certificates.volume_bound, {"n": 3, "discarded": 0, "beta": 0.1}),
         (certificates.samples_needed, {"volume": 0.1, "beta": 0.1}),

@@ -22,7 +22,7 @@ def test_every_plant_executes_its_tasks_alone_and_together(name: str) -> None:
     assert np.isfinite(validation.distances(points)).all()
     plan = validation.plan(points[0])
     executed = validation.system.execute(plan.controller, plan.task)
-    assert validation.accept(plan, executed).distance is not None
+    assert validation.accept(plan, executed) >= 0
     assert executed.states.shape[-1] == len(plant.ranges)
     assert imperfections(plant) == (["none"] if name in HALVES["misleading"] else list(IMPERFECTIONS))
 

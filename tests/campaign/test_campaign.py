@@ -175,7 +175,7 @@ def test_tasks_of_failed_executions_are_executed_again_first(validation: Validat
             return validation.system.execute(controller, task)
 
     fuse = Fuse()
-    campaign = Campaign(validation.with_system(fuse), search=searches.Random(), seed=1).run(6)
+    campaign = Campaign(validation.with_parts(system=fuse), search=searches.Random(), seed=1).run(6)
     failed = [trial.parameters for trial in campaign.failed]
     assert 0 < len(failed) < 6
     with pytest.raises(InputError, match="again needs a reason"):

@@ -21,7 +21,8 @@ def test_only_earlier_trials_are_learned_from() -> None:
     assert learned is not None
     assert isinstance(learned, LearnedDistance)
     executed = [(t.unit_point, campaign.store.trajectory(t.number, "system")) for t in campaign.trials[:4]]
-    expected = DynamicsStudy(campaign.validation, 3).predict(executed)
+    study = DynamicsStudy(campaign.validation, 3)
+    expected = study.prediction_of(study.learn(executed), executed)
     assert expected is not None
     np.testing.assert_array_equal(learned.expected(POINTS, 4), expected.expected(POINTS)[0])
     assert not np.array_equal(learned.expected(POINTS, 4), learned.expected(POINTS, 8))

@@ -56,7 +56,7 @@ def test_a_suggestion_costs_at_least_its_designs() -> None:
     assert found.suggestion is not None
     assert found.fast is not None
     assert found.design >= BURNT > found.closed_loop
-    usual = [usual_effort(1, budget).points for budget in (150, 22)]
+    usual = [usual_effort(1, budget).exact for budget in (150, 22)]  # in one dimension, none is rough
     assert found.suggestion >= usual[0] * BURNT
     assert found.choice is not None
     assert found.verdict is not None
@@ -96,7 +96,7 @@ def test_a_suggestion_that_cannot_be_predicted_has_no_estimate() -> None:
                 raise ValueError
             return controllers.LQR([1.0, 0.1], [1e-2], [10.0, 1.0]).design(task, model)
 
-    validation = with_synthesizer(Refusing()).with_distance(distances.WholeTrajectory())
+    validation = with_synthesizer(Refusing()).with_parts(distance=distances.WholeTrajectory())
     found = ThinkingCosts.measured(validation, [np.array([3.0]), np.array([-3.0])])
     assert found.suggestion is None
     assert found.design < 1.0

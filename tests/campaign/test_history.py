@@ -44,7 +44,7 @@ def test_auto_goes_on_although_distances_were_told_without_trajectories(tmp_path
     assert len(np.unique([t.unit_point[0] for t in resumed.trials])) == 10
 
 
-def test_a_prediction_is_about_the_known_values_in_the_order_of_the_search() -> None:
+def test_a_prediction_leaves_out_what_was_executed_at_a_point() -> None:
     validation = make_validation()
     campaign = Campaign(validation, search=searches.Random(), seed=3)
     late = campaign.ask({"goal": 2.0})
@@ -58,8 +58,9 @@ def test_a_prediction_is_about_the_known_values_in_the_order_of_the_search() -> 
     assert [t.number for t in known] == [5, 1, 2, 3, 4]
     found = campaign.recorder.dynamics.prediction(campaign.trials)
     assert found is not None
-    expected = found.left_out(np.arange(5))
+    points = np.array([t.unit_point for t in known])
+    expected = found.left_out(points)
     np.testing.assert_allclose(expected, [t.distance for t in known], rtol=0.5)
-    np.testing.assert_array_equal(found.left_out(np.array([0, 3])), expected[[0, 3]])
+    np.testing.assert_array_equal(found.left_out(points[[0, 3]]), expected[[0, 3]])
     # Nothing was learned from the distance that was told alone.
     assert expected[1] == found.expected(known[1].unit_point[None])[0][0]

@@ -33,7 +33,7 @@ NARROW = Normal(1.0, 0.05)
 
 def narrow() -> Validation:
     whole = make_validation()
-    return whole.with_space(whole.space.distributed(goal=NARROW))
+    return whole.with_parts(space=whole.space.distributed(goal=NARROW))
 
 
 def goals(campaign: Campaign) -> np.ndarray:

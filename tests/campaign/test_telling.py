@@ -31,7 +31,7 @@ def test_a_report_of_each_kind_is_stored(campaign: Campaign, tmp_path: Path) -> 
     run = campaign.validation.system.execute(by_file.plan.controller, by_file.plan.task)
     run.to_csv(tmp_path / "run.csv")
     told = tell_result(campaign, made, by_file.number, SuppliedResult(tmp_path / "run.csv"))
-    assert told.distance == pytest.approx(campaign.validation.accept(by_file.plan, run).distance)
+    assert told.distance == pytest.approx(campaign.validation.accept(by_file.plan, run))
     assert tell_result(campaign, made, by_distance, SuppliedResult(distance=0.25)).distance == 0.25
     assert tell_result(campaign, made, failed.number, SuppliedResult(failed="cut out")).failure == "cut out"
     assert result_sentence(campaign.trials[1], "rad") == "trial 1 has the distance 0.25 rad"

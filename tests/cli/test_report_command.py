@@ -25,7 +25,7 @@ from ctxval import Experiment, distances
 def experiment(seed=0):
     open("imported", "a").close()
     return Experiment(
-        "short", make_validation().with_distance(distances.FinalState(weights=[1, 1])),
+        "short", make_validation().with_parts(distance=distances.FinalState(weights=[1, 1])),
         budget=4, threshold=9.0, units="rad",
         states=("angle [rad]", "rate [rad/s]"), inputs=("torque [N m]",),
     )

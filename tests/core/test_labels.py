@@ -21,7 +21,7 @@ def test_stated_labels_come_first_then_those_of_the_system() -> None:
 
 
 def test_an_experiment_gives_its_labels_to_its_validation_and_takes_those_it_has() -> None:
-    validation = make_validation().with_distance(distances.FinalState(weights=[1, 1]))
+    validation = make_validation().with_parts(distance=distances.FinalState(weights=[1, 1]))
     named = Experiment("a", validation, units="rad", states=("angle [rad]", "rate [rad/s]"))
     assert named.validation.labels == Labels(("angle [rad]", "rate [rad/s]"), (), "rad")
     assert named.names(2, 1) == ({"angle": "rad", "rate": "rad/s"}, {"u0": ""})
@@ -38,8 +38,8 @@ def test_labels_do_not_identify_an_experiment() -> None:
 def test_other_parts_keep_the_labels() -> None:
     labels = Labels(units="m")
     validation = make_validation().with_parts(labels=labels)
-    assert validation.with_space(validation.space).labels is labels
-    assert validation.with_distance(validation.distance).labels is labels
+    assert validation.with_parts(space=validation.space).labels is labels
+    assert validation.with_parts(distance=validation.distance).labels is labels
     with pytest.raises(InputError, match="labels must be a Labels"):
         validation.with_parts(labels="m")  # type: ignore[arg-type]
 

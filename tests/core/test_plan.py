@@ -36,7 +36,7 @@ from ctxval.errors import DesignError, DistanceError, InputError, UnknownNameErr
 )
 @pytest.mark.parametrize("how", ["run", "ask", "audit"])
 def test_a_distance_that_cannot_be_used_costs_nothing(distance: Any, how: str) -> None:
-    campaign = Campaign(make_validation().with_distance(distance), search=searches.Random())
+    campaign = Campaign(make_validation().with_parts(distance=distance), search=searches.Random())
     calls = {"run": lambda: campaign.run(2), "ask": campaign.ask, "audit": lambda: campaign.audit(2)}
     for _ in range(2):
         with pytest.raises(DistanceError):
@@ -103,12 +103,12 @@ def test_a_distance_of_a_trajectory_with_itself_that_is_not_0_is_a_warning() -> 
     def shifted(model: Any, system: Any, task: Task) -> Any:
         return np.abs(system.final_state - model.final_state).sum(axis=-1) + 0.1
 
-    campaign = Campaign(make_validation().with_distance(shifted), search=searches.Random())
+    campaign = Campaign(make_validation().with_parts(distance=shifted), search=searches.Random())
     with pytest.warns(DistanceWarning, match="and itself is 0.1, not 0"):
         campaign.run(1)
     assert len(campaign.trials) == 1
     for to_task in (GoalError(), TrackingError()):
-        Campaign(make_validation().with_distance(to_task), search=searches.Random()).run(1)  # no warning
+        Campaign(make_validation().with_parts(distance=to_task), search=searches.Random()).run(1)  # no warning
 
 
 OF_STATES = ("components", "angles", "state")
@@ -134,16 +134,16 @@ def test_every_distance_takes_states_by_name(name: str) -> None:
     for option in options_of_states(name):
         by_name, by_index = (0 if option == "state" else (0,)), ("state 0" if option == "state" else ["state 0"])
         validation = make_validation().with_parts(labels=labels)
-        named = validation.with_distance(cls(**required, **{option: by_index})).distance
+        named = validation.with_parts(distance=cls(**required, **{option: by_index})).distance
         indexed = cls(**required, **{option: by_name})
         assert named == indexed
         assert named.describe() == indexed.describe() if hasattr(named, "describe") else True
         with pytest.raises(UnknownNameError, match="did you mean 'state 0'"):
-            validation.with_distance(cls(**required, **{option: "stat 0" if option == "state" else ["stat 0"]}))
+            validation.with_parts(distance=cls(**required, **{option: "stat 0" if option == "state" else ["stat 0"]}))
 
 
 def test_names_given_before_the_labels_are_resolved_with_them() -> None:
-    unnamed = make_validation().with_distance(FinalState(components=["angle"]))
+    unnamed = make_validation().with_parts(distance=FinalState(components=["angle"]))
     n = len(unnamed.plan([0.5]).task.initial_state)
     labelled = unnamed.with_parts(labels=Labels(("angle", *(f"x{i}" for i in range(1, n)))))
     assert labelled.distance == FinalState(components=(0,))
@@ -186,7 +186,7 @@ def test_the_offset_of_a_start_is_measured_as_the_distance_measures_states() -> 
     moved = plan.model_trajectory.copy()
     moved.states[0, 0] += 0.5
     weights = [2.0, *[1.0] * (moved.states.shape[-1] - 1)]
-    offset = start_offset(validation.with_distance(FinalState(weights=weights)), [0.5], moved)
+    offset = start_offset(validation.with_parts(distance=FinalState(weights=weights)), [0.5], moved)
     assert (offset.size, offset.text) == (pytest.approx(1.0), "0.5 in x0")
-    alone = start_offset(validation.with_distance(lambda m, s, t: 0.0), [0.5], moved)
+    alone = start_offset(validation.with_parts(distance=lambda m, s, t: 0.0), [0.5], moved)
     assert alone.size == pytest.approx(0.5)

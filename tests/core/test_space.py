@@ -268,24 +268,6 @@ def test_iid_points_are_uniform_over_the_box(space: TaskSpace) -> None:
     np.testing.assert_allclose(np.corrcoef(unit.T), np.eye(4), atol=0.03)
 
 
-@pytest.mark.parametrize("n", [0, 1, 3, 8, 100])
-def test_sobol_points_are_a_prefix_of_one_seeded_sequence(space: TaskSpace, n: int) -> None:
-    points = space.sobol(n, seed=3)
-    assert points.shape == (n, 4)
-    np.testing.assert_array_equal(points, space.sobol(128, seed=3)[:n])
-    assert ((points >= space.low) & (points <= space.high)).all()
-
-
-def test_sobol_points_of_a_power_of_two_fill_every_slice_once() -> None:
-    unit = TaskSpace(a=(0, 1), b=(0, 1)).sobol(16, seed=0)
-    for column in np.floor(16 * unit).astype(int).T:
-        assert sorted(column) == list(range(16))
-
-
-def test_sobol_points_differ_between_seeds(space: TaskSpace) -> None:
-    assert not np.array_equal(space.sobol(8, seed=0), space.sobol(8, seed=1))
-
-
 def test_a_grid_has_both_ends_and_every_combination() -> None:
     grid = TaskSpace(a=(0, 2), b=(-1, 1)).grid(3)
     assert grid.tolist() == [[a, b] for a in (0.0, 1.0, 2.0) for b in (-1.0, 0.0, 1.0)]

@@ -85,7 +85,7 @@ def recorded() -> tuple[Trajectory, float]:
     noise = 0.05 * np.random.default_rng(0).normal(size=model.states.shape)
     noise[0] = 0
     one = Trajectory(model.times, model.states + noise, model.inputs * 0.9)
-    distance = made.validation.accept(plan, one).distance
+    distance = made.validation.accept(plan, one)
     assert distance is not None
     assert distance > 0.05
     return one, distance
@@ -235,5 +235,5 @@ def test_the_same_recording_in_other_clothes_has_the_same_distance(
         with pytest.raises(InputError, match=r"two columns|several columns|twice|must have \d+ cells"):
             read(path, mapping)
         return
-    found = made.validation.accept(plan, read(path, mapping)).distance
+    found = made.validation.accept(plan, read(path, mapping))
     assert found == pytest.approx(recorded()[1], rel=1e-9)

@@ -9,12 +9,12 @@ from scipy.stats import norm
 
 from ctxval.gp import regression
 from ctxval.gp.acquisition import LogExpectedImprovement, Uncertainty, UpperConfidenceBound, log_improvement, maximise
-from ctxval.gp.kernels import Linear, Matern, Sum
+from ctxval.gp.kernels import Matern
 
 
 def process(n: int = 12, noise: float = 1e-4, prior: bool = False) -> regression.GaussianProcess:
     X = np.random.default_rng(0).random((n, 2))
-    kernel, theta = Sum(Matern(2.5, ard=True), Linear()), np.log([1.0, 0.3, 0.5, 0.2, 0.4])
+    kernel, theta = Matern(2.5, ard=True, linear=(1e-4, 50.0)), np.log([1.0, 0.3, 0.5, 0.2, 0.4])
     mean = (lambda X: X[:, 0] * X[:, 1]) if prior else regression.zero_mean
     return regression.condition(kernel, theta, X, np.sin(5 * X).sum(axis=1), noise=noise, mean=mean)
 
@@ -97,9 +97,9 @@ def test_an_improvement_that_cannot_be_told_from_none_still_has_a_slope() -> Non
 
 
 def test_where_nothing_is_uncertain_the_gradient_is_that_of_the_mean() -> None:
-    # One observation of a linear function through it: without noise the variance vanishes there exactly.
+    # Without noise, the variance vanishes exactly at an observation.
     X = np.array([[0.5, 0.5]])
-    certain = regression.condition(Linear(), np.log([1.0, 1.0]), X, np.array([1.0]), noise=0.0)
+    certain = regression.condition(Matern(), np.log([1.0, 1.0]), X, np.array([1.0]), noise=0.0)
     assert certain.predict_with_gradient(X)[1][0] == 0
     bound = UpperConfidenceBound(certain, 2.0)
     np.testing.assert_array_equal(bound.with_gradient(X)[1], certain.predict_with_gradient(X)[2:][0])

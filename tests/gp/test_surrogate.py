@@ -11,7 +11,7 @@ from ctxval._util.arrays import Array
 from ctxval.errors import InputError
 from ctxval.gp import regression
 from ctxval.gp.cholesky import pivoted_cholesky, pivoted_rows
-from ctxval.gp.kernels import Linear, Matern
+from ctxval.gp.kernels import Matern
 from ctxval.gp.surrogate import LONG, SurrogateHyperparameters, fit_surrogate, kept_rows, learn
 from rig_thorough import more
 
@@ -52,8 +52,8 @@ def test_the_surrogate_is_close_to_the_function_between_many_values() -> None:
 
 def test_the_given_kernel_and_noise_are_used() -> None:
     X, y = data()
-    surrogate = fit_surrogate(X, y, Linear(), noise=(0.3, 0.3))
-    assert surrogate.process.kernel == Linear()
+    surrogate = fit_surrogate(X, y, Matern(2.5, ard=True), noise=(0.3, 0.3))
+    assert surrogate.process.kernel == Matern(2.5, ard=True)
     assert surrogate.process.noise == pytest.approx(0.3)
 
 

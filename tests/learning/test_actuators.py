@@ -127,7 +127,7 @@ def test_none_is_found_where_a_state_is_hidden_that_is_no_actuator() -> None:
 
             return systems.Simulated(step).execute(controller, task)
 
-    assert found(cart().with_system(Oscillating()), 8) is None
+    assert found(cart().with_parts(system=Oscillating()), 8) is None
 
 
 @pytest.mark.slow

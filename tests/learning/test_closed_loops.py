@@ -87,7 +87,7 @@ def expected(validation: Validation) -> Array:
     for j, point in enumerate(POINTS):
         plan = validation.plan(validation.space.from_unit(point))
         for s in range(len(draws)):
-            loop = rollout(draws.model_of(s).step, plan.controller, plan.task)
+            loop = rollout(draws[s].step, plan.controller, plan.task)
             found[s, j] = validation.distance(plan.model_trajectory, loop, plan.task)
     return found
 

@@ -286,11 +286,11 @@ def test_one_draw_is_a_model_for_one_pair_and_for_batches() -> None:
     x, u = np.random.default_rng(1).normal(size=(3, 4, 2)), np.random.default_rng(2).normal(size=(3, 4, 1))
     together = draws.step(np.repeat(x.reshape(1, 12, 2), len(draws), 0), np.repeat(u.reshape(1, 12, 1), len(draws), 0))
     for index in (0, 1, len(draws) - 1):
-        batch = draws.model_of(index).step(x, u)
+        batch = draws[index].step(x, u)
         np.testing.assert_allclose(batch.reshape(12, 2), together[index], atol=1e-9)
-        np.testing.assert_allclose(draws.model_of(index).step(x[1, 2], u[1, 2]), batch[1, 2], atol=1e-9)
+        np.testing.assert_allclose(draws[index].step(x[1, 2], u[1, 2]), batch[1, 2], atol=1e-9)
     with pytest.raises(IndexError, match=f"there are {len(draws)} draws"):
-        draws.model_of(len(draws))
+        draws[len(draws)]
 
 
 def test_a_draw_stays_finite_at_states_that_diverged() -> None:
@@ -374,7 +374,7 @@ def learned_from(data: Transitions, sources: Rows | None = None, centres: int = 
 
 
 def mean(posterior: DynamicsPosterior) -> Model:
-    return posterior.mean.model_of(0)
+    return posterior.mean
 
 
 def test_it_predicts_what_the_model_misses() -> None:
@@ -466,7 +466,7 @@ def test_a_rough_mean_has_fewer_centres_and_almost_the_same_values() -> None:
     posterior = learned_from(data)
     (rough,) = posterior.rough_mean.expansions
     assert rough.centres.shape[1] < len(posterior.rows)
-    fine, coarse = (one.model_of(0).step(data.x, data.u) for one in (posterior.mean, posterior.rough_mean))
+    fine, coarse = (one.step(data.x, data.u) for one in (posterior.mean, posterior.rough_mean))
     size = np.abs(fine - MODEL.step(data.x, data.u)).max()
     np.testing.assert_allclose(coarse, fine, atol=0.05 * size)
 

@@ -163,7 +163,9 @@ def random_executions(validation: Validation, count: int) -> list[tuple[Array, A
 
 
 def test_nothing_is_suspected_if_state_and_input_explain_the_executions() -> None:
-    validation = loaded_cart().with_system(systems.Simulated(lambda x, u: cart(x, u, np.array(0.3)), vectorized=True))
+    validation = loaded_cart().with_parts(
+        system=systems.Simulated(lambda x, u: cart(x, u, np.array(0.3)), vectorized=True)
+    )
     study = DynamicsStudy(validation.with_parts(physical=()))
     learned = study.learn(random_executions(validation, 8))
     assert learned is not None
@@ -198,8 +200,10 @@ def test_data_of_another_system_are_left_out(load: float) -> None:
     rng = np.random.default_rng(0)
     x, u = rng.uniform([-0.5, -0.5], [2.5, 1.5], (200, 2)), rng.uniform(-6, 6, (200, 1))
     model = models.Linear.fit(Transitions(x, u, cart(x, u, np.zeros(200)), DT))
-    validation = loaded_cart(()).with_model(model)
-    validation = validation.with_system(systems.Simulated(lambda x, u: cart(x, u, np.array(load)), vectorized=True))
+    validation = loaded_cart(()).with_parts(model=model)
+    validation = validation.with_parts(
+        system=systems.Simulated(lambda x, u: cart(x, u, np.array(load)), vectorized=True)
+    )
     learned = DynamicsStudy(validation).learn(random_executions(validation, 4))
     assert learned is not None
     assert learned.with_data == (load == 0)

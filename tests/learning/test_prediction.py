@@ -22,7 +22,8 @@ MODEL = models.Linear([[1.0, 0.1], [0.0, 0.9]], [[0.0], [0.1]])
 
 
 def predict_distance(validation: Validation, runs: list[tuple[Array, Trajectory]]) -> Prediction | None:
-    return DynamicsStudy(validation).predict(runs)
+    study = DynamicsStudy(validation)
+    return study.prediction_of(study.learn(runs), runs)
 
 
 def executed(validation: Validation, points: Array) -> list[tuple[Array, Trajectory]]:
@@ -60,9 +61,13 @@ def test_an_execution_left_out_is_predicted_from_the_others() -> None:
     runs = executed(validation, np.random.default_rng(1).random((5, 2)))
     prediction = predict_distance(validation, runs)
     assert prediction is not None
-    values = validation.distances(validation.space.from_unit(np.array([point for point, _ in runs])))
-    np.testing.assert_allclose(prediction.left_out(np.arange(5)), values, rtol=0.1)
-    assert prediction.left_out(np.array([3])).shape == (1,)
+    points = np.array([point for point, _ in runs])
+    values = validation.distances(validation.space.from_unit(points))
+    np.testing.assert_allclose(prediction.left_out(points), values, rtol=0.1)
+    assert prediction.left_out(points[3:4]).shape == (1,)
+    new = np.array([[0.5, 0.5]])
+    np.testing.assert_array_equal(prediction.left_out(np.concatenate([new, points]))[1:], prediction.left_out(points))
+    np.testing.assert_array_equal(prediction.left_out(new), prediction.expected(new)[0])
 
 
 def test_a_distance_composed_of_a_vector_has_a_second_prediction_from_the_vectors() -> None:
@@ -174,12 +179,12 @@ class InPlace:
 
 
 def test_a_distance_that_changes_its_arrays_does_not_change_later_predictions() -> None:
-    validation = make_validation().with_distance(InPlace())
+    validation = make_validation().with_parts(distance=InPlace())
     points = np.linspace(0.1, 0.9, 4)[:, None]
     prediction = predict_distance(validation, executed(validation, points))
     assert prediction is not None
-    first = prediction.left_out(np.arange(4))
-    np.testing.assert_array_equal(prediction.left_out(np.arange(4)), first)
+    first = prediction.left_out(points)
+    np.testing.assert_array_equal(prediction.left_out(points), first)
 
 
 class OneByOne:
@@ -198,14 +203,15 @@ class OneByOne:
 def test_the_vectors_need_no_design_of_a_task_that_is_planned() -> None:
     validation = linear.experiment(0, dim=2).validation
     validation.synthesizer = synthesizer = OneByOne(validation.synthesizer)
-    prediction = predict_distance(validation, executed(validation, np.random.default_rng(0).random((6, 4))))
+    points = np.random.default_rng(0).random((6, 4))
+    prediction = predict_distance(validation, executed(validation, points))
     assert prediction is not None
     assert prediction.otherwise is not None
-    prediction.left_out(np.arange(6))
+    prediction.left_out(points)
     designed = synthesizer.designed
     second = prediction.otherwise()
     assert second is not None
-    assert np.isfinite(second.left_out(np.arange(6))).all()
+    assert np.isfinite(second.left_out(points)).all()
     assert synthesizer.designed == designed
 
 
@@ -215,8 +221,7 @@ def test_parts_that_are_changed_in_place_are_seen(part: str) -> None:
     runs = executed(validation, np.random.default_rng(0).random((4, 4)))
     points = np.random.default_rng(1).random((5, 4))
     study = DynamicsStudy(validation)
-    assert study.is_current
-    before = study.predict(runs)
+    parts, before = study.state_of_parts(), study.prediction_of(study.learn(runs), runs)
     assert before is not None
     first = before.expected(points)[0]
     changed: Any = getattr(validation, part)
@@ -224,7 +229,7 @@ def test_parts_that_are_changed_in_place_are_seen(part: str) -> None:
         changed.A = 0.9 * changed.A
     else:
         changed.limits = 0.1
-    assert not study.is_current
+    assert study.state_of_parts() != parts
     after = predict_distance(validation, runs)
     assert after is not None
     assert not np.allclose(after.expected(points)[0], first)
@@ -275,8 +280,10 @@ def test_a_point_left_out_is_predicted_from_the_others_with_the_same_hyperparame
     whole, without = predict_composed(X, bent(X), norm), predict_composed(X[:-1], bent(X[:-1]), norm)
     assert whole is not None
     assert without is not None
-    assert whole.left_out(np.array([29]))[0] == pytest.approx(without.expected(X[-1:])[0][0], rel=0.02)
-    assert whole.left_out(np.array([4, 7])).shape == (2,)
+    assert whole.left_out(X[-1:])[0] == pytest.approx(without.expected(X[-1:])[0][0], rel=0.02)
+    assert whole.left_out(X[[4, 7]]).shape == (2,)
+    new = points(3, 1)
+    np.testing.assert_array_equal(whole.left_out(new), whole.expected(new)[0])
 
 
 def test_the_units_do_not_matter() -> None:

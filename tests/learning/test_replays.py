@@ -94,7 +94,7 @@ def test_a_method_of_the_synthesizer_that_is_another_one_loses_no_replay() -> No
 
 
 def test_a_distance_that_changes_its_arrays_does_not_change_the_replay() -> None:
-    replay = replays(make_validation().with_distance(InPlace()), [], [np.array([0.5])])[0]
+    replay = replays(make_validation().with_parts(distance=InPlace()), [], [np.array([0.5])])[0]
     assert replay is not None
     assert replay.corrected is not None
     assert replay.corrected.states.any()

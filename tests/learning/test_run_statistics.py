@@ -59,7 +59,7 @@ def test_influences_are_differences_of_single_loops(smooth: tuple[RunStatistics,
     learned = smooth[0].learned
     found, task = influences(learned), 4
     size = 0.1 * learned.posterior.data.sizes[1]
-    push, mean = np.array([0.0, size]), learned.posterior.mean.model_of(0)
+    push, mean = np.array([0.0, size]), learned.posterior.mean
     validation = cart().with_parts(system=systems.Simulated(lambda x, u: mean.step(x, u) + push, vectorized=True))
     moved = abs(execute(validation, POINTS[task])[1] - float(learned.expected(POINTS[[task]])[0]))
     assert found[1, task] * size >= moved * (1 - 1e-6)  # the larger one of both signs

@@ -103,4 +103,4 @@ def test_states_that_cannot_be_estimated_leave_the_distance_to_be_learned() -> N
     study = DynamicsStudy(validation)
     assert study.learn(executed) is not None
     assert study.learn(wild) is None
-    assert study.predict(wild) is not None
+    assert study.prediction_of(study.learn(wild), wild) is not None

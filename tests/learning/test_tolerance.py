@@ -47,7 +47,7 @@ def posterior(planner: LoopPlanner) -> DynamicsPosterior:
 
 
 def test_pushes_are_those_of_single_rollouts(planner: LoopPlanner, posterior: DynamicsPosterior) -> None:
-    response, mean = push_response(planner, posterior, TASKS), posterior.mean.model_of(0)
+    response, mean = push_response(planner, posterior, TASKS), posterior.mean
     (planned,) = planner.plan(TASKS)
     residual = response.residuals[0] * planned.task.dt
     largest = []

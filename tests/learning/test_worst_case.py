@@ -163,7 +163,7 @@ class Kinked(Folded):
 @pytest.mark.slow
 def test_kinks_of_a_distance_that_says_so_are_no_jumps_and_jumps_are_still_seen() -> None:
     def largest(height: float, distance: distances.Distance) -> float:
-        planner = LoopPlanner(jumping(height).validation.with_distance(distance))
+        planner = LoopPlanner(jumping(height).validation.with_parts(distance=distance))
         settings = replace(WorstCaseSettings.for_dimension(2), pool=256)
         return WorstCaseSearch(planner, 0, settings).largest_jump(learned())
 

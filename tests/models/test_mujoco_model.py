@@ -105,7 +105,7 @@ def test_it_is_the_model_of_a_campaign_and_repeats_itself_in_a_store(tmp_path: P
     )
     assert Campaign(validation, store=tmp_path / "a.sqlite").run(2, explore=True).worst is not None
     assert len(Campaign(validation, store=tmp_path / "a.sqlite").run(3, explore=True).completed) == 3
-    exact = validation.with_model(models.MuJoCo(mjcf(0.08), dt=DT))
+    exact = validation.with_parts(model=models.MuJoCo(mjcf(0.08), dt=DT))
     assert exact.outcome([0.7]).distance == pytest.approx(0, abs=1e-9)
     again = pickle.loads(pickle.dumps(validation.model))
     np.testing.assert_array_equal(again.step(np.ones(2), np.ones(1)), validation.model.step(np.ones(2), np.ones(1)))

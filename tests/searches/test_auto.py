@@ -69,7 +69,7 @@ def test_rough_predictions_and_batches_have_prices_of_their_own() -> None:
     assert effort.rough > effort.exact > 0
     seconds = search.thinking_seconds(Costs(1.0, None, rough=0.1, batch=0.5), 2000)
     np.testing.assert_allclose(seconds, effort.exact + 0.1 * effort.rough + 0.5 * effort.batches)
-    np.testing.assert_allclose(search.thinking_seconds(Costs(1.0, None), 2000), effort.points)
+    np.testing.assert_allclose(search.thinking_seconds(Costs(1.0, None), 2000), effort.exact + effort.rough)
 
 
 def test_a_choice_that_is_mostly_rough_predicts_more_points() -> None:

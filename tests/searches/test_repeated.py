@@ -9,7 +9,7 @@ from ctxval._util.arrays import Array
 from ctxval.certificates import CertificateOptions, Posterior
 from ctxval.core.controller import Controller
 from ctxval.errors import InputError
-from ctxval.searches import GPUCB, Auto, BayesianOptimisation, Prediction, Random, Repeated, by_name
+from ctxval.searches import GPUCB, Auto, BayesianOptimisation, Random, Repeated, by_name
 from ctxval.testing import check_search
 
 
@@ -60,25 +60,6 @@ def test_a_failure_counts_as_an_evaluation_and_what_failed_always_has_no_mean() 
     second = search.ask(2)
     assert np.array_equal(second[0], second[1])
     assert not np.array_equal(first[0], second[0])
-
-
-def test_the_prediction_s_rows_are_those_of_points() -> None:
-    seen: list[list[int]] = []
-
-    class Judging(GPUCB):
-        def use_prediction(self, prediction: Prediction | None) -> None:
-            assert prediction is not None
-            seen.append(prediction.left_out(np.arange(len(self.points))).astype(int).tolist())
-
-    search = Repeated(Judging(), 2)
-    search.reset(1, 0)
-    search.use_prediction(Prediction(lambda points: (points[:, 0], points[:, 0]), lambda rows: 10.0 * rows, 5))
-    for value in (np.nan, 1.0, 2.0, 3.0, 4.0, 5.0):
-        point = search.ask()
-        search.tell(point, [value])
-    search.ask()
-    # Known values are rows 0 (first point, its second evaluation), 1 and 2 (second point), 3 and 4 (third point).
-    assert seen[-1] == [0, 10, 30]
 
 
 def test_it_finds_the_largest_mean_of_a_noisy_function() -> None:

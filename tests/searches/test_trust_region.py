@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ctxval._util.arrays import Array, Rows
+from ctxval._util.arrays import Array
 from ctxval._util.describe import describe
 from ctxval.errors import InputError
 from ctxval.searches import Auto, BayesianOptimisation, Prediction, Random, TrustRegion
@@ -33,8 +33,8 @@ def predicting(guess: Function, doubt: Function | None = None, known: Array | No
     def expected(X: Array) -> tuple[Array, Array]:
         return guess(X), np.full(len(X), 0.01) if doubt is None else doubt(X)
 
-    def left_out(rows: Rows) -> Array:
-        return np.zeros(len(rows)) if known is None else guess(known)[rows]
+    def left_out(points: Array) -> Array:
+        return np.zeros(len(points)) if known is None else guess(points)
 
     return Prediction(expected, left_out, budget=600)
 

@@ -83,7 +83,7 @@ def test_the_worst_task_is_that_of_a_dense_grid_and_the_share_of_bad_tasks_has_i
 
 def test_the_share_is_a_probability_under_the_distribution_of_tasks() -> None:
     validation = cart(controllers.LQR([10.0, 1.0], [0.1], limits=0.5))
-    near = validation.with_space(validation.space.distributed(goal=Normal(0.5, 0.05)))
+    near = validation.with_parts(space=validation.space.distributed(goal=Normal(0.5, 0.05)))
     report = aspect1.check(near, threshold=0.2, tasks=40)
     assert report.exceeding  # the search goes everywhere
     assert report.share == pytest.approx(1 - 0.05 ** (1 / 20))  # and no draw is near the far goals

@@ -15,7 +15,7 @@ from ctxval.core.plan import Plan, least_distance, recorded_before_failure
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.trial import AT_LEAST, Origin, State, Trial
 from ctxval.core.validation import Validation
-from ctxval.errors import InputError
+from ctxval.errors import DistanceError, InputError
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,8 +107,10 @@ class Execution:
             return replace(ended, seconds=self.seconds)
         if self.failed is not None or self.distance is not None:
             return self
-        measurement = validation.accept(plan, self.trajectory, start_tolerance)
-        return replace(self, distance=measurement.distance, unusable=measurement.unusable)
+        try:
+            return replace(self, distance=validation.accept(plan, self.trajectory, start_tolerance))
+        except DistanceError as error:
+            return replace(self, unusable=text_of(error))
 
     def ended(self, trial: Trial, *, executed: bool = True) -> Trial:
         """Return a trial in the final state that this measured execution gives it."""
@@ -116,7 +118,8 @@ class Execution:
         note = {key: value for key, value in (trial.note or {}).items() if key != AT_LEAST}
         if self.at_least is not None:
             note[AT_LEAST] = self.at_least
-        ended = replace(trial, state=state, executed=executed, distance=self.distance, failure=self._failure)
+        failure = self.unusable if self.failed is None else text_of(self.failed)
+        ended = replace(trial, state=state, executed=executed, distance=self.distance, failure=failure)
         return replace(ended, seconds=self.seconds, note=note or None)
 
     def is_that_of(self, trial: Trial) -> bool:
@@ -126,8 +129,4 @@ class Execution:
         else:
             # A distance that another type of processor has computed differs in its last digits.
             same = bool(np.isclose(trial.distance, self.distance, rtol=1e-9, atol=0))
-        return same and trial.failure == self._failure and trial.state != "open"
-
-    @property
-    def _failure(self) -> str | None:
-        return self.unusable if self.failed is None else text_of(self.failed)
+        return same and trial.failure == self.ended(trial).failure and trial.state != "open"

@@ -13,7 +13,7 @@ import numpy as np
 from ctxval._util.arrays import Array
 from ctxval._util.progress import stage
 from ctxval._util.texts import parted, reason_of
-from ctxval.campaign.history import executed_trials, for_known_values, largest_distance, waiting_points
+from ctxval.campaign.history import executed_trials, largest_distance, waiting_points
 from ctxval.campaign.storage.store import Store
 from ctxval.certificates.dynamics import bound_of, draws_for
 from ctxval.certificates.dynamics_diagnostics import DENSE, FEWEST, PREDICTIONS, doubt_of, failed, jumps
@@ -74,6 +74,7 @@ class CampaignDynamics:
         self._store = store
         self.elsewhere: Callable[[], Sequence[Trajectory]] = tuple
         self.failure: str | None = None
+        self._parts: tuple[str, bytes] | None = None  # of the study, when it learned first
         self._learned: dict[tuple[object, ...], tuple[Sequence[Trajectory], LearnedDynamics | None, str | None]] = {}
 
     def use_quantile(self, quantile: float) -> None:
@@ -85,8 +86,8 @@ class CampaignDynamics:
     def learned(self, trials: Sequence[Trial], *, alone: bool = False) -> LearnedDynamics | None:
         """Return what the completed trials, and unless ``alone`` other recordings teach; None if it is nothing."""
         executed, others = executed_trials(self._store, trials), () if alone else self.elsewhere()
-        if not self.study.is_current:
-            self.study, self._learned = self.study.anew(), {}
+        if self._parts is not None and self._parts != self.study.state_of_parts():  # they were changed in place
+            self.study, self._learned, self._parts = self.study.anew(), {}, None
         # The other recordings are kept with what they taught, so that their identities stay theirs. A result may be
         # replaced, and then has another distance.
         key = (*((trial.number, trial.distance) for trial, _ in executed), *map(id, others))
@@ -95,6 +96,7 @@ class CampaignDynamics:
                 del self._learned[next(iter(self._learned))]
             learned, failure = None, None
             try:
+                self._parts = self._parts or self.study.state_of_parts()
                 learned = self.study.learn([(trial.unit_point, trajectory) for trial, trajectory in executed], others)
             except Exception as error:  # users' parts
                 failure = reason_of(error)
@@ -112,16 +114,12 @@ class CampaignDynamics:
         With ``pending``, open trials count as if they had been executed as predicted. How good a prediction is, is
         still seen from what was executed.
         """
-        trajectories = executed_trials(self._store, trials)
         learned = self.learned(trials)
-        executed = [(trial.unit_point, trajectory) for trial, trajectory in trajectories]
-        predicted = self.study.prediction_of(learned, executed)
-        if predicted is None:
-            return None
-        prediction = for_known_values(predicted, trials, [trial for trial, _ in trajectories])
-        waiting, otherwise = waiting_points(trials), prediction.otherwise
-        if not pending or not len(waiting):
+        executed = [(trial.unit_point, trajectory) for trial, trajectory in executed_trials(self._store, trials)]
+        prediction, waiting = self.study.prediction_of(learned, executed), waiting_points(trials)
+        if prediction is None or not pending or not len(waiting):
             return prediction
+        otherwise = prediction.otherwise
 
         def after() -> Prediction:
             as_if = None if learned is None else self._as_if(learned, executed, waiting)
@@ -310,10 +308,6 @@ class CampaignDynamics:
         note = (trial.note or {}).get(PREDICTION)
         present = isinstance(note, dict) and note.get("experiment") == self.experiment
         return prediction_in(trial.note) if present else None
-
-    def to_note(self, prediction: ExecutionPrediction) -> dict[str, Any]:
-        """Return a prediction as it is stored, with what identifies the experiment that it belongs to."""
-        return {PREDICTION: {**prediction.to_json(), "experiment": self.experiment}}
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -14,7 +14,7 @@ from ctxval._util.arrays import Array
 from ctxval._util.progress import advance, stage
 from ctxval._util.texts import text_of
 from ctxval.campaign.choices import Choice, Execution, OpenTrial
-from ctxval.campaign.dynamics import CampaignDynamics
+from ctxval.campaign.dynamics import PREDICTION, CampaignDynamics
 from ctxval.campaign.goals_of_model import GoalsOfModel
 from ctxval.campaign.history import history_of
 from ctxval.campaign.identity import described_plainly, identify, remeasure, with_distance
@@ -141,7 +141,7 @@ class TrialRecorder:
         """Recompute the distances of all stored executions, with another distance if one is given."""
         validation, description = self.validation, self.description
         if distance is not None:
-            validation = validation.with_distance(distance)
+            validation = validation.with_parts(distance=distance)
             description = with_distance(description, described_plainly(validation.distance))
         changed = remeasure(self.store, validation, description)
         self._redefine(validation, description)
@@ -253,7 +253,7 @@ class TrialRecorder:
         if origin == "iid" and choice.planned_draws is not None:
             note = {**(note or {}), PLANNED: choice.planned_draws}
         if self.predicts and (predicted := self.dynamics.predict(trials, unit_point)) is not None:
-            note = {**(note or {}), **self.dynamics.to_note(predicted)}
+            note = {**(note or {}), PREDICTION: {**predicted.to_json(), "experiment": self.dynamics.experiment}}
         key = unit_point.tobytes()
         same = (trial.parameters for trial in trials if trial.unit_point.tobytes() == key)
         parameters = choice.parameters or next(same, None) or space.describe_point(space.from_unit(unit_point))

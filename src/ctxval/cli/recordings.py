@@ -155,7 +155,7 @@ def replay(
         chosen,
         recordings,
         steps=REPLAYED if steps is None else numbers(steps),
-        validation=None if loaded is None else loaded.validation.with_model(chosen),
+        validation=None if loaded is None else loaded.validation.with_parts(model=chosen),
         executions=executions,
         seed=seed,
     )

@@ -54,13 +54,9 @@ def minimise(cost: QuadraticCost, around: Expansion, limits: Limits | None, damp
     """
     if damping.any():
         return _recursion(cost, around, limits, damping[:, None, None] * np.eye(len(cost.R)))
-    if limits is None and around.linear:
-        return _linear(cost, around)
-    return _recursion(cost, around, limits, None)
-
-
-def _linear(cost: QuadraticCost, around: Expansion) -> InputStep:
-    """Return the step for a linear model: its gains are known, so only the slope of the cost-to-go is computed."""
+    if limits is not None or not around.linear:
+        return _recursion(cost, around, limits, None)
+    # The gains for a linear model are known, so only the slope of the cost-to-go is computed.
     horizon, batch = around.inputs.shape[:2]
     known = linear_gains(cost, around.A, around.B, horizon)
     weighed = around.inputs @ cost.R

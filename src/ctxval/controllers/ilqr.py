@@ -77,11 +77,17 @@ class ILQR(QuadraticSynthesizer):
         """Return the controller, and for each task the cost, the number of iterations and whether they converged."""
         self.cost.require_task(task)
         with np.errstate(all="ignore"):
-            descent = _Descent(self, task, model)
+            descent, batch = _Descent(self, task, model), task.batch_shape
             while len(rows := np.flatnonzero(descent.active)):
                 descent.advance(rows)
             descent.undamp(np.flatnonzero(~descent.converged))
-        return descent.solution(task.batch_shape)
+        gains, inputs, states = (
+            np.moveaxis(array, 0, 1).reshape(*batch, len(array), *array.shape[2:])
+            for array in (descent.K, descent.U, descent.X[:-1])
+        )
+        converged = descent.converged.reshape(batch)
+        controller = AffineFeedback(gains, inputs, states, self.limits, converged)
+        return ILQRSolution(controller, descent.J.reshape(batch), descent.iterations.reshape(batch), converged)
 
 
 class _Descent:
@@ -92,12 +98,14 @@ class _Descent:
         self.settings, self.cost, self.model, self.limits = settings, settings.cost, model, settings.limits
         self.reference = np.moveaxis(task.reference.reshape(-1, task.horizon + 1, n), 1, 0)
         batch = self.reference.shape[1]
-        self.U = self._clipped(np.zeros((task.horizon, batch, m)))
+        self.U = np.zeros((task.horizon, batch, m))
+        if self.limits is not None:
+            self.U = self.limits.clip(self.U)
         self.X = np.empty((task.horizon + 1, batch, n))
         self.X[0] = task.initial_state.reshape(-1, n)
         for t in range(task.horizon):
             self.X[t + 1] = model.step(self.X[t], self.U[t])
-        self.J = self._costs(np.arange(batch), self.X, self.U)
+        self.J = self.cost.value(self.X - self.reference, self.U)
         if not np.isfinite(self.J).all():
             raise DesignError("iLQR cannot start: the model diverges under zero input within the horizon.")
         self.K = np.zeros((task.horizon, batch, m, n))
@@ -188,7 +196,19 @@ class _Descent:
         of = np.repeat(np.arange(len(waiting)), counts)
         index = np.arange(len(of)) - np.repeat(np.cumsum(counts) - counts - tried, counts)
         lengths, tasks = _STEP_LENGTHS[index], waiting[of]
-        X, U, J = self._forward(rows[tasks], policy, tasks, lengths)
+        # The model runs under u = u_old + length * k + K (x - x_old).
+        X_old = self.X[:, rows[tasks]]
+        U = self.U[:, rows[tasks]] + lengths[:, None] * policy.k[:, tasks]
+        K = policy.K[:, tasks] if policy.K.ndim == 4 else policy.K
+        X = np.empty_like(X_old)
+        X[0] = X_old[0]
+        for t in range(len(U)):
+            U[t] += fed_back(K[t], X[t] - X_old[t])
+            if self.limits is not None:
+                U[t] = self.limits.clip(U[t])
+            X[t + 1] = self.model.step(X[t], U[t])
+        J = self.cost.value(X - self.reference[:, rows[tasks]], U)
+        J = np.where(np.isfinite(J), J, np.inf)
         expected = lengths * policy.slope[tasks] + 0.5 * lengths**2 * policy.curvature[tasks]
         good = np.flatnonzero(self.J[rows[tasks]] - J >= -1e-4 * expected)
         moved, first = np.unique(of[good], return_index=True)
@@ -200,33 +220,3 @@ class _Descent:
         self.shortened[to] = index[chosen] > 0
         self.damping[to] = np.where(self.damping[to] > _LEAST_DAMPING, self.damping[to] / 10, 0.0)
         return np.isin(np.arange(len(waiting)), moved)
-
-    def _forward(self, rows: Rows, policy: InputStep, tasks: Rows, lengths: Array) -> tuple[Array, Array, Array]:
-        """Run the model under ``u = u_old + length * k + K (x - x_old)``; return states, inputs and costs."""
-        X_old = self.X[:, rows]
-        U = self.U[:, rows] + lengths[:, None] * policy.k[:, tasks]
-        K = policy.K[:, tasks] if policy.K.ndim == 4 else policy.K
-        X = np.empty_like(X_old)
-        X[0] = X_old[0]
-        for t in range(len(U)):
-            U[t] += fed_back(K[t], X[t] - X_old[t])
-            U[t] = self._clipped(U[t])
-            X[t + 1] = self.model.step(X[t], U[t])
-        return X, U, self._costs(rows, X, U)
-
-    def _costs(self, rows: Rows, X: Array, U: Array) -> Array:
-        J = self.cost.value(X - self.reference[:, rows], U)
-        return np.where(np.isfinite(J), J, np.inf)
-
-    def _clipped(self, inputs: Array) -> Array:
-        return inputs if self.limits is None else self.limits.clip(inputs)
-
-    def solution(self, batch_shape: tuple[int, ...]) -> ILQRSolution:
-
-        def batch_first(array: Array) -> Array:
-            return np.moveaxis(array, 0, 1).reshape(*batch_shape, len(array), *array.shape[2:])
-
-        parts = batch_first(self.K), batch_first(self.U), batch_first(self.X[:-1])
-        converged = self.converged.reshape(batch_shape)
-        controller = AffineFeedback(*parts, self.limits, converged)
-        return ILQRSolution(controller, self.J.reshape(batch_shape), self.iterations.reshape(batch_shape), converged)

@@ -47,14 +47,6 @@ class Outcome(ShortRepr):
     distance: float
 
 
-@dataclass(frozen=True)
-class Measurement:
-    """The distance of an execution, or the reason why there is none: the distance function gave no usable number."""
-
-    distance: float | None
-    unusable: str | None = None
-
-
 def require_execution(plan: Plan, trajectory: Trajectory, start_tolerance: float) -> None:
     """Check that a complete trajectory belongs to the task of a plan; see :class:`Validation` for the tolerance."""
     expected = plan.model_trajectory

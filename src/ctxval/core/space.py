@@ -273,14 +273,6 @@ class TaskSpace:
         return self.from_unit(self.unit_draws(n, rng))
 
     @checked
-    def sobol(self, n: NonNegativeInt, seed: NonNegativeInt) -> Array:
-        """Return n points of a scrambled Sobol sequence, shape ``(n, d)``."""
-        from scipy.stats import qmc  # imported here, because it is slow to load and seldom needed
-
-        sampler = qmc.Sobol(self.dimension, rng=np.random.default_rng(seed))
-        return self.from_unit(sampler.random_base2(max(0, int(np.ceil(np.log2(max(n, 1))))))[:n])
-
-    @checked
     def grid(self, per_axis: AxisPoints) -> Array:
         """Return a full grid that includes both bounds of each axis, shape ``(per_axis ** d, d)``."""
         axes = [np.linspace(low, high, per_axis) for low, high in zip(self.low, self.high, strict=True)]

@@ -81,7 +81,13 @@ class Trajectory:
     def __post_init__(self) -> None:
         for name in ("times", "states", "inputs"):
             object.__setattr__(self, name, as_floats(name, getattr(self, name)))
-        _require_fitting(self.times.shape, self.states.shape, self.inputs.shape)
+        times, states, inputs = self.times.shape, self.states.shape, self.inputs.shape
+        axes = len(times) == 1 and len(states) >= 2 and len(inputs) == len(states) and states[:-2] == inputs[:-2]
+        if not axes or states[-2] != times[0] or inputs[-2] != times[0] - 1:
+            got = f"{times}, {states} and {inputs}"
+            raise ShapeError(
+                f"a trajectory needs times (H+1,), states (..., H+1, n) and inputs (..., H, m), got {got}."
+            )
 
     @property
     def horizon(self) -> int:
@@ -142,12 +148,10 @@ class Trajectory:
         try:
             arrays = Archive(source if isinstance(source, bytes) else read_bytes(source, most), most)
             ended = arrays.text("ended") if "ended" in arrays.names else COMPLETE
-            names = ("times", "states", "inputs")
-            shapes = [arrays.header(name)[0] for name in names]
-            _require_fitting(*shapes)
-            if shape is not None and ended == COMPLETE and shapes[1] != shape:
-                raise ShapeError(f"the trajectory must have states of shape {shape}, got {shapes[1]}.")
-            times, states, inputs = (arrays.numbers(name) for name in names)
+            held = arrays.header("states")[0]
+            if shape is not None and ended == COMPLETE and held != shape:
+                raise ShapeError(f"the trajectory must have states of shape {shape}, got {held}.")
+            times, states, inputs = (arrays.numbers(name) for name in ("times", "states", "inputs"))
             return Trajectory(times, states, inputs, ended)
         except ShapeError:
             raise
@@ -260,28 +264,22 @@ _TIMES = 0.01  # largest difference between the times of a recording and those o
 def require_times(trajectory: Trajectory, times: Array) -> None:
     """Check that a trajectory has these times ``(H + 1,)``, counted from its first time."""
     dt, recorded = times[1] - times[0], trajectory.times - trajectory.times[0]
+    misses = np.abs(recorded - times) if len(recorded) == len(times) else np.array([np.inf])
+    if (misses <= _TIMES * dt).all():
+        return
     period = float(np.median(np.diff(recorded)))
     advice = f"; {unit_advice(period, dt) or '--resample interpolates a recording to these times'}"
     if len(recorded) != len(times):
         got = f"{len(recorded)} with steps of {period:g} s{advice}"
         raise InputError(f"the trajectory must have {len(times)} times, {len(times) - 1} steps of {dt:g} s, got {got}.")
-    misses = np.abs(recorded - times)
-    if not (misses <= _TIMES * dt).all():
-        k = int(np.argmax(~(misses <= _TIMES * dt)))
-        first = f"time {k} must be {times[k]:g} s after the first, got {recorded[k]:g} s"
-        largest = f"The largest difference is {np.max(misses):.3g} s{advice}"
-        raise InputError(f"the trajectory must have steps of {dt:g} s: {first}. {largest}.")
+    k = int(np.argmax(~(misses <= _TIMES * dt)))
+    first = f"time {k} must be {times[k]:g} s after the first, got {recorded[k]:g} s"
+    largest = f"The largest difference is {np.max(misses):.3g} s{advice}"
+    raise InputError(f"the trajectory must have steps of {dt:g} s: {first}. {largest}.")
 
 
 def _listed(names: Sequence[str]) -> str:
     return enumerated((name[:60] for name in names), 20)
-
-
-def _require_fitting(times: tuple[int, ...], states: tuple[int, ...], inputs: tuple[int, ...]) -> None:
-    axes = len(times) == 1 and len(states) >= 2 and len(inputs) == len(states) and states[:-2] == inputs[:-2]
-    if not axes or states[-2] != times[0] or inputs[-2] != times[0] - 1:
-        got = f"{times}, {states} and {inputs}"
-        raise ShapeError(f"a trajectory needs times (H+1,), states (..., H+1, n) and inputs (..., H, m), got {got}.")
 
 
 def _chosen(table: CsvTable, letter: str, names: Sequence[str] | None) -> dict[str, float]:

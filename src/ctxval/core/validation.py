@@ -19,12 +19,12 @@ from ctxval._util.cores import raised_by_signal
 from ctxval._util.describe import describe, without_numbers
 from ctxval._util.progress import advance
 from ctxval._util.representation import call, lines, shown
-from ctxval._util.texts import parted, reason_of, text_of
+from ctxval._util.texts import parted, reason_of
 from ctxval.core.controller import Controller, Synthesizer, is_controller
 from ctxval.core.distance import Distance
 from ctxval.core.labels import Labels, names_of, require_names
 from ctxval.core.model import Model, Step, as_model, require_time_step
-from ctxval.core.plan import Measurement, Outcome, Plan, require_execution
+from ctxval.core.plan import Outcome, Plan, require_execution
 from ctxval.core.rollout import rollout
 from ctxval.core.space import Parameters, TaskSpace
 from ctxval.core.system import OutputsLike, Simulated, System, WithOutputs, as_outputs
@@ -107,14 +107,6 @@ class Validation:
         # The numbers of M are learned: its closed loops show whether it is the same.
         return {**parts, "model": without_numbers(describe(self.model))}
 
-    def with_distance(self, distance: Distance) -> Validation:
-        """Return this validation with another distance."""
-        return self.with_parts(distance=distance)
-
-    def with_model(self, model: Model | Step) -> Validation:
-        """Return this validation with another model."""
-        return self.with_parts(model=model)
-
     def on_model(self, distance: Distance, *, units: str | None = None) -> Validation:
         """Return this validation with M itself in the place of S, which is never executed (the paper's Aspect 1).
 
@@ -157,16 +149,8 @@ class Validation:
             return rollout(self.model.step, controller, task)
         return self.outputs.of(rollout(self.model.step, self.outputs.seen_by(controller), task))
 
-    def with_space(self, space: TaskSpace) -> Validation:
-        """Return this validation with another task space of the same parameters, for example with a distribution."""
-        return self.with_parts(space=space)
-
-    def with_system(self, system: System) -> Validation:
-        """Return the validation of another system with the same model, controllers and tasks."""
-        return self.with_parts(system=system)
-
     def with_parts(self, **changed: Any) -> Validation:
-        """Return this validation with other arguments."""
+        """Return this validation with other arguments, such as another ``model``, ``distance`` or ``space``."""
         return Validation(**{**vars(self), **changed})
 
     def names(self, states: int, inputs: int) -> tuple[dict[str, str], dict[str, str]]:
@@ -213,16 +197,12 @@ class Validation:
         require_execution(plan, trajectory, self.start_tolerance if start_tolerance is None else start_tolerance)
         return trajectory
 
-    def accept(self, plan: Plan, trajectory: object, start_tolerance: float | None = None) -> Measurement:
-        """Check that a trajectory is an execution of a plan, as :meth:`require` does, and measure its distance.
+    def accept(self, plan: Plan, trajectory: object, start_tolerance: float | None = None) -> float:
+        """Check that a trajectory is an execution of a plan, as :meth:`require` does, and return its distance.
 
         This is the single check for all executions: of a system, of workers, and recordings of users.
         """
-        executed = self.require(plan, trajectory, start_tolerance)
-        try:
-            return Measurement(self.measure(plan, executed))
-        except DistanceError as error:
-            return Measurement(None, text_of(error))
+        return self.measure(plan, self.require(plan, trajectory, start_tolerance))
 
     def measure(self, plan: Plan, trajectory: Trajectory) -> float:
         """Return d(p)."""

@@ -5,8 +5,8 @@ This package is independent of control: points are rows of numbers, often in the
 
 from __future__ import annotations
 
-from ctxval.gp.kernels import Kernel, Linear, Matern, Sum
+from ctxval.gp.kernels import Matern
 from ctxval.gp.regression import GaussianProcess
 from ctxval.gp.surrogate import Surrogate
 
-__all__ = ["GaussianProcess", "Kernel", "Linear", "Matern", "Sum", "Surrogate"]
+__all__ = ["GaussianProcess", "Matern", "Surrogate"]

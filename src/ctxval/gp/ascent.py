@@ -233,11 +233,6 @@ class Effort:
     rough: int  # number of points at which its approximation is evaluated
     batches: int  # number of calls in which all of these are evaluated
 
-    @property
-    def points(self) -> int:
-        """The number of all points."""
-        return self.exact + self.rough
-
 
 def usual_effort(dimension: int, budget: int) -> Effort:
     """Return what a search with this budget usually evaluates, if the function has an approximation."""

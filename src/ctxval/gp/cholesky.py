@@ -6,7 +6,7 @@ LAPACK is called directly, without the checks of scipy.linalg, which cost more t
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -62,25 +62,21 @@ class CholeskyFactor:
         return float(np.log(np.diag(self.L)).sum())
 
 
-def factorise(covariance: Array, noises: float | Iterable[float]) -> CholeskyFactor:
-    """Return the Cholesky factor of ``covariance + noise I``, shape ``(n, n)``; several noises are tried in turn."""
-    tried = [noises] if isinstance(noises, float) else noises
-    for noise in tried:
+def factorise(covariance: Array, noise: float, *, insist: bool = False) -> CholeskyFactor:
+    """Return the Cholesky factor of ``covariance + noise I``, shape ``(n, n)``.
+
+    To insist is to try ten times as much noise after each failure, up to 1e30 times as much.
+    """
+    for _ in range(31 if insist else 1):
         noisy = np.array(covariance, order="F")
         noisy.ravel("K")[:: len(noisy) + 1] += noise  # its diagonal
         L, info = dpotrf(noisy, lower=1, clean=1, overwrite_a=1)
         if not info and not np.isnan(np.trace(L)):  # some LAPACKs let NaN pass
             return CholeskyFactor(np.asarray(L))
+        noise *= 10
     raise InputError(
         f"the covariance of {len(covariance)} observations is not positive definite; raise the noise variance."
     )
-
-
-def tenfold(noise: float) -> Iterator[float]:
-    """Yield a noise variance, then ten times as much, and so on, up to 1e30 times as much."""
-    for _ in range(31):
-        yield noise
-        noise *= 10
 
 
 def pivoted_rows(kernel: Covariance, theta: Array, X: Array, count: int, least: float) -> Rows:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,7 +13,7 @@ from scipy.optimize import minimize
 from ctxval._util.arrays import Array, Rows
 from ctxval.errors import InputError
 from ctxval.gp.cholesky import CholeskyFactor, factorise
-from ctxval.gp.kernels import Bounds, Kernel
+from ctxval.gp.kernels import Bounds, Matern
 
 Mean = Callable[[Array], Array]
 """A prior mean: points ``(n, d)`` -> values ``(n,)``."""
@@ -34,7 +34,7 @@ def zero_mean(X: Array) -> Array:
 class GaussianProcess:
     """A Gaussian process conditioned on observations; make one with :func:`condition` or :func:`fit`."""
 
-    kernel: Kernel
+    kernel: Matern
     theta: Array
     noise: float
     mean: Mean
@@ -73,16 +73,16 @@ class GaussianProcess:
 class MultiOutputProcess:
     """Gaussian processes of zero mean for several outputs that share a covariance, conditioned on observations."""
 
-    kernel: Kernel
+    kernel: Matern
     theta: Array
     X: Array  # (n, d)
     Y: Array  # (n, k)
-    noises: Sequence[float] = (NOISE,)  # tried in this order until the covariance matrix is positive definite
+    noise: float = NOISE  # the least noise variance; points that are too similar need more
 
     @functools.cached_property
     def factor(self) -> CholeskyFactor:
         """The Cholesky factor of ``K + noise I``."""
-        return factorise(self.kernel(self.theta, self.X, self.X), self.noises)
+        return factorise(self.kernel(self.theta, self.X, self.X), self.noise, insist=True)
 
     @functools.cached_property
     def weights(self) -> Array:
@@ -107,7 +107,7 @@ def _covariances_and_variance(process: GaussianProcess | MultiOutputProcess, X: 
 
 
 def condition(
-    kernel: Kernel, theta: Array, X: Array, y: Array, *, noise: float = NOISE, mean: Mean = zero_mean
+    kernel: Matern, theta: Array, X: Array, y: Array, *, noise: float = NOISE, mean: Mean = zero_mean
 ) -> GaussianProcess:
     """Return the process with these hyperparameters, conditioned on observations ``(n, d)``, ``(n,)``."""
     factor = factorise(kernel(theta, X, X), noise)
@@ -128,7 +128,7 @@ def log_likelihood_of_outputs(K: Array, noise: float, Y: Array) -> tuple[float, 
 
 
 def log_marginal_likelihood(
-    kernel: Kernel, theta: Array, noise: float, X: Array, residual: Array
+    kernel: Matern, theta: Array, noise: float, X: Array, residual: Array
 ) -> tuple[float, Array]:
     """Return log p(residual | X, theta, noise) and its gradient by (theta, log noise), eq. 5.9.
 
@@ -145,7 +145,7 @@ def log_marginal_likelihood(
 
 
 def fit(
-    kernel: Kernel,
+    kernel: Matern,
     X: Array,
     y: Array,
     *,

@@ -13,10 +13,10 @@ from ctxval._util.boxes import farthest_rows
 from ctxval._util.representation import ShortRepr
 from ctxval.errors import InputError
 from ctxval.gp.hyperposterior import Warp
-from ctxval.gp.kernels import Kernel, Linear, Matern, Sum
+from ctxval.gp.kernels import Matern
 from ctxval.gp.regression import NOISE, GaussianProcess, LogDensity, Mean, condition, fit, zero_mean
 
-_KERNEL = Sum(Matern(1.5, ard=True, length_scale=(0.02, 100.0)), Linear())  # of SurrogateHyperparameters
+_KERNEL = Matern(1.5, ard=True, length_scale=(0.02, 100.0), linear=(1e-4, 50.0))  # of SurrogateHyperparameters
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +36,7 @@ class Surrogate(ShortRepr):
 def fit_surrogate(
     points: Array,
     values: Array,
-    kernel: Kernel | None = None,
+    kernel: Matern | None = None,
     *,
     noise: tuple[float, float] = (NOISE, NOISE),
     prior_mean: Mean | None = None,

@@ -21,7 +21,7 @@ from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.validation import Validation
 from ctxval.errors import DistanceError
-from ctxval.learning.draws import DisturbedDynamics, DrawnModel, DynamicsDraws
+from ctxval.learning.draws import DisturbedDynamics, DynamicsDraws
 from ctxval.learning.dynamics_posterior import DynamicsPosterior
 from ctxval.learning.noisy_draws import NoisyDraws, NoisyRuns
 
@@ -151,7 +151,7 @@ class LoopPlanner:
                 together = rollout(step, plan.controller, task.starting_at(start))
                 loops = [Trajectory(together.times, together.states[s], together.inputs[s]) for s in range(S)]
             else:
-                loops = [rollout(DrawnModel(draws[s]).step, plan.controller, task) for s in range(S)]
+                loops = [rollout(draws[s].step, plan.controller, task) for s in range(S)]
             runs.append(self._stacked(plan, loops))
         return runs
 
@@ -181,7 +181,7 @@ class LoopPlanner:
                     after = needed.step(*(part.reshape(len(needed), q, -1) for part in whole))
                     return np.asarray(after.reshape(-1, x.shape[-1])[here])
 
-                of_tasks = step if plan.task.batch_shape else draws.model_of(first).step
+                of_tasks = step if plan.task.batch_shape else draws[first].step
                 distances[0, plan.rows] = self.compared(plan, rollout(of_tasks, plan.controller, plan.task))
             advance(R * len(plan.rows), units=_UNITS)
         of_loops = distances.reshape(R, S, q).swapaxes(0, 1).reshape(S * R, q)
@@ -230,26 +230,30 @@ class LoopPlanner:
         return draws > 1 and bool(self._together)
 
     def compared(self, planned: PlannedTasks, loops: Trajectory) -> Array:
-        """Return the distances ``(q,)`` of loops; infinity if a loop diverges, NaN if that of M does."""
-        known, runs = planned.promised.finite & loops.finite, [planned.promised, loops]
+        """Return the distances ``(q,)`` of loops; infinity if a loop diverges, NaN if that of M does.
+
+        It is infinity, too, if the distance raises an exception or returns no finite number: nothing is known then.
+        Tasks are measured one by one if the distance does not take a batch.
+        """
+        task, promised, between = planned.task, planned.promised, self.validation.distance_between
+        model, system, known = promised, loops, promised.finite & loops.finite
         if not known.all():  # a distance need not take what is not finite
             kept = known[..., None, None]
-            runs = [Trajectory(r.times, np.where(kept, r.states, 0.0), np.where(kept, r.inputs, 0.0)) for r in runs]
-        distances = np.where(known, self.measured(planned.task, *runs), np.inf)
-        return np.where(planned.promised.finite, distances, np.nan).reshape(len(planned.rows))
-
-    def measured(self, task: Task, model: Trajectory, system: Trajectory) -> Array:
-        """Return the distance of each task, ``(...)``, one by one if the distance does not take a batch.
-
-        It is infinity if the distance raises an exception or returns no finite number: nothing is known then.
-        """
+            model, system = (
+                Trajectory(run.times, np.where(kept, run.states, 0.0), np.where(kept, run.inputs, 0.0))
+                for run in (promised, loops)
+            )
+        values = np.empty(0)
         with contextlib.suppress(DistanceError):
-            values = self.validation.distance_between(model, system, task)
-            if values.shape == model.batch_shape:
-                return np.where(np.isfinite(values), values, np.inf)
-        if not model.batch_shape:
-            return np.array(np.inf)
-        return np.array([float(self.measured(task[k], model[k], system[k])) for k in range(model.batch_shape[0])])
+            values = between(model, system, task)
+        if values.shape != known.shape:
+            values = np.full(known.shape, np.inf)
+            for k in range(known.size if known.ndim else 0):
+                with contextlib.suppress(DistanceError):
+                    alone = between(model[k], system[k], task[k])
+                    values[k] = alone if not alone.shape else np.inf
+        distances = np.where(known & np.isfinite(values), values, np.inf)
+        return np.where(promised.finite, distances, np.nan).reshape(len(planned.rows))
 
 
 def _probed(controller: Controller, task: Task, steps: int) -> Array:

@@ -17,7 +17,7 @@ from ctxval.learning.residual_data import ResidualData
 
 @dataclass(frozen=True, eq=False)
 class DynamicsDraws(ShortRepr):
-    """S models ``M + r_s``, run together: a draw is the first axis of states and inputs."""
+    """S models ``M + r_s``, run together: a draw is the first axis of states and inputs; a single draw is a model."""
 
     model: Model
     data: ResidualData
@@ -32,6 +32,8 @@ class DynamicsDraws(ShortRepr):
     def __getitem__(self, rows: ArrayLike) -> DynamicsDraws:
         """Return some draws; their rows are in ascending order."""
         rows = np.atleast_1d(np.asarray(rows, dtype=np.intp))
+        if not (rows < len(self)).all():
+            raise IndexError(f"there are {len(self)} draws.")
         if len(rows) == len(self):
             return self
         firsts = np.cumsum([0, *(len(each.weights) for each in self.expansions)])
@@ -40,7 +42,10 @@ class DynamicsDraws(ShortRepr):
         return replace(self, expansions=kept)
 
     def step(self, x: Array, u: Array) -> Array:
-        """Return the next states, shapes ``(S, q, n), (S, q, m) -> (S, q, n)``."""
+        """Return the next states, shapes ``(S, q, n), (S, q, m) -> (S, q, n)``; of a single draw ``(..., n)``."""
+        shape = x.shape
+        if len(self) == 1:
+            x, u = rows_of(x)[None], rows_of(u)[None]
         with np.errstate(all="ignore"):
             z = bounded(self.data.standardised(x, u))
             parts = np.split(z, np.cumsum([len(each.weights) for each in self.expansions[:-1]], dtype=int))
@@ -49,13 +54,7 @@ class DynamicsDraws(ShortRepr):
                 learned = np.minimum(np.maximum(learned, -self.limit), self.limit)
             residuals = np.zeros_like(x)
             residuals[:, :, self.data.learned] = learned
-            return self.model.step(x, u[..., : self.data.inputs]) + residuals * self.data.units
-
-    def model_of(self, index: int) -> DrawnModel:
-        """Return one draw as a model."""
-        if not 0 <= index < len(self):
-            raise IndexError(f"there are {len(self)} draws.")
-        return DrawnModel(self[index])
+            return (self.model.step(x, u[..., : self.data.inputs]) + residuals * self.data.units).reshape(shape)
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,19 +74,10 @@ class DisturbedDynamics(ShortRepr):
         return replace(self, ways=self.ways[np.atleast_1d(rows)])
 
     def step(self, x: Array, u: Array) -> Array:
-        """Return the next states, shapes ``(S, q, n), (S, q, m) -> (S, q, n)``."""
-        return np.asarray(DrawnModel(self.mean).step(x, u) + self.added(self.ways, x))
-
-
-@dataclass(frozen=True, eq=False)
-class DrawnModel(ShortRepr):
-    """The model ``M + r_s`` of the only one of some draws."""
-
-    draws: DynamicsDraws | DisturbedDynamics
-
-    def step(self, x: Array, u: Array) -> Array:
-        """Return the next state; shapes ``(..., n), (..., m) -> (..., n)``."""
-        return np.asarray(self.draws.step(rows_of(x)[None], rows_of(u)[None]).reshape(x.shape))
+        """Return the next states, shapes ``(S, q, n), (S, q, m) -> (S, q, n)``; of a single way ``(..., n)``."""
+        together = x if len(self) > 1 else rows_of(x)[None]
+        moved = self.mean.step(x, u).reshape(together.shape) + self.added(self.ways, together)
+        return np.asarray(moved.reshape(x.shape))
 
 
 def bounded(z: Array) -> Array:

@@ -21,7 +21,7 @@ from ctxval._util.representation import ShortRepr
 from ctxval.core.model import Model
 from ctxval.core.trajectory import Transitions
 from ctxval.errors import InputError
-from ctxval.gp.cholesky import factorise, pivoted_rows, tenfold
+from ctxval.gp.cholesky import factorise, pivoted_rows
 from ctxval.learning.draws import DynamicsDraws, bounded
 from ctxval.learning.hyperparameters import (
     FAMILIES,
@@ -185,7 +185,7 @@ class DynamicsPosterior(ShortRepr):
             rows = np.concatenate([self.rows, some[spare]])
             Z, Y = self._known(rows)
             covariance = most.kernel(most.theta, Z, Z)
-            factor = factorise(covariance, tenfold(most.noise))
+            factor = factorise(covariance, most.noise, insist=True)
             added = float((factor.L[-1] ** 2).sum() - covariance[-1, -1])
             inverse, known = factor.inverse(), factor.solve(Y)
             weights = np.repeat(known[None], len(left_out), axis=0)
@@ -196,7 +196,7 @@ class DynamicsPosterior(ShortRepr):
                 remaining[gone] = 0.0
                 misfit = covariance[kept] @ remaining + added * remaining[kept] - Y[kept]
                 if not np.abs(misfit).max(initial=0.0) < 1e-6:
-                    again = factorise(covariance[np.ix_(kept, kept)], tenfold(most.noise))
+                    again = factorise(covariance[np.ix_(kept, kept)], most.noise, insist=True)
                     remaining[kept] = again.solve(Y[kept])
         return self._limited(KernelExpansion.of(most, Z, weights))
 

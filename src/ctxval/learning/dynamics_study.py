@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import functools
-import time
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -70,23 +69,20 @@ class DynamicsStudy(ShortRepr):
         self._others: dict[str, DynamicsStudy] = {}
         self._actuators: dict[bytes, Actuator | None] = {}
         self._actuated: DynamicsStudy | None = None
-        self._parts: tuple[str, bytes] | None = None
 
     def anew(self, quantile: float | None = None) -> DynamicsStudy:
         """Return a study of the same experiment that has learned nothing yet, with a quantile if it is given."""
         return DynamicsStudy(self.given, self.seed, self.quantile if quantile is None else quantile)
 
-    @property
-    def is_current(self) -> bool:
-        """Whether M and the synthesizer are as they were; fitting M again in place would change what is kept."""
-        return self._parts is None or self._parts == self._state_of_parts()
+    def state_of_parts(self) -> tuple[str, bytes]:
+        """Return the description of M and the synthesizer, and some steps of M, which a description may not show.
 
-    def _state_of_parts(self) -> tuple[str, bytes]:
-        """Return the description of M and the synthesizer, and some steps of M, which a description may not show."""
-        parts, steps = self.validation, b""
-        if self._loops is not None:
-            middle = self._loops.horizon // 2
-            pairs = self._loops.states[..., middle, :], self._loops.inputs[..., middle, :]
+        If a part is changed in place, as by fitting M again, what is kept here no longer holds.
+        """
+        parts, loops, steps = self.validation, self.extended.loops, b""
+        if loops is not None:
+            middle = loops.horizon // 2
+            pairs = loops.states[..., middle, :], loops.inputs[..., middle, :]
             steps = np.asarray(parts.model.step(*pairs)).tobytes()
         return repr(describe([parts.model, parts.synthesizer])), steps
 
@@ -95,17 +91,6 @@ class DynamicsStudy(ShortRepr):
         """Searches the tasks for the largest distance of each draw."""
         settings = WorstCaseSettings.for_dimension(self.validation.space.dimension, self.planner.batched)
         return WorstCaseSearch(self.planner, self.seed, settings)
-
-    @functools.cached_property
-    def _timed_loops(self) -> tuple[Trajectory | None, float]:
-        """Closed loops on M, and the seconds that they took."""
-        with single_threaded():
-            started = time.perf_counter()
-            return self.extended.loops, time.perf_counter() - started
-
-    @property
-    def _loops(self) -> Trajectory | None:
-        return self._timed_loops[0]
 
     @functools.cached_property
     def unseen_parameters(self) -> tuple[int, ...]:
@@ -118,8 +103,6 @@ class DynamicsStudy(ShortRepr):
         Returns None if there are no recorded transitions, if M explains them, if no task can be planned, or if
         states of M cannot be estimated from recorded outputs.
         """
-        if self._parts is None:
-            self._parts = self._state_of_parts()
         extended, logged = self.extended.executions(executed), () if self.extended.needs_tasks else logged
         if extended is None:
             return None
@@ -158,9 +141,9 @@ class DynamicsStudy(ShortRepr):
         extended, model = self.extended.executions(executed), before_refinement(self.validation.model)
         for with_data in (True, False):
             recorded = self._recorded(extended, (), with_data) if extended else None
-            if recorded is None or self._loops is None or not extended:
+            if recorded is None or self.extended.loops is None or not extended:
                 return None
-            settings, seed = PosteriorSettings.for_horizon(self._loops.horizon), (self.seed, len(executed), 0)
+            settings, seed = PosteriorSettings.for_horizon(self.extended.loops.horizon), (self.seed, len(executed), 0)
             split = split_transitions(model, *recorded, seed, settings)
             if split is not None and (parts := split.posterior()) is not None:
                 points, loops = np.array([point for point, _ in extended]), [loop for _, loop in extended]
@@ -176,10 +159,10 @@ class DynamicsStudy(ShortRepr):
             key = digest([*(trajectory for _, trajectory in executed[:count]), *logged]) + bytes([with_data])
             if key not in self._covariances:
                 some = recorded if count == len(executed) else self._recorded(executed[:count], logged, with_data)
-                if some is None or self._loops is None:
+                if some is None or self.extended.loops is None:
                     continue
                 model, seed = before_refinement(self.validation.model), (self.seed, count, 0)
-                settings = PosteriorSettings.for_horizon(self._loops.horizon)
+                settings = PosteriorSettings.for_horizon(self.extended.loops.horizon)
                 self._covariances[key] = learn_covariances(model, *some, seed, settings)
             covariances = self._covariances[key]
             if covariances is not None:
@@ -249,17 +232,18 @@ class DynamicsStudy(ShortRepr):
 
     @functools.cached_property
     def _data(self) -> Transitions | None:
-        return None if self._loops is None else data_near(self.validation.model, self._loops)
+        loops = self.extended.loops
+        return None if loops is None else data_near(self.validation.model, loops)
 
     def _recorded(
         self, executed: Executed, logged: Sequence[Trajectory], with_data: bool
     ) -> tuple[Transitions, Rows] | None:
-        if self._loops is None:
+        if self.extended.loops is None:
             return None
         # The data that M was made from tell no earlier inputs.
         data = self._data if with_data and self.actuator is None else None
         loops = [replace(loop, inputs=self.extended.acting(loop)) for _, loop in executed]
-        return recorded_transitions(data, loops, self._loops, logged)
+        return recorded_transitions(data, loops, self.extended.loops, logged)
 
     def _with_parameter(self, name: str) -> DynamicsStudy:
         """Return the study with another task parameter as a state; it is kept."""
@@ -344,23 +328,19 @@ class DynamicsStudy(ShortRepr):
         name, with_it, without_it = self._most_telling(plain)
         return None if name is None or with_it > without_it / 2 else (name, without_it / max(with_it, 1e-300))
 
-    def predict(self, executed: Executed) -> Prediction | None:
-        """Return the distances that executions predict, for a search; None if nothing can be learned.
+    def prediction_of(self, learned: LearnedDynamics | None, executed: Executed) -> Prediction | None:
+        """Return the distances that executions, and what was learned from them, predict; None if nothing is known.
 
         If the distance is composed of a short vector, such as the error of the final state, a second prediction models
         the vector as a function of p, because an error that is no function of state and input may still be a function
-        of p. The first prediction offers the second one as ``otherwise``. If there is no first prediction, the second
-        one is returned instead.
+        of p. The first prediction offers the second one as ``otherwise``. If nothing was learned, the second one is
+        returned instead.
         """
-        return self.prediction_of(self.learn(executed), executed)
-
-    def prediction_of(self, learned: LearnedDynamics | None, executed: Executed) -> Prediction | None:
-        """Return :meth:`predict` for what was learned from these executions, and possibly from other recordings."""
         with single_threaded():
             if learned is None:
                 return self._predict_vectors(executed)
-            loops, seconds = self._timed_loops
-            in_parallel = loops is not None and not loops.batch_shape and seconds > _SLOW
+            loops = self.extended.loops
+            in_parallel = loops is not None and not loops.batch_shape and self.extended.seconds > _SLOW
             planner, posterior = learned.study.planner, learned.posterior
             exact = PredictedDistance(planner, posterior, learned.executed, in_parallel, posterior.mean)
             # If few centres do not suffice, both predictions are one, so that no task is predicted twice.

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
@@ -17,7 +18,7 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from ctxval._util.arrays import Array
+from ctxval._util.arrays import Array, single_threaded
 from ctxval.core.controller import Controller, ControllerWithMemory, Synthesizer
 from ctxval.core.distance import Distance
 from ctxval.core.labels import Labels, labels_of
@@ -118,8 +119,12 @@ class ExtendedValidation:
 
     @functools.cached_property
     def loops(self) -> Trajectory | None:
-        """Closed loops on M; None if no task can be planned."""
-        return closed_loops_on_model(self.validation)
+        """Closed loops on M, which took so many ``seconds``; None if no task can be planned."""
+        with single_threaded():
+            begun = time.perf_counter()
+            loops = closed_loops_on_model(self.validation)
+            self.seconds = time.perf_counter() - begun
+        return loops
 
     @functools.cached_property
     def pairs(self) -> Array:

@@ -19,7 +19,7 @@ from scipy.special import gammaln, logsumexp
 from ctxval._util.arrays import Array, Rows
 from ctxval.errors import InputError
 from ctxval.gp.cholesky import CholeskyFactor, factorise, pivoted_rows
-from ctxval.gp.kernels import Covariance, Linear, Matern, Towards
+from ctxval.gp.kernels import Covariance, Matern, Towards
 from ctxval.gp.regression import most_likely
 
 FAMILIES = ((2.5, 0.0), (2.5, 1.0), (1.5, 0.0))
@@ -36,7 +36,7 @@ NOISE = (1e-7, 1.0)
 _LENGTH, _LINEAR_PART = (3.0, 1.0), (1.0, 5.0)
 _FREEDOM = 6.0  # degrees of freedom of the t distribution of the proposals
 
-_LINEAR_KERNEL = Linear(centre=0.0, variance=(1e-4, 1e6))
+_LINEAR = (1e-4, 1e6)  # bounds of the variances of the constant and of the linear part
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class ResidualKernel(Covariance):
 
     def box(self, dimension: int) -> tuple[Array, Array]:
         """Return the bounds of (theta, log noise); no column is irrelevant beyond 100 standard deviations."""
-        low, high = np.log([*[(0.05, 100.0)] * dimension, *[_LINEAR_KERNEL.variance] * 2, NOISE]).T
+        low, high = np.log([*[(0.05, 100.0)] * dimension, *[_LINEAR] * 2, NOISE]).T
         return low, high
 
     def within(self, parameters: Array) -> tuple[Array, float]:
@@ -65,19 +65,22 @@ class ResidualKernel(Covariance):
     def towards(self, theta: Array, Z: Array) -> Towards:
         """Return the covariances with points ``(m, k)`` as a function of other points."""
         matern = Matern(self.nu, ard=True).towards(np.concatenate([[0.0], theta[:-2]]), Z)
-        linear = _LINEAR_KERNEL.towards(theta[-2:], Z)
+        constant, slope = np.exp(theta[-2:])
 
         def covariances(X: Array) -> Array:
+            linear = (slope * X) @ Z.T
+            linear += constant
             total = self._grow(matern(X), X, Z)
-            total += linear(X)
+            total += linear
             return total
 
         return covariances
 
     def diagonal(self, theta: Array, X: Array) -> Array:
         """Return the variances k(z, z), shape ``(n,)``."""
-        grown = 1 + self.growth * (X[:, X.shape[1] - self.inputs :] ** 2).sum(axis=1)
-        return np.asarray(grown + _LINEAR_KERNEL.diagonal(theta[-2:], X))
+        (constant, slope), inputs = np.exp(theta[-2:]), X[:, X.shape[1] - self.inputs :]
+        grown = 1 + self.growth * (inputs**2).sum(axis=1)
+        return np.asarray(grown + (constant + slope * (X**2).sum(axis=1)))
 
     def with_gradient(self, theta: Array, Z: Array) -> tuple[Array, Callable[[Array], Array]]:
         """Return K = k(Z, Z), and the function ``W -> sum_ij W_ij dK_ij/dtheta`` of a symmetric W."""

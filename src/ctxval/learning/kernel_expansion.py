@@ -13,7 +13,7 @@ from itertools import groupby, product
 import numpy as np
 
 from ctxval._util.arrays import Array, Rows
-from ctxval.gp.cholesky import CholeskyFactor, factorise, pivoted_cholesky, tenfold
+from ctxval.gp.cholesky import CholeskyFactor, factorise, pivoted_cholesky
 from ctxval.learning.hyperparameters import ResidualHyperparameters, ResidualKernel
 
 
@@ -140,7 +140,7 @@ class Component:
     ) -> Component:
         """Return the process conditioned on pairs ``(M, k)``, with amplitudes drawn from their posterior."""
         kernel, theta = hyperparameters.kernel, hyperparameters.theta
-        factor = factorise(kernel(theta, Z, Z), tenfold(hyperparameters.noise))
+        factor = factorise(kernel(theta, Z, Z), hyperparameters.noise, insist=True)
         weights = factor.solve(Y)
         squares = (Y * weights).sum(axis=0)
         return cls(hyperparameters, Z, factor, weights, squares, squares).again(rng)

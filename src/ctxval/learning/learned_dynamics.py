@@ -97,7 +97,7 @@ class LearnedDynamics(ShortRepr):
         without = self.posterior.means_without([[k] for k in range(len(self.executed))])
         errors, of_model = list[Array](), list[Array]()
         for k, loop in enumerate(self.trajectories_of_system):
-            for model, of in ((without.model_of(k), errors), (self.study.validation.model, of_model)):
+            for model, of in ((without[k], errors), (self.study.validation.model, of_model)):
                 of.append((model.step(loop.states[:-1], loop.inputs) - loop.states[1:])[:, learned])
         scale = np.sqrt((np.concatenate(of_model) ** 2).mean(axis=0))
         return float(np.sqrt(((np.concatenate(errors) / np.maximum(scale, 1e-300)) ** 2).mean()))

@@ -74,7 +74,7 @@ class NoiseStudy:
             last = records[-1]
             with contextlib.suppress(np.linalg.LinAlgError, InputError, ValueError), np.errstate(all="ignore"):
                 mean = posterior.means_without([[len(records) - 1]])
-                predicted: Array = mean.step(last.states[None, :-1], last.inputs[None])[0]
+                predicted = mean.step(last.states[:-1], last.inputs)
                 is_needed = predicted_by_history(posterior, records, self.extended.pairs, predicted)
         if not is_needed:
             return None

@@ -17,14 +17,13 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from ctxval._util.arrays import Array, Rows, single_threaded
+from ctxval._util.arrays import Array, single_threaded
 from ctxval._util.cores import on_all_cores
 from ctxval._util.progress import advance
 from ctxval.core.distance import ComposedDistance
 from ctxval.core.trajectory import Trajectory
 from ctxval.errors import ShapeError
-from ctxval.gp.cholesky import tenfold
-from ctxval.gp.kernels import Linear, Matern, Sum
+from ctxval.gp.kernels import Matern
 from ctxval.gp.regression import MultiOutputProcess, log_likelihood_of_outputs, most_likely
 from ctxval.learning.closed_loops import LoopPlanner, halved
 from ctxval.learning.draws import DynamicsDraws
@@ -34,7 +33,7 @@ from ctxval.searches import Prediction
 Executed = Sequence[tuple[Array, Trajectory]]
 """Points of the unit cube ``(d,)`` with the system's trajectories there."""
 
-_KERNEL = Sum(Matern(2.5, ard=True, length_scale=(0.05, 100.0), variance=(1e-6, 1e3)), Linear(variance=(1e-6, 1e3)))
+_KERNEL = Matern(2.5, ard=True, length_scale=(0.05, 100.0), variance=(1e-6, 1e3), linear=(1e-6, 1e3))
 _NOISE = 1e-8  # noise variance relative to the vectors' mean square: it keeps the covariance matrix positive definite
 _LEARNED_FROM = 200  # largest number of vectors, the latest ones, from which the hyperparameters are learned
 
@@ -66,13 +65,20 @@ class PredictedDistance:
         distance, doubt = np.array([self._known[key] for key in keys]).reshape(-1, 2).T
         return distance, doubt
 
-    def left_out(self, rows: Rows) -> Array:
-        """Return the distances predicted at executed points, each from the executions of other points, ``(k,)``."""
-        points = self.executed[rows]
-        without = self.posterior.means_without(executions_of(self.executed, points))
-        with single_threaded():
-            parts = halved(lambda some: self.planner.own_distances(without[some], points[some, None])[:, 0], len(rows))
-        distances = np.concatenate([[np.nan] if part is None else part for _, part in parts])
+    def left_out(self, points: Array) -> Array:
+        """Return the distances predicted at points, each from the executions of other points, ``(k,)``."""
+        executions = executions_of(self.executed, points)
+        is_executed = np.array([bool(rows) for rows in executions])
+        distances, known = np.empty(len(points)), points[is_executed]
+        if not is_executed.all():  # a distance without a recording teaches nothing that could be left out
+            distances[~is_executed] = self(points[~is_executed])[0]
+        if len(known):
+            without = self.posterior.means_without(list(filter(None, executions)))
+            with single_threaded():
+                parts = halved(
+                    lambda some: self.planner.own_distances(without[some], known[some, None])[:, 0], len(known)
+                )
+            distances[is_executed] = np.concatenate([[np.nan] if part is None else part for _, part in parts])
         return np.where(np.isfinite(distances), distances, np.nan)
 
     def _predicted(self, points: Array) -> Array:
@@ -143,8 +149,7 @@ def predict_composed(points: Array, vectors: Array, compose: Callable[[Array], A
         return None
     with single_threaded():
         theta = _most_likely(points[-_LEARNED_FROM:], vectors[-_LEARNED_FROM:] / scale)
-    noises = (_NOISE, *(_NOISE + more for more in tenfold(_NOISE)))  # points may be too similar for the first
-    process = MultiOutputProcess(_KERNEL, theta, points, vectors / scale, noises)
+    process = MultiOutputProcess(_KERNEL, theta, points, vectors / scale, _NOISE)
 
     def expected(at: Array) -> tuple[Array, Array]:
         """Return the values composed of the expected vectors ``(m,)``, and the relative deviation of draws ``(m,)``."""
@@ -157,8 +162,15 @@ def predict_composed(points: Array, vectors: Array, compose: Callable[[Array], A
         deviation = np.sqrt(((drawn - values) ** 2).mean(axis=0))
         return values, deviation / np.maximum(np.abs(values), 1e-12 * scale)
 
-    def left_out(rows: Rows) -> Array:
-        return np.asarray(compose(scale * process.left_out(rows)))
+    def left_out(at: Array) -> Array:
+        executions, values = executions_of(points, at), np.empty(len(at))
+        known = np.array([bool(rows) for rows in executions])
+        if not known.all():
+            values[~known] = expected(at[~known])[0]
+        if known.any():
+            rows = np.array([rows[0] for rows in executions if rows])
+            values[known] = compose(scale * process.left_out(rows))
+        return values
 
     # Many points may be predicted, because no controller is designed for them.
     return Prediction(expected, left_out, 6000)

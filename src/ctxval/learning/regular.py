@@ -152,7 +152,7 @@ class Boundary:
         data, n = posterior.data, len(posterior.data.sizes)
         known = data.transitions[np.flatnonzero(data.sources >= 0)]
         with single_threaded(), np.errstate(all="ignore"):
-            expected = posterior.mean.model_of(0).step(irregular.x, irregular.u)
+            expected = posterior.mean.step(irregular.x, irregular.u)
         pairs, others = (data.standardised(each.x, each.u) for each in (known, irregular))
         regular = np.concatenate([pairs[:, :n], data.standardised(known.x_next, known.u)[:, :n]])
         # A step that hits something may begin before it, and leaves it as if nothing were there.

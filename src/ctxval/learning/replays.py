@@ -19,7 +19,7 @@ from ctxval.core.rollout import rollout
 from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory
 from ctxval.core.validation import Validation
-from ctxval.learning.draws import DrawnModel
+from ctxval.learning.draws import DynamicsDraws
 from ctxval.learning.dynamics_study import DynamicsStudy
 from ctxval.learning.learned_dynamics import LearnedDynamics
 from ctxval.learning.prediction import executions_of
@@ -44,17 +44,17 @@ def replay_executed(
         learned: what executions teach; those at the task that is replayed are left out.
         wanted: points of the unit cube ``(d,)`` of the tasks.
     """
-    models: list[DrawnModel | None] = [None] * len(wanted)
+    models: list[DynamicsDraws | None] = [None] * len(wanted)
     study = DynamicsStudy(validation) if learned is None else learned.study
     with single_threaded():
         if learned is not None:
             with contextlib.suppress(Exception):  # the user's own parts, at states that no execution has reached
                 without = learned.posterior.means_without(executions_of(learned.executed, wanted))
-                models = [without.model_of(k) for k in range(len(wanted))]
+                models = [without[k] for k in range(len(wanted))]
         return [_replayed(study, model, point) for model, point in zip(models, wanted, strict=True)]
 
 
-def _replayed(study: DynamicsStudy, model: DrawnModel | None, point: Array) -> Replay | None:
+def _replayed(study: DynamicsStudy, model: DynamicsDraws | None, point: Array) -> Replay | None:
     advance()
     validation, space = study.validation, study.validation.space
     try:

@@ -15,7 +15,6 @@ import numpy as np
 
 from ctxval._util.arrays import Array, single_threaded
 from ctxval.core.trajectory import Trajectory
-from ctxval.learning.draws import DrawnModel
 from ctxval.learning.dynamics_study import DynamicsStudy
 from ctxval.learning.histories import Record
 from ctxval.learning.learned_dynamics import LearnedDynamics
@@ -149,7 +148,7 @@ def _residuals(learned: LearnedDynamics, record: Record) -> tuple[Array, Array, 
     noisy, posterior = learned.noisy, learned.posterior
     if noisy is None:
         data, most = posterior.data, posterior.most_probable
-        residuals = record.states[1:] - DrawnModel(posterior.mean).step(record.states[:-1], record.inputs)
+        residuals = record.states[1:] - posterior.mean.step(record.states[:-1], record.inputs)
         Z = data.standardised(record.states[:-1], record.inputs)
         doubt = np.zeros(len(data.sizes))
         variance = most.whitened(Z)[1].mean() * most.squares / len(most.centres)

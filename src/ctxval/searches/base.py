@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
-from ctxval._util.arrays import Array, ArrayLike, Rows, as_floats
+from ctxval._util.arrays import Array, ArrayLike, as_floats
 from ctxval._util.checked import NonNegativeInt, PositiveInt, checked
 from ctxval._util.representation import ShortRepr, call, options
 from ctxval.errors import InputError, ShapeError
@@ -43,9 +43,8 @@ class Prediction(ShortRepr):
     expected: Callable[[Array], tuple[Array, Array]]
     """Points ``(m, d)`` -> expected values ``(m,)`` and their doubt ``(m,)``, both NaN if a value cannot be predicted.
     The doubt is 0 if all that leads to a value was seen before, and about 1 if nothing was."""
-    left_out: Callable[[Rows], Array]
-    """Rows ``(k,)`` -> leave-one-out predictions ``(k,)``. Rows count the points with a known value, in the order of
-    asking; each is predicted as if it had not been evaluated."""
+    left_out: Callable[[Array], Array]
+    """Points ``(k, d)`` with known values -> predictions ``(k,)``, each as if that point had not been evaluated."""
     budget: int  # number of points that may be predicted to choose one, known points not counted
     otherwise: Callable[[], Prediction | None] | None = None  # another one, if leave-one-out errors show a bad one
     costs: Callable[[], Costs] | None = None  # measures the costs, which takes some predictions
@@ -53,15 +52,6 @@ class Prediction(ShortRepr):
     steady: Callable[[Array], bool] | None = None  # whether a point has the value of its neighbours; None if all have
     pending: Pending | None = None  # the points that are being evaluated
     candidates: Array | None = None  # the only points that may be evaluated (r, d); None if all may
-
-    def with_rows(self, left_out_of: Callable[[Prediction], Callable[[Rows], Array]]) -> Prediction:
-        """Return the prediction, and those that it may turn to, with a function of other rows for each ``left_out``."""
-
-        def otherwise() -> Prediction | None:
-            other = None if self.otherwise is None else self.otherwise()
-            return None if other is None else other.with_rows(left_out_of)
-
-        return replace(self, left_out=left_out_of(self), otherwise=otherwise)
 
 
 @runtime_checkable

@@ -17,7 +17,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ctxval._util.arrays import Array, single_threaded
-from ctxval._util.boxes import Box
 from ctxval._util.checked import NonNegativeFloat, PositiveInt
 from ctxval._util.registry import part
 from ctxval.gp.acquisition import Acquisition, LogExpectedImprovement, UpperConfidenceBound, maximise
@@ -41,11 +40,6 @@ class _Branch:
     upper: bool
     best: float = -np.inf  # the largest value in this half since the branch began
     misses: int = 0  # number of successive executions in the branch without improvement
-
-    def box(self, dimension: int) -> Box:
-        low, high = np.zeros(dimension), np.ones(dimension)
-        (low if self.upper else high)[self.coordinate] = 0.5
-        return low, high
 
 
 @part("bayesian-optimisation")
@@ -94,14 +88,17 @@ class BayesianOptimisation(SequentialSearch):
             acquisition: Acquisition = UpperConfidenceBound(process, 100.0)
         elif len(values) % _BOUND == _BOUND - 1:
             acquisition = UpperConfidenceBound(process, self.beta)
-        elif branch is not None:
-            acquisition = LogExpectedImprovement(process, _worthwhile(learned, values, branch.best))
         else:
-            # Predicted values of pending points count, so that the points of one batch do not all improve on one value.
-            believed = float(process.y[int(known[rows].sum()) :].max(initial=-np.inf))
-            best = _worthwhile(learned, values, float(np.nanmax(values)))
-            acquisition = LogExpectedImprovement(process, max(best, believed))
-        box = None if branch is None else branch.box(self.dimension)
+            largest = float(np.nanmax(values))
+            least = (largest if branch is None else branch.best) + _WORTH * float(largest - np.nanmedian(values))
+            best = float(learned.standardised(np.array([least]))[0])
+            if branch is None:
+                # Predicted values of pending points count, so that points of one batch do not all improve on one value.
+                best = max(best, float(process.y[int(known[rows].sum()) :].max(initial=-np.inf)))
+            acquisition = LogExpectedImprovement(process, best)
+        box = np.zeros(self.dimension), np.ones(self.dimension)
+        if branch is not None:
+            box[0 if branch.upper else 1][branch.coordinate] = 0.5
         known_first, away = best_first(points, values), points[~known]
         point = maximise(acquisition, self.dimension, known_first, rng, box=box, corners=True, away=away)
         return point, {
@@ -124,12 +121,6 @@ class BayesianOptimisation(SequentialSearch):
         if self._memo is None or self._memo[0] != key:
             self._memo = (key, learn(points[:count], values[:count]))
         return self._memo[1]
-
-
-def _worthwhile(learned: SurrogateHyperparameters, values: Array, best: float) -> float:
-    """Return the value to improve on, in the process's units."""
-    margin = _WORTH * float(np.nanmax(values) - np.nanmedian(values))
-    return float(learned.standardised(np.array([best + margin]))[0])
 
 
 def _filling(points: Array, rng: np.random.Generator) -> Array:

@@ -8,7 +8,7 @@ from ctxval._util.arrays import Array, single_threaded
 from ctxval._util.checked import NonNegativeFloat, PositiveFloat, PositiveInt
 from ctxval._util.registry import part
 from ctxval.gp.acquisition import Uncertainty, UpperConfidenceBound, maximise
-from ctxval.gp.kernels import Kernel, Matern
+from ctxval.gp.kernels import Matern
 from ctxval.gp.regression import NOISE, Mean
 from ctxval.gp.surrogate import Surrogate, fit_surrogate, kept_rows
 from ctxval.searches.base import SequentialSearch, best_first
@@ -35,13 +35,13 @@ class GPUCB(SequentialSearch):
         beta: NonNegativeFloat = 2.0,
         initial: PositiveInt = 5,
         *,
-        kernel: Kernel | None = None,
+        kernel: Matern | None = None,
         noise: tuple[PositiveFloat, PositiveFloat] = (NOISE, NOISE),
         prior_mean: Mean | None = None,
     ) -> None:
         self.beta = beta
         self.initial = initial
-        self.kernel: Kernel = Matern(1.5) if kernel is None else kernel
+        self.kernel = Matern(1.5) if kernel is None else kernel
         self.noise = noise
         self.prior_mean = prior_mean
 

@@ -46,16 +46,12 @@ class Repeated(SequentialSearch):
                 return np.asarray(points[rows[0]])
         self._inner.reset(self.dimension, self._seed)
         if groups:
-            values, known, prediction = self.values, np.isfinite(self.values), self._prediction
+            values, known = self.values, np.isfinite(self.values)
             known_rows = [rows[known[rows]] for rows in groups]
             means = [values[rows].mean() if len(rows) else np.nan for rows in known_rows]
             self._inner.tell(points[[rows[0] for rows in groups]], means)
             self._inner.remember([self.notes[rows[0]] for rows in groups])
-            if prediction is not None:
-                # The rows of the inner search count points, those of the prediction count all known values.
-                evaluated = np.array([known[: rows[0]].sum() for rows in known_rows if len(rows)], dtype=np.intp)
-                prediction = prediction.with_rows(lambda each: lambda rows: each.left_out(evaluated[rows]))
-            self._inner.use_prediction(prediction)
+            self._inner.use_prediction(self._prediction)
         point = np.asarray(self._inner.ask(1)[0])
         self._last_note = self._inner.note()
         return point

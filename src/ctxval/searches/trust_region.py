@@ -22,7 +22,6 @@ import numpy as np
 from scipy.spatial.distance import cdist
 
 from ctxval._util.arrays import Array, Mask, single_threaded
-from ctxval._util.boxes import Box
 from ctxval._util.checked import NonNegativeFloat, PositiveInt
 from ctxval._util.progress import expect
 from ctxval._util.registry import part
@@ -49,9 +48,6 @@ class _Candidate:
     expected: float
     doubt: float
 
-    def optimistic(self, optimism: float) -> float:
-        return self.expected * (1 + optimism * self.doubt)
-
 
 def _optimistic(predicted: Callable[[Array], tuple[Array, Array]], optimism: float) -> Callable[[Array], Array]:
     """Return the optimistic value: the prediction d_hat, raised by kappa (``optimism``) times its doubt w."""
@@ -73,10 +69,6 @@ class _Region:
     point: Array | None = None
     misses: int = 0  # number of successive executions without improvement
     stale: int = 0  # number of successive regions that have not improved the largest value of all
-
-    def box(self, dimension: int) -> Box:
-        centre = np.full(dimension, 0.5) if self.point is None else self.point
-        return np.clip(centre - self.radius, 0, 1), np.clip(centre + self.radius, 0, 1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,12 +128,12 @@ class TrustRegion(SequentialSearch):
                     "doubt": candidate.doubt,
                 }
                 why_hedge = self._why_hedge()
-                return candidate.point if why_hedge is None else self._without_prediction(rng, why_hedge)
+                if why_hedge is None:
+                    return candidate.point
+                why = why_hedge
+                break
             why = doubtful or "nothing is predicted anywhere"
             prediction = None if prediction.otherwise is None else prediction.otherwise()
-        return self._without_prediction(rng, why)
-
-    def _without_prediction(self, rng: np.random.Generator, why: str) -> Array:
         point, note = self._fallback.choose(self.points, self.values, rng)
         self._last_note = {**note, "why": why}
         return point
@@ -149,11 +141,11 @@ class TrustRegion(SequentialSearch):
     # How good the prediction is
 
     def _why_not(self, prediction: Prediction, surrogate_error: Callable[[], float]) -> str | None:
-        values = self.values[np.isfinite(self.values)]
-        if not self.compare_with_surrogate or len(values) < _COMPARED_FROM:
+        known = np.flatnonzero(np.isfinite(self.values))
+        if not self.compare_with_surrogate or len(known) < _COMPARED_FROM:
             return None
-        rows = np.arange(len(values))[-_COMPARED_ON:]
-        error = _log_error(prediction.left_out(rows), values[rows])
+        latest = known[-_COMPARED_ON:]
+        error = _log_error(prediction.left_out(self.points[latest]), self.values[latest])
         if error <= 0.1 or error <= surrogate_error():  # a small error needs no comparison
             return None
         return (
@@ -223,8 +215,9 @@ class TrustRegion(SequentialSearch):
             if best is not None:
                 # It may exceed the region's best value and, with ten times the optimism, the largest value of all.
                 least, largest = 1 + _IMPROVEMENT, float(np.nanmax(history.values, initial=0.0))
-                patient = best.optimistic(10.0 * self.optimism)
-                if best.optimistic(self.optimism) > region.best * least and patient > largest * least:
+                kappas = self.optimism, 10.0 * self.optimism
+                optimistic, patient = (best.expected * (1 + kappa * best.doubt) for kappa in kappas)
+                if optimistic > region.best * least and patient > largest * least:
                     return best, region
         # The optimism grows with every region that finds nothing larger, so the search explores more.
         bold = self.optimism * self.boldness ** (1 + region.stale)
@@ -234,7 +227,9 @@ class TrustRegion(SequentialSearch):
         self, prediction: Prediction, optimism: float, region: _Region, history: _History, rng: np.random.Generator
     ) -> _Candidate | None:
         """Return the new point of largest optimistic value in a region; None if no point there can be predicted."""
-        value, few, box = _optimistic(prediction.expected, optimism), prediction.candidates, region.box(self.dimension)
+        value, few = _optimistic(prediction.expected, optimism), prediction.candidates
+        centre = np.full(self.dimension, 0.5) if region.point is None else region.point
+        box = np.clip(centre - region.radius, 0, 1), np.clip(centre + region.radius, 0, 1)
         if few is not None:
             points = few[((few >= box[0]) & (few <= box[1])).all(axis=1)]
             promised = value(points) if len(points) else np.empty(0)
@@ -264,24 +259,23 @@ class TrustRegion(SequentialSearch):
             if note is not None and note.get("engine") == _ENGINE:
                 if note["climb"] > region.number:
                     region = _Region(note["climb"], note["radius"], stale=region.stale + 1)
-                region = self._after(region, point, value, note)
+                if not np.isfinite(value):
+                    region = replace(region, misses=region.misses + 1)
+                elif value > region.best * (1 + _IMPROVEMENT) or region.point is None:
+                    grown = region.radius if region.point is None else min(1.0, 2 * region.radius)
+                    region = replace(region, best=value, point=point, misses=0, radius=grown)
+                else:
+                    if value > region.best:
+                        region = replace(region, best=value, point=point)
+                    right = abs(value - note["expected"]) <= 0.1 * max(value, note["expected"])
+                    radius = region.radius if right else region.radius / 2
+                    region = replace(region, misses=region.misses + 1, radius=radius)
             elif value > region.best:
                 region = replace(region, best=value, point=point)
             if value > largest * (1 + _IMPROVEMENT) or largest == -np.inf:
                 region = replace(region, stale=0)
             largest = max(largest, value) if np.isfinite(value) else largest
         return region
-
-    def _after(self, region: _Region, point: Array, value: float, note: Note) -> _Region:
-        if not np.isfinite(value):
-            return replace(region, misses=region.misses + 1)
-        if value > region.best * (1 + _IMPROVEMENT) or region.point is None:
-            grown = region.radius if region.point is None else min(1.0, 2 * region.radius)
-            return replace(region, best=value, point=point, misses=0, radius=grown)
-        if value > region.best:
-            region = replace(region, best=value, point=point)
-        right = abs(value - note["expected"]) <= 0.1 * max(value, note["expected"])
-        return replace(region, misses=region.misses + 1, radius=region.radius if right else region.radius / 2)
 
 
 def _log_error(expected: Array, values: Array) -> float:
@@ -328,7 +322,8 @@ class Auto(TrustRegion):
             prediction = replace(prediction, budget=self.designs(prediction))
             known = int(np.isfinite(self.values).sum())  # of which some are predicted, too, for a comparison
             compared = min(known, _COMPARED_ON) if known >= _COMPARED_FROM else 0
-            expect(usual_effort(self.dimension, prediction.budget).points + compared)
+            usual = usual_effort(self.dimension, prediction.budget)
+            expect(usual.exact + usual.rough + compared)
         super().use_prediction(prediction)
 
     def propose(self, rng: np.random.Generator) -> Array:

@@ -140,7 +140,7 @@ def test_the_seed_draws_the_data_and_so_the_model() -> None:
 @pytest.mark.parametrize("variant", dubins.VARIANTS)
 def test_every_part_keeps_its_contract(variant: str) -> None:
     validation = dubins.experiment(variant=variant).validation
-    batch = validation.task(validation.space.parameters(validation.space.sobol(4, seed=0)))
+    batch = validation.task(validation.space.parameters(validation.space.iid(4, np.random.default_rng(0))))
     check_model(validation.model, states=3, inputs=2)
     check_synthesizer(validation.synthesizer, batch, validation.model)
     check_system(validation.system, validation.synthesizer.design(batch[0], validation.model), batch[0])
@@ -149,7 +149,7 @@ def test_every_part_keeps_its_contract(variant: str) -> None:
 @pytest.mark.parametrize("variant", dubins.VARIANTS)
 def test_a_batch_of_distances_is_the_distances_one_by_one(variant: str) -> None:
     validation = dubins.experiment(variant=variant).validation
-    points = validation.space.sobol(4, seed=1)
+    points = validation.space.iid(4, np.random.default_rng(1))
     singles = [validation.outcome(point).distance for point in points]
     np.testing.assert_allclose(validation.distances(points), singles, rtol=1e-6)
 

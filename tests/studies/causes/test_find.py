@@ -183,7 +183,7 @@ def test_executions_that_begin_elsewhere_are_not_explained_by_the_dynamics() -> 
             return self.shifts.pop(0)
 
     def report_of(*shifts: float, force: Any = no_force) -> CauseReport:
-        validation = campaign(slide(no_force)).validation.with_system(Shifted(*shifts, force=force))
+        validation = campaign(slide(no_force)).validation.with_parts(system=Shifted(*shifts, force=force))
         return find_causes(Campaign(validation, search=searches.by_name("random"), seed=0).run(3))
 
     report = report_of(0.1, 0.1, 0.1)

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from ctxval import models
-from ctxval.studies.causes.plant import plant_of
+from ctxval.studies.causes.cause import plant_of
 from ctxval.studies.causes.signals import Delay, Lag
 
 

@@ -38,9 +38,8 @@ def test_executions_alone_teach_a_model_without_data() -> None:
     given = validation.model
     assert isinstance(given, models.Linear)
     # On half of the circle: on the other half tasks start at -pi, where executions of this one teach nothing.
-    bare = validation.with_space(TaskSpace(goal=(0.0, np.pi, "rad"))).with_model(
-        models.Linear(given.A, given.B, given.c)
-    )
+    space = TaskSpace(goal=(0.0, np.pi, "rad"))
+    bare = validation.with_parts(space=space, model=models.Linear(given.A, given.B, given.c))
     goals = bare.space.grid(101)
     before = bare.distances(goals).max()
     found = refine(campaign(bare, 0), 0.1 * before, 6, certificate=CHEAP)

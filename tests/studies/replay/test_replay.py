@@ -324,7 +324,7 @@ def test_recordings_of_a_small_region_are_said_to_be_left() -> None:
 def test_recordings_that_the_model_explains_predict_nothing_of_the_tasks() -> None:
     pendulum = by_name("pendulum", 0).validation
     model = models.Linear(pendulum.model.A, pendulum.model.B, pendulum.model.c)  # type: ignore[attr-defined]
-    validation = pendulum.with_model(model)  # without the data that it was learned from
+    validation = pendulum.with_parts(model=model)  # without the data that it was learned from
     plan = validation.plan([1.0])
     one = systems.Simulated(model).execute(plan.controller, plan.task)
     log = MemoryTable("run", {"t": one.times, "x": one.states, "u": one.inputs})

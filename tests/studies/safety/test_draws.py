@@ -39,6 +39,8 @@ def test_unsafe_draws_are_counted_and_bound_the_share(tmp_path: Path) -> None:
 def test_what_cannot_be_drawn_is_refused() -> None:
     with pytest.raises(InputError, match="nothing to draw from"):
         draw_tasks(Campaign(validation()), 1.6, 10)
-    suite = validation().with_space(TaskSuite({"a": {"wall": 1.0, "speed": 1.0}, "b": {"wall": 2.0, "speed": 1.2}}))
+    suite = validation().with_parts(
+        space=TaskSuite({"a": {"wall": 1.0, "speed": 1.0}, "b": {"wall": 2.0, "speed": 1.2}})
+    )
     with pytest.raises(InputError, match="a suite has finitely many tasks"):
         draw_tasks(Campaign(suite), 0.1, 10)

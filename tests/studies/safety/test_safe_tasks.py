@@ -36,7 +36,7 @@ def test_a_drift_with_one_wall_has_its_closed_form() -> None:
     expected = np.maximum(of_model - 2 * np.maximum(of_system, 0), 0)
     np.testing.assert_allclose(given.distances(points), expected, atol=1e-12)
     assert expected.max() == pytest.approx(D_B, abs=0.01)
-    assert given.with_distance(MaximumDeviation()).distances(points).max() == pytest.approx(D_A)
+    assert given.with_parts(distance=MaximumDeviation()).distances(points).max() == pytest.approx(D_A)
 
 
 @pytest.mark.slow
@@ -117,7 +117,7 @@ def random_linear(seed: int) -> tuple[Validation, Validation]:
         synthesizer=controllers.LQR([1.0, 1.0], [0.1, 0.1]),
         distance=MaximumDeviation(2),
     )
-    return plain, plain.with_distance(UnsafeMargin(spec))
+    return plain, plain.with_parts(distance=UnsafeMargin(spec))
 
 
 @pytest.mark.parametrize("seed", range(8))
@@ -139,14 +139,14 @@ def test_both_distances_certify_safe_tasks_alone_and_the_specification_certifies
 
 def test_what_cannot_be_assessed_is_refused_in_one_sentence() -> None:
     with pytest.raises(InputError, match="the distance must be an UnsafeMargin of a specification"):
-        assess(Campaign(validation().with_distance(distances.FinalState())))
+        assess(Campaign(validation().with_parts(distance=distances.FinalState())))
     with pytest.raises(InputError, match="no drawn task satisfies the specification on the model with a margin of 9"):
         require_safe_tasks(validation(9.0))
     with pytest.raises(InputError, match="no drawn task satisfies the specification on the model at all"):
         require_safe_tasks(validation(farthest=0.45))
     flat = ReachAvoid(avoid=Box(low=[0.0, 0.0], high=[1.0, 1.0]), components=(0,))
     with pytest.raises(ShapeError, match="the Box must have 1 dimension, one for each state"):
-        require_safe_tasks(validation().with_distance(UnsafeMargin(flat)))
+        require_safe_tasks(validation().with_parts(distance=UnsafeMargin(flat)))
     assert require_safe_tasks(validation()) == pytest.approx(0.62, abs=0.1)
 
 

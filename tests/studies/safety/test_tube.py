@@ -109,6 +109,6 @@ def test_what_has_no_tube_is_refused() -> None:
     policy = VALIDATION.with_parts(synthesizer=controllers.Policy(lambda t, x, task: x[..., :1]))
     with pytest.raises(InputError, match="affine feedback of one task"):
         tube_of(policy, policy.plan([1.0]), disturbance)
-    curved = VALIDATION.with_model(lambda x, u: MODEL.step(x, u) + 0.01 * np.sin(x))
+    curved = VALIDATION.with_parts(model=lambda x, u: MODEL.step(x, u) + 0.01 * np.sin(x))
     with pytest.raises(InputError, match="a tube needs a linear model"):
         tube_of(curved, curved.plan([1.0]), disturbance)

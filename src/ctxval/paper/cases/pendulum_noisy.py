@@ -26,4 +26,4 @@ def experiment(seed: int = 0) -> Experiment:
         delay=DELAY,
         seed=seed,
     )
-    return replace(ideal, name="pendulum-noisy", validation=parts.with_system(system), truth=None)
+    return replace(ideal, name="pendulum-noisy", validation=parts.with_parts(system=system), truth=None)

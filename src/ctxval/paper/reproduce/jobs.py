@@ -201,7 +201,7 @@ def _aspects(job: Job, validation: Validation) -> Result:
     references = validation.task(validation.space.parameters(points)).reference
     return {
         "model_error": validation.on_model(missed).distances(points).tolist(),
-        "system_error": validation.with_distance(missed).distances(points).tolist(),
+        "system_error": validation.with_parts(distance=missed).distances(points).tolist(),
         "size": np.abs(references[..., 1:, 1]).mean(axis=-1).tolist(),
     }
 

@@ -164,7 +164,7 @@ class Candidate:
         if self._last is None or self._last[0] != key:
             self._last = key, None
             with suppress(Exception):  # the user's parts, at states that no execution has reached
-                self._last = key, self._study.predict(list(executed))
+                self._last = key, self._study.prediction_of(self._study.learn(executed), executed)
         return self._last[1]
 
 

@@ -194,7 +194,7 @@ class _Loop:
                 if number == 1:
                     raise
                 return f"no better model can be learned: {str(error).removesuffix('.')}"
-        validation = self.first.validation.with_model(model)
+        validation = self.first.validation.with_parts(model=model)
         same = same_controllers(validation, list(self._executed(self.rounds)))
         if same.worst is not None and same.worst > self.threshold:
             return (
@@ -283,7 +283,7 @@ def with_best_jacobian(validation: Validation, refined: Refined) -> tuple[Refine
         return refined, None
     other = Corrected(model.model, model.correction, linearised="model", data=model.data)
     kept = Refined(other, refined.data, refined.before)
-    costs = [_typical_cost(validation.with_model(either)) for either in (refined, kept)]
+    costs = [_typical_cost(validation.with_parts(model=either)) for either in (refined, kept)]
     if costs[0] <= 0.95 * costs[1]:  # clearly
         return refined, None
     return kept, (
@@ -310,7 +310,7 @@ def _linearises_once(validation: Validation, model: Linear) -> bool:
 
     counted = Counted()
     with suppress(CtxvalError):
-        validation.with_model(counted).plan(validation.space.from_unit(np.full(validation.space.dimension, 0.5)))
+        validation.with_parts(model=counted).plan(validation.space.from_unit(np.full(validation.space.dimension, 0.5)))
         return 1 <= counted.points <= 2
     return False
 
@@ -347,6 +347,5 @@ def same_controllers(validation: Validation, executed: Sequence[tuple[Trial, Tra
         with suppress(Exception):  # users' parts may raise anything: what cannot be compared differs
             plan = validation.plan(validation.space.from_unit(trial.unit_point))
             if gives_inputs(plan, recorded, 1e-6):  # a share of the largest magnitude of each input
-                distance = validation.accept(plan, recorded).distance
-                distances += [] if distance is None else [distance]
+                distances.append(validation.accept(plan, recorded))
     return SameControllers(len(recent), len(distances), max(distances, default=None))

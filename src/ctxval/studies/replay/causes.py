@@ -107,7 +107,7 @@ def _learned(model: Model, where: Windows, folds: Rows, held: Mask, seed: int) -
         if posterior is None:
             return np.zeros_like(x)
         # What is learned may be a linear model of the system, without M.
-        return np.asarray(posterior.mean.model_of(0).step(x, u) - model.step(x, u))
+        return np.asarray(posterior.mean.step(x, u) - model.step(x, u))
 
 
 @dataclass(frozen=True)

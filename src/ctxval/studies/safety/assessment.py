@@ -119,7 +119,7 @@ def judged_by(experiment: Experiment, distance: UnsafeMargin) -> Experiment:
 
     The unit is that of the states that the specification looks at, if they have one.
     """
-    given = experiment.validation.with_distance(distance)
+    given = experiment.validation.with_parts(distance=distance)
     labels = [parted(label)[1] for label in experiment.states]
     components = getattr(spec_distance(given).spec, "components", None)
     places = range(len(labels)) if components is None else [i for i in components if isinstance(i, int)]
@@ -257,7 +257,7 @@ def _compared(campaign: Campaign, trial: Trial, system: Trajectory) -> tuple[Uns
 
 def _deviation_bound(campaign: Campaign, spec: Any, confidence: float) -> float | None:
     """Return the bound that learned dynamics give on the largest deviation; None if they give none."""
-    validation = campaign.validation.with_distance(MaximumDeviation(2, getattr(spec, "components", None)))
+    validation = campaign.validation.with_parts(distance=MaximumDeviation(2, getattr(spec, "components", None)))
     pairs = [(trial.unit_point, system) for trial, system in executed_trials(campaign.store, campaign.trials)]
     with suppress(Exception):  # users' parts, at states that no execution has reached
         learned = DynamicsStudy(validation, campaign.seed).learn(pairs)

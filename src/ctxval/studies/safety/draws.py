@@ -136,7 +136,7 @@ def draw_tasks(
     sampler = TasksWithMargin(LoopPlanner(validation), validation.space, spec, float(margin))
     sampler(np.random.default_rng(0), 1)  # refuses a margin that no task has
     drawn = Campaign(
-        validation.with_space(validation.space.sampled(sampler)).with_distance(UnsafeMargin(spec)),
+        validation.with_parts(space=validation.space.sampled(sampler), distance=UnsafeMargin(spec)),
         search=by_name("random"),
         store=Store(store),
         seed=campaign.seed,
