@@ -248,11 +248,19 @@ def fit_lagged(
                 if height > best:
                     theta, best = other, height
                     break
-    fit = _conditioned(history, scaled, theta, live, rows, None)
-    local = local_noise(scaled.Z[:, : pairs.shape[1]], fit.innovations[:, live])
-    if local is None:
+    fit, within = _conditioned(history, scaled, theta, live, rows, None), scaled.Z[:, : pairs.shape[1]]
+    for _ in range(3):  # records with little noise weigh more, so the mean fits them better, and noise differs more
+        local = local_noise(within, _unit(fit.innovations / fit.rows, live)[:, live])
+        if local is None:
+            return fit
+        fit = _conditioned(history, scaled, theta, live, 1 / local(within)[:, None], local)
+    # Where there is no noise at all, innovations are smaller than weights say. Drawn among these, those beyond an edge
+    # would be too small.
+    left = local_noise(within, fit.innovations[:, live])
+    if left is None:
         return fit
-    return _conditioned(history, scaled, theta, live, 1 / local(scaled.Z[:, : pairs.shape[1]])[:, None], local)
+    unit = _unit(fit.innovations / left(within)[:, None], live)
+    return replace(fit, local=replace(left, before=fit.local), innovations=unit)
 
 
 def _conditioned(

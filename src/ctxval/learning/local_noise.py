@@ -1,4 +1,4 @@
-"""Noise that varies with state and input."""
+"""Noise that varies with state and input: other in a region, such as on gravel, or more where the system is fast."""
 
 from __future__ import annotations
 
@@ -10,31 +10,59 @@ from scipy.spatial.distance import cdist
 from ctxval._util.arrays import Array
 
 _PRIOR = 8.0  # innovations of the average size that each average holds
+_GAIN = 6.0  # least gain of the log likelihood of innovations that were left out
+# Least gain by a split at the best of all places, and the fewest innovations on each side of it.
+_SPLIT_GAIN, _FEWEST = 15.0, 20
+_LEAST = 1e-4  # least relative variance: without it, records without noise would outweigh all others
+
+
+@dataclass(frozen=True)
+class Split:
+    """A place in one coordinate at which noise changes, and the part on each side: a variance or a further split."""
+
+    coordinate: int
+    at: float
+    below: Split | float
+    above: Split | float
+
+    def __call__(self, pairs: Array) -> Array:
+        """Return the variances ``(N,)`` at pairs ``(N, n + m)``."""
+        sides = [side(pairs) if isinstance(side, Split) else side for side in (self.below, self.above)]
+        return np.where(pairs[:, self.coordinate] <= self.at, *sides)
 
 
 @dataclass(frozen=True, eq=False)
 class LocalNoise:
-    """The standard deviation of innovations relative to the constant one, as an average over centres."""
+    """The standard deviation of innovations relative to the constant one: parts, times an average over centres."""
 
+    parts: Split | None  # None if no coordinate has a place at which noise changes
     centres: Array  # standardised states and inputs, (C, n + m)
-    variances: Array  # the relative variances there, (C,)
+    variances: Array  # the variances there relative to those of the parts, (C,)
+    before: LocalNoise | None = None  # to which this one is relative; None if to a constant
 
     def __call__(self, pairs: Array) -> Array:
         """Return the relative standard deviations ``(N,)`` at standardised states and inputs ``(N, n + m)``."""
         K = _near(pairs, self.centres) + 1e-12
-        return np.asarray(np.sqrt(K @ self.variances / K.sum(axis=1)))
+        variances = K @ self.variances / K.sum(axis=1)
+        if self.parts is not None:
+            variances *= self.parts(pairs)
+        return np.asarray(np.sqrt(variances) * (1.0 if self.before is None else self.before(pairs)))
 
 
 def local_noise(pairs: Array, innovations: Array) -> LocalNoise | None:
     """Return how unit innovations ``(N, k)`` vary over states and inputs; None if a constant is about as likely.
 
-    The squared innovations are averaged around each point with a prior of the constant one. The average must predict
-    those that are left out.
+    Where noise begins at a place, such as an edge, an average over neighbours would be too small inside: such places
+    split the space first. Then squared innovations are averaged around each point, with a prior of the constant one.
+    The average must predict those that are left out.
     """
     if not innovations.shape[1]:
         return None
     squares = (innovations**2).mean(axis=1)
     squares = squares / max(squares.mean(), 1e-300)
+    parts = _parts(pairs, squares, innovations.shape[1])
+    if isinstance(parts, Split):
+        squares = squares / parts(pairs)
     rng = np.random.default_rng(len(pairs))
     some = rng.permutation(len(pairs))[:400]
     K = _near(pairs[some], pairs)
@@ -42,11 +70,31 @@ def local_noise(pairs: Array, innovations: Array) -> LocalNoise | None:
     averages = (K @ squares + _PRIOR) / (K.sum(axis=1) + _PRIOR)
     # The log likelihood of normal innovations with these variances, above that with a variance of 1.
     gains = -0.5 * innovations.shape[1] * (np.log(averages) + squares[some] / averages - squares[some])
-    if gains.sum() <= 6.0:  # least gain of the log likelihood of innovations that were left out
+    smooth = gains.sum() > _GAIN
+    if not smooth and not isinstance(parts, Split):
         return None
     centres = pairs[rng.permutation(len(pairs))[:80]]
     K = _near(centres, pairs)
-    return LocalNoise(centres, (K @ squares + _PRIOR) / (K.sum(axis=1) + _PRIOR))
+    variances = (K @ squares + _PRIOR) / (K.sum(axis=1) + _PRIOR) if smooth else np.ones(len(centres))
+    return LocalNoise(parts if isinstance(parts, Split) else None, centres, variances)
+
+
+def _parts(pairs: Array, squares: Array, k: int) -> Split | float:
+    """Return the variance of squared innovations ``(N,)``, the means of k each, or those on both sides of a split."""
+    n, mean = len(squares), max(float(squares.mean()), _LEAST)
+    if n >= 2 * _FEWEST:
+        count, order = np.arange(1, n)[:, None], np.argsort(pairs, axis=0, kind="stable")
+        ordered, total = np.take_along_axis(pairs, order, axis=0), np.cumsum(squares[order], axis=0)
+        below, above = total[:-1] / count, (total[-1] - total[:-1]) / (n - count)
+        logs = count * np.log(np.maximum(below, _LEAST)) + (n - count) * np.log(np.maximum(above, _LEAST))
+        gains = 0.5 * k * (n * np.log(mean) - logs)  # of the log likelihood of normal innovations
+        gains[(ordered[1:] == ordered[:-1]) | (count < _FEWEST) | (n - count < _FEWEST)] = -np.inf
+        row, j = map(int, np.unravel_index(int(gains.argmax()), gains.shape))
+        if gains[row, j] > _SPLIT_GAIN:
+            at = float(ordered[row : row + 2, j].mean())
+            low = pairs[:, j] <= at
+            return Split(j, at, _parts(pairs[low], squares[low], k), _parts(pairs[~low], squares[~low], k))
+    return mean
 
 
 def _near(pairs: Array, others: Array) -> Array:
