@@ -25,10 +25,11 @@ from dynamics_reporting import REPORTING
 from dynamics_rough import ROUGH
 from dynamics_truths import truth
 
-RULE = 7
+RULE = 8
 """Version of the rule by which campaigns are run now: eight tests at drawn tasks come before a validation (5), and the
-corners of positions are executed (6), and places of positions are entered after the tests (7). Campaigns of systems
-without positions are the same by both, and so are falsified ones by 6 and 7; they have the newer number."""
+corners of positions are executed (6), places of positions are entered after the tests (7), and numbers such as x and y
+are a position (8). Campaigns of systems without such positions are the same, and so are falsified ones by 6 and 7; they
+have the newer number."""
 
 WITH_TESTS = 5  # the first rule with tests at drawn tasks
 
