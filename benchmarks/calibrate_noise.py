@@ -29,9 +29,8 @@ RULE = 6
 """Version of the rule by which campaigns are run. Since version 4, a vague prediction is no test; campaigns that were
 over before any test in version 3 are the same. Since version 5, noise of measurements is kept however little it moves
 distances; campaigns whose noise was kept from the second execution on, or that measure exactly, are the same. Since
-version 6, numbers such as x and z are a position, which the quadrotor alone has, and noise may begin at an edge, which
-no plant has: 15 of 15 campaigns of the others were the same in all digits. Campaigns that are the same have the number
-of the newer version."""
+version 6, noise may begin at an edge, which it does in no plant: 15 of 15 campaigns were the same in all digits.
+Campaigns that are the same have the number of the newer version."""
 
 CONFIDENCES = (0.8, 0.9, 0.95)
 """Those for which the coverage of bounds is counted."""

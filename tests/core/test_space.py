@@ -123,6 +123,7 @@ def test_neighbouring_numbers_that_differ_in_an_axis_are_a_position() -> None:
     assert space.positions == (slice(1, 3), slice(3, 6))
     assert TaskSpace(goal=ends, start=ends).positions == ()
     assert TaskSpace(x=(0, 1), y=(0, 1)).positions == ()
+    assert TaskSpace(x=ends, z=ends, goal_y=ends, goal_z=ends).positions == ()  # not on the ground
     assert TaskSpace(x=ends, y=(0, 1, "mm")).positions == ()
     assert TaskSpace(x=ends, load=(0, 1, "kg"), y=ends).positions == ()
 

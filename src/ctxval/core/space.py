@@ -54,9 +54,10 @@ class Parameters:
 _LENGTHS = ("m", "mm", "cm", "km", "in", "ft")
 
 
-def _is_next_axis(first: str, second: str) -> bool:
+def _differ_in(first: str, second: str, axes: str) -> bool:
+    """Return whether names differ in one axis alone, as ``goal_x`` and ``goal_y`` do in ``xy``."""
     different = [a + b for a, b in zip(first.lower(), second.lower(), strict=False) if a != b]
-    return len(first) == len(second) and different in (["xy"], ["xz"], ["yz"])
+    return len(first) == len(second) and different == [axes]
 
 
 class TaskSpace:
@@ -131,21 +132,25 @@ class TaskSpace:
     def positions(self) -> tuple[slice, ...]:
         """The columns of the parameters that are positions in space, two or three components in a unit of length.
 
-        They are vectors, or neighbouring numbers whose names differ in an axis alone: ``goal_x`` and ``goal_y``.
+        They are vectors, or neighbouring numbers whose names differ in an axis alone: ``goal_x`` and ``goal_y``, and
+        perhaps ``goal_z``. Numbers such as x and z alone are no place on the ground.
         """
-        groups, last = list[slice](), ""
-        for name, at in self._columns.items():
-            if self.units[name] not in _LENGTHS:
-                last = ""
-            elif isinstance(at, slice):
+        groups, last = list[slice](), ""  # the number before, if it is a length
+        for name, columns in self._columns.items():
+            at = columns if isinstance(columns, slice) else slice(columns, columns + 1)
+            is_length, is_number = self.units[name] in _LENGTHS, at is not columns
+            axes = "yz" if groups and groups[-1].stop - groups[-1].start == 2 else "xy"
+            if (
+                is_length
+                and is_number
+                and last
+                and self.units[last] == self.units[name]
+                and _differ_in(last, name, axes)
+            ):
+                groups[-1] = slice(groups[-1].start, at.stop)
+            elif is_length:
                 groups.append(at)
-                last = ""
-            elif last and self.units[last] == self.units[name] and _is_next_axis(last, name):
-                groups[-1] = slice(groups[-1].start, at + 1)
-                last = name
-            else:
-                groups.append(slice(at, at + 1))
-                last = name
+            last = name if is_number and is_length else ""
         return tuple(at for at in groups if at.stop - at.start in (2, 3))
 
     def values_of(self, name: str, points: Array) -> Any:
