@@ -27,7 +27,7 @@ def test_noise_that_grows_smoothly_is_averaged_over_neighbours() -> None:
     truth = np.exp(0.3 * pairs[:, 1])
     local = local_noise(pairs, (truth * rng.standard_normal(1500))[:, None])
     assert local is not None
-    assert np.corrcoef(np.log(local(pairs)), np.log(truth))[0, 1] > 0.8
+    assert np.corrcoef(np.log(local(pairs)), np.log(truth))[0, 1] > 0.7
 
 
 def test_noise_that_is_the_same_everywhere_is_not_local() -> None:

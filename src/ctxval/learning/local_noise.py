@@ -84,13 +84,18 @@ def _parts(pairs: Array, squares: Array, k: int) -> Split | float:
     n, mean = len(squares), max(float(squares.mean()), _LEAST)
     if n >= 2 * _FEWEST:
         count, order = np.arange(1, n)[:, None], np.argsort(pairs, axis=0, kind="stable")
-        ordered, total = np.take_along_axis(pairs, order, axis=0), np.cumsum(squares[order], axis=0)
-        below, above = total[:-1] / count, (total[-1] - total[:-1]) / (n - count)
-        logs = count * np.log(np.maximum(below, _LEAST)) + (n - count) * np.log(np.maximum(above, _LEAST))
-        gains = 0.5 * k * (n * np.log(mean) - logs)  # of the log likelihood of normal innovations
-        gains[(ordered[1:] == ordered[:-1]) | (count < _FEWEST) | (n - count < _FEWEST)] = -np.inf
-        row, j = map(int, np.unravel_index(int(gains.argmax()), gains.shape))
-        if gains[row, j] > _SPLIT_GAIN:
+        ordered, gains = np.take_along_axis(pairs, order, axis=0), list[Array]()
+        # Of the log likelihood of normal innovations, and of those with heavier tails: a few large ones, such as hits
+        # of a wall, are no noise that begins somewhere.
+        limited = np.maximum(squares, _LEAST)
+        for values, power in ((limited, 0.5 * k), (np.sqrt(limited), 1.0 * k)):
+            total = np.cumsum(values[order], axis=0)
+            below, above = total[:-1] / count, (total[-1] - total[:-1]) / (n - count)
+            gains.append(power * (n * np.log(values.mean()) - count * np.log(below) - (n - count) * np.log(above)))
+        gain = np.minimum(*gains)
+        gain[(ordered[1:] == ordered[:-1]) | (count < _FEWEST) | (n - count < _FEWEST)] = -np.inf
+        row, j = map(int, np.unravel_index(int(gain.argmax()), gain.shape))
+        if gain[row, j] > _SPLIT_GAIN:
             at = float(ordered[row : row + 2, j].mean())
             low = pairs[:, j] <= at
             return Split(j, at, _parts(pairs[low], squares[low], k), _parts(pairs[~low], squares[~low], k))
