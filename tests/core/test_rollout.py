@@ -96,8 +96,14 @@ def test_a_loop_that_diverges_says_at_which_step() -> None:
 
 def test_an_input_that_is_not_finite_is_told_as_such() -> None:
     loop = rollout(lambda x, u: x, lambda t, x: np.array([np.nan]), Task([0.0], horizon=2, dt=0.1))
-    assert loop.ended == "not finite in its inputs"
+    assert loop.ended == "got NaN from its controller at step 0"
     assert not loop.finite
+    late = rollout(
+        lambda x, u: x + u, lambda t, x: np.where(x < 2, 1.0, np.nan) + 0 * x, Task([0.0], horizon=9, dt=0.1)
+    )
+    assert late.ended == "got NaN from its controller at step 2"
+    infinite = rollout(lambda x, u: x, lambda t, x: np.array([np.inf]), Task([0.0], horizon=2, dt=0.1))
+    assert infinite.ended == "not finite in its inputs"
 
 
 @pytest.mark.parametrize(

@@ -13,6 +13,8 @@ from ctxval.core.task import Task
 from ctxval.core.trajectory import Trajectory
 from ctxval.errors import CtxvalError, ShapeError
 
+_ENORMOUS = 1e100  # states from which sums of inputs may overflow
+
 
 def rollout(step: Step, controller: Controller, task: Task, *, partial: bool = False) -> Trajectory:
     """Run a controller in closed loop with ``x_next = step(x, u)`` over the task's horizon.
@@ -56,5 +58,12 @@ def rollout(step: Step, controller: Controller, task: Task, *, partial: bool = F
     trajectory = Trajectory(task.times, np.moveaxis(states, 0, -2), np.moveaxis(inputs, 0, -2))
     if trajectory.finite.all():
         return trajectory
-    bad = ~np.isfinite(states).reshape(task.horizon + 1, -1).all(axis=1)
-    return replace(trajectory, ended=f"diverged at step {bad.argmax()}" if bad.any() else "not finite in its inputs")
+    flat = states.reshape(task.horizon + 1, -1)
+    bad = ~np.isfinite(flat).all(axis=1)
+    first = int(bad.argmax()) if bad.any() else task.horizon
+    # NaN for a state that is a number is the controller's doing, unless the loop grew beyond all numbers.
+    ordinary = np.abs(flat[:first]).max(axis=1) < _ENORMOUS
+    without = ordinary & np.isnan(inputs.reshape(task.horizon, -1)[:first]).any(axis=1)
+    if without.any():
+        return replace(trajectory, ended=f"got NaN from its controller at step {without.argmax()}")
+    return replace(trajectory, ended=f"diverged at step {first}" if bad.any() else "not finite in its inputs")
