@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -50,10 +50,11 @@ class Recordings(ShortRepr):
         """The number of recorded steps."""
         return sum(run.trajectory.horizon for run in self.runs)
 
-    def transitions(self) -> tuple[Transitions, Rows]:
-        """Return the steps of all recordings as transitions, and the number of the recording of each."""
-        parts = [run.trajectory.transitions() for run in self.runs]
-        of = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
+    def transitions(self, runs: Iterable[int] | None = None) -> tuple[Transitions, Rows]:
+        """Return the steps of some recordings as transitions, and the number of the recording of each."""
+        numbers = list(range(len(self.runs)) if runs is None else runs)
+        parts = [self.runs[number].trajectory.transitions() for number in numbers]
+        of = np.repeat(np.array(numbers, dtype=np.intp), [len(part) for part in parts])
         return replace(Transitions.joined(parts), dt=self.dt), of
 
 
