@@ -377,7 +377,7 @@ def test_a_model_that_fails_stops_the_campaign_and_the_next_run_goes_on_behind_i
 
     model = Bad()
     campaign = gp_ucb(make_validation(model=model))
-    with pytest.raises(ModelError, match="model's closed loop diverged at step 1"):
+    with pytest.raises(ModelError, match="model's closed loop got NaN from its controller at step 0"):
         campaign.run(3)
     assert (campaign.executions, len(campaign.failed)) == (0, 1)
     model.fails = False
