@@ -177,10 +177,12 @@ class ExecutionLoop:
         They are all executions if none moved, or the last ones in a row of this call: who runs again goes on.
         """
         failed = ended = [trial for trial in self.recorder.trials if trial.executed]
+        if len(ended) < _ALIKE or not self.in_a_row or (self.budget is not None and len(ended) >= self.budget):
+            return None
         which, fewest, numbers = "all", _ALIKE, [trial.number for trial in ended]
         if any(trial.state != "failed" for trial in ended) or self.recorder.store.trajectories(numbers, "system"):
             failed, which, fewest = self.in_a_row, "the last", _IN_A_ROW
-        if len(failed) < fewest or (self.budget is not None and len(ended) >= self.budget):
+        if len(failed) < fewest:
             return None
         reasons = {re.sub(r"[-+.\d]+", "", trial.failure or "") for trial in failed}
         if len(reasons) > 1 or reasons.pop().startswith("diverged"):

@@ -81,7 +81,7 @@ class EmptyBox:
     @property
     def share(self) -> float:
         """The share of the task space that the box holds."""
-        return float(np.prod(np.subtract(self.high, self.low)))
+        return (self.high[0] - self.low[0]) * (self.high[1] - self.low[1])
 
 
 def largest_empty_box(X: Array) -> EmptyBox | None:

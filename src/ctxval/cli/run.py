@@ -20,7 +20,7 @@ from ctxval.cli import base
 from ctxval.cli.base import command, err, named_values, out, print_table
 from ctxval.cli.config.settings import Settings, read_settings
 from ctxval.cli.config.stored_settings import budget_of, limit_of
-from ctxval.cli.stores import print_envelope
+from ctxval.cli.stores import page_path, print_envelope
 from ctxval.core.trajectory import Transitions
 from ctxval.core.trial import designs_sentence
 from ctxval.errors import CertificateError, InputError
@@ -135,7 +135,7 @@ def run(
             report["error_percent"] = missed
         result = {"verdict": None if verdict is None else verdict.to_json(), "budget": total}
         if with_report:
-            page = path.with_suffix(".report.html")
+            page = page_path(path)
             # An earlier run may have written the same report.
             current = page.is_file() and campaign.store.computed(base.RUN) == {**result, "report": str(page)}
             try:

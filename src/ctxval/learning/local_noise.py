@@ -36,16 +36,16 @@ class LocalNoise:
     """The standard deviation of innovations relative to the constant one: parts, times an average over centres."""
 
     parts: Split | None  # None if no coordinate has a place at which noise changes
-    centres: Array  # standardised states and inputs, (C, n + m)
+    centres: Array  # standardised states and inputs, (C, n + m); none if noise is the same within each part
     variances: Array  # the variances there relative to those of the parts, (C,)
     before: LocalNoise | None = None  # to which this one is relative; None if to a constant
 
     def __call__(self, pairs: Array) -> Array:
         """Return the relative standard deviations ``(N,)`` at standardised states and inputs ``(N, n + m)``."""
-        K = _near(pairs, self.centres) + 1e-12
-        variances = K @ self.variances / K.sum(axis=1)
-        if self.parts is not None:
-            variances *= self.parts(pairs)
+        variances = np.ones(len(pairs)) if self.parts is None else self.parts(pairs)
+        if len(self.centres):
+            K = _near(pairs, self.centres) + 1e-12
+            variances = variances * (K @ self.variances / K.sum(axis=1))
         return np.asarray(np.sqrt(variances) * (1.0 if self.before is None else self.before(pairs)))
 
 
@@ -61,8 +61,9 @@ def local_noise(pairs: Array, innovations: Array) -> LocalNoise | None:
     squares = (innovations**2).mean(axis=1)
     squares = squares / max(squares.mean(), 1e-300)
     parts = _parts(pairs, squares, innovations.shape[1])
-    if isinstance(parts, Split):
-        squares = squares / parts(pairs)
+    split = parts if isinstance(parts, Split) else None
+    if split is not None:
+        squares = squares / split(pairs)
     rng = np.random.default_rng(len(pairs))
     some = rng.permutation(len(pairs))[:400]
     K = _near(pairs[some], pairs)
@@ -70,13 +71,11 @@ def local_noise(pairs: Array, innovations: Array) -> LocalNoise | None:
     averages = (K @ squares + _PRIOR) / (K.sum(axis=1) + _PRIOR)
     # The log likelihood of normal innovations with these variances, above that with a variance of 1.
     gains = -0.5 * innovations.shape[1] * (np.log(averages) + squares[some] / averages - squares[some])
-    smooth = gains.sum() > _GAIN
-    if not smooth and not isinstance(parts, Split):
-        return None
+    if gains.sum() <= _GAIN:
+        return None if split is None else LocalNoise(split, pairs[:0], np.empty(0))
     centres = pairs[rng.permutation(len(pairs))[:80]]
     K = _near(centres, pairs)
-    variances = (K @ squares + _PRIOR) / (K.sum(axis=1) + _PRIOR) if smooth else np.ones(len(centres))
-    return LocalNoise(parts if isinstance(parts, Split) else None, centres, variances)
+    return LocalNoise(split, centres, (K @ squares + _PRIOR) / (K.sum(axis=1) + _PRIOR))
 
 
 def _parts(pairs: Array, squares: Array, k: int) -> Split | float:

@@ -22,7 +22,7 @@ from ctxval.certificates.bounds import (
     with_error,
     with_units,
 )
-from ctxval.certificates.covering import RESOLUTION
+from ctxval.certificates.covering import RESOLUTION, EmptyBox
 from ctxval.certificates.dynamics_evidence import PushedDistances, Tolerance
 from ctxval.certificates.sample import executions_of
 from ctxval.certificates.sentences.statements import condition_on_dynamics, conditions_on_dynamics
@@ -227,11 +227,11 @@ def _not_tried(empty: Mapping[str, Any] | None, space: TaskSpace | None) -> str:
     """Return, as a sentence after a space, the largest box of two task parameters without an execution."""
     if empty is None or space is None:
         return ""
-    low, high = space.low, space.high
-    ends = zip(empty["parameters"], empty["low"], empty["high"], strict=True)
-    sides = ((*parted(space.labels[j]), *(low[j] + np.array(box) * (high[j] - low[j])).tolist()) for j, *box in ends)
+    box, low, high = EmptyBox(**empty), space.low, space.high
+    ends = zip(box.parameters, box.low, box.high, strict=True)
+    sides = ((*parted(space.labels[j]), *(low[j] + np.array(side) * (high[j] - low[j])).tolist()) for j, *side in ends)
     both = " and ".join(f"{name} {first:.3g} to {last:.3g} {unit}".rstrip() for name, unit, first, last in sides)
-    share = 100 * np.prod(np.subtract(empty["high"], empty["low"]))
+    share = 100 * box.share
     return f" No execution had {both} together ({share:.0f} % of the task space, the largest box of two parameters)."
 
 
