@@ -11,6 +11,7 @@ from sklearn.gaussian_process import kernels as oracle
 
 from ctxval.errors import InputError
 from ctxval.gp import regression
+from ctxval.gp.cholesky import factorise
 from ctxval.gp.kernels import Matern
 
 KERNELS: dict[str, Matern] = {
@@ -338,7 +339,12 @@ def test_a_process_of_several_outputs_is_one_of_each() -> None:
 def test_points_too_much_alike_are_given_more_noise() -> None:
     X, Y = np.zeros((5, 2)), np.arange(5.0)[:, None]
     process = regression.MultiOutputProcess(Matern(), THETA["matern32"], X, Y, 1e-18)
-    np.testing.assert_allclose(process.predict(X)[0], 2.0, rtol=0.1)  # rounding, with so little noise
+    K = process.kernel(process.theta, X, X)
+    with pytest.raises(InputError, match="not positive definite"):
+        factorise(K, process.noise)  # it vanishes beside the variances
+    np.testing.assert_allclose(process.factor.L @ process.factor.L.T, K, rtol=1e-12)
+    noisy = regression.MultiOutputProcess(Matern(), THETA["matern32"], X, Y, 1e-3)
+    np.testing.assert_allclose(noisy.predict(X)[0], 2.0, rtol=1e-3)
 
 
 def test_hyperparameters_without_a_positive_definite_covariance_are_impossible() -> None:
