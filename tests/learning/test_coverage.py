@@ -217,8 +217,9 @@ def test_coordinates_of_a_position_are_states_that_begin_at_it_or_have_it_as_goa
     )  # fmt: skip
     points = np.random.default_rng(0).random((5, 5))
     planned = LoopPlanner(validation).plan(points)
-    assert position_states(validation.space, planned, points) == [[2, 3], [2, 1]]
-    assert position_states(validation.space, planned, points, goals=False) == [[2, 1]]
+    unknown = ["x[0]", "x[1]", "x[2]", "x[3]"]
+    assert position_states(validation.space, unknown, planned, points) == [[2, 3], [2, 1]]
+    assert position_states(validation.space, unknown, planned, points, goals=False) == [[2, 1]]
 
 
 def test_coordinates_of_a_position_may_have_another_unit_origin_and_direction() -> None:
@@ -231,7 +232,47 @@ def test_coordinates_of_a_position_may_have_another_unit_origin_and_direction() 
     )  # fmt: skip
     points = np.random.default_rng(0).random((5, 3))
     planned = LoopPlanner(validation).plan(points)
-    assert position_states(validation.space, planned, points) == [[3, 2]]
+    assert position_states(validation.space, ["x[0]", "x[1]", "x[2]", "x[3]"], planned, points) == [[3, 2]]
+
+
+@pytest.mark.parametrize(
+    ("labels", "expected"),
+    [
+        (["x [m]", "y [m]", "vx [m/s]", "vy [m/s]"], [[0, 1]]),
+        (["east [km]", "north [km]", "vx [m/s]", "vy [m/s]"], [[0, 1]]),
+        (["tool_x", "tool_y", "rate_1", "rate_2"], [[0, 1]]),
+        (["vx", "vy", "x", "y"], []),
+        (["x[0]", "x[1]", "x[2]", "x[3]"], []),
+        (["q1 [rad]", "q2 [rad]", "w1 [rad/s]", "w2 [rad/s]"], []),
+        (["x [m]", "z [m]", "vx [m/s]", "vz [m/s]"], []),
+        (["vx [m/s]", "vy [m/s]", "x [m]", "y [m]"], []),  # where runs end does not vary in these
+    ],
+)
+def test_goals_by_radius_and_angle_are_places_if_labels_of_states_say_so(
+    labels: list[str], expected: list[list[int]]
+) -> None:
+    validation = make_planner(states=4).validation.with_parts(
+        space=TaskSpace(radius=(0.4, 1, "m"), angle=(0, 6, "rad")),
+        task=lambda p: Task(
+            np.zeros((*np.shape(p.angle), 4)),
+            goal=np.stack([p.radius * np.cos(p.angle), p.radius * np.sin(p.angle), 0 * p.angle, 0 * p.angle], axis=-1),
+            horizon=5, dt=0.1,
+        ),
+    )  # fmt: skip
+    points = np.random.default_rng(0).random((9, 2))
+    planned = LoopPlanner(validation).plan(points)
+    assert position_states(validation.space, labels, planned, points) == expected
+    assert position_states(validation.space, labels, planned, points, goals=False) == []
+
+
+def test_two_states_on_one_line_are_no_place() -> None:
+    validation = make_planner(states=2).validation.with_parts(
+        space=TaskSpace(along=(-1, 1)),
+        task=lambda p: Task(np.stack([p.along, 2 * p.along], axis=-1), horizon=5, dt=0.1),
+    )
+    points = np.random.default_rng(0).random((9, 1))
+    planned = LoopPlanner(validation).plan(points)
+    assert position_states(validation.space, ["x [m]", "y [m]"], planned, points) == []
 
 
 def test_where_an_execution_moves_in_one_step_there_is_no_pocket() -> None:

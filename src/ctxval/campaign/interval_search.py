@@ -149,9 +149,8 @@ class IntervalSearch:
         # The whole evidence may decide if nothing that a few draws show leaves the verdict open.
         bound, enough = self._bound(evidence), len(self._ended) >= FEWEST
         decides = enough and raised(evidence, bound) <= self.limit and doubt_of(evidence, self.best, bound) is None
-        if decides and evidence.pocket is None and self.recorder.validation.space.positions:
-            learned = dynamics.learned(trials)
-            evidence = evidence if learned is None else replace(evidence, pocket=learned.pocket)
+        if decides and evidence.pocket is None and (learned := dynamics.learned(trials)) is not None:
+            evidence = replace(evidence, pocket=learned.pocket)
             decides = unentered_pocket(evidence) is None
         if decides:
             whole = dynamics.evidence(trials, self.options.confidence, keep=self.keeps)

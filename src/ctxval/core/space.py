@@ -11,7 +11,7 @@ import numpy as np
 from ctxval._util.arrays import Array, ArrayLike, as_finite, as_floats, require_shape
 from ctxval._util.checked import Must, NonNegativeInt, checked
 from ctxval._util.representation import call, named
-from ctxval._util.texts import shortened
+from ctxval._util.texts import parted, shortened
 from ctxval.core.task_distribution import ByParameter, BySampler, Continuous, Sampler, TaskDistribution
 from ctxval.errors import InputError, ShapeError, UnknownNameError
 
@@ -54,10 +54,23 @@ class Parameters:
 _LENGTHS = ("m", "mm", "cm", "km", "in", "ft")
 
 
-def _differ_in(first: str, second: str, axes: str) -> bool:
-    """Return whether names differ in one axis alone, as ``goal_x`` and ``goal_y`` do in ``xy``."""
+def _different_axes(first: str, second: str) -> str:
+    """Return ``xy`` of names such as ``goal_x`` and ``goal_y``, which differ in one letter; empty if they do not."""
     different = [a + b for a, b in zip(first.lower(), second.lower(), strict=False) if a != b]
-    return len(first) == len(second) and different == [axes]
+    return different[0] if len(first) == len(second) and len(different) == 1 else ""
+
+
+def are_coordinates_of_ground(first: str, second: str) -> bool:
+    """Return whether labels ``name [unit]`` of two states are those of a place on the ground.
+
+    They are lengths in one unit, or numbers without a unit whose names end in x and y and are no velocities. Those of
+    x and z are no place on the ground.
+    """
+    (name, unit), (other, unit_of_other) = parted(first), parted(second)
+    axes = _different_axes(name, other)
+    if not unit:
+        return not unit_of_other and axes == "xy" and not name.lower().startswith("v")
+    return unit in _LENGTHS and unit == unit_of_other and axes not in ("xz", "yz")
 
 
 class TaskSpace:
@@ -145,7 +158,7 @@ class TaskSpace:
                 and is_number
                 and last
                 and self.units[last] == self.units[name]
-                and _differ_in(last, name, axes)
+                and _different_axes(last, name) == axes
             ):
                 groups[-1] = slice(groups[-1].start, at.stop)
             elif is_length:

@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 from ctxval._util.arrays import Array, Rows
 from ctxval._util.texts import parted
 from ctxval.core.coverage import StateInputCoverage, StateInputGap, StatePocket, UntriedCorner
-from ctxval.core.space import TaskSpace
+from ctxval.core.space import TaskSpace, are_coordinates_of_ground
 from ctxval.core.trajectory import Trajectory
 from ctxval.learning.closed_loops import Loops, PlannedTasks
 from ctxval.learning.dynamics_posterior import DynamicsPosterior
@@ -23,6 +23,7 @@ from ctxval.learning.dynamics_posterior import DynamicsPosterior
 MOST_COORDINATES = 6
 """Largest number of state-input coordinates for which pairs of coordinates are compared."""
 _MOSTLY = [1e-3, 1 - 1e-3]  # quantiles of what is visited that are its range
+_FLAT = 0.1  # largest share of its longer side of a region that is a line rather than a plane
 _FARTHEST = 1e3  # standardised coordinates are limited to this magnitude
 
 
@@ -173,15 +174,18 @@ def largest_pocket(
 
 
 def position_states(
-    space: TaskSpace, planned: Sequence[PlannedTasks], points: Array, *, goals: bool = True
+    space: TaskSpace, labels: Sequence[str], planned: Sequence[PlannedTasks], points: Array, *, goals: bool = True
 ) -> list[list[int]]:
-    """Return, of each position that is a task parameter, the two states that are its coordinates on the ground.
+    """Return, of each position that tasks choose, the two states that are its coordinates on the ground.
 
-    In each task, these states begin at the position, or have it as their goal, in any unit, origin and direction. Of
-    three coordinates, the first two are taken: posts and walls stand on the ground, and runs do not enter all of a
-    volume in a few executions.
+    In each task, these states begin at a position that is a task parameter, or have it as their goal, in any unit,
+    origin and direction. Of three coordinates, the first two are taken: posts and walls stand on the ground, and runs
+    do not enter all of a volume in a few executions. If no parameter is a position, two states are coordinates if
+    their labels say so, and tasks vary where they begin or their goal in two dimensions, such as by a radius and an
+    angle.
 
     Args:
+        labels: the label of each state, with its unit if that is known.
         points: the tasks in the order of their planning, points of the unit cube ``(q, d)``.
         goals: whether goals are states, and no outputs.
     """
@@ -200,6 +204,10 @@ def position_states(
         same = [[*chain.from_iterable(map(np.flatnonzero, states))] for states in zip(*fits, strict=True)]
         if all(same):
             groups.append([int(states[0]) for states in same][:2])
+    for i, j in [] if groups else combinations(range(len(labels)), 2):
+        if are_coordinates_of_ground(labels[i], labels[j]):
+            spreads = [np.linalg.svd(end[:, [i, j]] - end[:, [i, j]].mean(axis=0), compute_uv=False) for end in ends]
+            groups += [[i, j]] if any(small > _FLAT * large for large, small in spreads) else []
     return groups
 
 

@@ -202,7 +202,7 @@ class LearnedDynamics(ShortRepr):
         space, labels = self.study.validation.space, self.labels[:states]
         goals = self.study.given.outputs is None
         # A suite has no other tasks.
-        positions = position_states(space, planned, pool, goals=goals) if space.members is None else []
+        positions = position_states(space, labels, planned, pool, goals=goals) if space.members is None else []
         return largest_pocket(visited[finite], self.trajectories_of_system, labels, positions, rows[finite], pool)
 
     @property
