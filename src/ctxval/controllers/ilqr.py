@@ -64,8 +64,7 @@ class ILQR(QuadraticSynthesizer):
         limits: LimitsLike | None = None,
     ) -> None:
         super().__init__(QuadraticCost(Q, R, Q_final), limits)
-        self.iterations = iterations
-        self.tolerance = tolerance
+        self.iterations, self.tolerance = iterations, tolerance
 
     def describe(self) -> dict[str, Any]:
         return {**super().describe(), "iterations": self.iterations, "tolerance": self.tolerance}

@@ -120,13 +120,9 @@ def condition(hyperparameters: Hyperparameters, X: Array, values: Array, warp: W
     mean = float(pull[:, 1].sum() / precision)
     scale2 = float((y - mean) @ (pull[:, 1] - mean * pull[:, 0])) / (n - 1)
     scale2 = max(scale2, np.finfo(np.float64).tiny)
-    log_likelihood = (
-        scale.log_slope(values)
-        - factor.half_log_determinant()
-        - 0.5 * np.log(precision)
-        - 0.5 * (n - 1) * np.log(scale2)
-    )
-    return Conditioned(hyperparameters, scale, y, factor, mean, float(1 / precision), scale2, float(log_likelihood))
+    volume = scale.log_slope(values) - factor.half_log_determinant()
+    log_likelihood = float(volume - 0.5 * np.log(precision) - 0.5 * (n - 1) * np.log(scale2))
+    return Conditioned(hyperparameters, scale, y, factor, mean, float(1 / precision), scale2, log_likelihood)
 
 
 def draw_hyperparameters(
@@ -254,15 +250,11 @@ class Paths:
         waves = _waves(flat, self.frequencies).reshape(s, q, -1)
         known = self.conditioned.hyperparameters
         correlations = known.kernel(flat, self.X).reshape(s, q, -1)
-        values = np.einsum("sqf,fs->sq", waves, self.amplitudes) + np.einsum(
-            "sqn,ns->sq", correlations, self.corrections
-        )
-        half = len(self.frequencies)
+        values = np.einsum("sqf,fs->sq", waves, self.amplitudes)
+        values = values + np.einsum("sqn,ns->sq", correlations, self.corrections)
         # d cos = -sin, d sin = cos, each times its frequency
-        turned = (
-            waves[..., :half] * self.amplitudes[half:].T[:, None]
-            - waves[..., half:] * self.amplitudes[:half].T[:, None]
-        )
+        half, amplitudes = len(self.frequencies), self.amplitudes.T[:, None]
+        turned = waves[..., :half] * amplitudes[..., half:] - waves[..., half:] * amplitudes[..., :half]
         slopes = turned @ self.frequencies
         weights = np.repeat(self.corrections.T, q, axis=0)
         lengths = np.exp(known.log_scales)

@@ -206,8 +206,7 @@ def most_likely(
 
     if best_start:
         starts = starts[[np.argmin([negative(start)[0] for start in starts])]]
-    options: Any = {"maxiter": iterations, **({} if tolerance is None else {"ftol": tolerance})}
-    climbs = [
-        minimize(negative, start, jac=True, method="L-BFGS-B", bounds=bounds, options=options) for start in starts
-    ]
+    limits: Any = {"maxiter": iterations, **({} if tolerance is None else {"ftol": tolerance})}
+    settings: Any = {"jac": True, "method": "L-BFGS-B", "bounds": bounds, "options": limits}
+    climbs = [minimize(negative, start, **settings) for start in starts]
     return np.asarray(min(climbs, key=lambda climb: float(climb.fun)).x)

@@ -26,12 +26,8 @@ from ctxval.learning.dynamics_posterior import DynamicsPosterior
 from ctxval.learning.noisy_draws import NoisyDraws, NoisyRuns
 
 T = TypeVar("T")
-
-AnyDraws = DynamicsDraws | NoisyDraws
-"""Draws of dynamics without and with noise."""
-
-Together = AnyDraws | DisturbedDynamics
-"""Systems that are run together."""
+AnyDraws = DynamicsDraws | NoisyDraws  # without and with noise
+Together = AnyDraws | DisturbedDynamics  # systems that are run together
 
 _UNITS = "closed loops", "designs", "tasks"  # of stages that closed loops are progress of
 _REMEMBERED = 64_000_000  # largest size of the plans that are kept, in bytes, approximately
@@ -83,10 +79,7 @@ class LoopPlanner:
         return False
 
     def plan(self, points: Array, together: int = 512) -> list[PlannedTasks]:
-        """Return the plans of points ``(q, d)``; tasks for which no controller can be designed are left out.
-
-        If the synthesizer takes batches, at most ``together`` tasks are planned in one call.
-        """
+        """Return the plans of points ``(q, d)``, at most ``together`` in one call, without those without a design."""
         size, plans = together if self.batched else 1, list[PlannedTasks]()
         for first in range(0, len(points), size):
             some = points[first : first + size]
@@ -303,10 +296,8 @@ def loop_pairs(planner: LoopPlanner, posterior: DynamicsPosterior, tasks: Array)
 def unseen_parameters(planner: LoopPlanner, some: Array) -> tuple[int, ...]:
     """Return the indices of the task parameters that change the closed loops of M by less than 2 % of their deviation.
 
-    What they change in the system, such as a payload, is no function of state and input.
-
-    Args:
-        some: tasks, of which one parameter after the other is moved to its bounds, shape ``(q, d)``.
+    What they change in the system, such as a payload, is no function of state and input. One parameter after the other
+    of some tasks ``(q, d)`` is moved to its bounds.
     """
     d = some.shape[1]
     ends = moves_to_bounds(some, np.zeros(d), np.ones(d)).reshape(-1, d)

@@ -60,8 +60,7 @@ class History:
     def of(cls, model: Model, structure: Structure, scales: Array, middle: tuple[Array, Array]) -> History:
         """Return the recursion with the steady gain of a Kalman filter of M, linearised at a state and an input.
 
-        Args:
-            scales: standard deviations of the process noise of each state, shape ``(n,)``.
+        The process noise of each state has standard deviations ``(n,)``.
         """
         n = len(scales)
         if not structure.ratio:

@@ -137,10 +137,7 @@ class ErrorVectors:
 def predict_composed(points: Array, vectors: Array, compose: Callable[[Array], Array]) -> Prediction | None:
     """Return a prediction of values from the vectors ``(n, k)`` of which they are composed at points ``(n, d)``.
 
-    Returns None if fewer than two vectors are known, or if all of them are zero.
-
-    Args:
-        compose: vectors ``(..., k)`` -> values ``(...)``.
+    It composes vectors ``(..., k)`` to values. It is None if fewer than two vectors are known, or if all are zero.
     """
     if points.ndim != 2 or vectors.ndim != 2 or len(points) != len(vectors):
         raise ShapeError(f"points must be (n, d) and vectors (n, k), got {points.shape}, {vectors.shape}.")
@@ -185,13 +182,7 @@ def _most_likely(X: Array, Y: Array) -> Array:
 
     def log_density(theta: Array) -> tuple[float, Array]:
         away = (theta - medians) / deviations
-        value, gradient = _log_likelihood(theta, X, Y)
-        return value - 0.5 * float(away @ away), gradient - away / deviations
+        value, W = log_likelihood_of_outputs(_KERNEL(theta, X, X), _NOISE, Y)
+        return value - 0.5 * float(away @ away), _KERNEL.weighted_gradient(theta, X, W) - away / deviations
 
     return most_likely(log_density, medians[None], _KERNEL.bounds(d))
-
-
-def _log_likelihood(theta: Array, X: Array, Y: Array) -> tuple[float, Array]:
-    """Return ``sum_j log p(Y[:, j] | X, theta)``, up to a constant, and its gradient (Rasmussen and Williams, 5.9)."""
-    value, W = log_likelihood_of_outputs(_KERNEL(theta, X, X), _NOISE, Y)
-    return value, _KERNEL.weighted_gradient(theta, X, W)

@@ -30,12 +30,8 @@ def recorded_transitions(
 ) -> tuple[Transitions, Rows] | None:
     """Return the known transitions of the system and the execution of each; -1 for data that the model was made from.
 
-    Returns None if there are none. Of many transitions, a random part is returned.
-
-    Args:
-        data: transitions that the model was made from, as :func:`data_near` returns them.
-        loops: closed loops on M, which show which of the other data the tasks need.
-        logged: recordings that belong to no task; their numbers follow those of the executions.
+    Returns None if there are none. Of many transitions, a random part is returned, and of recordings that belong to no
+    task, those near closed loops on M; the numbers of these recordings follow those of the executions.
     """
     parts = [trajectory.transitions() for trajectory in executed]
     sources = [np.full(len(part), k) for k, part in enumerate(parts)]

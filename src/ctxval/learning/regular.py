@@ -180,11 +180,9 @@ class Boundary:
 
 
 def _separated(regular: Array, ends: Array, columns: Sequence[int]) -> tuple[Explanation, float]:
-    """Return a function that separates points, and the share of the regular ones beyond its first irregular one.
+    """Return a function that separates regular points ``(N, k)`` and ends, and how many it has on the irregular side.
 
-    Args:
-        regular: points ``(N, k)``.
-        ends: ``(e, M, k)``; of each irregular transition, the end with the largest value counts.
+    Of each irregular transition ``(e, M, k)``, the end with the largest value counts. The number is a share.
     """
     F, of_ends = _quadratic(regular), _quadratic(ends.reshape(-1, ends.shape[-1])).reshape(*ends.shape[:2], -1)
     chosen, M = np.full(ends.shape[1], len(ends) - 1), ends.shape[1]

@@ -38,11 +38,9 @@ class Replay(ShortRepr):
 def replay_executed(
     validation: Validation, learned: LearnedDynamics | None, wanted: Sequence[Array]
 ) -> list[Replay | None]:
-    """Return the replays of tasks; None for a task that cannot be planned.
+    """Return the replays of tasks, points ``(d,)`` of the unit cube; None for a task that cannot be planned.
 
-    Args:
-        learned: what executions teach; those at the task that is replayed are left out.
-        wanted: points of the unit cube ``(d,)`` of the tasks.
+    Of what executions teach, those at the task that is replayed are left out.
     """
     models: list[DynamicsDraws | None] = [None] * len(wanted)
     study = DynamicsStudy(validation) if learned is None else learned.study

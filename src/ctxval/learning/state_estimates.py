@@ -28,11 +28,8 @@ _SHARES = np.array([1.0, 1e-1, 1e-2, 1e-3, 1e-4])
 class StateEstimates:
     """The states of M along executions, estimated from their inputs and outputs; they are kept like these.
 
-    A refined model is estimated as the model before, whose residual is learned.
-
-    Args:
-        validation: the user's validation, which has outputs.
-        states: states of closed loops on M ``(..., H + 1, n)``, whose changes in one step are typical.
+    A refined model is estimated as the model before, whose residual is learned. States of closed loops on M
+    ``(..., H + 1, n)`` have typical changes in one step.
     """
 
     def __init__(self, validation: Validation, outputs: Outputs, states: Array) -> None:
@@ -83,15 +80,9 @@ def smoothed_states(
 ) -> tuple[Array, Array]:
     """Return the most probable states of a model with these inputs and outputs, and how well outputs are predicted.
 
-    Args:
-        start: the first state ``(n,)``, before the first outputs correct it.
-        y: outputs ``(H + 1, p)``.
-        u: inputs ``(H, m)``.
-        steps: typical changes of the states in one step, ``(n,)``.
-
-    Returns:
-        States ``(H + 1, k, n)``, and mean squared innovations ``(k, p)``, for each of k shares of what the model misses
-        in recorded directions.
+    These are states ``(H + 1, k, n)``, and mean squared innovations ``(k, p)``, for each of k shares of what the model
+    misses in recorded directions. They begin at a state ``(n,)`` before the first of the outputs y ``(H + 1, p)``
+    correct it, have inputs u ``(H, m)``, and change by typical steps ``(n,)``.
     """
     k, scale = len(_SHARES), np.diag(steps)
     C = outputs.jacobian(start) @ scale

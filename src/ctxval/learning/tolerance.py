@@ -60,9 +60,7 @@ def pushed(
 ) -> DisturbedDynamics:
     """Return a model whose next state is moved by pushes ``(S, n)``, everywhere or only where no record is near.
 
-    Args:
-        widths: the ranges of the states on rollouts, shape ``(n,)``.
-        recorded: recorded states in units of these ranges.
+    Recorded states are in units of the ranges of the states on rollouts, the widths ``(n,)``.
     """
 
     def added(ways: Rows, x: Array) -> Array:

@@ -155,10 +155,7 @@ class WorstCaseSearch:
         for _ in range(int(np.log2(_NEARER))):
             later = np.abs(distances[:, 2] - distances[:, 1]) > np.abs(distances[:, 1] - distances[:, 0])
             ends = np.where(later[:, None], [1, 2], [0, 1])
-            tasks, distances = (
-                np.take_along_axis(tasks, ends[..., None], axis=1),
-                np.take_along_axis(distances, ends, axis=1),
-            )
+            tasks, distances = np.take_along_axis(tasks, ends[..., None], 1), np.take_along_axis(distances, ends, 1)
             middle = tasks.mean(axis=1)
             value = self.planner.distances(posterior.mean, self.planner.plan(middle), len(middle))[0]
             tasks = np.stack([tasks[:, 0], middle, tasks[:, 1]], axis=1)
@@ -181,10 +178,8 @@ class WorstCaseSearch:
     ) -> WorstCase:
         """Return the largest distance on the posterior mean, as if it were the only draw.
 
-        Args:
-            of_pool: the distances of the pool's tasks on the posterior mean, shape ``(N,)``.
-            known: tasks to look at in any case, such as those of earlier maxima, points ``(k, d)``.
-            globally: whether large distances on a small share of the tasks are looked for.
+        The distances there of the pool's tasks ``(N,)`` are given, and ``known`` tasks ``(k, d)`` to look at in any
+        case. Globally, large distances on a small share of the tasks are looked for, too.
         """
         if self.members is not None:
             left, values = self._left(known), _finite(of_pool)

@@ -124,8 +124,7 @@ class FeedforwardReLU(IncrementModel):
     ) -> None:
         self.weights = [as_finite(f"weights[{i}]", value) for i, value in enumerate(weights)]
         self.biases = [as_finite(f"biases[{i}]", value) for i, value in enumerate(biases)]
-        self.scaling = scaling
-        self.data = data
+        self.scaling, self.data = scaling, data
         pair, states = len(scaling.shift_in), len(scaling.shift_out)
         widths = [pair, *[bias.size for bias in self.biases]]
         shapes = [weight.shape for weight in self.weights]
@@ -213,10 +212,8 @@ class GaussianProcessModel(IncrementModel):
         data: Transitions | None = None,
     ) -> None:
         self.covariance = covariance
-        self.centres: Array = as_finite("centres", centres)
-        self.weights: Array = as_finite("weights", weights)
-        self.scaling = scaling
-        self.data = data
+        self.centres, self.weights = as_finite("centres", centres), as_finite("weights", weights)
+        self.scaling, self.data = scaling, data
         pair, states = len(scaling.shift_in), len(scaling.shift_out)
         fits = self.centres.ndim == 2 and self.weights.shape == (len(self.centres), states)
         if not fits or self.centres.shape[1] != pair or covariance.length_scales.shape != (pair,):

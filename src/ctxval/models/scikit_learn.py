@@ -34,9 +34,7 @@ class ScikitLearn:
     """
 
     def __init__(self, regressor: Any, *, increments: bool = True, data: Transitions | None = None) -> None:
-        self.regressor = regressor
-        self.increments = increments
-        self.data = data
+        self.regressor, self.increments, self.data = regressor, increments, data
         features = getattr(regressor, "n_features_in_", None)
         if features is None or not callable(getattr(regressor, "predict", None)):
             raise InputError(f"the regressor must be fitted and have predict and n_features_in_, got {regressor!r}.")

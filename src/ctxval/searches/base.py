@@ -182,12 +182,11 @@ class SequentialSearch(BaseSearch):
         if not ((rows >= 0) & (rows <= 1)).all():
             raise InputError(f"points must be in the unit cube, got {rows.tolist()}.")
         for point, value in zip(rows, scalars.tolist(), strict=True):
-            waiting = (slot for slot in self._slots.get(_key(point), []) if np.isnan(self._values[slot]))
-            slot = next(waiting, None)
-            if slot is None:
-                self._append(point, value, None)
+            waiting = [slot for slot in self._slots.get(_key(point), []) if np.isnan(self._values[slot])]
+            if waiting:
+                self._values[waiting[0]] = value
             else:
-                self._values[slot] = value
+                self._append(point, value, None)
 
     def amend(self, point: Array) -> None:
         """Replace the point that was asked for last by the one that is evaluated, which has fewer digits."""

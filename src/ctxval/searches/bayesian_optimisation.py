@@ -55,8 +55,7 @@ class BayesianOptimisation(SequentialSearch):
     """
 
     def __init__(self, initial: PositiveInt = 3, beta: NonNegativeFloat = 4.0) -> None:
-        self.initial = initial
-        self.beta = beta
+        self.initial, self.beta = initial, beta
 
     def reset(self, dimension: int, seed: int) -> None:
         super().reset(dimension, seed)

@@ -21,11 +21,8 @@ class Repeated(SequentialSearch):
     """
 
     def __init__(self, search: Search, times: PositiveInt = 3) -> None:
-        self.search = search
-        self.times = times
-        self._inner = BaseSearch.of(search)
-        self.initial = times * self._inner.initial
-        self.discard = self._inner.discard
+        self.search, self.times, self._inner = search, times, BaseSearch.of(search)
+        self.initial, self.discard = times * self._inner.initial, self._inner.discard
 
     def reset(self, dimension: int, seed: int) -> None:
         super().reset(dimension, seed)

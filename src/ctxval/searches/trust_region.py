@@ -16,7 +16,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from scipy.spatial.distance import cdist
@@ -40,8 +40,7 @@ _COMPARED_FROM = 6  # number of known values from which on the prediction must b
 _COMPARED_ON = 24  # largest number of known values, the latest ones, on which the two are compared
 
 
-@dataclass(frozen=True, eq=False)
-class _Candidate:
+class _Candidate(NamedTuple):
     """A point ``(d,)`` of the unit cube, the value that is predicted there, and its doubt."""
 
     point: Array
@@ -120,13 +119,8 @@ class TrustRegion(SequentialSearch):
                 doubtful = self._why_not(prediction, surrogate_error)
                 candidate, region = self._promising(prediction, rng) if doubtful is None else (None, _Region())
             if candidate is not None:
-                self._last_note = {
-                    "engine": _ENGINE,
-                    "climb": region.number,
-                    "radius": region.radius,
-                    "expected": candidate.expected,
-                    "doubt": candidate.doubt,
-                }
+                of_region = {"engine": _ENGINE, "climb": region.number, "radius": region.radius}
+                self._last_note = {**of_region, "expected": candidate.expected, "doubt": candidate.doubt}
                 why_hedge = self._why_hedge()
                 if why_hedge is None:
                     return candidate.point
@@ -148,12 +142,10 @@ class TrustRegion(SequentialSearch):
         error = _log_error(prediction.left_out(self.points[latest]), self.values[latest])
         if error <= 0.1 or error <= surrogate_error():  # a small error needs no comparison
             return None
-        return (
-            f"leaving one out, the prediction errs by {error:.2g} where the surrogate errs by {surrogate_error():.2g}"
-        )
+        errs = f"errs by {error:.2g} where the surrogate errs by {surrogate_error():.2g}"
+        return f"leaving one out, the prediction {errs}"
 
     def _surrogate_error(self) -> float:
-        """Return the error of leave-one-out predictions by the surrogate, on the latest values."""
         known = np.isfinite(self.values)
         points, values = self.points[known], self.values[known]
         kept = kept_rows(points, values, 150, long=150)  # they end with the latest values, which are compared
@@ -164,16 +156,15 @@ class TrustRegion(SequentialSearch):
 
     def _why_hedge(self) -> str | None:
         """Return why the surrogate chooses in place of the prediction, every second time; None if it does not."""
-        rows = [
-            row for row in np.flatnonzero(np.isfinite(self.values)) if (self.notes[row] or {}).get("engine") == _ENGINE
-        ]
-        if not rows or not self.hedge or (self.notes[-1] or {}).get("engine") != _ENGINE:
+        values, notes = self.values, [note or {} for note in self.notes]
+        rows = [row for row in np.flatnonzero(np.isfinite(values)) if notes[row].get("engine") == _ENGINE]
+        if not rows or not self.hedge or notes[-1].get("engine") != _ENGINE:
             return None
-        last = [(self.values[row], (self.notes[row] or {})["expected"]) for row in rows[-2:]]
+        last = [(values[row], notes[row]["expected"]) for row in rows[-2:]]
         error = min(abs(value - expected) / max(value, expected, 1e-300) for value, expected in last)
         if len(last) == 2 and (self._last_note or {})["doubt"] > 1 and error > 0.5:
             return f"the last two predictions erred by {100 * error:.0f} % or more and the next one is in doubt"
-        values = self.values[np.isfinite(self.values)]
+        values = values[np.isfinite(values)]
         gains = values[1:] > (1 + _IMPROVEMENT) * np.maximum.accumulate(values)[:-1]
         fruitless = len(gains) - int(np.flatnonzero(gains).max(initial=-1)) - 1
         return f"the last {fruitless} executions found nothing larger" if fruitless >= 6 else None
@@ -186,9 +177,8 @@ class TrustRegion(SequentialSearch):
         The point that follows from the known values alone comes first. If it is being evaluated already, the next one
         is chosen as if all pending points had the expected values.
         """
-        points, values, notes = self.points, self.values, self.notes
+        points, values, notes, pending = self.points, self.values, self.notes, prediction.pending
         whole = _History(points, values, notes, points[~np.isfinite(values)])
-        pending = prediction.pending
         if pending is None:
             return self._next(prediction, whole, rng)
         waiting = np.isnan(values) & (points[:, None] == pending.points).all(axis=2).any(axis=1)

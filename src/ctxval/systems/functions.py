@@ -50,8 +50,7 @@ class Function:
     """
 
     def __init__(self, execute: Callable[[Feedback, Task], Any], *, batched: bool = False) -> None:
-        self.function = execute
-        self.batched = batched
+        self.function, self.batched = execute, batched
 
     def execute(self, controller: Controller, task: Task) -> Trajectory:
         returned = self.function(started(controller, task), task)

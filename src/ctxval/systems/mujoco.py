@@ -52,10 +52,8 @@ class MuJoCo:
         threads: PositiveInt = 1,
     ) -> None:
         self._digest, self._model = compile_mjcf(mjcf)
-        self.substeps = substeps
-        self.threads = threads
-        self.sites = (sites,) if isinstance(sites, str) else tuple(sites)
-        self.axes = axes
+        self.substeps, self.threads = substeps, threads
+        self.sites, self.axes = (sites,) if isinstance(sites, str) else tuple(sites), axes
         self._coordinates = _coordinates(self._model, self.sites, axes)
 
     @property
