@@ -48,10 +48,7 @@ class Expansion:
 
 
 def minimise(cost: QuadraticCost, around: Expansion, limits: Limits | None, damping: Array) -> InputStep:
-    """Return the step that minimises the expansion of the cost, over inputs within the limits.
-
-    The damping ``(N,)`` is added to the curvature of the inputs of each task.
-    """
+    """Return the step that minimises the expansion, with so much damping ``(N,)``, over inputs within the limits."""
     if damping.any():
         return _recursion(cost, around, limits, damping[:, None, None] * np.eye(len(cost.R)))
     if limits is not None or not around.linear:

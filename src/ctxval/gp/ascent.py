@@ -24,10 +24,7 @@ _COORDINATES = (0.0, 0.25, 0.5)
 
 
 class Evaluations:
-    """The evaluations of a function over a box within the unit cube, no more of them than a budget.
-
-    If the budget is not strict, a climb that has begun may exceed it.
-    """
+    """The evaluations of a function over a box, within a budget that only a climb may exceed, if it is not strict."""
 
     def __init__(self, function: Values, low: Array, high: Array, budget: int, *, strict: bool = True) -> None:
         self.low, self.high, self.dimension = low, high, len(low)

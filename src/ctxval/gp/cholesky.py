@@ -33,10 +33,7 @@ class CholeskyFactor:
         return np.asarray(dtrtrs(self.L, right, lower=1)[0])
 
     def whiten_many(self, right: Array) -> Array:
-        """Return ``L^-1 right`` for many columns, by a product with the inverse factor, which is faster.
-
-        The columns of ``right`` are contiguous, and may be overwritten.
-        """
+        """Return ``L^-1 right`` by the inverse factor, faster for many contiguous columns; they may be overwritten."""
         return np.asarray(dtrmm(1.0, self.inverse_factor, right, lower=1, overwrite_b=1))
 
     def inverse(self) -> Array:
@@ -63,10 +60,7 @@ class CholeskyFactor:
 
 
 def factorise(covariance: Array, noise: float, *, insist: bool = False) -> CholeskyFactor:
-    """Return the Cholesky factor of ``covariance + noise I``, shape ``(n, n)``.
-
-    To insist is to try ten times as much noise after each failure, up to 1e30 times as much.
-    """
+    """Return the factor of ``covariance + noise I``; to insist is to raise the noise tenfold until it succeeds."""
     for _ in range(31 if insist else 1):
         noisy = np.array(covariance, order="F")
         noisy.ravel("K")[:: len(noisy) + 1] += noise  # its diagonal
@@ -80,10 +74,7 @@ def factorise(covariance: Array, noise: float, *, insist: bool = False) -> Chole
 
 
 def pivoted_rows(kernel: Covariance, theta: Array, X: Array, count: int, least: float) -> Rows:
-    """Return at most ``count`` rows by pivoted Cholesky: each has the largest variance given the rows before it.
-
-    The choice ends if no remaining variance is larger than ``least``.
-    """
+    """Return at most ``count`` rows by pivoted Cholesky, each with the largest variance given those before it."""
     towards = kernel.towards(theta, X)
     return pivoted_cholesky(kernel.diagonal(theta, X), lambda row: towards(X[row : row + 1])[0], count, least)[0]
 

@@ -130,10 +130,7 @@ def log_likelihood_of_outputs(K: Array, noise: float, Y: Array) -> tuple[float, 
 def log_marginal_likelihood(
     kernel: Matern, theta: Array, noise: float, X: Array, residual: Array
 ) -> tuple[float, Array]:
-    """Return log p(residual | X, theta, noise) and its gradient by (theta, log noise), eq. 5.9.
-
-    The residual ``(n,)`` is the observations minus the prior mean.
-    """
+    """Return log p(residual | X, theta, noise) of y - mean(X), and its gradient by (theta, log noise), eq. 5.9."""
     factor = factorise(kernel(theta, X, X), noise)
     alpha = factor.solve(residual)
     W = factor.inverse()

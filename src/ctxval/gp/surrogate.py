@@ -94,10 +94,7 @@ class SurrogateHyperparameters(ShortRepr):
         return np.asarray((self.warp.forward(values) - self.shift) / self.scale)
 
     def condition(self, points: Array, values: Array) -> GaussianProcess:
-        """Return the process given values ``(n,)`` at points ``(n, d)``.
-
-        Pending and failed points have the value NaN, and are assigned the value that the others predict.
-        """
+        """Return the process given values at points ``(n, d)``; NaN becomes the value that the others predict."""
         known = np.isfinite(values)
         process = condition(_KERNEL, self.theta, points[known], self.standardised(values[known]))
         return _with_imputed(process, points[~known])

@@ -256,10 +256,7 @@ def _probed(controller: Controller, task: Task, steps: int) -> Array:
 
 
 def halved(function: Callable[[Rows], T], count: int) -> list[tuple[Rows, T | None]]:
-    """Return what a function of rows returns for all of ``count`` rows; where it fails, the rows are halved.
-
-    It is None for a single row. The user's parts may fail on tasks and at states that no execution has reached.
-    """
+    """Return what a function of all rows returns; rows where it fails are halved, and a single one of them has None."""
     results: list[tuple[Rows, T | None]] = []
     left = [np.arange(count)]
     while left:

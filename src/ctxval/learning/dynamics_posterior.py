@@ -108,10 +108,7 @@ class DynamicsPosterior(ShortRepr):
 
     @functools.cached_property
     def rows(self) -> Rows:
-        """The transitions that it is conditioned on; each has the largest variance given those before it.
-
-        They represent the others for the most probable hyperparameters, and are the same for all hyperparameters.
-        """
+        """The transitions that represent the others for the most probable hyperparameters, by their variance."""
         most, count = self._rescaled(self.covariances.posterior.mode), self.covariances.settings.centres
         with single_threaded():
             return pivoted_rows(most.kernel, most.theta, self.data.pairs, count, least=_PIVOT * most.noise)
@@ -241,10 +238,7 @@ class DynamicsPosterior(ShortRepr):
 
     @property
     def noise(self) -> float:
-        """The learned variance of noise, as a share of the mean square of a state's residual.
-
-        It is the median over the draws of the hyperparameters, of the state in which it is largest.
-        """
+        """The median share of noise in the mean square of a state's residual, of the state in which it is largest."""
         return float(np.median([(component.noise**2).max() for component in self.components]))
 
 
@@ -278,10 +272,7 @@ def learn_covariances(
 
 
 def condition(covariances: LearnedCovariances, transitions: Transitions, sources: Rows) -> DynamicsPosterior | None:
-    """Return the posterior of the dynamics given recorded transitions, and hyperparameters learned from some of them.
-
-    Returns None if fewer than two transitions are usable, or if the model explains all of them.
-    """
+    """Return the posterior given transitions and learned covariances; None if nothing usable is left to learn."""
     data = residual_data(covariances.model, transitions, sources)
     return None if data is None else DynamicsPosterior(covariances, data)
 

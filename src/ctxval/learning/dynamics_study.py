@@ -95,11 +95,7 @@ class DynamicsStudy(ShortRepr):
         return unseen_parameters(self.planner, self.search.pool[:8])
 
     def learn(self, executed: Executed, logged: Sequence[Trajectory] = ()) -> LearnedDynamics | None:
-        """Return what executions teach, and recordings with the same time step that belong to no task.
-
-        Returns None if there are no recorded transitions, if M explains them, if no task can be planned, or if
-        states of M cannot be estimated from recorded outputs.
-        """
+        """Return what executions, and recordings that belong to no task, teach; None if it is nothing."""
         extended, logged = self.extended.executions(executed), () if self.extended.needs_tasks else logged
         if extended is None:
             return None
@@ -213,10 +209,7 @@ class DynamicsStudy(ShortRepr):
         return None if again is None else others.with_noisy(again)
 
     def with_states(self, executed: Executed, point: Array, trajectory: Trajectory) -> Trajectory | None:
-        """Return a later execution with the states that are learned; None if they cannot be estimated.
-
-        It is a trajectory of a task ``(d,)``, recorded like the executions that were learned from.
-        """
+        """Return a later execution of a task ``(d,)`` with the states that are learned; None without estimates."""
         extended = self.extended.executions([*executed, (point, trajectory)])
         return None if extended is None else extended[-1][1]
 

@@ -36,10 +36,7 @@ from ctxval.learning.state_estimates import StateEstimates
 
 
 def with_states_of_model(validation: Validation) -> Validation:
-    """Return a validation whose trajectories have the states of M; itself if the states are recorded.
-
-    Its system is that of the given one, and cannot be executed.
-    """
+    """Return a validation, not to be executed, whose trajectories have the states of M; itself if it records states."""
     if validation.outputs is None:
         return validation
     return ExtendedValidation(validation.with_parts(physical=())).validation
@@ -129,10 +126,7 @@ class ExtendedValidation:
         return np.asarray(pairs[:: max(1, len(pairs) // 600)])
 
     def executions(self, executed: Executed, some: int | None = None) -> Executed | None:
-        """Return executions as closed loops of the other validation; None if states of M cannot be estimated.
-
-        Estimates are learned from the first ``some`` of them, by default as many as are scheduled.
-        """
+        """Return executions of the other validation; None without states, estimated as in the first ``some``."""
         some = scheduled(len(executed)) if some is None else some
         acting = list(executed)
         if self.actuator is not None:  # with the inputs that act alone, the same object each time

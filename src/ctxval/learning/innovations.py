@@ -227,11 +227,7 @@ def fit_lagged(
     products: bool = True,
     usual: bool = False,
 ) -> LaggedFit:
-    """Return the posterior if records are the state; hyperparameters are learned if they are not given.
-
-    If the ``usual`` one is asked for, its hyperparameters are the most likely ones a priori and its noise is constant,
-    which costs little.
-    """
+    """Return the posterior if records are the state; the ``usual`` one has the prior's hyperparameters, and is cheap."""
     Z, E, _ = history.along(records)
     scaled, rows = Scaled.of(Z, E, pairs, records[0].inputs.shape[1], products), np.ones((len(Z), 1))
     if usual:
@@ -303,11 +299,7 @@ class FilterFit(InnovationsFit):
 def fit_filter(
     history: History, records: Sequence[Record], pairs: Array, plain: InnovationsFit, steps: int = 5
 ) -> FilterFit:
-    """Return the posterior with measurement noise, from that of records as states.
-
-    Raises:
-        LinAlgError: if the filter diverges.
-    """
+    """Return the posterior with measurement noise, from that without; LinAlgError if the filter diverges."""
     live, n = plain.live, plain.scaled.states
     Z, E, _ = history.along(records)
     # The units are those of the records, not those of a filter that knows no residual yet.

@@ -52,10 +52,7 @@ class LearnedDynamics(ShortRepr):
 
     @functools.cached_property
     def noisy(self) -> NoisyPosterior | None:
-        """The dynamics with noise and histories, learned from the executions.
-
-        It is None if the next state follows from state and input, or if they cannot be learned.
-        """
+        """The dynamics with noise and histories; None if state and input suffice, or if nothing can be learned."""
         if not len(self.executed):
             return None
         with single_threaded():
@@ -207,10 +204,7 @@ class LearnedDynamics(ShortRepr):
 
     @property
     def untried_parameter(self) -> tuple[int, float, Array] | None:
-        """A parameter that M's loops do not depend on, its largest gap between executions, and a task in the gap.
-
-        The gap is a share of the parameter's range; None if there is no such parameter.
-        """
+        """A parameter without effect on M's loops, its largest gap as a share of its range, and a task in the gap."""
         members, gaps = self.study.validation.space.members, list[tuple[int, float, float]]()
         for j in self.study.unseen_parameters:
             ordered = np.sort(self.executed[:, j])

@@ -44,12 +44,7 @@ _TASKS, _RUNS = 6, 10  # these tasks, and how often each of them is run
 
 
 class NoiseStudy:
-    """Learns dynamics with noise and histories of one experiment; chosen structures are kept.
-
-    Args:
-        search: whose pool of tasks shows what noise does to distances.
-        quantile: the share of the executions of a task that a distance is about.
-    """
+    """Learns dynamics with noise and histories of one experiment; chosen structures are kept."""
 
     def __init__(
         self, extended: ExtendedValidation, planner: LoopPlanner, search: WorstCaseSearch, seed: int, quantile: float
@@ -58,12 +53,7 @@ class NoiseStudy:
         self._structures = Latest[bytes, ChosenStructure](8)
 
     def learn(self, posterior: DynamicsPosterior, records: Sequence[Record]) -> NoisyPosterior | None:
-        """Return dynamics with noise; None if executions follow from task, state and input, or if nothing is learned.
-
-        Args:
-            posterior: what the executions teach without noise.
-            records: of these executions.
-        """
+        """Return dynamics with noise; None if task, state and input suffice for executions, or nothing is learned."""
         # Executions do not follow from task, state and input if noise, or what is not recorded, acts.
         is_needed = (
             float((posterior.most_probable.noise**2).max()) > NOISY
@@ -115,10 +105,7 @@ class NoiseStudy:
         replicates: int,
         chosen: ChosenStructure | None = None,
     ) -> tuple[NoisyPosterior, ChosenStructure] | None:
-        """Return the posterior of noisy dynamics, and its structure, which is learned unless it was chosen before.
-
-        Returns None if nothing can be learned: the recursions diverge, or numbers are too large.
-        """
+        """Return the posterior of noisy dynamics and its structure, which may be chosen; None if recursions diverge."""
         data = posterior.data
         try:
             with single_threaded(), np.errstate(all="ignore"):
@@ -228,11 +215,7 @@ def fit_structures(
 def predicted_by_history(
     posterior: DynamicsPosterior, records: Sequence[Record], pairs: Array, without_history: Array
 ) -> bool:
-    """Return whether a history predicts the last record far better than state and input do, or neither predicts it.
-
-    The last record is left out. ``without_history`` has the predictions ``(H, n)`` of its states without a history,
-    learned from the other records.
-    """
+    """Return whether a history predicts the last record far better than state and input do, or neither predicts it."""
     last, sizes, live = records[-1], posterior.data.sizes, posterior.data.learned
 
     def share(errors: Array) -> float:

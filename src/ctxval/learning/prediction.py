@@ -135,10 +135,7 @@ class ErrorVectors:
 
 
 def predict_composed(points: Array, vectors: Array, compose: Callable[[Array], Array]) -> Prediction | None:
-    """Return a prediction of values from the vectors ``(n, k)`` of which they are composed at points ``(n, d)``.
-
-    It composes vectors ``(..., k)`` to values. It is None if fewer than two vectors are known, or if all are zero.
-    """
+    """Return a prediction of values composed of vectors ``(n, k)`` at points; None for less than two, or only zeros."""
     if points.ndim != 2 or vectors.ndim != 2 or len(points) != len(vectors):
         raise ShapeError(f"points must be (n, d) and vectors (n, k), got {points.shape}, {vectors.shape}.")
     scale = float(np.sqrt((vectors**2).mean())) if len(vectors) else 0.0

@@ -55,10 +55,7 @@ def recorded_transitions(
 
 
 def closed_loops_on_model(validation: Validation) -> Trajectory | None:
-    """Return closed loops on M for random tasks: a batch, or one task if there can be no batch.
-
-    Returns None if no task can be planned.
-    """
+    """Return closed loops on M for random tasks: a batch, or one task; None if no task can be planned."""
     space = validation.space
     points = space.from_unit(np.random.default_rng(0).random((64, space.dimension)))
     batches = [points] if getattr(validation.synthesizer, "batched", False) else []
@@ -96,10 +93,7 @@ def digest(runs: Iterable[Trajectory | Record]) -> bytes:
 
 
 def scheduled(count: int) -> int:
-    """Return the largest number of executions, up to ``count``, at which hyperparameters are learned.
-
-    These are 0 to 4, 6, 8, 12, 16, 24 and so on, two in each doubling.
-    """
+    """Return the largest of 0 to 4, 6, 8, 12, 16, 24 and so on, two in each doubling, that is not above ``count``."""
     step = 1
     while count >= 4 * step:
         step *= 2

@@ -77,10 +77,7 @@ def residual_data(model: Model, transitions: Transitions, sources: Rows) -> Resi
 
 
 def smoother_than(data: ResidualData, count: int) -> tuple[Model, ResidualData] | None:
-    """Return a linear model and its residuals if with them the transitions are far more probable than with M's.
-
-    The hyperparameters are learned from ``count`` transitions.
-    """
+    """Return a linear model and its residuals if these are far more probable than M's, by ``count`` transitions."""
     # With at least 10 transitions for each coefficient, the fit itself explains little.
     if len(data.pairs) < 10 * (data.pairs.shape[1] + 1):
         return None

@@ -67,10 +67,7 @@ class RunStatistics:
         distance: float | None,
         learned: LearnedDynamics | None = None,
     ) -> dict[str, RunStatistic]:
-        """Return the statistics of a later run, with the states that are learned, beside what was learned.
-
-        Without its task, ``(d,)``, and its distance, only those of the residuals are known.
-        """
+        """Return the statistics of a later run; without its task ``(d,)`` and distance, only those of the residuals."""
         learned = self.learned if learned is None else learned
         study, floors = learned.study, self.floors**2
         if point is None:
@@ -141,10 +138,7 @@ def influences(learned: LearnedDynamics) -> Array:
 
 
 def _residuals(learned: LearnedDynamics, record: Record) -> tuple[Array, Array, Array, Array]:
-    """Return residuals ``(H, n)`` of a record, and the regressors ``(H, k)``.
-
-    Between them are the mean squares of the doubt and of the noise, ``(n,)``.
-    """
+    """Return residuals ``(H, n)``, mean squares of doubt and noise, ``(n,)``, and regressors ``(H, k)`` of a record."""
     noisy, posterior = learned.noisy, learned.posterior
     if noisy is None:
         data, most = posterior.data, posterior.most_probable

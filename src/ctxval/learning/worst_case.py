@@ -100,10 +100,7 @@ class WorstCaseSearch:
 
     @functools.cached_property
     def pool(self) -> Array:
-        """Tasks that are spread over the cube, every second one with coordinates at bounds, shape ``(N, d)``.
-
-        Of a suite, they are all tasks.
-        """
+        """Tasks of a suite, or spread over the cube, every second one with coordinates at bounds, shape ``(N, d)``."""
         if self.members is not None:
             return self.members
         rng = np.random.default_rng([self._seed, 0])
@@ -163,10 +160,7 @@ class WorstCaseSearch:
         return distances
 
     def deeper(self, posterior: AnyPosterior, rng: np.random.Generator) -> tuple[Array, Array]:
-        """Return the largest distances on the mean ``(2,)`` in two separate searches, and their points ``(2, d)``.
-
-        Each of them has four times as many tasks as the usual one, and none of its tasks.
-        """
+        """Return the largest distances on the mean ``(2,)``, and where, in two searches of four times as many tasks."""
         distance, none = self._on_one(posterior.mean), np.empty((0, self.dimension))
         evaluations = 4 * self.settings.evaluations
         with single_threaded():

@@ -266,10 +266,7 @@ class GaussianProcessModel(IncrementModel):
 
 
 def log_likelihood(theta: Array, Z: Array, Y: Array) -> tuple[float, Array]:
-    """Return ``sum_o log p(Y[:, o] | Z, theta)`` up to a constant, and its gradient (eqs. 5.8 and 5.9).
-
-    The pairs Z are ``(M, k)``, the outputs Y ``(M, n)``; theta has the logarithms of (variance, noise, length-scales).
-    """
+    """Return ``sum_o log p(Y[:, o] | Z, theta)`` up to a constant, and its gradient (eqs. 5.8 and 5.9)."""
     variance, noise, *length_scales = np.exp(theta)
     covariance = SquaredExponential(float(variance), np.array(length_scales))
     K = covariance(Z, Z)

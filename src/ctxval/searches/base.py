@@ -104,10 +104,7 @@ class BaseSearch(Search):
 
     @property
     def uses_prediction(self) -> bool:
-        """Whether a campaign computes a prediction before it asks for points, which is costly.
-
-        By default it does if the subclass has its own :meth:`use_prediction`.
-        """
+        """Whether a campaign computes a costly prediction: if the subclass has its own :meth:`use_prediction`."""
         return type(self).use_prediction is not BaseSearch.use_prediction
 
     def use_prediction(self, prediction: Prediction | None) -> None:
@@ -121,10 +118,7 @@ class BaseSearch(Search):
         """Take the notes on a history that was told: one for each point, in the order of the points."""
 
     def estimate(self, points: Array, values: Array) -> float | None:
-        """Return the estimate of the maximum: the largest known value after the ``discard`` largest are left out.
-
-        Returns None if there are too few values.
-        """
+        """Return the largest known value after the ``discard`` largest are left out; None if there are too few."""
         ordered = np.sort(values)[::-1]
         return float(ordered[self.discard]) if len(ordered) > self.discard else None
 

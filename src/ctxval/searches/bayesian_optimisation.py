@@ -108,10 +108,7 @@ class BayesianOptimisation(SequentialSearch):
         }
 
     def _learned(self, points: Array, values: Array) -> SurrogateHyperparameters:
-        """Return hyperparameters learned from the first values; a fixed schedule says how many of them are used.
-
-        They are learned at each new value up to 40, at every second value up to 80, and so on.
-        """
+        """Return hyperparameters learned at each new value up to 40, at every second value up to 80, and so on."""
         step = 1
         while len(values) >= 40 * step:
             step *= 2

@@ -54,10 +54,7 @@ class Repeated(SequentialSearch):
         return point
 
     def estimate(self, points: Array, values: Array) -> float | None:
-        """Return the estimate of the largest mean, from the points with at least ``times`` known values.
-
-        Returns None if there are too few such points.
-        """
+        """Return the estimate of the largest mean, from the points with at least ``times`` known values, if any."""
         groups: dict[bytes, list[int]] = {}
         for row, point in enumerate(points):
             groups.setdefault(point.tobytes(), []).append(row)

@@ -48,16 +48,6 @@ class _Candidate(NamedTuple):
     doubt: float
 
 
-def _optimistic(predicted: Callable[[Array], tuple[Array, Array]], optimism: float) -> Callable[[Array], Array]:
-    """Return the optimistic value: the prediction d_hat, raised by kappa (``optimism``) times its doubt w."""
-
-    def value(points: Array) -> Array:
-        expected, doubt = predicted(points)
-        return np.asarray(expected * (1 + optimism * doubt))
-
-    return value
-
-
 @dataclass(frozen=True, eq=False)
 class _Region:
     """The state of a trust region, computed from notes and values."""
@@ -217,7 +207,12 @@ class TrustRegion(SequentialSearch):
         self, prediction: Prediction, optimism: float, region: _Region, history: _History, rng: np.random.Generator
     ) -> _Candidate | None:
         """Return the new point of largest optimistic value in a region; None if no point there can be predicted."""
-        value, few = _optimistic(prediction.expected, optimism), prediction.candidates
+
+        def optimistic(predicted: Callable[[Array], tuple[Array, Array]], points: Array) -> Array:
+            expected, doubt = predicted(points)  # d_hat, raised by kappa times its doubt w
+            return np.asarray(expected * (1 + optimism * doubt))
+
+        value, few = functools.partial(optimistic, prediction.expected), prediction.candidates
         centre = np.full(self.dimension, 0.5) if region.point is None else region.point
         box = np.clip(centre - region.radius, 0, 1), np.clip(centre + region.radius, 0, 1)
         if few is not None:
@@ -227,7 +222,7 @@ class TrustRegion(SequentialSearch):
             points, promised = points[order], promised[order]
         else:
             budget = min(prediction.budget, POINTS * self.dimension)
-            rough = None if prediction.rough is None else _optimistic(prediction.rough, optimism)
+            rough = None if prediction.rough is None else functools.partial(optimistic, prediction.rough)
             starts = best_first(history.points, history.values)[:8]
             points, promised = ascend(value, box, budget, starts, rng, rough)
         points = points[self._is_new(points, history) & np.isfinite(promised)]
