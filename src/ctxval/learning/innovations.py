@@ -227,7 +227,7 @@ def fit_lagged(
     products: bool = True,
     usual: bool = False,
 ) -> LaggedFit:
-    """Return the posterior if records are the state; the ``usual`` one has the prior's hyperparameters, and is cheap."""
+    """Return the posterior if records are the state; the ``usual`` one is cheap: it learns no hyperparameters."""
     Z, E, _ = history.along(records)
     scaled, rows = Scaled.of(Z, E, pairs, records[0].inputs.shape[1], products), np.ones((len(Z), 1))
     if usual:
