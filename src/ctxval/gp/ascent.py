@@ -14,13 +14,10 @@ import numpy as np
 from ctxval._util.arrays import Array
 from ctxval._util.boxes import Box, climb, moves_to_bounds, separated_rows
 
-Values = Callable[[Array], Array]
-"""Points ``(m, d)`` -> values ``(m,)``."""
-
+Values = Callable[[Array], Array]  # points (m, d) -> values (m,)
 _SHARES = np.array([0.03, 0.1, 0.3, 0.6, 1.0])  # steps of a line search, as shares of the way to a corner
 _LENGTHS = np.array([0.1, 0.4])  # steps along the slopes, as shares of the box in the steepest coordinate
-_COORDINATES = (0.0, 0.25, 0.5)
-"""Shares of the coordinates that are moved to the corner alone, at least one coordinate each."""
+_COORDINATES = (0.0, 0.25, 0.5)  # shares of the coordinates that are moved to the corner alone, at least one each
 
 
 class Evaluations:

@@ -18,10 +18,8 @@ from ctxval._util.arrays import Array, Rows
 from ctxval._util.boxes import separated_rows
 from ctxval.gp.ascent import Evaluations, Values
 
-_SAMPLED, _EVOLVED, _CLIMBED = 0.35, 0.7, 0.88
-"""Shares of the evaluations after which sampling, evolution and climbs end."""
-_REACHES = (0.3, 0.1)
-"""Least distance of good parents in the first and the last generation, and of elites, as a share of the diagonal."""
+_SAMPLED, _EVOLVED, _CLIMBED = 0.35, 0.7, 0.88  # shares of the evaluations after which these parts end
+_REACHES = (0.3, 0.1)  # least distance of good parents at first and at last, and of elites, in diagonals
 _STEPS = (0.3, 0.005)  # largest standard deviation of a mutation in the first and in the last generation
 
 

@@ -23,8 +23,7 @@ from ctxval.errors import InputError
 from ctxval.gp.cholesky import CholeskyFactor, factorise
 from ctxval.gp.kernels import Matern
 
-EXACT = 1e-10
-"""Noise variance, relative to sigma^2, of values without noise: it keeps the Cholesky factor safe."""
+EXACT = 1e-10  # noise variance, relative to sigma^2, of values without noise: it keeps the Cholesky factor safe
 
 
 @dataclass(frozen=True)
@@ -65,11 +64,11 @@ class Prior:
     smoothness: tuple[float, ...] = (1.5, 2.5)  # values of nu of the Matern kernel, equally likely
     length_scale: float = 0.3  # median of the log-normal length-scales in the cube, times the root of the dimension
     deviation: float = 1.0  # standard deviation of their logarithms
+    # bounds of the noise variance relative to sigma^2; it is log-uniform between them, and equal bounds fix it
     noise: tuple[float, float] = (EXACT, EXACT)
-    """Bounds of the noise variance relative to sigma^2; it is log-uniform between them, and equal bounds fix it."""
+    # c of log(y + c), in means of the values. If no value is negative, the logarithm and the values themselves are
+    # equally likely. None excludes the logarithm.
     offset: float | None = 0.1
-    """c of ``log(y + c)``, in means of the values. If no value is negative, the logarithm and the values themselves are
-    equally likely. None excludes the logarithm."""
     spread_share: float = 0.5  # share of the data from which hyperparameters are drawn a second time
 
     def centre(self, dimension: int) -> float:
@@ -211,9 +210,8 @@ def _slice(log_density: Callable[[Array], float], state: Array, direction: Array
 # rule; Wilson, Borovitskiy, Terenin, Mostowsky and Deisenroth 2020). The prior's path is approximated by random waves;
 # the correction is exact.
 
+# Frequencies of a prior path: the error of its covariance is about 1 / sqrt(2 WAVES), that of its maximum much smaller.
 WAVES = 512
-"""Number of frequencies of a prior path. The error of its covariance is about ``1 / sqrt(2 WAVES)``, and that of a
-path's maximum much smaller."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,14 +15,9 @@ from ctxval.errors import InputError
 from ctxval.gp.cholesky import CholeskyFactor, factorise
 from ctxval.gp.kernels import Bounds, Matern
 
-Mean = Callable[[Array], Array]
-"""A prior mean: points ``(n, d)`` -> values ``(n,)``."""
-
-LogDensity = Callable[[Array], tuple[float, Array]]
-"""Hyperparameters -> (the logarithm of their density, its gradient)."""
-
-NOISE = 1e-6
-"""The least noise variance, for values of unit variance: it keeps the covariance matrix positive definite."""
+Mean = Callable[[Array], Array]  # a prior mean: points (n, d) -> values (n,)
+LogDensity = Callable[[Array], tuple[float, Array]]  # hyperparameters -> the logarithm of their density, its gradient
+NOISE = 1e-6  # the least noise variance, for values of unit variance: it keeps the covariance positive definite
 
 
 def zero_mean(X: Array) -> Array:

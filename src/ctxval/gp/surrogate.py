@@ -157,8 +157,7 @@ def spread_rows(values: Array, count: int) -> Rows:
     return np.sort(np.concatenate([largest, evenly]))
 
 
-LONG = 1000
-"""Length of a history from which on only a subset is kept."""
+LONG = 1000  # length of a history from which on only a subset is kept
 
 
 def kept_rows(points: Array, values: Array, count: int, long: int = LONG) -> Rows:

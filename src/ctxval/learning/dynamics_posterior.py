@@ -189,13 +189,9 @@ class DynamicsPosterior(ShortRepr):
                     remaining[kept] = again.solve(Y[kept])
         return self._limited(KernelExpansion.of(most, Z, weights))
 
-    @property
-    def limit(self) -> Array:
-        """The largest standardised residual that the mean returns, in magnitude, shape ``(n,)``."""
-        return np.asarray(5.0 * np.abs(self.data.outputs).max(axis=0))
-
     def _limited(self, mean: KernelExpansion) -> DynamicsDraws:
-        return DynamicsDraws(self.covariances.model, self.data, (mean,), limit=self.limit[self.data.learned])
+        limit = np.asarray(5.0 * np.abs(self.data.outputs).max(axis=0))[self.data.learned]
+        return DynamicsDraws(self.covariances.model, self.data, (mean,), limit=limit)
 
     def unfamiliarity(self, states: Array, inputs: Array) -> Array:
         """Return the standard deviation of r along states and inputs ``(q, H, m)``, as a share of a typical step."""
@@ -215,7 +211,7 @@ class DynamicsPosterior(ShortRepr):
 
         Closed loops visit the ``relevant`` standardised pairs ``(R, k)``.
         """
-        model, settings = self.covariances.model, self.covariances.settings
+        settings = self.covariances.settings
         count = settings.functions if functions is None else functions
         with single_threaded():
             if some is None:
@@ -227,7 +223,7 @@ class DynamicsPosterior(ShortRepr):
             groups = [list(group) for _, group in groupby(components, lambda component: id(component.factor))]
             drawn = [draw_functions(group, relevant, count, settings.pivots, rng) for group in groups]
         expansions, left_out = zip(*drawn, strict=True)
-        return DynamicsDraws(model, self.data, joined(expansions), max(left_out))
+        return DynamicsDraws(self.covariances.model, self.data, joined(expansions), max(left_out))
 
     @property
     def deviations(self) -> Array:

@@ -18,8 +18,7 @@ import numpy as np
 from ctxval._util.arrays import Array
 from ctxval.core.model import Model
 
-Residual = Callable[[Array], Array]
-"""The residual ``r(z)`` of regressors ``(..., D)``, shape ``(..., n)``."""
+Residual = Callable[[Array], Array]  # r(z) of regressors (..., D), shape (..., n)
 
 
 @dataclass(frozen=True)

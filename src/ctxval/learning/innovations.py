@@ -28,9 +28,7 @@ _CANDIDATES = 600  # regressors from which centres are chosen
 _LENGTH = np.log(3.0)  # median of the length-scales in standard deviations of the data; their logarithms deviate by 1
 _AMPLITUDES = np.logspace(-4, 2, 19)  # of the residual, in root mean squares
 _NOISES = np.logspace(-3.3, 0.3, 18)  # standard deviations of the noise, in root mean squares of the residual
-
-DrawnWeights = tuple[Features, Array, Array]
-"""Features, and weights ``(k, F, n)`` and standard deviations of the noise ``(k, n)`` of k draws."""
+DrawnWeights = tuple[Features, Array, Array]  # weights (k, F, n) and standard deviations of noise (k, n) of k draws
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,11 +60,6 @@ class Scaled:
     def states(self) -> int:
         """The number n of states."""
         return int(self.E.shape[1])
-
-    @property
-    def usual_theta(self) -> Array:
-        """The most likely hyperparameters a priori."""
-        return np.full(self.states + self.inputs + 2, _LENGTH)
 
     @functools.cached_property
     def centres(self) -> Array:
@@ -230,10 +223,11 @@ def fit_lagged(
     """Return the posterior if records are the state; the ``usual`` one is cheap: it learns no hyperparameters."""
     Z, E, _ = history.along(records)
     scaled, rows = Scaled.of(Z, E, pairs, records[0].inputs.shape[1], products), np.ones((len(Z), 1))
+    most_likely = np.full(scaled.states + scaled.inputs + 2, _LENGTH)  # a priori
     if usual:
-        return _conditioned(history, scaled, scaled.usual_theta, live, rows, None)
+        return _conditioned(history, scaled, most_likely, live, rows, None)
     if theta is None:
-        theta, best = scaled.usual_theta, _height(scaled, scaled.usual_theta, live, rows)
+        theta, best = most_likely, _height(scaled, most_likely, live, rows)
         # Moves of one coordinate at a time; that of lags does nothing if there are none.
         moved = [i for i in range(len(theta)) if history.structure.lags or i != len(theta) - 2]
         for step, i in product((0.9, 0.5), moved):

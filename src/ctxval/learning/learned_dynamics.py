@@ -137,17 +137,13 @@ class LearnedDynamics(ShortRepr):
                 self._draws[key] = drawn
             values = planner.distances(self._draws[key], planned, len(points))
             of_pool, loops = (planner.run(self.drawn_from.silent, plans) for plans in (search.plans, planned))
-            beyond = np.full(len(points), np.inf)
-            executed_only = self.boundary is not None
-            all_beyond = beyond_records(self.posterior, of_pool, loops, executed_only=executed_only)
-            for plan, each in zip(planned, all_beyond, strict=True):
+            beyond, crossed, boundary = np.full(len(points), np.inf), np.ones(len(points)), self.boundary
+            all_beyond = beyond_records(self.posterior, of_pool, loops, executed_only=boundary is not None)
+            for plan, loop, each in zip(planned, loops, all_beyond, strict=True):
                 beyond[plan.rows] = each
-            if self.boundary is None:
-                return values, beyond, None
-            crossed = np.ones(len(points))
-            for plan, loop in zip(planned, loops, strict=True):
-                crossed[plan.rows] = self.boundary.crossed(self.posterior, loop)
-        return values, beyond, crossed
+                if boundary is not None:
+                    crossed[plan.rows] = boundary.crossed(self.posterior, loop)
+        return values, beyond, None if boundary is None else crossed
 
     def worst_case_of(self, draws: int) -> WorstCase:
         """Return the largest distance over all tasks, for each of at least so many draws of the dynamics."""

@@ -33,11 +33,8 @@ STRUCTURES = (
 EXACT = 1e-3  # share of noise below which records with lags determine the next one
 NOISY = 0.01  # share of noise from which executions of one task differ
 _BETTER, _GOOD = 0.1, 0.02  # share of the error without a history, and of the residual, that a history leaves
-
+# Standard deviation of the distance of a task over its executions, as a share of the largest distance, that matters.
 MATTERS = 0.01
-"""Standard deviation of the distance of a task over its executions, as a share of the largest distance, from which
-noise matters."""
-
 _ROUNDING = 1e-5  # standard deviation, as a share of a state's, below which it is rounding
 _TRIED = 32  # tasks of the pool among which those with the largest distances show what noise does
 _TASKS, _RUNS = 6, 10  # these tasks, and how often each of them is run
@@ -55,11 +52,8 @@ class NoiseStudy:
     def learn(self, posterior: DynamicsPosterior, records: Sequence[Record]) -> NoisyPosterior | None:
         """Return dynamics with noise; None if task, state and input suffice for executions, or nothing is learned."""
         # Executions do not follow from task, state and input if noise, or what is not recorded, acts.
-        is_needed = (
-            float((posterior.most_probable.noise**2).max()) > NOISY
-            or self._effect(posterior) > MATTERS
-            or self._effect(posterior, _scatter_of(records)) > MATTERS
-        )
+        is_needed = float((posterior.most_probable.noise**2).max()) > NOISY or self._effect(posterior) > MATTERS
+        is_needed = is_needed or self._effect(posterior, _scatter_of(records)) > MATTERS
         if not is_needed and len(records) >= 3:
             last = records[-1]
             with contextlib.suppress(np.linalg.LinAlgError, InputError, ValueError), np.errstate(all="ignore"):

@@ -17,7 +17,7 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from ctxval._util.arrays import Array, single_threaded
+from ctxval._util.arrays import Array, Rows, single_threaded
 from ctxval._util.cores import on_all_cores
 from ctxval._util.progress import advance
 from ctxval.core.distance import ComposedDistance
@@ -30,9 +30,7 @@ from ctxval.learning.draws import DynamicsDraws
 from ctxval.learning.dynamics_posterior import DynamicsPosterior
 from ctxval.searches import Prediction
 
-Executed = Sequence[tuple[Array, Trajectory]]
-"""Points of the unit cube ``(d,)`` with the system's trajectories there."""
-
+Executed = Sequence[tuple[Array, Trajectory]]  # points of the unit cube (d,) with the system's trajectories there
 _KERNEL = Matern(2.5, ard=True, length_scale=(0.05, 100.0), variance=(1e-6, 1e3), linear=(1e-6, 1e3))
 _NOISE = 1e-8  # noise variance relative to the vectors' mean square: it keeps the covariance matrix positive definite
 _LEARNED_FROM = 200  # largest number of vectors, the latest ones, from which the hyperparameters are learned
@@ -74,27 +72,26 @@ class PredictedDistance:
             distances[~is_executed] = self(points[~is_executed])[0]
         if len(known):
             without = self.posterior.means_without(list(filter(None, executions)))
+            own = self.planner.own_distances
             with single_threaded():
-                parts = halved(
-                    lambda some: self.planner.own_distances(without[some], known[some, None])[:, 0], len(known)
-                )
+                parts = halved(lambda some: own(without[some], known[some, None])[:, 0], len(known))
             distances[is_executed] = np.concatenate([[np.nan] if part is None else part for _, part in parts])
         return np.where(np.isfinite(distances), distances, np.nan)
 
     def _predicted(self, points: Array) -> Array:
         """Return distances and doubts ``(2, m)``; NaN for a task that cannot be planned or where a part fails."""
 
-        def closed_loops(some: Array) -> Array:
+        def closed_loops(some: Rows) -> Array:
             predicted = np.full((2, len(some)), np.nan)
-            planned = self.planner.plan(some)
+            planned = self.planner.plan(points[some])
             for plan, loops in zip(planned, self.planner.run(self.mean, planned), strict=True):
                 with np.errstate(all="ignore"):
                     doubt = self.posterior.unfamiliarity(loops.states[0], loops.inputs[0])
                 predicted[:, plan.rows] = loops.distances[0], doubt
             return predicted
 
-        parts = halved(lambda rows: closed_loops(points[rows]), len(points))
-        return np.concatenate([np.full((2, 1), np.nan) if part is None else part for _, part in parts], axis=1)
+        parts = [part for _, part in halved(closed_loops, len(points))]
+        return np.concatenate([np.full((2, 1), np.nan) if part is None else part for part in parts], axis=1)
 
 
 def executions_of(executed: Array, points: Iterable[Array]) -> list[list[int]]:

@@ -20,9 +20,7 @@ from ctxval.learning.histories import Record
 from ctxval.learning.learned_dynamics import LearnedDynamics
 from ctxval.learning.tolerance import pushed
 
-NEGLIGIBLE = 0.01
-"""Share of the threshold: what moves no distance by so much is no change."""
-
+NEGLIGIBLE = 0.01  # share of the threshold: what moves no distance by so much is no change
 _LEAST, _MOST = 1e-6, 0.3  # limits of negligible residuals, as shares of a state's typical step
 
 
@@ -114,8 +112,8 @@ class RunStatistic:
     information: Array | None = None
 
 
+# The statistic of the executed distance: its squared error, standardised by the draws of the dynamics.
 DISTANCE = "errors of the predicted distance"
-"""Name of the statistic of the executed distance: its squared error, standardised by the draws of the dynamics."""
 
 
 def names(study: DynamicsStudy, states: int) -> Sequence[str]:

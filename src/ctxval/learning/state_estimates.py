@@ -21,8 +21,8 @@ from ctxval.learning.prediction import Executed
 from ctxval.models.corrected import before_refinement
 from ctxval.models.increments import standard_deviations
 
+# What M misses in recorded directions, beside what it misses in all others, as shares of their steps.
 _SHARES = np.array([1.0, 1e-1, 1e-2, 1e-3, 1e-4])
-"""What M misses in recorded directions, beside what it misses in all others, as shares of their steps."""
 
 
 class StateEstimates:
@@ -95,15 +95,13 @@ def smoothed_states(
     measurement = np.diag((1e-6 * _SHARES[-1] * spreads) ** 2)
     inputs = np.repeat(u[:, None], k, axis=1)
     known, _ = corrected(outputs, Estimate(np.repeat(start[None], k, axis=0), process), y[0], measurement)
-    filtered, priors, jacobians, innovations = [known], list[Estimate](), list[Array](), list[Array]()
+    steps_back, innovations = list[tuple[Estimate, Array, Estimate]](), list[Array]()
     for t in range(len(u)):
-        prior, A = predicted(model, known, inputs[t], process)
+        before, (prior, A) = known, predicted(model, known, inputs[t], process)
         known, innovation = corrected(outputs, prior, y[t + 1], measurement)
-        filtered.append(known)
-        priors.append(prior)
-        jacobians.append(A)
+        steps_back.append((before, A, prior))
         innovations.append(innovation)
     states = [known.mean]
-    for t in reversed(range(len(u))):
-        states.append(smoothed(filtered[t], jacobians[t], priors[t], states[-1]))
+    for step_back in reversed(steps_back):
+        states.append(smoothed(*step_back, states[-1]))
     return np.stack(states[::-1]), np.square(innovations).mean(axis=0)

@@ -23,9 +23,7 @@ from ctxval.learning.closed_loops import AnyDraws, LoopPlanner, PlannedTasks, lo
 from ctxval.learning.dynamics_posterior import DynamicsPosterior
 from ctxval.learning.noisy_draws import SETTLED, NoisyDraws, NoisyPosterior
 
-AnyPosterior = DynamicsPosterior | NoisyPosterior
-"""The posterior of dynamics without and with noise."""
-
+AnyPosterior = DynamicsPosterior | NoisyPosterior  # of dynamics without and with noise
 _DIVERGED = 1e30  # the distance of a loop that diverges, in searches: larger than all others, and finite
 _EVALUATIONS = (512, 2048, 4096, 6000, 6000, 6000, 12000)  # tasks of a global search, for 1, 2, ... parameters
 _SHOWN = 16  # largest number of these tasks
@@ -72,6 +70,11 @@ class WorstCase:
     unplanned: float  # share of the pool's tasks for which no controller can be designed, or on which M diverges
     # largest share by which a distance on the mean is larger than those of tasks that are nearly the same
     sharpness: float = 0.0
+
+    def with_draws(self, maxima: Array, points: Array, loops: int, left_out: float) -> WorstCase:
+        """Return what a search has found on the mean and then, in so many more loops, on draws."""
+        maxima, evaluations = np.where(maxima >= _DIVERGED, np.inf, maxima), self.evaluations + loops
+        return replace(self, maxima=maxima, points=points, evaluations=evaluations, left_out=left_out)
 
 
 class WorstCaseSearch:
@@ -215,14 +218,7 @@ class WorstCaseSearch:
             tasks = self._shared_tasks(of_mean, known, self.settings.shared // 4, rng)
             draws = posterior.draw(self.relevant(posterior, tasks, rng), rng, 1, _SCREENED[0])
             values = self._distances(draws, tasks)
-        maxima, points = values.max(axis=1), tasks[values.argmax(axis=1)]
-        return replace(
-            of_mean,
-            maxima=np.where(maxima >= _DIVERGED, np.inf, maxima),
-            points=points,
-            evaluations=of_mean.evaluations + values.size,
-            left_out=draws.left_out,
-        )
+        return of_mean.with_draws(values.max(axis=1), tasks[values.argmax(axis=1)], values.size, draws.left_out)
 
     def maxima(
         self, posterior: AnyPosterior, of_mean: WorstCase, known: Array, rng: np.random.Generator, functions: int
@@ -247,14 +243,8 @@ class WorstCaseSearch:
             distances = np.maximum(flat.reshape(beside.shape[:2]), 0.0)
             peak, next_to_it = distances[:, 0], np.median(distances[:, 1:], axis=1)
             lost = np.divide(peak - next_to_it, peak, out=np.zeros(len(peak)), where=peak > 0)
-        return replace(
-            of_mean,
-            maxima=np.where(maxima >= _DIVERGED, np.inf, maxima),
-            points=points,
-            evaluations=of_mean.evaluations + loops,
-            left_out=draws.left_out,
-            sharpness=float(max(lost.max(initial=0.0), 0.0)),
-        )
+        sharpness = float(max(lost.max(initial=0.0), 0.0))
+        return replace(of_mean.with_draws(maxima, points, loops, draws.left_out), sharpness=sharpness)
 
     def _shared_tasks(self, of_mean: WorstCase, known: Array, count: int, rng: np.random.Generator) -> Array:
         """Return the tasks that draws share: elites, known tasks and random ones; of a suite, those not known."""

@@ -23,13 +23,10 @@ from ctxval.gp.acquisition import Acquisition, LogExpectedImprovement, UpperConf
 from ctxval.gp.surrogate import SurrogateHyperparameters, kept_rows, learn
 from ctxval.searches.base import Note, SequentialSearch, best_first
 
-_WORTH = 0.005
-"""Least improvement worth an execution, as a share of the difference between the best value and the median."""
-_EVERYWHERE = 4
-"""Period of executions that are chosen from the whole cube, also in a branch; in few dimensions they fill the space."""
+_WORTH = 0.005  # least improvement worth an execution, as a share of the best value's excess over the median
+_EVERYWHERE = 4  # period of executions from the whole cube, also in a branch; in few dimensions they fill the space
 _BOUND = 3  # period of executions that maximise the upper confidence bound
-_ENGINE = "scalar"
-"""The name of this search in notes. Existing stores contain it, so it differs from the name of the class."""
+_ENGINE = "scalar"  # the name of this search in notes of existing stores, so it differs from that of the class
 
 
 @dataclass(frozen=True, eq=False)

@@ -30,10 +30,7 @@ from ctxval.gp.surrogate import fit_surrogate, kept_rows
 from ctxval.searches.base import Costs, Note, Prediction, SequentialSearch, best_first
 from ctxval.searches.bayesian_optimisation import BayesianOptimisation
 
-_ENGINE = "climb"
-"""The name of this search in notes. Existing stores contain it, so it differs from the name of the class."""
-
-
+_ENGINE = "climb"  # the name of this search in notes of existing stores, so it differs from that of the class
 POINTS = 400  # largest number of points that are predicted for one suggestion, for each dimension
 _IMPROVEMENT = 1e-3  # least predicted improvement worth an execution, as a share of the largest value
 _COMPARED_FROM = 6  # number of known values from which on the prediction must be better than the surrogate
@@ -274,9 +271,7 @@ def _log_error(expected: Array, values: Array) -> float:
 Thinking = Literal["balanced", "fast", "thorough"]
 
 FAST = 0.15  #: share of the largest number of points that fast thinking predicts
-_SHARES = (1.0, 0.4, FAST)
-"""Shares of the largest number of points that are predicted for one choice, from thorough to fast."""
-
+_SHARES = (1.0, 0.4, FAST)  # of the largest number of points that are predicted for a choice, from thorough to fast
 DESIGNS = "designs"  #: key in a note: the number of points that are predicted for each choice of the campaign
 
 
