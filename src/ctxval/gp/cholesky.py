@@ -68,9 +68,8 @@ def factorise(covariance: Array, noise: float, *, insist: bool = False) -> Chole
         if not info and not np.isnan(np.trace(L)):  # some LAPACKs let NaN pass
             return CholeskyFactor(np.asarray(L))
         noise *= 10
-    raise InputError(
-        f"the covariance of {len(covariance)} observations is not positive definite; raise the noise variance."
-    )
+    what = f"the covariance of {len(covariance)} observations"
+    raise InputError(f"{what} is not positive definite; raise the noise variance.")
 
 
 def pivoted_rows(kernel: Covariance, theta: Array, X: Array, count: int, least: float) -> Rows:

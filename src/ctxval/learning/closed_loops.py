@@ -199,11 +199,8 @@ class LoopPlanner:
     def _stacked(self, planned: PlannedTasks, loops: Sequence[Trajectory]) -> Loops:
         states, inputs = np.stack([loop.states for loop in loops]), np.stack([loop.inputs for loop in loops])
         shape = (len(loops), len(planned.rows))
-        return Loops(
-            np.array([self.compared(planned, loop) for loop in loops]).reshape(shape),
-            states.reshape(*shape, *states.shape[-2:]),
-            inputs.reshape(*shape, *inputs.shape[-2:]),
-        )
+        distances = np.array([self.compared(planned, loop) for loop in loops]).reshape(shape)
+        return Loops(distances, *(part.reshape(*shape, *part.shape[-2:]) for part in (states, inputs)))
 
     def _takes_draws_together(self, planned: PlannedTasks, draws: int) -> bool:
         """Return whether controllers take draws as another first axis; if not, one loop is run after the other."""
@@ -215,11 +212,9 @@ class LoopPlanner:
             self._together = False
             with contextlib.suppress(Exception), np.errstate(all="ignore"):  # the user's controller
                 together = _probed(controller, planned.task.starting_at(probes), steps)
-                each = (_probed(controller, planned.task.starting_at(probe), steps) for probe in probes)
-                one_by_one = np.stack(list(each), axis=1)
-                self._together = together.shape == one_by_one.shape and np.allclose(
-                    together, one_by_one, equal_nan=True
-                )
+                each = [_probed(controller, planned.task.starting_at(probe), steps) for probe in probes]
+                alone = np.stack(each, axis=1)
+                self._together = together.shape == alone.shape and np.allclose(together, alone, equal_nan=True)
         return draws > 1 and bool(self._together)
 
     def compared(self, planned: PlannedTasks, loops: Trajectory) -> Array:

@@ -187,11 +187,10 @@ class LearnedDynamics(ShortRepr):
             planned = planner.plan(pool)
             loops = planner.run(self.posterior.mean, planned)
         visited = np.concatenate([each.states.reshape(-1, states) for each in loops])
-        of_task = [
-            np.broadcast_to(plan.rows[:, None], each.states.shape[:3])
-            for plan, each in zip(planned, loops, strict=True)
+        steps = [
+            np.broadcast_to(p.rows[:, None], each.states.shape[:3]) for p, each in zip(planned, loops, strict=True)
         ]
-        rows, finite = np.concatenate([each.ravel() for each in of_task]), np.isfinite(visited).all(axis=1)
+        rows, finite = np.concatenate([each.ravel() for each in steps]), np.isfinite(visited).all(axis=1)
         space, labels = self.study.validation.space, self.labels[:states]
         goals = self.study.given.outputs is None
         # A suite has no other tasks.

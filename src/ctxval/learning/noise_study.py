@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -159,8 +160,7 @@ def _scatter_of(records: Sequence[Record]) -> Array:
     return np.asarray(np.sqrt(np.mean([(record.states[0] - record.start) ** 2 for record in records], axis=0)))
 
 
-@dataclass(frozen=True, eq=False)
-class ChosenStructure:
+class ChosenStructure(NamedTuple):
     """A structure, learned from some executions, with the hyperparameters of the fit whose records are the state."""
 
     structure: Structure
@@ -188,17 +188,14 @@ def fit_structures(
     if chosen is not None:
         plain = lagged(Structure(0 if chosen.structure.ratio else chosen.structure.lags), chosen.theta)
         return (filtered(chosen.structure, plain) if chosen.structure.ratio else plain), chosen
-    longest = max(1, len(records))
-    fits: list[InnovationsFit] = [
-        lagged(structure, None) for structure in STRUCTURES if not structure.ratio and structure.lags <= longest
-    ]
-    of_states = fits[0]
-    least = min(fit.share for fit in fits)
+    possible = [structure for structure in STRUCTURES if structure.lags <= max(1, len(records))]
+    fits: list[InnovationsFit] = [lagged(structure, None) for structure in possible if not structure.ratio]
+    of_states, least = fits[0], min(fit.share for fit in fits)
     exact = [fit for fit in fits if fit.share <= max(10 * least, 1e-6)] if least <= EXACT else []
     best = min(exact, key=lambda fit: fit.history.structure.lags) if exact else max(fits, key=_preference)
     if best.share > NOISY:
-        for structure in STRUCTURES:
-            if structure.ratio and structure.lags <= longest:
+        for structure in possible:
+            if structure.ratio:
                 with contextlib.suppress(np.linalg.LinAlgError):
                     fits.append(filtered(structure, of_states))
         best = max(fits, key=_preference)

@@ -52,9 +52,8 @@ class StateEstimates:
                     if trajectory not in self._known:
                         task = self.validation.task(space.parameters(space.from_unit(point)))
                         start = np.asarray(task.initial_state, dtype=np.float64)
-                        self._known[trajectory] = smoothed_states(
-                            model, self.outputs, start, trajectory.states, trajectory.inputs, self.steps
-                        )
+                        recorded = trajectory.states, trajectory.inputs
+                        self._known[trajectory] = smoothed_states(model, self.outputs, start, *recorded, self.steps)
         except Exception:  # the user's parts, at states that M never reaches by itself
             return None
         known = [(*self._known[trajectory], trajectory) for _, trajectory in executed]
@@ -68,10 +67,8 @@ class StateEstimates:
         for states, _, trajectory in known:
             # The last states are left out, because only later outputs would show them.
             end = min(-(-states.shape[-1] // trajectory.states.shape[-1]) - 1, trajectory.horizon - 1)
-            kept = trajectory.horizon - end
-            estimated.append(
-                Trajectory(trajectory.times[: kept + 1], states[: kept + 1, chosen], trajectory.inputs[:kept])
-            )
+            kept, times = trajectory.horizon - end, trajectory.times
+            estimated.append(Trajectory(times[: kept + 1], states[: kept + 1, chosen], trajectory.inputs[:kept]))
         return estimated
 
 

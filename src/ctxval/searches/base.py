@@ -170,9 +170,8 @@ class SequentialSearch(BaseSearch):
         self._require_reset()
         rows, scalars = as_floats("points", points), as_floats("values", values)
         if rows.ndim != 2 or rows.shape[1] != self._dimension or scalars.shape != (len(rows),):
-            raise ShapeError(
-                f"tell needs points (n, {self._dimension}) and values (n,), got {rows.shape} and {scalars.shape}."
-            )
+            got = f"{rows.shape} and {scalars.shape}"
+            raise ShapeError(f"tell needs points (n, {self._dimension}) and values (n,), got {got}.")
         if not ((rows >= 0) & (rows <= 1)).all():
             raise InputError(f"points must be in the unit cube, got {rows.tolist()}.")
         for point, value in zip(rows, scalars.tolist(), strict=True):
