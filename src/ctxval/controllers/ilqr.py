@@ -169,12 +169,10 @@ class _Descent:
         self.K[:, rows[chosen]] = policy.K[:, chosen] if policy.K.ndim == 4 else policy.K[:, None]
 
     def _line_search(self, rows: Rows, policy: InputStep, waiting: Rows) -> Rows:
-        """Accept for each waiting task the longest step that lowers its cost; return the tasks with such a step.
-
-        A task whose last step was the full one tries only this at first. Others try several lengths in one call.
-        """
+        """Accept for each waiting task the longest step that lowers its cost; return the tasks with such a step."""
         moved, tried = [waiting[:0]], np.zeros(len(waiting), dtype=int)
         while len(waiting):
+            # A task whose last step was the full one tries only this at first. Others try several lengths in one call.
             several = self.shortened[rows[waiting]] | (tried > 0)
             # Up to 256 loops on a model that takes batches, one more costs little.
             width = int(np.clip(256 // max(1, several.sum()), 1, self.together))
@@ -367,7 +365,6 @@ def _value(moves: Array, slope: Array, Q_uu: Array) -> Array:
 
 
 def _inner(first: Array, second: Array) -> Array:
-    """Return the sums over time and inputs of products, ``(N,)``."""
     return np.asarray(np.einsum("tni,tni->n", first, second))
 
 

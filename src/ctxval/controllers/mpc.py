@@ -183,10 +183,7 @@ def _softened(
 def _quadratic_program(
     hessian: Array, slope: Array, rows: Array, box: Sequence[Array], gaps: Sequence[Array]
 ) -> tuple[Array, float] | None:
-    """Minimise ``1/2 z'Hz + g'z`` for z within a box and ``rows z`` within the gaps.
-
-    Return z and the largest multiplier of a row; None if there is no solution.
-    """
+    """Minimise ``1/2 z'Hz + g'z``, z in a box and ``rows z`` in the gaps; return z and the largest multiplier."""
     casadi = require_extra("casadi", "mpc", "MPC controllers need")
     dense = casadi.Sparsity.dense
     sizes = {"h": dense(*hessian.shape), "a": dense(len(rows), len(slope))}

@@ -101,10 +101,8 @@ def _evolve(done: Evaluations, rng: np.random.Generator) -> None:
 
 
 def _prominences(points: Array, heights: Array, rows: Rows) -> Array:
-    """Return by how much some rows exceed a local linear fit, without themselves, to their neighbours.
-
-    The scale is linear near the median of the heights and logarithmic far from it; failures are lowest.
-    """
+    """Return by how much some rows exceed a local linear fit, without themselves, to their neighbours."""
+    # The scale is linear near the median of the heights and logarithmic far from it; failures are lowest.
     finite = heights[np.isfinite(heights)]
     low, middle, high = np.quantile(finite, [0.25, 0.5, 0.75])
     spread = (high - low) or float(finite.std()) or 1.0

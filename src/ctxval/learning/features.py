@@ -10,6 +10,8 @@ import numpy as np
 from ctxval._util.arrays import Array, Rows
 from ctxval.gp.kernels import Matern
 
+LinearFunction = tuple[Array, Array]  # weights of the Matern functions (M, n), and of the linear parts
+
 
 @dataclass(frozen=True, eq=False)
 class Features:
@@ -44,14 +46,14 @@ class Features:
     def function(self, weights: Array) -> LinearFunction:
         """Return the sum of the features with weights ``(F, n)``, which is cheaper than the features."""
         M = len(self.centres)
-        return LinearFunction(self.whiten @ weights[:M], weights[M:])
+        return self.whiten @ weights[:M], weights[M:]
 
     def values(self, z: Array, functions: Sequence[tuple[Rows, LinearFunction]]) -> Array:
         """Return the values ``(N, n)`` of functions at regressors ``(N, D)``, each at some rows."""
         matern, linear = self._matern(z), self._linear(z)
         values = np.empty((len(z), self.states))
-        for rows, function in functions:
-            values[rows] = matern[rows] @ function.matern + linear[rows] @ function.linear
+        for rows, (of_matern, of_linear) in functions:
+            values[rows] = matern[rows] @ of_matern + linear[rows] @ of_linear
         return values
 
     def _matern(self, z: Array) -> Array:
@@ -79,14 +81,6 @@ class Features:
             # Standard deviation of products of an input and a state, relative to that of the linear part.
             parts.append(0.3 * (u[:, :, None] * x[:, None, :]).reshape(len(z), -1))
         return self.linear * np.concatenate(parts, axis=1)
-
-
-@dataclass(frozen=True, eq=False)
-class LinearFunction:
-    """Weights of the Matern functions ``(M, n)`` and of the linear parts."""
-
-    matern: Array
-    linear: Array
 
 
 def spread_rows(Z: Array, count: int) -> Rows:

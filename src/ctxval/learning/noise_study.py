@@ -112,10 +112,9 @@ class NoiseStudy:
         return NoisyPosterior(fit, data, _scatter_of(records), horizon, replicates, self.quantile, seed), chosen
 
     def _effect(self, posterior: DynamicsPosterior | NoisyPosterior, starts: Array | None = None) -> float:
-        """Return the largest standard deviation of the distance of a task, as a share of the largest distance.
+        """Return the largest standard deviation of a task's distance over noise, as a share of the largest distance.
 
-        It is that over noise or, if they are given, over initial states with standard deviations ``(n,)`` around those
-        of the tasks. Of some tasks, those with the largest distances count. Only finite distances do.
+        If they are given, it is that over starts with such deviations ``(n,)``. The tasks have large finite distances.
         """
         causes, planner = [posterior.deviations] if starts is None else [starts], self.planner
         if starts is None and isinstance(posterior, NoisyPosterior):

@@ -144,15 +144,11 @@ class WorstCaseSearch:
         return float(jumps[np.isfinite(jumps)].max(initial=0.0))
 
     def _nearer(self, posterior: AnyPosterior, tasks: Array, distances: Array) -> Array:
-        """Return distances ``(k, 3)`` of three tasks in a row that are ``_NEARER`` times nearer, where they bend most.
-
-        Of each row, the half with the larger change is kept, which a jump is in.
-        """
-        # Rows of such tasks that are looked at more closely if the distance has kinks.
+        """Return distances ``(k, 3)`` of tasks in a row that are ``_NEARER`` times nearer, where they bend most."""
         bends = np.abs(distances[:, 1] - 0.5 * (distances[:, 0] + distances[:, 2]))
         rows = np.argsort(-np.nan_to_num(bends, nan=0.0, posinf=0.0), kind="stable")[:64]
         tasks, distances = tasks[rows], distances[rows]
-        for _ in range(int(np.log2(_NEARER))):
+        for _ in range(int(np.log2(_NEARER))):  # of each row, the half with the larger change is kept: a jump is in it
             later = np.abs(distances[:, 2] - distances[:, 1]) > np.abs(distances[:, 1] - distances[:, 0])
             ends = np.where(later[:, None], [1, 2], [0, 1])
             tasks, distances = np.take_along_axis(tasks, ends[..., None], 1), np.take_along_axis(distances, ends, 1)
@@ -260,11 +256,9 @@ class WorstCaseSearch:
         return np.asarray(~(self.members[:, None] == known).all(axis=2).any(axis=1))
 
     def _distances(self, draws: AnyDraws, points: Array) -> Array:
-        """Return the distances ``(S, q)`` of draws on points ``(q, d)``, as a search takes them."""
         return _finite(self.planner.distances(draws, self.planner.plan(points), len(points)))
 
     def _on_one(self, mean: AnyDraws) -> Callable[[Array], Array]:
-        """Return the distances ``(q,)`` on one draw, such as the posterior mean, as a function of points."""
         return lambda points: np.asarray(self._distances(mean, points)[0])
 
     def relevant(self, posterior: AnyPosterior, tasks: Array, rng: np.random.Generator) -> Array:

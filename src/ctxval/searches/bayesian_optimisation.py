@@ -117,7 +117,6 @@ class BayesianOptimisation(SequentialSearch):
 
 
 def _filling(points: Array, rng: np.random.Generator) -> Array:
-    """Return the candidate ``(d,)`` that is farthest from all points."""
     candidates = rng.random((512, points.shape[1]))
     gaps = np.linalg.norm(candidates[:, None, :] - points[None, :, :], axis=2).min(axis=1)
     return np.asarray(candidates[np.argmax(gaps)])

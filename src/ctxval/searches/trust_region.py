@@ -47,8 +47,6 @@ class _Candidate(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class _Region:
-    """The state of a trust region, computed from notes and values."""
-
     number: int = 0
     radius: float = 1.0  # half its width; 1 for the whole cube
     best: float = -np.inf  # its largest value, at the point
