@@ -389,8 +389,7 @@ def test_a_linear_residual_is_learned_everywhere_from_few_transitions() -> None:
     other = models.Linear([[1.02, 0.05], [0.1, 0.9]], [[0.05], [0.08]])
     posterior = learned_from(Transitions(x, u, other.step(x, u)))
     far, push = 10 * rng.normal(size=(50, 2)), rng.normal(size=(50, 1))
-    assert posterior.mean.limit is not None
-    largest = 0.9 * posterior.mean.limit * posterior.data.units
+    largest = 0.9 * posterior.limit * posterior.data.units
     bounded = (np.abs(other.step(far, push) - MODEL.step(far, push)) < largest).all(axis=1)
     assert bounded.sum() > 5
     np.testing.assert_allclose(mean(posterior).step(far, push)[bounded], other.step(far, push)[bounded], atol=1e-3)

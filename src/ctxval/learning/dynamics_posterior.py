@@ -189,9 +189,13 @@ class DynamicsPosterior(ShortRepr):
                     remaining[kept] = again.solve(Y[kept])
         return self._limited(KernelExpansion.of(most, Z, weights))
 
+    @property
+    def limit(self) -> Array:
+        """The largest standardised residual that the mean returns, in magnitude, shape ``(n,)``."""
+        return np.asarray(5.0 * np.abs(self.data.outputs).max(axis=0))
+
     def _limited(self, mean: KernelExpansion) -> DynamicsDraws:
-        limit = np.asarray(5.0 * np.abs(self.data.outputs).max(axis=0))[self.data.learned]
-        return DynamicsDraws(self.covariances.model, self.data, (mean,), limit=limit)
+        return DynamicsDraws(self.covariances.model, self.data, (mean,), limit=self.limit[self.data.learned])
 
     def unfamiliarity(self, states: Array, inputs: Array) -> Array:
         """Return the standard deviation of r along states and inputs ``(q, H, m)``, as a share of a typical step."""

@@ -4,13 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from ctxval._util.arrays import Array, Rows
 from ctxval.gp.kernels import Matern
 
-LinearFunction = tuple[Array, Array]  # weights of the Matern functions (M, n), and of the linear parts
+
+class LinearFunction(NamedTuple):
+    """Weights of the Matern functions ``(M, n)`` and of the linear parts."""
+
+    matern: Array
+    linear: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,14 +52,14 @@ class Features:
     def function(self, weights: Array) -> LinearFunction:
         """Return the sum of the features with weights ``(F, n)``, which is cheaper than the features."""
         M = len(self.centres)
-        return self.whiten @ weights[:M], weights[M:]
+        return LinearFunction(self.whiten @ weights[:M], weights[M:])
 
     def values(self, z: Array, functions: Sequence[tuple[Rows, LinearFunction]]) -> Array:
         """Return the values ``(N, n)`` of functions at regressors ``(N, D)``, each at some rows."""
         matern, linear = self._matern(z), self._linear(z)
         values = np.empty((len(z), self.states))
-        for rows, (of_matern, of_linear) in functions:
-            values[rows] = matern[rows] @ of_matern + linear[rows] @ of_linear
+        for rows, function in functions:
+            values[rows] = matern[rows] @ function.matern + linear[rows] @ function.linear
         return values
 
     def _matern(self, z: Array) -> Array:
