@@ -81,12 +81,11 @@ def pivoted_rows(kernel: Covariance, theta: Array, X: Array, count: int, least: 
 def pivoted_cholesky(
     variances: Array, covariances: Callable[[int], Array], count: int, least: float
 ) -> tuple[Rows, Array, Array]:
-    """Return those rows ``(k,)`` of a covariance matrix that represent all of it, and their Cholesky factor ``(k, k)``.
+    """Return rows ``(k,)`` that represent a covariance matrix, their Cholesky factor ``(k, k)``, and what is left.
 
-    The third array has the variances of all n rows given these ``(n,)``.
-
-    The matrix has the diagonal ``variances`` ``(n,)``, and ``covariances`` returns one of its rows in an array that may
-    be overwritten; count and least are as in :func:`pivoted_rows`.
+    The variances given these rows ``(n,)`` are left. The matrix has the diagonal ``variances`` ``(n,)``, and
+    ``covariances`` returns one of its rows in an array that may be overwritten. The choice ends after ``count`` rows,
+    or if no remaining variance is larger than ``least``.
     """
     left = np.array(variances)
     columns = np.empty((min(count, len(left)), len(left)))

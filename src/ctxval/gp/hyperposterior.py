@@ -28,10 +28,7 @@ EXACT = 1e-10  # noise variance, relative to sigma^2, of values without noise: i
 
 @dataclass(frozen=True)
 class Warp:
-    """A scale on which values are a Gaussian process.
-
-    The unit of the values makes their likelihood comparable with that of the logarithm, which has no unit.
-    """
+    """A scale on which values are a Gaussian process; their unit makes likelihoods of two scales comparable."""
 
     offset: float = np.inf  # c of log(y + c); infinity for the values themselves
     unit: float = 1.0

@@ -111,11 +111,7 @@ def condition(
 
 
 def log_likelihood_of_outputs(K: Array, noise: float, Y: Array) -> tuple[float, Array]:
-    """Return ``sum_o log p(Y[:, o])`` up to a constant, and its derivative W with respect to K.
-
-    The outputs ``(n, k)`` share the covariance K ``(n, n)``. If K changes by a small dK, the value changes by
-    ``sum(W * dK)`` (Rasmussen and Williams 2006, eqs. 5.8 and 5.9).
-    """
+    """Return ``sum_o log p(Y[:, o])`` of outputs that share K, up to a constant, and its derivative by K (eq. 5.9)."""
     factor = factorise(K, noise)
     alpha = factor.solve(Y)
     value = -0.5 * (Y * alpha).sum() - Y.shape[1] * factor.half_log_determinant()

@@ -218,11 +218,7 @@ class LoopPlanner:
         return draws > 1 and bool(self._together)
 
     def compared(self, planned: PlannedTasks, loops: Trajectory) -> Array:
-        """Return the distances ``(q,)`` of loops; infinity if a loop diverges, NaN if that of M does.
-
-        It is infinity, too, if the distance raises an exception or returns no finite number: nothing is known then.
-        Tasks are measured one by one if the distance does not take a batch.
-        """
+        """Return the distances ``(q,)`` of loops; infinity if one diverges or cannot be measured, NaN if M diverges."""
         task, promised, between = planned.task, planned.promised, self.validation.distance_between
         model, system, known = promised, loops, promised.finite & loops.finite
         if not known.all():  # a distance need not take what is not finite

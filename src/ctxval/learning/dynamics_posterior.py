@@ -145,10 +145,7 @@ class DynamicsPosterior(ShortRepr):
         return self.mean if rough.centres.shape[1] == len(self.rows) else self._limited(rough)
 
     def with_few_centres(self, least: int, error: float) -> KernelExpansion:
-        """Return the mean of r conditioned on as few of the transitions as predict the others well.
-
-        It tries ``least`` of them first, then twice as many. ``error`` is a share of the residuals at the others.
-        """
+        """Return the mean of r given so few transitions as predict the others up to a share, at ``least`` so many."""
         most, (Z, Y) = self.most_probable, self._known(self.rows)
         while least < len(Z):
             with single_threaded():

@@ -165,10 +165,7 @@ class DynamicsStudy(ShortRepr):
     def as_if_executed(
         self, learned: LearnedDynamics, executed: Executed, pending: Executed, logged: Sequence[Trajectory] = ()
     ) -> LearnedDynamics | None:
-        """Return what executions teach with those that are pending, as if these had gone as predicted.
-
-        The hyperparameters stay. Pending are :meth:`LearnedDynamics.trajectories` of tasks that are being executed.
-        """
+        """Return what executions teach with pending ones, as if these had gone as predicted; hyperparameters stay."""
         if learned.study is not self:
             return learned.study.as_if_executed(learned, executed, pending, logged)
         together = [*(self.extended.executions(executed) or ()), *pending]

@@ -85,10 +85,7 @@ class NoisyDraws(ShortRepr):
 
 
 class NoisyRuns:
-    """The steps of closed loops that run together, one after the other; it remembers their histories.
-
-    Each loop has a draw, a sequence of noise ``(...)`` and an initial state; ``first`` are the first records.
-    """
+    """The steps of closed loops that run together, one after the other; it remembers their histories."""
 
     def __init__(self, draws: NoisyDraws, of_draw: Rows, of_replicate: Rows, start: Array) -> None:
         self._draws, self._fit = draws, draws.fit

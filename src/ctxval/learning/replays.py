@@ -38,10 +38,7 @@ class Replay(ShortRepr):
 def replay_executed(
     validation: Validation, learned: LearnedDynamics | None, wanted: Sequence[Array]
 ) -> list[Replay | None]:
-    """Return the replays of tasks, points ``(d,)`` of the unit cube; None for a task that cannot be planned.
-
-    Of what executions teach, those at the task that is replayed are left out.
-    """
+    """Return the replays of tasks ``(d,)``, each without its own executions; None for one that cannot be planned."""
     models: list[DynamicsDraws | None] = [None] * len(wanted)
     study = DynamicsStudy(validation) if learned is None else learned.study
     with single_threaded():
