@@ -22,6 +22,8 @@ class DrawnDistances(ShortRepr):
     #: distances on S draws ``(S, K)``; infinity if the loop diverges, NaN if no controller can be designed
     draws: Array
     beyond: Array  #: how far the loop on the mean leaves the records, as a share of the visited range ``(K,)``
+    #: how far it comes from places that executions entered ``(K,)``, as a share of what is allowed; 0 without positions
+    away: Array
     #: how far it crosses the boundary of the regular part, from -1 to 1; None if there is no boundary
     crossed: Array | None = None
 
@@ -54,18 +56,19 @@ class DrawnDistances(ShortRepr):
             np.concatenate([self.points, others.points]),
             np.concatenate([self.draws, others.draws], axis=1),
             np.concatenate([self.beyond, others.beyond]),
+            np.concatenate([self.away, others.away]),
             None if self.crossed is None or others.crossed is None else np.concatenate([self.crossed, others.crossed]),
         )
 
     def leaving(self, most: float) -> Array:
-        """Return how far loops leave the records or cross the boundary ``(K,)``: nothing is known of those above 1.
+        """Return how far loops leave the records and places, or cross the boundary ``(K,)``: above 1, nothing is known.
 
         Args:
             most: by how much loops may leave the records, as a share of the visited range.
         """
         # Both have the same slope: smaller slopes cost more of the set, because their errors reach farther.
         beyond = self.beyond if self.crossed is None else np.maximum(self.beyond, most + self.crossed)
-        return np.asarray(np.minimum(beyond / most, LARGEST))
+        return np.asarray(np.minimum(np.maximum(beyond / most, self.away), LARGEST))
 
     def upper(self, factor: float, threshold: float) -> Array:
         """Return mean + k spread as shares of the threshold ``(K,)``, at most ``LARGEST``."""
