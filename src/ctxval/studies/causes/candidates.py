@@ -35,20 +35,14 @@ def _ratio(cause: Cause) -> Candidate:
 
 
 def candidates(plant: Plant, x: Array, u: Array, residuals: Array, *, outputs: bool) -> tuple[Candidate, ...]:
-    """Return the dictionary of a plant.
-
-    Args:
-        x, u, residuals: recorded states ``(N, n)``, inputs ``(N, m)`` and what M misses of the next states ``(N, n)``.
-        outputs: whether the states are estimates from outputs, so that no sensor of them can be wrong.
-    """
+    """Return the dictionary of a plant for recorded states and inputs, and what M misses of next states ``(N, n)``."""
     missed = np.sqrt([(column**2).mean() for column in residuals.T])
-    forces = (candidate for joint in plant.ports for candidate in _forces(plant, joint, x, u, missed))
     return (
         *_of_inputs(plant),
-        *forces,
+        *(candidate for joint in plant.ports for candidate in _forces(plant, joint, x, u, missed)),
         *(_of_mujoco(plant, missed) if isinstance(plant.model, MuJoCo) else _of_joints(plant)),
         _of_size(mechanics.TimeStep((1.0,)), 0.2, 5.0, 0.1, 0.95, 1.05),
-        *(() if outputs else _of_sensors(plant, x)),
+        *(() if outputs else _of_sensors(plant, x)),  # states that are estimated have no sensors
     )
 
 
@@ -71,15 +65,13 @@ def _of_inputs(plant: Plant) -> Iterator[Candidate]:
 
 
 def _of_joints(plant: Plant) -> Iterator[Candidate]:
+    # The joints have positions, all or none.
     rates = tuple(joint.rate for joint in plant.joints if joint.position is not None)
-    for joint in plant.joints:
-        yield _ratio(mechanics.Inertia((1.0,), (joint,), plant.dt))
-        if joint.position is not None:
-            yield _ratio(mechanics.Gravity((1.0,), (joint,), rates, plant.dt))
-    if len(plant.joints) > 1:
-        yield _ratio(mechanics.Inertia((1.0,), plant.joints, plant.dt))
+    together = [plant.joints] if len(plant.joints) > 1 else []
+    for joints in (*((joint,) for joint in plant.joints), *together):
+        yield _ratio(mechanics.Inertia((1.0,), joints, plant.dt))
         if rates:
-            yield _ratio(mechanics.Gravity((1.0,), plant.joints, rates, plant.dt))
+            yield _ratio(mechanics.Gravity((1.0,), joints, rates, plant.dt))
 
 
 def _forces(plant: Plant, joint: Joint, x: Array, u: Array, missed: Array) -> Iterator[Candidate]:

@@ -7,7 +7,7 @@ for those that are commanded, the next state, or what is recorded of a state.
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
@@ -40,8 +40,8 @@ class Plant(ShortRepr):
 
     model: Model
     dt: float
-    states: Mapping[str, str]  #: names with units
-    inputs: Mapping[str, str]
+    states: dict[str, str]  #: names with units
+    inputs: dict[str, str]
     joints: tuple[Joint, ...]  #: one for each rate of a position; if no state is a position, one for each state
     ports: tuple[Joint, ...]  #: where forces on joints may enter; a joint may have several
     changes: Array  #: typical changes of the states in a step, shape ``(n,)``
@@ -84,9 +84,7 @@ class Plant(ShortRepr):
         return self.state(joint.rate)[1]
 
 
-def plant_of(
-    model: Model, dt: float, states: Mapping[str, str], inputs: Mapping[str, str], x: Array, u: Array
-) -> Plant:
+def plant_of(model: Model, dt: float, states: dict[str, str], inputs: dict[str, str], x: Array, u: Array) -> Plant:
     """Return the plant of a model from states ``(N, n)`` and inputs ``(N, m)`` of closed loops."""
     with np.errstate(all="ignore"):
         reached = np.asarray(model.step(x, u))
@@ -96,9 +94,7 @@ def plant_of(
     commanded = np.maximum(np.abs(u).max(axis=0, initial=0.0), 1e-9)
     if isinstance(model, MuJoCo):
         compiled = model.compiled
-        driven = {
-            int(compiled.actuator_trnid[k, 0]): k for k in range(compiled.nu) if compiled.actuator_trntype[k] == 0
-        }
+        driven = {compiled.actuator_trnid[k, 0]: k for k in range(compiled.nu) if compiled.actuator_trntype[k] == 0}
         joints = ports = tuple(
             Joint(compiled.nq + dof, position, 1.0, driven.get(number), dof)
             for number, (kind, position, dof) in enumerate(
@@ -108,15 +104,12 @@ def plant_of(
         )
     else:
         joints = _joints(dt, x, reached)
-        ports = _ports(model, x, u, reached, commanded, joints)
+        ports = tuple(_ports(model, x, u, reached, commanded, joints))
     return Plant(model, dt, states, inputs, joints, ports, np.maximum(changes, 1e-12), commanded)
 
 
 def _joints(dt: float, x: Array, reached: Array) -> tuple[Joint, ...]:
-    """Return the rates, each with the position whose derivative it is in what the model does.
-
-    If no state is a position, each state is a rate.
-    """
+    """Return the rates, each with the position whose derivative it is; each state is a rate if none is a position."""
     n = x.shape[1]
     change = (reached - x) / dt
     pairs: dict[int, tuple[int, float]] = {}
@@ -135,9 +128,7 @@ def _joints(dt: float, x: Array, reached: Array) -> tuple[Joint, ...]:
     return tuple(Joint(i, *pairs[i]) for i in rates if i in pairs) or tuple(map(Joint, rates))
 
 
-def _ports(
-    model: Model, x: Array, u: Array, reached: Array, commanded: Array, joints: tuple[Joint, ...]
-) -> tuple[Joint, ...]:
+def _ports(model: Model, x: Array, u: Array, reached: Array, commanded: Array, joints: Sequence[Joint]) -> list[Joint]:
     """Return the places where forces may enter: at the inputs that move a joint, and as accelerations of joints.
 
     An input may be the force on any joint that it moves, because other joints move with it. A joint that one input
@@ -158,20 +149,16 @@ def _ports(
                     alone.add(joint.rate)
     if m < len(joints):
         ports += [joint for joint in joints if joint.rate not in alone]
-    return tuple(ports)
+    return ports
 
 
 @dataclass(frozen=True)
 class Cause(ShortRepr):
-    """Something that a model lacks, with its sizes in physical units.
-
-    A subclass changes one of the hooks below. All of them take batches.
-    """
+    """Something that a model lacks, with sizes in physical units. A subclass changes one of the hooks, for batches."""
 
     sizes: tuple[float, ...]
     name: ClassVar[str]  #: what it is in two or three words
-    #: whether the inputs that act depend on earlier ones, so that it cannot be a part of a step
-    remembers: ClassVar[bool] = False
+    remembers: ClassVar[bool] = False  #: whether inputs that act depend on earlier ones, so that no step has it
 
     def with_sizes(self, sizes: Sequence[float]) -> Cause:
         """Return the cause with other sizes."""
@@ -182,10 +169,7 @@ class Cause(ShortRepr):
         return model
 
     def follow(self, u: Array, memory: Any) -> tuple[Array, Any]:
-        """Return the inputs that act ``(..., m)`` for those of the causes before, and what is remembered of them.
-
-        The memory is None at the first step.
-        """
+        """Return the inputs that act ``(..., m)`` for those of causes before, and a memory; None at the first step."""
         return u, memory
 
     def pushed(self, model: Model, x: Array, u: Array, free: Array, reached: Array) -> Array:
@@ -218,12 +202,10 @@ class Cause(ShortRepr):
 
 @dataclass(frozen=True, eq=False)
 class Repaired(ShortRepr):
-    """A model with causes in it.
+    """A model with causes in it, which is also a system. Causes of the inputs act in their order, after the controller.
 
-    It is a model and a system. As a system, it has all causes. A step of the model is a function of state and input, so
-    it lacks causes that remember inputs, such as a delay; ``complete`` is False then.
-
-    Causes of the inputs act in the given order, after the controller.
+    A step of the model is a function of state and input, so it lacks causes that remember inputs, such as a delay;
+    ``complete`` is False then. As a system, it has all causes.
     """
 
     given: Model
@@ -234,10 +216,7 @@ class Repaired(ShortRepr):
     @functools.cached_property
     def mechanics(self) -> Model:
         """M with what causes change in it."""
-        model = self.given
-        for cause in self.causes:
-            model = cause.model(model)
-        return model
+        return functools.reduce(lambda model, cause: cause.model(model), self.causes, self.given)
 
     @property
     def complete(self) -> bool:
@@ -284,8 +263,7 @@ class Repaired(ShortRepr):
     def execute(self, controller: Controller, task: Task, noise: Array | None = None) -> Trajectory:
         """Return the closed loop with all causes; the controller acts on what is recorded.
 
-        Args:
-            noise: what is added to each recorded state, ``(H + 1, ..., n)``; that of the initial state has it already.
+        Noise ``(H + 1, ..., n)`` is added to each recorded state; the initial state of the task has it already.
         """
         truth = self.true(np.asarray(task.initial_state, dtype=np.float64) - (0.0 if noise is None else noise[0]))
         memories: list[Any] = [None] * len(self.causes)

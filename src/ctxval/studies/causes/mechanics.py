@@ -10,7 +10,6 @@ import numpy as np
 
 from ctxval._util.arrays import Array
 from ctxval.core.model import Model
-from ctxval.models import MuJoCo
 from ctxval.studies.causes.cause import Cause, Joint, Plant
 
 
@@ -18,8 +17,7 @@ from ctxval.studies.causes.cause import Cause, Joint, Plant
 class Force(Cause):
     """A force on a joint, in units of its input, of MuJoCo, or of an acceleration; held over a step."""
 
-    #: where it enters
-    joint: Joint = Joint(0)  # noqa: RUF009  # it is frozen
+    joint: Joint = Joint(0)  # noqa: RUF009  # where it enters; it is frozen
     probe: float = 1.0  #: a force that is typical of the joint, with which its effect in M is measured
     dt: float = 1.0  #: seconds
 
@@ -36,11 +34,7 @@ class Force(Cause):
         return _accelerated(np.zeros_like(x), [self.joint], np.full_like(x, self.dt), self.dt)
 
     def force(self, rate: Array, load: Array, stopping: Array) -> Array:
-        """Return the force ``(...)`` at a mean rate; the force ``stopping`` would stop the joint within the step.
-
-        Args:
-            load: the magnitude of the force that the gears carry.
-        """
+        """Return the force ``(...)`` at a rate, a load of the gears, and a force that would stop the joint."""
         raise NotImplementedError
 
     def load(self, model: Any, x: Array, u: Array) -> Array:
@@ -50,12 +44,11 @@ class Force(Cause):
     def pushed(self, model: Model, x: Array, u: Array, free: Array, reached: Array) -> Array:
         effect, number = self.effect(model, x, u, free), self.joint.rate
         moving = np.where(np.abs(effect[..., number]) > 1e-12, effect[..., number], 1e-12)
-
         rate = 0.5 * (x[..., number] + reached[..., number])
         return reached + effect * self.force(rate, self.load(model, x, u), -reached[..., number] / moving)[..., None]
 
-    def amount(self, plant: Plant, size: float, per: str = "") -> str:
-        return f"{size:.3g} {plant.force_unit(self.joint)}{per}"
+    def amount(self, plant: Plant, size: float) -> str:
+        return f"{size:.3g} {plant.force_unit(self.joint)}"
 
 
 @dataclass(frozen=True)
@@ -83,7 +76,7 @@ class Viscous(Force):
     def text(self, plant: Plant) -> str:
         rate = plant.rate_unit(self.joint)
         more = "more" if self.sizes[0] >= 0 else "less"
-        size = self.amount(plant, abs(self.sizes[0]), f" per {rate}" if rate else "")
+        size = self.amount(plant, abs(self.sizes[0])) + (f" per {rate}" if rate else "")
         return f"{plant.joint_name(self.joint)} has {more} viscous friction than M ({size})"
 
 
@@ -133,8 +126,16 @@ class LoadFriction(Force):
     rates: tuple[int, ...] = ()  #: the rates of all joints that inputs drive
 
     def load(self, model: Any, x: Array, u: Array) -> Array:
-        if self.joint.dof is not None:
-            return np.abs(_pulls(model, x, u)[..., self.joint.dof])
+        if self.joint.dof is not None:  # the force of the actuators minus what pulls, by the dynamics of MuJoCo
+            import mujoco
+
+            states, inputs, nq = x.reshape(-1, x.shape[-1]), u.reshape(-1, u.shape[-1]), model.compiled.nq
+            data, pulls = mujoco.MjData(model.compiled), np.full(len(states), np.nan)
+            for k in np.flatnonzero(np.isfinite(states).all(axis=1)):
+                data.qpos, data.qvel, data.ctrl = states[k, :nq], states[k, nq:], inputs[k]
+                mujoco.mj_forward(model.compiled, data)
+                pulls[k] = (data.qfrc_actuator + data.qfrc_bias)[self.joint.dof]
+            return np.asarray(np.abs(pulls).reshape(x.shape[:-1]))
         unmoved, m = np.asarray(model.step(x, np.zeros_like(u))), u.shape[-1]
         if self.joint.input is None:
             number = self.joint.rate
@@ -156,20 +157,6 @@ class LoadFriction(Force):
         more = f", and {self.amount(plant, self.sizes[1])}" if self.sizes[1] > 1e-3 * self.probe else ""
         name = plant.joint_name(self.joint)
         return f"the friction of {name} depends on the load ({100 * self.sizes[0]:.3g} % of it{more})"
-
-
-def _pulls(model: MuJoCo, x: Array, u: Array) -> Array:
-    """Return the forces of actuators minus what pulls at the joints ``(..., nv)``, by the dynamics of MuJoCo."""
-    import mujoco
-
-    compiled = model.compiled
-    data, rows = mujoco.MjData(compiled), x.reshape(-1, x.shape[-1])
-    pulls = np.full((len(rows), compiled.nv), np.nan)
-    for k in np.flatnonzero(np.isfinite(rows).all(axis=1)):
-        data.qpos, data.qvel, data.ctrl = rows[k, : compiled.nq], rows[k, compiled.nq :], u.reshape(len(rows), -1)[k]
-        mujoco.mj_forward(compiled, data)
-        pulls[k] = data.qfrc_actuator + data.qfrc_bias
-    return pulls.reshape(*x.shape[:-1], -1)
 
 
 def _accelerated(reached: Array, joints: Sequence[Joint], gained: Array, dt: float) -> Array:
