@@ -40,20 +40,12 @@ class Plant(ShortRepr):
 
     model: Model
     dt: float
-    states: dict[str, str]  #: names with units
-    inputs: dict[str, str]
+    states: list[tuple[str, str]]  #: names and units
+    inputs: list[tuple[str, str]]
     joints: tuple[Joint, ...]  #: one for each rate of a position; if no state is a position, one for each state
     ports: tuple[Joint, ...]  #: where forces on joints may enter; a joint may have several
     changes: Array  #: typical changes of the states in a step, shape ``(n,)``
     commanded: Array  #: largest magnitudes of the inputs, shape ``(m,)``
-
-    def state(self, index: int) -> tuple[str, str]:
-        """Return the name and the unit of a state."""
-        return list(self.states.items())[index]
-
-    def input(self, index: int) -> tuple[str, str]:
-        """Return the name and the unit of an input."""
-        return list(self.inputs.items())[index]
 
     @property
     def compiled(self) -> Any:
@@ -65,23 +57,23 @@ class Plant(ShortRepr):
         if joint.dof is not None:
             number = int(self.compiled.dof_jntid[joint.dof])
             return str(self.compiled.joint(number).name) or f"joint {number + 1}"
-        return self.state(joint.rate if joint.position is None else joint.position)[0]
+        return self.states[joint.rate if joint.position is None else joint.position][0]
 
     def force_unit(self, joint: Joint) -> str:
         """Return the unit in which forces on a joint are counted."""
         if joint.dof is not None:
             return "N m" if self.compiled.jnt_type[self.compiled.dof_jntid[joint.dof]] == 3 else "N"
         if joint.input is not None:
-            name, unit = self.input(joint.input)
+            name, unit = self.inputs[joint.input]
             return unit or f"of {name}"
-        unit = self.state(joint.rate)[1]
+        unit = self.states[joint.rate][1]
         return f"{unit.removesuffix('/s')}/s^2" if unit.endswith("/s") else f"{unit}/s" if unit else "per s"
 
     def rate_unit(self, joint: Joint) -> str:
         """Return the unit of a joint's rate."""
-        if joint.dof is not None and not self.state(joint.rate)[1]:
+        if joint.dof is not None and not self.states[joint.rate][1]:
             return "rad/s" if self.force_unit(joint) == "N m" else "m/s"
-        return self.state(joint.rate)[1]
+        return self.states[joint.rate][1]
 
 
 def plant_of(model: Model, dt: float, states: dict[str, str], inputs: dict[str, str], x: Array, u: Array) -> Plant:
@@ -105,7 +97,8 @@ def plant_of(model: Model, dt: float, states: dict[str, str], inputs: dict[str, 
     else:
         joints = _joints(dt, x, reached)
         ports = tuple(_ports(model, x, u, reached, commanded, joints))
-    return Plant(model, dt, states, inputs, joints, ports, np.maximum(changes, 1e-12), commanded)
+    names = list(states.items()), list(inputs.items())
+    return Plant(model, dt, *names, joints, ports, np.maximum(changes, 1e-12), commanded)
 
 
 def _joints(dt: float, x: Array, reached: Array) -> tuple[Joint, ...]:
@@ -198,6 +191,27 @@ class Cause(ShortRepr):
     def mjcf(self, plant: Plant) -> str | None:
         """Return the line of MJCF that puts it into a MuJoCo model; None if there is none."""
         return None
+
+
+@dataclass(frozen=True)
+class Candidate(ShortRepr):
+    """A cause whose sizes are to be fitted."""
+
+    cause: Cause
+    low: tuple[float, ...] = ()  #: bounds of the sizes
+    high: tuple[float, ...] = ()
+    scales: tuple[float, ...] = ()  #: changes of the sizes that matter, for the steps of the fit
+    starts: tuple[tuple[float, ...], ...] = ((),)  #: first guesses, of which the best one is refined
+
+
+def of_size(cause: Cause, low: float, high: float, scale: float, *starts: float) -> Candidate:
+    """Return a candidate with one size."""
+    return Candidate(cause, (low,), (high,), (scale,), tuple((start,) for start in starts))
+
+
+def of_ratio(cause: Cause) -> Candidate:
+    """Return a candidate whose size is a ratio."""
+    return of_size(cause, 0.1, 10.0, 0.1, 0.95, 1.1)
 
 
 @dataclass(frozen=True, eq=False)

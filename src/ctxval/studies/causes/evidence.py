@@ -12,8 +12,7 @@ from ctxval._util.arrays import Array, Mask, Rows
 from ctxval._util.representation import ShortRepr
 from ctxval.core.model import Model
 from ctxval.core.trajectory import Trajectory
-from ctxval.studies.causes.candidates import Candidate
-from ctxval.studies.causes.cause import Repaired
+from ctxval.studies.causes.cause import Candidate, Repaired
 
 STEPS = (1, 6)  # of the predictions
 _LARGEST = 1e3  # of a residual, as a multiple of the typical one of M

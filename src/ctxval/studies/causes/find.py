@@ -20,12 +20,11 @@ from ctxval.core.trial import Trial
 from ctxval.core.validation import Validation
 from ctxval.errors import CtxvalError, DistanceError, InputError
 from ctxval.learning.extended import estimates_by_loops_on_model
-from ctxval.studies.causes.candidates import Candidate, candidates
-from ctxval.studies.causes.cause import Repaired, plant_of
+from ctxval.models import MuJoCo
+from ctxval.studies.causes import mechanics, signals
+from ctxval.studies.causes.cause import Candidate, Plant, Repaired, of_size, plant_of
 from ctxval.studies.causes.evidence import STEPS, Evidence, Explanation, explained, screened
-from ctxval.studies.causes.mechanics import Force
 from ctxval.studies.causes.report import CauseReport, Explained, Separating
-from ctxval.studies.causes.signals import SensorOffset
 
 _DRAWS = 12  # of noise
 _ALIKE = 10.0  # differences of the criterion that do not tell causes apart
@@ -257,7 +256,7 @@ class _Study:
         gap = float(gaps[:, state].mean())
         alike = np.ptp(gaps[:, state]) < 0.5 * abs(gap)
         for each in self.dictionary:
-            if alike and isinstance(each.cause, SensorOffset) and each.cause.state == state:
+            if alike and isinstance(each.cause, signals.SensorOffset) and each.cause.state == state:
                 repaired = Repaired(self.model, (each.cause.with_sizes([gap]),))
                 return Explanation((replace(each, cause=repaired.causes[0]),), repaired, 0.0, 1.0)
         return None
@@ -346,9 +345,21 @@ class _Study:
         return best
 
 
+def candidates(plant: Plant, x: Array, u: Array, residuals: Array, *, outputs: bool) -> tuple[Candidate, ...]:
+    """Return the dictionary of a plant for recorded states and inputs, and what M misses of next states ``(N, n)``."""
+    missed = np.sqrt([(column**2).mean() for column in residuals.T])
+    return (
+        *signals.of_inputs(plant),
+        *(candidate for joint in plant.ports for candidate in mechanics.forces(plant, joint, x, u, missed)),
+        *(mechanics.of_mujoco(plant, missed) if isinstance(plant.model, MuJoCo) else mechanics.of_joints(plant)),
+        of_size(mechanics.TimeStep((1.0,)), 0.2, 5.0, 0.1, 0.95, 1.05),
+        *(() if outputs else signals.of_sensors(plant, x)),  # states that are estimated have no sensors
+    )
+
+
 def _contains(general: Explained, special: Explained) -> bool:
     """Return whether an explanation has another one as a special case, as Stribeck friction has Coulomb friction."""
     ends = general.causes[-1], special.causes[-1]
-    forces = [cause for cause in ends if isinstance(cause, Force)]
+    forces = [cause for cause in ends if isinstance(cause, mechanics.Force)]
     more = len(general.explanation.sizes) > len(special.explanation.sizes)
     return more and len(forces) == 2 and forces[0].joint.rate == forces[1].joint.rate

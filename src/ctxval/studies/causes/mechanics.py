@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from ctxval._util.arrays import Array
 from ctxval.core.model import Model
-from ctxval.studies.causes.cause import Cause, Joint, Plant
+from ctxval.studies.causes.cause import Candidate, Cause, Joint, Plant, of_ratio, of_size
 
 
 @dataclass(frozen=True)
@@ -302,3 +302,79 @@ class MassCentre(OfMuJoCo):
         place = np.array(plant.compiled.body_ipos[self.body])
         place[self.axis] += self.sizes[0]
         return f'<inertial pos="{" ".join(f"{value:.5g}" for value in place)}"/>'
+
+
+def forces(plant: Plant, joint: Joint, x: Array, u: Array, missed: Array) -> Iterator[Candidate]:
+    """Yield the forces that may enter at a place, in sizes whose effects are as large as what M misses of its rate."""
+    probe = 0.1 * float(plant.commanded[joint.input]) if joint.input is not None and joint.dof is None else 1.0
+    rows = slice(None, None, max(1, len(x) // 50))
+    free = np.asarray(plant.model.step(x[rows], u[rows]))
+    unit = Bias((1.0,), joint, probe, plant.dt)
+    effects = unit.effect(plant.model, x[rows], u[rows], free)[:, joint.rate]
+    effects = effects[np.isfinite(effects)]
+    size = float(np.sqrt((effects**2).mean())) if len(effects) else 0.0
+    force = float(missed[joint.rate]) / size if size > 0 else 0.0
+    speed = float(np.sqrt((x[:, joint.rate] ** 2).mean()))
+    if force <= 0 or speed <= 0:
+        return
+    where = joint, 0.1 * force, plant.dt
+    most, least, slope = 20 * force, 0.1 * force, force / speed
+    if joint.input is None or joint.dof is not None:  # otherwise it is an offset of the input
+        yield of_size(Bias((0.0,), *where), -most, most, least, 0.0)
+    if joint.dof is None:
+        yield of_size(Viscous((0.0,), *where), -20 * slope, 20 * slope, 0.1 * slope, 0.0)
+        yield of_size(Coulomb((0.0,), *where), 0.0, most, least, 0.3 * force, force)
+    yield Candidate(
+        Stribeck((0.0, 0.0, 1.0), *where),
+        (0.0, 0.0, 0.01 * speed),
+        (most, most, 2 * speed),
+        (least, least, 0.1 * speed),
+        ((0.5 * force, 0.5 * force, 0.3 * speed), (0.7 * force, 0.3 * force, 0.1 * speed)),
+    )
+    starts = ((0.05, 0.0), (0.2, 0.3 * force))
+    rates = tuple(dict.fromkeys(port.rate for port in plant.ports if port.input is not None))
+    yield Candidate(LoadFriction((0.0, 0.0), *where, rates), (0.0, 0.0), (2.0, most), (0.05, least), starts)
+
+
+def of_joints(plant: Plant) -> Iterator[Candidate]:
+    """Yield what may be wrong with joints of a model that is not of MuJoCo."""
+    # The joints have positions, all or none.
+    rates = tuple(joint.rate for joint in plant.joints if joint.position is not None)
+    together = [plant.joints] if len(plant.joints) > 1 else []
+    for joints in (*((joint,) for joint in plant.joints), *together):
+        yield of_ratio(Inertia((1.0,), joints, plant.dt))
+        if rates:
+            yield of_ratio(Gravity((1.0,), joints, rates, plant.dt))
+
+
+def of_mujoco(plant: Plant, missed: Array) -> Iterator[Candidate]:
+    """Yield what may be wrong with joints and bodies of a model of MuJoCo."""
+    import mujoco
+
+    compiled = plant.compiled
+    data = mujoco.MjData(compiled)
+    mujoco.mj_forward(compiled, data)
+    inertias = np.zeros((compiled.nv, compiled.nv))
+    mujoco.mj_fullM(compiled, data, inertias)
+    for joint in plant.joints:
+        if missed[joint.rate] <= 1e-6 * plant.changes[joint.rate]:  # the joint has no fault
+            continue
+        inertia = float(np.abs(inertias[joint.dof, joint.dof]))
+        force = inertia * float(missed[joint.rate]) / plant.dt
+        speed = max(float(plant.changes[joint.position]) / plant.dt, 1e-9)
+        for attribute, size in (("damping", force / speed), ("frictionloss", force), ("armature", inertia)):
+            low = -float(getattr(compiled, f"dof_{attribute}")[joint.dof])
+            starts = (0.3 * size, size) if attribute == "frictionloss" else (0.0,)
+            # More damping would make the integration unstable.
+            most = min(20 * size, inertia / compiled.opt.timestep) if attribute == "damping" else 20 * size
+            cause = JointAttribute((0.0,), attribute, joint)
+            yield of_size(cause, low, most, 0.05 * size, *starts)
+    masses = compiled.body_mass
+    moved = (compiled.body_dofnum > 0) | (compiled.body_parentid > 0)
+    bodies = [body for body in range(1, compiled.nbody) if masses[body] > 0 and moved[body]]
+    for body in sorted(bodies, key=lambda each: -float(masses[each]))[:8]:
+        yield of_ratio(BodyMass((1.0,), body))
+        extent = float(np.sqrt(compiled.body_inertia[body].max() / masses[body]))
+        for axis in range(3 if extent > 0 else 0):
+            moved_centre = MassCentre((0.0,), body, axis)
+            yield of_size(moved_centre, -3 * extent, 3 * extent, 0.05 * extent, 0.0)

@@ -121,10 +121,8 @@ class Candidate:
         points = np.where(snapped, np.round(points), points) if self._space.members is None else self._space.members
         with stage("predicting distances", len(points), "designs"):
             expected = prediction.expected(points)[0]
-        if not np.isfinite(expected).any():
-            return None
-        best = int(np.nanargmax(np.where(np.isfinite(expected), expected, np.nan)))
-        return float(expected[best]), points[best]
+        best = int(np.argmax(np.where(np.isfinite(expected), expected, -np.inf)))
+        return (float(expected[best]), points[best]) if np.isfinite(expected[best]) else None
 
     def of_draw(self, executed: Executed, point: Array, draw: int, most: float | None) -> tuple[float, float] | None:
         """Return the prediction of a draw and its mean over other tasks; None if nothing can be predicted."""

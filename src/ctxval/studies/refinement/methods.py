@@ -61,9 +61,7 @@ class Method(ABC):
     def learn(self, model: Model, records: Records) -> Learned:
         """Return the model that is learned from records; ``model`` is the first one, which is corrected or replaced.
 
-        Raises:
-            InputError: if the records do not suffice.
-            ModelError: if the learned model is not usable.
+        An InputError says that the records do not suffice; a ModelError, that the learned model is not usable.
         """
 
 

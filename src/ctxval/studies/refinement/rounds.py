@@ -109,8 +109,7 @@ class Refinement:
     residual: MeasuredResidual | None = None  #: the measured residual of the last model; None if no model was learned
     #: the one-step errors on held-out executions, before and after, for each state
     accuracy: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    #: the parameters of the user's function in the last model; none for other methods
-    parameters: tuple[FittedParameter, ...] = ()
+    parameters: tuple[FittedParameter, ...] = ()  #: those of the user's function in the last model; else none
     units: str = ""
 
     @property

@@ -124,7 +124,7 @@ def stepped(model: Model, x: Array, u: Array) -> Array:
 
 
 def squared(errors: Array, sizes: Array) -> Array:
-    """Return the mean over states that change of squared errors in units of sizes, ``(N,)``; large if not finite."""
+    """Return the mean over states of squared errors in units of sizes, 0 for size 0, ``(N,)``; large if not finite."""
     with np.errstate(all="ignore"):
         squares = ((errors / np.where(sizes > 0, sizes, np.inf)) ** 2).mean(axis=1)
         return np.asarray(np.nan_to_num(squares, nan=1e12, posinf=1e12).clip(max=1e12))
