@@ -28,9 +28,7 @@ from ctxval.searches import Prediction
 
 Question = Literal["worst", "mean"]
 
-Executed = Sequence[tuple[Array, Trajectory]]
-"""Executed tasks, points of the unit cube ``(d,)``, with the system's trajectories."""
-
+Executed = Sequence[tuple[Array, Trajectory]]  #: executed tasks, points ``(d,)`` of the unit cube, with trajectories
 OnTrial = Callable[[str, Trial], None]  #: called with the name of a candidate and each of its trials that has ended
 
 

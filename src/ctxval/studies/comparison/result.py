@@ -20,10 +20,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+# What each question is about, and the columns of the tables of candidates and of pairs.
 WORDS: dict[Question, str] = {"worst": "largest distance d*", "mean": "expected distance"}
-"""What each question is about."""
-
-# The columns of the tables of candidates and of pairs.
 CANDIDATES = ("candidate", "executions", "shared", "largest distance", "bound on d*", "draws", "mean distance")
 PAIRS = ("question", "smaller", "than", "difference", "interval", "tasks")
 

@@ -19,12 +19,9 @@ from ctxval.models.corrected import before_refinement
 from ctxval.models.saved import write_model, write_transitions
 
 _ARRAYS = (Linear, FeedforwardReLU, GaussianProcessModel, Corrected)
+#: the models that a file of each suffix can hold
 SUFFIXES: dict[str, tuple[type, ...]] = {".npz": _ARRAYS, ".onnx": _ARRAYS, ".toml": (Parametric,)}
-"""The models that a file of each suffix can hold."""
-
-BESIDE = (".data.npz", ".residual.json", ".residual.txt")
-"""The suffixes of the files that may be written beside a model."""
-
+BESIDE = (".data.npz", ".residual.json", ".residual.txt")  #: the suffixes of files that may be written beside a model
 _NO_REFERENCE = "the parameters of a function can only be written with the reference module:attr to it (--step)."
 
 
