@@ -40,14 +40,11 @@ TASKS = 100  # number of simulated tasks, unless another one is given
 
 @dataclass(frozen=True, eq=False)
 class SimulatedTask:
-    """A task on M, and how far M is from completing it.
-
-    There is no error, but a reason, if no controller could be designed, or if M diverges.
-    """
+    """A task on M, and how far M is from completing it."""
 
     parameters: dict[str, Any]
     error: float | None
-    reason: str = ""
+    reason: str = ""  #: why there is no error: no controller could be designed, or M diverges
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,17 +54,13 @@ class Aspect1Report:
     distance: Distance  #: the distance between the trajectory of M and its task; the units are empty if not known
     units: str
     threshold: float | None  #: the largest error with which a task counts as completed; None if there is none
-    #: all tasks, the worst first; tasks without an error come before those with one
-    simulated: tuple[SimulatedTask, ...]
-    #: the verdict on M against the threshold, with a bound over all tasks; None if there is no threshold
-    verdict: Verdict | None
-    #: the share of all tasks that M does not complete is at most this with confidence 0.95, because so many of the
-    #: independent draws among the simulated tasks exceed the threshold; None if there is no threshold
+    simulated: tuple[SimulatedTask, ...]  #: all tasks, the worst first, before them those without an error
+    verdict: Verdict | None  #: on M against the threshold, with a bound over all tasks; None if there is no threshold
+    #: with confidence 0.95 by the independent draws, the largest share of all tasks that M does not complete; None if
+    #: there is no threshold
     share: float | None
-    #: the distribution of tasks as a text, under which the share is a probability; None if it is uniform
-    distribution: str | None
-    #: how much the controllers of neighbouring tasks differ, and the parameters of two such tasks; None if no tasks are
-    #: neighbours
+    distribution: str | None  #: that of tasks, under which the share is a probability, as a text; None if it is uniform
+    #: how much controllers of neighbouring tasks differ, and two such tasks; None if no tasks are neighbours
     flips: Flips | None
     flipped: tuple[dict[str, Any], dict[str, Any]] | None
     #: the share of the steps at which each of the ``inputs`` is at a limit; None if there are no inputs
@@ -134,7 +127,6 @@ def check(
     Args:
         threshold: the largest error with which a task counts as completed, in the units of ``distance``.
         distance: how far the trajectory of M is from completing its task; that of :func:`completion` by default.
-        tasks: number of simulated tasks.
         search: chooses the tasks; Bayesian optimisation by default.
     """
     measured = completion(validation) if distance is None else distance
@@ -176,7 +168,7 @@ def completion(validation: Validation) -> Distance:
         shared = {name: getattr(distance, name) for name in ("norm", "components", "weights", "scales", "angles")}
     n = validation.recorded(task.initial_state).shape[-1]
     aimed = aimed_states(validation, n)
-    if shared.get("components") is None and shared.get("weights") is None and shared.get("scales") is None:
+    if all(shared.get(name) is None for name in ("components", "weights", "scales")):
         shared["components"] = tuple(aimed.tolist()) if 0 < len(aimed) < n else None
     if (task.reference == task.goal[..., None, :]).all():
         return GoalError(**shared)

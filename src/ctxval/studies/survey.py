@@ -90,30 +90,26 @@ class Survey(ShortRepr):
         model, far = f"the {self.best.kind} model", f"{counted(close, 'step')} ({close * dt:.3g} s)"
         if not close:
             return f"{model} errs by more than {share} after one step of {dt:g} s already: it suits no task yet"
+        suits = f"up to {far}, and by more after that: it suits tasks that end, or that feedback corrects, in less time"
         if close == compared:
-            suits = "at least {far}, as long as was compared: it suits tasks in the recorded range"
-        else:
-            suits = (
-                "up to {far}, and by more after that: it suits tasks that end, or that feedback corrects, in less time"
-            )
-        return f"{model} errs by less than {share} for {suits.format(far=far)}"
+            suits = f"at least {far}, as long as was compared: it suits tasks in the recorded range"
+        return f"{model} errs by less than {share} for {suits}"
 
     def to_json(self) -> dict[str, Any]:
         """Return all results as plain values."""
-        return plain_numbers(
-            {
-                "sources": self.sources,
-                "fields": list(map(asdict, self.fields)),
-                "states": self.recordings.states,
-                "inputs": self.recordings.inputs,
-                "guesses": self.guesses,
-                "fit": self.fit.to_json(),
-                "replay": self.replay.to_json(),
-                "close": self.reach[0],
-                "compared": self.reach[1],
-                "statement": self.statement,
-            }
-        )
+        values = {
+            "sources": self.sources,
+            "fields": list(map(asdict, self.fields)),
+            "states": self.recordings.states,
+            "inputs": self.recordings.inputs,
+            "guesses": self.guesses,
+            "fit": self.fit.to_json(),
+            "replay": self.replay.to_json(),
+            "close": self.reach[0],
+            "compared": self.reach[1],
+            "statement": self.statement,
+        }
+        return plain_numbers(values)
 
 
 def survey(
@@ -274,9 +270,8 @@ def _reach(model: Model, recordings: Recordings, whole: int) -> tuple[int, int]:
     with single_threaded():
         errors = step_errors(model, replace(recordings, runs=tuple(recordings.runs[number] for number in held)), grid)
     close, most = 0, 0
-    for count in sorted({error.steps for error in errors}):
-        most = count
-        if any(not error.relative < CLOSE or error.diverged for error in errors if error.steps == count):
+    for most in sorted({error.steps for error in errors}):
+        if any(not error.relative < CLOSE or error.diverged for error in errors if error.steps == most):
             break
-        close = count
+        close = most
     return close, most

@@ -31,6 +31,8 @@ from ctxval.core.plan import gives_inputs
 from ctxval.errors import InputError
 from ctxval.studies.comparison import CandidateResult, PairResult
 from ctxval.studies.comparison.candidates import TrialNote
+from rig_suites import COARSE
+from rig_suites import validation as suite
 
 
 def plant(x: np.ndarray, u: np.ndarray) -> np.ndarray:
@@ -311,3 +313,24 @@ def test_notes_of_others_are_no_notes_of_a_comparison() -> None:
         found = TrialNote.of(replace(trial, note=stored))
         assert found is not None
         assert vars(found) == vars(kept)
+
+
+def test_a_comparison_is_decided_when_all_tasks_were_executed() -> None:
+    candidates = {"little": suite(drag=0.3), "much": suite(drag=0.33)}
+    truths = {name: each.distances(COARSE.grid(2)).max() for name, each in candidates.items()}
+    found = compare(candidates, budget=50)
+    assert found.questions == ("worst",)
+    assert found.decided
+    assert found.pairs[0].smaller == min(truths, key=lambda name: truths[name])
+    assert all(result.executions <= len(COARSE) for result in found.candidates)
+
+
+def test_candidates_that_are_equal_are_not_told_apart_by_a_suite() -> None:
+    found = compare({"one": suite(), "other": suite()}, budget=50)
+    assert not found.decided
+    assert found.executions == len(COARSE)  # one execution counts for both
+
+
+def test_a_suite_has_no_expected_distance() -> None:
+    with pytest.raises(InputError, match="question must be worst for a suite"):
+        compare({"one": suite(), "other": suite(drag=0.1)}, question="mean")

@@ -21,24 +21,12 @@ def learned(validation: Validation) -> models.Refined:
     return models.Refined(found, records.transitions, validation.model)
 
 
-def with_synthesizer(synthesizer: Any) -> Validation:
-    made = make_cart()
-    return Validation(
-        space=made.space,
-        task=made.task,
-        system=made.system,
-        model=made.model,
-        synthesizer=synthesizer,
-        distance=made.distance,
-    )
-
-
 @pytest.mark.parametrize(
     ("synthesizer", "linearised"),
     [(controllers.LQR([1.0, 0.1], [0.1]), "model"), (controllers.ILQR([1.0, 0.1], [0.1]), "corrected")],
 )
 def test_one_linearisation_keeps_that_of_a_linear_model(synthesizer: Any, linearised: str) -> None:
-    validation = with_synthesizer(synthesizer)
+    validation = make_cart().with_parts(synthesizer=synthesizer)
     found, note = with_best_jacobian(validation, learned(validation))
     assert isinstance(found.model, models.Corrected)
     assert found.model.linearised == linearised

@@ -7,7 +7,7 @@ for those that are commanded, the next state, or what is recorded of a state.
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
@@ -40,20 +40,12 @@ class Plant(ShortRepr):
 
     model: Model
     dt: float
-    states: Mapping[str, str]  #: names with units
-    inputs: Mapping[str, str]
+    states: list[tuple[str, str]]  #: names and units
+    inputs: list[tuple[str, str]]
     joints: tuple[Joint, ...]  #: one for each rate of a position; if no state is a position, one for each state
     ports: tuple[Joint, ...]  #: where forces on joints may enter; a joint may have several
     changes: Array  #: typical changes of the states in a step, shape ``(n,)``
     commanded: Array  #: largest magnitudes of the inputs, shape ``(m,)``
-
-    def state(self, index: int) -> tuple[str, str]:
-        """Return the name and the unit of a state."""
-        return list(self.states.items())[index]
-
-    def input(self, index: int) -> tuple[str, str]:
-        """Return the name and the unit of an input."""
-        return list(self.inputs.items())[index]
 
     @property
     def compiled(self) -> Any:
@@ -65,28 +57,26 @@ class Plant(ShortRepr):
         if joint.dof is not None:
             number = int(self.compiled.dof_jntid[joint.dof])
             return str(self.compiled.joint(number).name) or f"joint {number + 1}"
-        return self.state(joint.rate if joint.position is None else joint.position)[0]
+        return self.states[joint.rate if joint.position is None else joint.position][0]
 
     def force_unit(self, joint: Joint) -> str:
         """Return the unit in which forces on a joint are counted."""
         if joint.dof is not None:
             return "N m" if self.compiled.jnt_type[self.compiled.dof_jntid[joint.dof]] == 3 else "N"
         if joint.input is not None:
-            name, unit = self.input(joint.input)
+            name, unit = self.inputs[joint.input]
             return unit or f"of {name}"
-        unit = self.state(joint.rate)[1]
+        unit = self.states[joint.rate][1]
         return f"{unit.removesuffix('/s')}/s^2" if unit.endswith("/s") else f"{unit}/s" if unit else "per s"
 
     def rate_unit(self, joint: Joint) -> str:
         """Return the unit of a joint's rate."""
-        if joint.dof is not None and not self.state(joint.rate)[1]:
+        if joint.dof is not None and not self.states[joint.rate][1]:
             return "rad/s" if self.force_unit(joint) == "N m" else "m/s"
-        return self.state(joint.rate)[1]
+        return self.states[joint.rate][1]
 
 
-def plant_of(
-    model: Model, dt: float, states: Mapping[str, str], inputs: Mapping[str, str], x: Array, u: Array
-) -> Plant:
+def plant_of(model: Model, dt: float, states: dict[str, str], inputs: dict[str, str], x: Array, u: Array) -> Plant:
     """Return the plant of a model from states ``(N, n)`` and inputs ``(N, m)`` of closed loops."""
     with np.errstate(all="ignore"):
         reached = np.asarray(model.step(x, u))
@@ -96,9 +86,7 @@ def plant_of(
     commanded = np.maximum(np.abs(u).max(axis=0, initial=0.0), 1e-9)
     if isinstance(model, MuJoCo):
         compiled = model.compiled
-        driven = {
-            int(compiled.actuator_trnid[k, 0]): k for k in range(compiled.nu) if compiled.actuator_trntype[k] == 0
-        }
+        driven = {compiled.actuator_trnid[k, 0]: k for k in range(compiled.nu) if compiled.actuator_trntype[k] == 0}
         joints = ports = tuple(
             Joint(compiled.nq + dof, position, 1.0, driven.get(number), dof)
             for number, (kind, position, dof) in enumerate(
@@ -108,15 +96,13 @@ def plant_of(
         )
     else:
         joints = _joints(dt, x, reached)
-        ports = _ports(model, x, u, reached, commanded, joints)
-    return Plant(model, dt, states, inputs, joints, ports, np.maximum(changes, 1e-12), commanded)
+        ports = tuple(_ports(model, x, u, reached, commanded, joints))
+    names = list(states.items()), list(inputs.items())
+    return Plant(model, dt, *names, joints, ports, np.maximum(changes, 1e-12), commanded)
 
 
 def _joints(dt: float, x: Array, reached: Array) -> tuple[Joint, ...]:
-    """Return the rates, each with the position whose derivative it is in what the model does.
-
-    If no state is a position, each state is a rate.
-    """
+    """Return the rates, each with the position whose derivative it is; each state is a rate if none is a position."""
     n = x.shape[1]
     change = (reached - x) / dt
     pairs: dict[int, tuple[int, float]] = {}
@@ -135,9 +121,7 @@ def _joints(dt: float, x: Array, reached: Array) -> tuple[Joint, ...]:
     return tuple(Joint(i, *pairs[i]) for i in rates if i in pairs) or tuple(map(Joint, rates))
 
 
-def _ports(
-    model: Model, x: Array, u: Array, reached: Array, commanded: Array, joints: tuple[Joint, ...]
-) -> tuple[Joint, ...]:
+def _ports(model: Model, x: Array, u: Array, reached: Array, commanded: Array, joints: Sequence[Joint]) -> list[Joint]:
     """Return the places where forces may enter: at the inputs that move a joint, and as accelerations of joints.
 
     An input may be the force on any joint that it moves, because other joints move with it. A joint that one input
@@ -158,20 +142,16 @@ def _ports(
                     alone.add(joint.rate)
     if m < len(joints):
         ports += [joint for joint in joints if joint.rate not in alone]
-    return tuple(ports)
+    return ports
 
 
 @dataclass(frozen=True)
 class Cause(ShortRepr):
-    """Something that a model lacks, with its sizes in physical units.
-
-    A subclass changes one of the hooks below. All of them take batches.
-    """
+    """Something that a model lacks, with sizes in physical units. A subclass changes one of the hooks, for batches."""
 
     sizes: tuple[float, ...]
     name: ClassVar[str]  #: what it is in two or three words
-    #: whether the inputs that act depend on earlier ones, so that it cannot be a part of a step
-    remembers: ClassVar[bool] = False
+    remembers: ClassVar[bool] = False  #: whether inputs that act depend on earlier ones, so that no step has it
 
     def with_sizes(self, sizes: Sequence[float]) -> Cause:
         """Return the cause with other sizes."""
@@ -182,10 +162,7 @@ class Cause(ShortRepr):
         return model
 
     def follow(self, u: Array, memory: Any) -> tuple[Array, Any]:
-        """Return the inputs that act ``(..., m)`` for those of the causes before, and what is remembered of them.
-
-        The memory is None at the first step.
-        """
+        """Return the inputs that act ``(..., m)`` for those of causes before, and a memory; None at the first step."""
         return u, memory
 
     def pushed(self, model: Model, x: Array, u: Array, free: Array, reached: Array) -> Array:
@@ -216,14 +193,33 @@ class Cause(ShortRepr):
         return None
 
 
+@dataclass(frozen=True)
+class Candidate(ShortRepr):
+    """A cause whose sizes are to be fitted."""
+
+    cause: Cause
+    low: tuple[float, ...] = ()  #: bounds of the sizes
+    high: tuple[float, ...] = ()
+    scales: tuple[float, ...] = ()  #: changes of the sizes that matter, for the steps of the fit
+    starts: tuple[tuple[float, ...], ...] = ((),)  #: first guesses, of which the best one is refined
+
+
+def of_size(cause: Cause, low: float, high: float, scale: float, *starts: float) -> Candidate:
+    """Return a candidate with one size."""
+    return Candidate(cause, (low,), (high,), (scale,), tuple((start,) for start in starts))
+
+
+def of_ratio(cause: Cause) -> Candidate:
+    """Return a candidate whose size is a ratio."""
+    return of_size(cause, 0.1, 10.0, 0.1, 0.95, 1.1)
+
+
 @dataclass(frozen=True, eq=False)
 class Repaired(ShortRepr):
-    """A model with causes in it.
+    """A model with causes in it, which is also a system. Causes of the inputs act in their order, after the controller.
 
-    It is a model and a system. As a system, it has all causes. A step of the model is a function of state and input, so
-    it lacks causes that remember inputs, such as a delay; ``complete`` is False then.
-
-    Causes of the inputs act in the given order, after the controller.
+    A step of the model is a function of state and input, so it lacks causes that remember inputs, such as a delay;
+    ``complete`` is False then. As a system, it has all causes.
     """
 
     given: Model
@@ -234,10 +230,7 @@ class Repaired(ShortRepr):
     @functools.cached_property
     def mechanics(self) -> Model:
         """M with what causes change in it."""
-        model = self.given
-        for cause in self.causes:
-            model = cause.model(model)
-        return model
+        return functools.reduce(lambda model, cause: cause.model(model), self.causes, self.given)
 
     @property
     def complete(self) -> bool:
@@ -284,8 +277,7 @@ class Repaired(ShortRepr):
     def execute(self, controller: Controller, task: Task, noise: Array | None = None) -> Trajectory:
         """Return the closed loop with all causes; the controller acts on what is recorded.
 
-        Args:
-            noise: what is added to each recorded state, ``(H + 1, ..., n)``; that of the initial state has it already.
+        Noise ``(H + 1, ..., n)`` is added to each recorded state; the initial state of the task has it already.
         """
         truth = self.true(np.asarray(task.initial_state, dtype=np.float64) - (0.0 if noise is None else noise[0]))
         memories: list[Any] = [None] * len(self.causes)

@@ -12,8 +12,7 @@ from ctxval._util.arrays import Array, Mask, Rows
 from ctxval._util.representation import ShortRepr
 from ctxval.core.model import Model
 from ctxval.core.trajectory import Trajectory
-from ctxval.studies.causes.candidates import Candidate
-from ctxval.studies.causes.cause import Repaired
+from ctxval.studies.causes.cause import Candidate, Repaired
 
 STEPS = (1, 6)  # of the predictions
 _LARGEST = 1e3  # of a residual, as a multiple of the typical one of M
@@ -24,24 +23,18 @@ _UNKNOWN = 1e3  # a standard deviation
 
 @dataclass(frozen=True, eq=False)
 class Predictions(ShortRepr):
-    """Predictions over some steps: where they begin, and residuals ``(n,)`` that are too small to be evidence.
-
-    ``states`` and ``inputs`` are rows of the first state and, in all padded runs, of the first input, shape ``(N,)``.
-    """
+    """Predictions over some steps."""
 
     steps: int
-    states: Rows
+    states: Rows  #: rows of the first state and, in all padded runs, of the first input, ``(N,)``
     inputs: Rows
-    floors: Array
+    floors: Array  #: residuals ``(n,)`` that are too small to be evidence
 
 
 class Evidence:
-    """Recorded executions, and what M misses in them.
+    """Recorded executions, and what M misses in them: residuals of sizes ``(n,)`` after one step and after several.
 
-    Attributes:
-        states: of all k runs, one after the other, ``(N + k, n)``.
-        inputs: of all runs, with zeros after the end of shorter ones, ``(k, H, m)``.
-        windows, sizes: predictions of one step and of several, and the sizes ``(n,)`` of the residuals of M in these.
+    The states ``(N + k, n)`` are of all k runs, one after the other, and inputs ``(k, H, m)`` are padded with zeros.
     """
 
     def __init__(
@@ -54,8 +47,7 @@ class Evidence:
     ) -> None:
         self.model, self.horizons = model, [len(run.inputs) for run in runs]
         self.states = np.concatenate([run.states for run in runs])
-        longest = max(self.horizons)
-        self.inputs = np.zeros((len(runs), longest, runs[0].inputs.shape[1]))
+        self.inputs = np.zeros((len(runs), max(self.horizons), runs[0].inputs.shape[1]))
         for padded, run in zip(self.inputs, runs, strict=True):
             padded[: len(run.inputs)] = run.inputs
         self.windows, self.sizes = list[Predictions](), list[Array]()
@@ -97,12 +89,10 @@ class Evidence:
         return np.asarray(repaired.recorded(x) - self.states[window.states + window.steps])
 
     def noise(self, repaired: Repaired) -> Array:
-        """Return the standard deviations ``(n,)`` of white noise of the measurements, as residuals of one step show it.
-
-        The noise of a measurement enters two successive residuals, with opposite signs.
-        """
+        """Return the standard deviations ``(n,)`` of white noise of measurements, as residuals of one step show it."""
         left = self.left_by(repaired, self._window(1, len(self.states)))
         left = np.nan_to_num(left / self.sizes[0], nan=_LARGEST).clip(-_LARGEST, _LARGEST)
+        # The noise of a measurement enters two successive residuals, with opposite signs.
         runs = np.split(left, np.cumsum(self.horizons)[:-1])
         products = np.concatenate([run[1:] * run[:-1] for run in runs])
         window = replace(self.windows[0], states=self.windows[0].states[::4], inputs=self.windows[0].inputs[::4])
@@ -114,16 +104,10 @@ class Evidence:
         return np.asarray(np.sqrt(np.maximum(variances, 0.0)) * self.sizes[0])
 
     def explained(self, repaired: Repaired, noise: Array) -> tuple[float, float]:
-        """Return the share of the squared residuals of M after several steps that is explained, except for noise.
+        """Return which share of M's squared residuals after several steps is explained, and its deviation by noise.
 
         The effect of a cause grows with the number of steps, and so does that of an error of its size. More steps than
-        in fits are therefore taken only if noise then hides less of the effect.
-
-        Args:
-            noise: standard deviations ``(n,)`` of white noise of the measurements.
-
-        Returns:
-            the share and, because of noise, its standard deviation.
+        in fits are therefore taken only if noise, with standard deviations ``(n,)``, then hides less of the effect.
         """
         steps, shortest = self.windows[1].steps, min(self.horizons)
         lengths = [steps, *({min(_LONGER * steps, shortest)} - {steps} if noise.any() else ())]
@@ -184,13 +168,10 @@ class Explanation(ShortRepr):
 def explained(
     evidence: Evidence, candidates: tuple[Candidate, ...], begun: Sequence[float] | Array, *, near: bool = False
 ) -> Explanation:
-    """Return causes whose sizes are fitted to records by nonlinear least squares.
+    """Return causes whose sizes are fitted to records by nonlinear least squares, from sizes that are ``begun`` with.
 
-    The residuals of each state are first divided by those of M, and then twice by what is left of them.
-
-    Args:
-        begun: the sizes of all causes with which the fit begins.
-        near: whether these were fitted to nearly the same records.
+    The residuals of each state are first divided by those of M, and then twice by what is left of them; only once if
+    the fit begins ``near`` its end, with sizes that were fitted to nearly the same records.
     """
     fit = _Fit(evidence, candidates)
     theta = np.array(begun)
@@ -214,8 +195,7 @@ def explained(
 def screened(evidence: Evidence, candidates: tuple[Candidate, ...]) -> tuple[float, Array]:
     """Return how badly causes explain records at most, and sizes to begin a fit with.
 
-    The last cause is tried at each of its first guesses, and one Gauss-Newton step is made from there. The criterion is
-    that of residuals which are linear in the sizes.
+    One Gauss-Newton step is made from each first guess of the last cause; residuals are taken as linear in the sizes.
     """
     fit = _Fit(evidence, candidates)
     known = [size for each in candidates[:-1] for size in each.cause.sizes]
@@ -242,15 +222,11 @@ class _Fit:
             for name in ("low", "high", "scales")
         )
         # Which cause it is counts like a size.
-        count = len(self.scales) + len(candidates)
-        self.penalty = count * float(np.log(len(evidence.windows[0].states)))
+        self.penalty = (len(self.scales) + len(candidates)) * float(np.log(len(evidence.windows[0].states)))
 
     def repaired(self, theta: Array) -> Repaired:
-        causes, rest = [], theta
-        for each in self.candidates:
-            count = len(each.scales)
-            causes.append(each.cause.with_sizes(rest[:count].tolist()))
-            rest = rest[count:]
+        sizes = iter(theta.tolist())
+        causes = (each.cause.with_sizes([next(sizes) for _ in each.scales]) for each in self.candidates)
         return Repaired(self.evidence.model, tuple(causes))
 
     def errors(self, theta: Array, sizes: Sequence[Array]) -> Array:
@@ -270,14 +246,10 @@ class _Fit:
         return np.stack(columns, axis=1)
 
     def most_likely_of_states(self, theta: Array) -> Array:
-        """Return the most likely of these sizes and of those that explain one state alone, by a Gauss-Newton step.
-
-        Where M integrates a position otherwise than the system does, a cause explains the rate alone.
-        """
-        here = self.errors(theta, self.evidence.sizes)
-        J = self.slope(theta, self.evidence.sizes, here)
-        n = len(self.evidence.sizes[0])
-        tried = [theta]
+        """Return the most likely of these sizes and of those that explain one state alone, by a Gauss-Newton step."""
+        # Where M integrates a position otherwise than the system does, a cause explains the rate alone.
+        here, n = self.errors(theta, self.evidence.sizes), len(self.evidence.sizes[0])
+        J, tried = self.slope(theta, self.evidence.sizes, here), [theta]
         for i in range(n):  # rows of errors are predictions after predictions, each with all states
             step = np.linalg.lstsq(J[i::n], -here[i::n], rcond=1e-8)[0]
             tried.append(np.clip(theta + step, self.low, self.high))
@@ -309,11 +281,8 @@ class _Fit:
             here = known.get(theta.tobytes())
             return self.slope(theta, sizes, self.errors(theta, sizes) if here is None else here)
 
-        result = least_squares(
-            errors, inside, slope, bounds=(self.low, self.high), x_scale=self.scales, max_nfev=evaluations,
-            xtol=1e-4, ftol=1e-5,
-        )  # fmt: skip
-        return np.asarray(result.x)
+        bounds, options = (self.low, self.high), {"max_nfev": evaluations, "xtol": 1e-4, "ftol": 1e-5}
+        return np.asarray(least_squares(errors, inside, slope, bounds=bounds, x_scale=self.scales, **options).x)
 
 
 def _size(errors: Array) -> Array:

@@ -20,12 +20,11 @@ from ctxval.core.trial import Trial
 from ctxval.core.validation import Validation
 from ctxval.errors import CtxvalError, DistanceError, InputError
 from ctxval.learning.extended import estimates_by_loops_on_model
-from ctxval.studies.causes.candidates import Candidate, candidates
-from ctxval.studies.causes.cause import Plant, Repaired, plant_of
+from ctxval.models import MuJoCo
+from ctxval.studies.causes import mechanics, signals
+from ctxval.studies.causes.cause import Candidate, Plant, Repaired, of_size, plant_of
 from ctxval.studies.causes.evidence import STEPS, Evidence, Explanation, explained, screened
-from ctxval.studies.causes.mechanics import Force
 from ctxval.studies.causes.report import CauseReport, Explained, Separating
-from ctxval.studies.causes.signals import SensorOffset
 
 _DRAWS = 12  # of noise
 _ALIKE = 10.0  # differences of the criterion that do not tell causes apart
@@ -40,14 +39,10 @@ _STEPS = 5  # of a failed execution
 
 @dataclass(frozen=True, eq=False)
 class ExecutedTask(ShortRepr):
-    """An executed task: its plan, what the system did, and the same with states of M if only outputs are recorded.
-
-    Of an execution that failed, these are the steps before its failure.
-    """
+    """An executed task: its plan, and what the system did; if the execution failed, the steps before its failure."""
 
     plan: Plan
     executed: Trajectory
-    states: Trajectory
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,58 +55,42 @@ class Predicted(ShortRepr):
 
 
 class ClosedLoops:
-    """Executions, and the closed loops of their plans on models with causes.
-
-    Attributes:
-        without, distances: squared deviations and distances of the executions from the loops on M.
-    """
+    """Executions, their deviations and distances from the loops on M, and closed loops on models with causes."""
 
     def __init__(self, validation: Validation, executions: Sequence[ExecutedTask]) -> None:
         self.validation, self.executions = validation, executions
-        whole = np.concatenate([each.executed.states for each in executions])
-        self.ranges = np.maximum(np.ptp(whole, axis=0), 1e-12)
-        efforts = np.concatenate([each.executed.inputs for each in executions])
-        self.efforts = np.maximum(np.ptp(efforts, axis=0), 1e-12)
-        on_model = [each.plan.model_trajectory.first(each.executed.horizon) for each in executions]
-        pairs = list(zip(executions, on_model, strict=True))
+        whole = [np.concatenate([getattr(each.executed, name) for each in executions]) for name in ("states", "inputs")]
+        self.ranges, self.efforts = (np.maximum(np.ptp(values, axis=0), 1e-12) for values in whole)
+        pairs = [(each, each.plan.model_trajectory.first(each.executed.horizon)) for each in executions]
         self.without = [self._deviation(each.executed, loop) for each, loop in pairs]
         self.distances = [self._distance(each, loop) for each, loop in pairs]
 
     def predicted(self, repaired: Repaired, execution: ExecutedTask, noise: Array) -> Predicted:
-        """Return the prediction of an execution from where it began.
+        """Return the prediction of an execution from where it began: the mean of loops with noise.
 
-        Noise of measurements acts on the system through the controller, and may move it out of dead zones and plays.
-        The prediction is therefore the mean of loops with noise.
-
-        Args:
-            noise: standard deviations ``(n,)`` of white noise of the recorded states.
+        Noise of measurements, white with standard deviations ``(n,)``, acts on the system through the controller, and
+        may move it out of dead zones and plays.
         """
         outputs = self.validation.outputs is not None
         loops = [] if outputs else self._noisy(repaired, execution, noise)
         if not loops:
             start = None if outputs else execution.executed.states[0]
-            loop = self.of_plan(repaired, execution.plan, start, execution.executed.horizon)
+            loop = self.of_plan(repaired, execution.plan, execution.executed.horizon, start)
             if loop is None:
                 return Predicted(np.inf, np.zeros(1), np.inf)
             loops = [loop]
-        count, first = len(loops), loops[0]
-        states, inputs = (np.mean([getattr(loop, name) for loop in loops], axis=0) for name in ("states", "inputs"))
-        mean = Trajectory(first.times, states, inputs)
-        by_noise = np.array([self._deviation(loop, mean) for loop in loops]) * (count + 1) / max(count - 1, 1)
+        means = (np.mean([getattr(loop, name) for loop in loops], axis=0) for name in ("states", "inputs"))
+        mean = Trajectory(loops[0].times, *means)
+        by_noise = np.array([self._deviation(loop, mean) for loop in loops]) * (len(loops) + 1) / max(len(loops) - 1, 1)
         return Predicted(self._deviation(execution.executed, mean), by_noise, self._distance(execution, mean))
 
     def distance_from_tasks(self, repaired: Repaired) -> float | None:
-        """Return the largest distance of the executions from loops that begin where their tasks begin.
-
-        Returns None if one of these loops fails.
-        """
-        loops = ((each, self.of_plan(repaired, each.plan, steps=each.executed.horizon)) for each in self.executions)
+        """Return the largest distance of executions from loops that begin where tasks begin; None if a loop fails."""
+        loops = ((each, self.of_plan(repaired, each.plan, each.executed.horizon)) for each in self.executions)
         largest = max(np.inf if loop is None else self._distance(each, loop) for each, loop in loops)
         return largest if np.isfinite(largest) else None
 
-    def of_plan(
-        self, repaired: Repaired, plan: Plan, start: Array | None = None, steps: int | None = None
-    ) -> Trajectory | None:
+    def of_plan(self, repaired: Repaired, plan: Plan, steps: int, start: Array | None = None) -> Trajectory | None:
         """Return the first steps of a plan's closed loop on a model with causes, without noise; None if it fails."""
         system: System = repaired
         if self.validation.outputs is not None:
@@ -120,7 +99,7 @@ class ClosedLoops:
             loop = system.execute(plan.controller, plan.task if start is None else plan.task.starting_at(start))
         except Exception:  # the user's own parts, at states that they never saw
             return None
-        loop = loop.first(plan.task.horizon if steps is None else steps)
+        loop = loop.first(steps)
         return loop if loop.finite.all() else None
 
     def _noisy(self, repaired: Repaired, execution: ExecutedTask, noise: Array) -> list[Trajectory]:
@@ -146,11 +125,9 @@ class ClosedLoops:
         return loops if all(loop.finite.all() for loop in loops) else []
 
     def _deviation(self, executed: Trajectory, loop: Trajectory) -> float:
-        """Return the mean squared deviation of a loop from another one without white noise, in shares of ranges.
-
-        White noise is what second differences over time show: the deviation that a cause makes is smooth beside it.
-        """
+        """Return the mean squared deviation of a loop from another one without white noise, in shares of ranges."""
         squares = 0.0
+        # White noise is what second differences over time show: what a cause makes is smooth beside it.
         for each in ((loop.states - executed.states) / self.ranges, (loop.inputs - executed.inputs) / self.efforts):
             noise = (np.diff(each, 2, axis=0) ** 2).mean(axis=0) / 6 if len(each) > 2 else 0.0
             squares += float(np.maximum((each**2).mean(axis=0) - noise, 0.0).mean())
@@ -177,8 +154,7 @@ def find_causes(campaign: Campaign, *, most: int = 2) -> CauseReport:
         InputError: if there are fewer than two executions with trajectories, or if they do not say enough.
     """
     validation = campaign.validation
-    trials = executed_trials(campaign.store, campaign.trials)
-    trials.sort(key=lambda pair: -(pair[0].distance or 0.0))
+    trials = sorted(executed_trials(campaign.store, campaign.trials), key=lambda pair: -(pair[0].distance or 0.0))
     failed = list[tuple[Trial, Trajectory]]()
     for trial in campaign.failed if validation.outputs is None else ():
         promised, run = campaign.trajectories(trial)
@@ -206,17 +182,15 @@ def find_causes(campaign: Campaign, *, most: int = 2) -> CauseReport:
             if estimated is None:
                 raise InputError("the states of the model cannot be estimated from the recorded outputs.")
             states = estimated
-        plans = [validation.plan(validation.space.from_unit(point)) for point, _ in executed]
-        executions = list(map(ExecutedTask, plans, (run for _, run in executed), states))
-        return _Study(validation, executions, len(failed)).report(most)
+        plan = validation.plan
+        executions = [ExecutedTask(plan(validation.space.from_unit(point)), run) for point, run in executed]
+        return replace(_Study(validation, executions, states).report(most), failed=len(failed))
 
 
 class _Study:
-    def __init__(self, validation: Validation, executions: Sequence[ExecutedTask], failed: int) -> None:
+    def __init__(self, validation: Validation, executions: list[ExecutedTask], runs: list[Trajectory]) -> None:
         self.validation, self.executions, self.model = validation, executions, validation.model
-        self.failed = failed
         self.outputs = validation.outputs is not None
-        runs = [each.states for each in executions]
         horizon = min(len(run.inputs) for run in runs)
         # Estimated states are worth little in one step.
         steps = (max(1, horizon // 60), max(1, horizon // 12)) if self.outputs else STEPS
@@ -228,9 +202,8 @@ class _Study:
         usable = np.isfinite(residuals).all(axis=1)
         if not usable.any():
             raise InputError("the model's steps are not finite at the recorded states.")
-        n, m = x.shape[1], u.shape[1]
-        states, inputs = validation.names(n, m)
-        self.plant: Plant = plant_of(self.model, executions[0].plan.task.dt, states, inputs, x[usable], u[usable])
+        names = validation.names(x.shape[1], u.shape[1])
+        self.plant = plant_of(self.model, executions[0].plan.task.dt, *names, x[usable], u[usable])
         self.dictionary = candidates(self.plant, x[usable], u[usable], residuals[usable], outputs=self.outputs)
         self.loops = ClosedLoops(validation, executions)
         self.before = max(self.loops.distances)
@@ -239,8 +212,7 @@ class _Study:
         from_start = None if self.outputs else self._in_closed_loop(Explanation((), Repaired(self.model, ()), 0.0, 1.0))
         if from_start is not None and from_start.complete >= _NAMED:
             offset = self._offset_of_starts()
-            group = [] if offset is None else [replace(from_start, explanation=offset)]
-            return self._reported(group, began_elsewhere=True)
+            return self._reported([] if offset is None else [replace(from_start, explanation=offset)], [], True)
         with stage("fitting causes", (2 * most - 1) * len(self.dictionary), "causes"):
             ranked = self._ranked(())
             chosen, alike = self._chosen(ranked)
@@ -257,15 +229,12 @@ class _Study:
                 if 1 - better.complete > 0.5 * (1 - chosen.complete):
                     break
                 chosen, alike = better, others
-        return self._reported([] if chosen is None else [chosen, *alike], ranked)
+        return self._reported([] if chosen is None else [chosen, *alike], ranked, False)
 
-    def _reported(
-        self, group: list[Explained], ranked: Sequence[Explanation] = (), *, began_elsewhere: bool = False
-    ) -> CauseReport:
+    def _reported(self, group: list[Explained], ranked: list[Explanation], began_elsewhere: bool) -> CauseReport:
         named = bool(group) and group[0].counts(self.before) and group[0].complete >= _NAMED
-        from_tasks = None
-        if group and not self.outputs and not began_elsewhere:
-            from_tasks = self.loops.distance_from_tasks(group[0].explanation.repaired)
+        told = group and not self.outputs and not began_elsewhere
+        from_tasks = self.loops.distance_from_tasks(group[0].explanation.repaired) if told else None
         return CauseReport(
             plant=self.plant,
             explained=tuple(group),
@@ -275,7 +244,6 @@ class _Study:
             executions=len(self.executions),
             before=self.before,
             from_tasks=from_tasks,
-            failed=self.failed,
             units=self.validation.labels.units,
             separating=self._separating(group) if named and len(group) > 1 else None,
             ranked=tuple(ranked[:5]),
@@ -286,21 +254,15 @@ class _Study:
         gaps = np.array([each.executed.states[0] - each.plan.model_trajectory.states[0] for each in self.executions])
         state = int((np.abs(gaps.mean(axis=0)) / self.loops.ranges).argmax())
         gap = float(gaps[:, state].mean())
+        alike = np.ptp(gaps[:, state]) < 0.5 * abs(gap)
         for each in self.dictionary:
-            if (
-                isinstance(each.cause, SensorOffset)
-                and each.cause.state == state
-                and np.ptp(gaps[:, state]) < 0.5 * abs(gap)
-            ):
+            if alike and isinstance(each.cause, signals.SensorOffset) and each.cause.state == state:
                 repaired = Repaired(self.model, (each.cause.with_sizes([gap]),))
                 return Explanation((replace(each, cause=repaired.causes[0]),), repaired, 0.0, 1.0)
         return None
 
     def _ranked(self, beside: tuple[Candidate, ...]) -> list[Explanation]:
-        """Return the explanations by each cause beside given ones, the most probable first.
-
-        All are screened on a part of the records, and the best ones are fitted to all of them.
-        """
+        """Return explanations by each cause beside given ones, the most probable first; the best of a screening."""
         kinds = [each.cause.with_sizes(()) for each in beside]
         results = []
         for each in self.dictionary:
@@ -329,7 +291,11 @@ class _Study:
             most = max(tried, key=lambda each: each.share)
             return (most if most.resolved and most.share > _LITTLE else None), []
         best = tried[-1]
-        others = [each for each in ranked if each is not best.explanation and _alike(best.explanation, each)]
+        # Of residuals that are nearly explained, differences by a third may be the way of integration.
+        left, most_probable = best.explanation.left, best.explanation.criterion
+        most_left = 1.3 * left + 2e-4 if left < 0.02 else -np.inf
+        alike = [each for each in ranked if each.criterion < most_probable + _ALIKE or each.left < most_left]
+        others = [each for each in alike if each is not best.explanation]
         group = [best, *(self._in_closed_loop(each) for each in others[:_CHECKED])]
         group = [each for each in group if 1 - each.share <= 2 * (1 - best.share) + 1e-3]
         first = min((each for each in group if each.counts(self.before)), key=lambda each: len(each.explanation.sizes))
@@ -361,37 +327,39 @@ class _Study:
 
     def _separating(self, group: Sequence[Explained]) -> Separating | None:
         """Return the task at which the predictions of causes that the executions do not tell apart differ most."""
-        first, space = group[0], self.validation.space
-        best: Separating | None = None
+        best, space = None, self.validation.space
         for point in space.from_unit(np.random.default_rng(0).random((24, space.dimension))):
             try:
                 plan = self.validation.plan(point)
             except CtxvalError:
                 continue
-            promised = self.loops.of_plan(first.explanation.repaired, plan)
-            if promised is None:
-                continue
-            for number, other in enumerate(group[1:], start=1):
-                loop = self.loops.of_plan(other.explanation.repaired, plan)
-                if loop is None:
+            steps = plan.task.horizon
+            first, *others = (self.loops.of_plan(each.explanation.repaired, plan, steps) for each in group)
+            for number, loop in enumerate(others, start=1):
+                if first is None or loop is None:
                     continue
-                gap = float(np.max(np.abs(loop.states - promised.states) / self.loops.ranges))
+                gap = float(np.max(np.abs(loop.states - first.states) / self.loops.ranges))
                 if best is None or gap > best.gap:
-                    apart = float(self.validation.distance_between(promised, loop, plan.task))
+                    apart = float(self.validation.distance_between(first, loop, plan.task))
                     best = Separating(space.describe_point(point), apart, number, gap)
         return best
 
 
-def _alike(best: Explanation, other: Explanation) -> bool:
-    """Return whether another explanation is as good as the best one, except for what is no evidence."""
-    # Of residuals that are nearly explained, differences by a third may be the way of integration.
-    systematic = best.left < 0.02 and other.left < 1.3 * best.left + 2e-4
-    return other.criterion < best.criterion + _ALIKE or systematic
+def candidates(plant: Plant, x: Array, u: Array, residuals: Array, *, outputs: bool) -> tuple[Candidate, ...]:
+    """Return the dictionary of a plant for recorded states and inputs, and what M misses of next states ``(N, n)``."""
+    missed = np.sqrt([(column**2).mean() for column in residuals.T])
+    return (
+        *signals.of_inputs(plant),
+        *(candidate for joint in plant.ports for candidate in mechanics.forces(plant, joint, x, u, missed)),
+        *(mechanics.of_mujoco(plant, missed) if isinstance(plant.model, MuJoCo) else mechanics.of_joints(plant)),
+        of_size(mechanics.TimeStep((1.0,)), 0.2, 5.0, 0.1, 0.95, 1.05),
+        *(() if outputs else signals.of_sensors(plant, x)),  # states that are estimated have no sensors
+    )
 
 
 def _contains(general: Explained, special: Explained) -> bool:
     """Return whether an explanation has another one as a special case, as Stribeck friction has Coulomb friction."""
     ends = general.causes[-1], special.causes[-1]
-    forces = [cause for cause in ends if isinstance(cause, Force)]
+    forces = [cause for cause in ends if isinstance(cause, mechanics.Force)]
     more = len(general.explanation.sizes) > len(special.explanation.sizes)
     return more and len(forces) == 2 and forces[0].joint.rate == forces[1].joint.rate

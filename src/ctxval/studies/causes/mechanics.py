@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -10,16 +10,14 @@ import numpy as np
 
 from ctxval._util.arrays import Array
 from ctxval.core.model import Model
-from ctxval.models import MuJoCo
-from ctxval.studies.causes.cause import Cause, Joint, Plant
+from ctxval.studies.causes.cause import Candidate, Cause, Joint, Plant, of_ratio, of_size
 
 
 @dataclass(frozen=True)
 class Force(Cause):
     """A force on a joint, in units of its input, of MuJoCo, or of an acceleration; held over a step."""
 
-    #: where it enters
-    joint: Joint = Joint(0)  # noqa: RUF009  # it is frozen
+    joint: Joint = Joint(0)  # noqa: RUF009  # where it enters; it is frozen
     probe: float = 1.0  #: a force that is typical of the joint, with which its effect in M is measured
     dt: float = 1.0  #: seconds
 
@@ -36,11 +34,7 @@ class Force(Cause):
         return _accelerated(np.zeros_like(x), [self.joint], np.full_like(x, self.dt), self.dt)
 
     def force(self, rate: Array, load: Array, stopping: Array) -> Array:
-        """Return the force ``(...)`` at a mean rate; the force ``stopping`` would stop the joint within the step.
-
-        Args:
-            load: the magnitude of the force that the gears carry.
-        """
+        """Return the force ``(...)`` at a rate, a load of the gears, and a force that would stop the joint."""
         raise NotImplementedError
 
     def load(self, model: Any, x: Array, u: Array) -> Array:
@@ -50,12 +44,11 @@ class Force(Cause):
     def pushed(self, model: Model, x: Array, u: Array, free: Array, reached: Array) -> Array:
         effect, number = self.effect(model, x, u, free), self.joint.rate
         moving = np.where(np.abs(effect[..., number]) > 1e-12, effect[..., number], 1e-12)
-
         rate = 0.5 * (x[..., number] + reached[..., number])
         return reached + effect * self.force(rate, self.load(model, x, u), -reached[..., number] / moving)[..., None]
 
-    def amount(self, plant: Plant, size: float, per: str = "") -> str:
-        return f"{size:.3g} {plant.force_unit(self.joint)}{per}"
+    def amount(self, plant: Plant, size: float) -> str:
+        return f"{size:.3g} {plant.force_unit(self.joint)}"
 
 
 @dataclass(frozen=True)
@@ -83,7 +76,7 @@ class Viscous(Force):
     def text(self, plant: Plant) -> str:
         rate = plant.rate_unit(self.joint)
         more = "more" if self.sizes[0] >= 0 else "less"
-        size = self.amount(plant, abs(self.sizes[0]), f" per {rate}" if rate else "")
+        size = self.amount(plant, abs(self.sizes[0])) + (f" per {rate}" if rate else "")
         return f"{plant.joint_name(self.joint)} has {more} viscous friction than M ({size})"
 
 
@@ -133,8 +126,16 @@ class LoadFriction(Force):
     rates: tuple[int, ...] = ()  #: the rates of all joints that inputs drive
 
     def load(self, model: Any, x: Array, u: Array) -> Array:
-        if self.joint.dof is not None:
-            return np.abs(_pulls(model, x, u)[..., self.joint.dof])
+        if self.joint.dof is not None:  # the force of the actuators minus what pulls, by the dynamics of MuJoCo
+            import mujoco
+
+            states, inputs, nq = x.reshape(-1, x.shape[-1]), u.reshape(-1, u.shape[-1]), model.compiled.nq
+            data, pulls = mujoco.MjData(model.compiled), np.full(len(states), np.nan)
+            for k in np.flatnonzero(np.isfinite(states).all(axis=1)):
+                data.qpos, data.qvel, data.ctrl = states[k, :nq], states[k, nq:], inputs[k]
+                mujoco.mj_forward(model.compiled, data)
+                pulls[k] = (data.qfrc_actuator + data.qfrc_bias)[self.joint.dof]
+            return np.asarray(np.abs(pulls).reshape(x.shape[:-1]))
         unmoved, m = np.asarray(model.step(x, np.zeros_like(u))), u.shape[-1]
         if self.joint.input is None:
             number = self.joint.rate
@@ -156,20 +157,6 @@ class LoadFriction(Force):
         more = f", and {self.amount(plant, self.sizes[1])}" if self.sizes[1] > 1e-3 * self.probe else ""
         name = plant.joint_name(self.joint)
         return f"the friction of {name} depends on the load ({100 * self.sizes[0]:.3g} % of it{more})"
-
-
-def _pulls(model: MuJoCo, x: Array, u: Array) -> Array:
-    """Return the forces of actuators minus what pulls at the joints ``(..., nv)``, by the dynamics of MuJoCo."""
-    import mujoco
-
-    compiled = model.compiled
-    data, rows = mujoco.MjData(compiled), x.reshape(-1, x.shape[-1])
-    pulls = np.full((len(rows), compiled.nv), np.nan)
-    for k in np.flatnonzero(np.isfinite(rows).all(axis=1)):
-        data.qpos, data.qvel, data.ctrl = rows[k, : compiled.nq], rows[k, compiled.nq :], u.reshape(len(rows), -1)[k]
-        mujoco.mj_forward(compiled, data)
-        pulls[k] = data.qfrc_actuator + data.qfrc_bias
-    return pulls.reshape(*x.shape[:-1], -1)
 
 
 def _accelerated(reached: Array, joints: Sequence[Joint], gained: Array, dt: float) -> Array:
@@ -315,3 +302,79 @@ class MassCentre(OfMuJoCo):
         place = np.array(plant.compiled.body_ipos[self.body])
         place[self.axis] += self.sizes[0]
         return f'<inertial pos="{" ".join(f"{value:.5g}" for value in place)}"/>'
+
+
+def forces(plant: Plant, joint: Joint, x: Array, u: Array, missed: Array) -> Iterator[Candidate]:
+    """Yield the forces that may enter at a place, in sizes whose effects are as large as what M misses of its rate."""
+    probe = 0.1 * float(plant.commanded[joint.input]) if joint.input is not None and joint.dof is None else 1.0
+    rows = slice(None, None, max(1, len(x) // 50))
+    free = np.asarray(plant.model.step(x[rows], u[rows]))
+    unit = Bias((1.0,), joint, probe, plant.dt)
+    effects = unit.effect(plant.model, x[rows], u[rows], free)[:, joint.rate]
+    effects = effects[np.isfinite(effects)]
+    size = float(np.sqrt((effects**2).mean())) if len(effects) else 0.0
+    force = float(missed[joint.rate]) / size if size > 0 else 0.0
+    speed = float(np.sqrt((x[:, joint.rate] ** 2).mean()))
+    if force <= 0 or speed <= 0:
+        return
+    where = joint, 0.1 * force, plant.dt
+    most, least, slope = 20 * force, 0.1 * force, force / speed
+    if joint.input is None or joint.dof is not None:  # otherwise it is an offset of the input
+        yield of_size(Bias((0.0,), *where), -most, most, least, 0.0)
+    if joint.dof is None:
+        yield of_size(Viscous((0.0,), *where), -20 * slope, 20 * slope, 0.1 * slope, 0.0)
+        yield of_size(Coulomb((0.0,), *where), 0.0, most, least, 0.3 * force, force)
+    yield Candidate(
+        Stribeck((0.0, 0.0, 1.0), *where),
+        (0.0, 0.0, 0.01 * speed),
+        (most, most, 2 * speed),
+        (least, least, 0.1 * speed),
+        ((0.5 * force, 0.5 * force, 0.3 * speed), (0.7 * force, 0.3 * force, 0.1 * speed)),
+    )
+    starts = ((0.05, 0.0), (0.2, 0.3 * force))
+    rates = tuple(dict.fromkeys(port.rate for port in plant.ports if port.input is not None))
+    yield Candidate(LoadFriction((0.0, 0.0), *where, rates), (0.0, 0.0), (2.0, most), (0.05, least), starts)
+
+
+def of_joints(plant: Plant) -> Iterator[Candidate]:
+    """Yield what may be wrong with joints of a model that is not of MuJoCo."""
+    # The joints have positions, all or none.
+    rates = tuple(joint.rate for joint in plant.joints if joint.position is not None)
+    together = [plant.joints] if len(plant.joints) > 1 else []
+    for joints in (*((joint,) for joint in plant.joints), *together):
+        yield of_ratio(Inertia((1.0,), joints, plant.dt))
+        if rates:
+            yield of_ratio(Gravity((1.0,), joints, rates, plant.dt))
+
+
+def of_mujoco(plant: Plant, missed: Array) -> Iterator[Candidate]:
+    """Yield what may be wrong with joints and bodies of a model of MuJoCo."""
+    import mujoco
+
+    compiled = plant.compiled
+    data = mujoco.MjData(compiled)
+    mujoco.mj_forward(compiled, data)
+    inertias = np.zeros((compiled.nv, compiled.nv))
+    mujoco.mj_fullM(compiled, data, inertias)
+    for joint in plant.joints:
+        if missed[joint.rate] <= 1e-6 * plant.changes[joint.rate]:  # the joint has no fault
+            continue
+        inertia = float(np.abs(inertias[joint.dof, joint.dof]))
+        force = inertia * float(missed[joint.rate]) / plant.dt
+        speed = max(float(plant.changes[joint.position]) / plant.dt, 1e-9)
+        for attribute, size in (("damping", force / speed), ("frictionloss", force), ("armature", inertia)):
+            low = -float(getattr(compiled, f"dof_{attribute}")[joint.dof])
+            starts = (0.3 * size, size) if attribute == "frictionloss" else (0.0,)
+            # More damping would make the integration unstable.
+            most = min(20 * size, inertia / compiled.opt.timestep) if attribute == "damping" else 20 * size
+            cause = JointAttribute((0.0,), attribute, joint)
+            yield of_size(cause, low, most, 0.05 * size, *starts)
+    masses = compiled.body_mass
+    moved = (compiled.body_dofnum > 0) | (compiled.body_parentid > 0)
+    bodies = [body for body in range(1, compiled.nbody) if masses[body] > 0 and moved[body]]
+    for body in sorted(bodies, key=lambda each: -float(masses[each]))[:8]:
+        yield of_ratio(BodyMass((1.0,), body))
+        extent = float(np.sqrt(compiled.body_inertia[body].max() / masses[body]))
+        for axis in range(3 if extent > 0 else 0):
+            moved_centre = MassCentre((0.0,), body, axis)
+            yield of_size(moved_centre, -3 * extent, 3 * extent, 0.05 * extent, 0.0)

@@ -20,9 +20,7 @@ class Explained(ShortRepr):
     """Causes that were tried in closed loop, each execution predicted without itself."""
 
     explanation: Explanation
-    #: the share of the squared closed-loop deviations of M that the causes explain, except for what simulated noise of
-    #: the measurements makes of them
-    share: float
+    share: float  #: of the squared closed-loop deviations of M that the causes explain, without those by noise
     uncertainty: float  #: the standard deviation of the share, because of noise
     structure: float  #: the same for the squared residuals of M after several steps
     uncertain_structure: float
@@ -68,21 +66,16 @@ class CauseReport(ShortRepr):
     """Why a model fails."""
 
     plant: Plant
-    #: the most probable causes, and others that the executions do not tell from them; empty if no cause predicts
-    #: held-out executions better than M
+    #: the most probable causes, and those like them; empty if no cause predicts held-out executions better than M
     explained: tuple[Explained, ...]
-    #: whether the first of these is the cause; otherwise the answer is none of these, and they are what comes nearest
-    named: bool
+    named: bool  #: whether the first of these is the cause; otherwise they are what comes nearest
     tried: int  #: the number of causes in the dictionary
     executions: int  #: the number of executions that were learned from
     before: float  #: their largest distance from M
     failed: int = 0  #: how many of them failed, of which only the steps before are known
     units: str = ""
-    #: whether M predicts the executions from where they began, and not from where their tasks begin
-    began_elsewhere: bool = False
-    #: the largest distance from M with the first causes if its loops begin where the tasks begin; None if states are
-    #: estimated, if no cause is in the dynamics, or if a loop fails
-    from_tasks: float | None = None
+    began_elsewhere: bool = False  #: whether M predicts from where executions began, and not from where tasks begin
+    from_tasks: float | None = None  #: the largest distance if loops begin where tasks begin; None if it is not known
     separating: Separating | None = None  #: the task that tells causes apart which these executions do not
     ranked: tuple[Explanation, ...] = ()  #: the most probable causes alone, the best one first
 
@@ -113,7 +106,7 @@ class CauseReport(ShortRepr):
         if not self.explained:
             return f"None of these {self.tried} causes: none predicts executions better that it was not fitted to."
         first = self.explained[0]
-        failed = "" if not self.failed else " until they failed"
+        failed = " until they failed" if self.failed else ""
         if 0 < self.failed < self.executions:
             failed = f", {self.failed} of them until {'they' if self.failed > 1 else 'it'} failed,"
         falls = first.distance < self.before
@@ -122,21 +115,17 @@ class CauseReport(ShortRepr):
             f"{'falls' if falls else 'rises'} from {self.before:.3g} to {first.distance:.3g}{units}"
         )
         if self.from_tasks is not None and self.from_tasks > max(2 * first.distance, _APART * self.before):
-            effect += (
-                ", predicted from where the executions began; from where their tasks begin, it is "
-                f"{self.from_tasks:.3g}{units}"
-            )
+            effect += ", predicted from where the executions began; from where their tasks begin, it is "
+            effect += f"{self.from_tasks:.3g}{units}"
         part, of = (first.share, "deviations") if first.resolved else (first.structure, "residuals, except for noise")
         share = f"{np.floor(1e3 * part) / 10:.4g} % of the squared {of}"
         if not self.named:
             less = "The largest part of the error that one explains" if first.share > 0.5 else "What comes nearest"
             effect = f"{'and' if falls else 'but'} {effect}"
             return f"None of these {self.tried} causes. {less}: {self._text(first)}. It explains {share}, {effect}."
-        what = "; or ".join(map(self._text, self.explained))
-        if len(self.explained) > 1:
-            what = f"One of these, which the executions do not tell apart: {what}"
-        if self.began_elsewhere:
-            what = f"{what}, or all executions began there"
+        what = "One of these, which the executions do not tell apart: " if len(self.explained) > 1 else ""
+        what += "; or ".join(map(self._text, self.explained))
+        what += ", or all executions began there" if self.began_elsewhere else ""
         together = "both" if len(first.causes) == 2 else "this"
         return f"{what[0].upper()}{what[1:]}. With {together} in M, {effect}. This explains {share}."
 
@@ -181,10 +170,7 @@ class CauseReport(ShortRepr):
             "explained": [
                 {
                     "text": self._text(each),
-                    "causes": [
-                        {"name": cause.name, "sizes": list(cause.sizes), "python": cause.python()}
-                        for cause in each.causes
-                    ],
+                    "causes": [{"name": c.name, "sizes": list(c.sizes), "python": c.python()} for c in each.causes],
                     **{name: getattr(each, name) for name in shares},
                     "criterion": each.explanation.criterion,
                     "residual_left": each.explanation.left,

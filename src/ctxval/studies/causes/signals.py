@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import combinations
 from typing import Any, ClassVar
 
 import numpy as np
 
 from ctxval._util.arrays import Array
 from ctxval.learning.actuators import Actuator
-from ctxval.studies.causes.cause import Cause, Plant
+from ctxval.studies.causes.cause import Candidate, Cause, Plant, of_ratio, of_size
 
 
 def _at(values: Array, index: int | list[int] | None, size: float, elsewhere: float = 0.0) -> Array:
@@ -41,7 +42,7 @@ class InputGain(Cause):
         return u * _at(u, self.input, self.sizes[0], 1.0), None
 
     def text(self, plant: Plant) -> str:
-        which = "all inputs have" if self.input is None else f"{plant.input(self.input)[0]} has"
+        which = "all inputs have" if self.input is None else f"{plant.inputs[self.input][0]} has"
         return f"{which} {self.sizes[0]:.3g} times the effect that M has"
 
     def mjcf(self, plant: Plant) -> str | None:
@@ -62,7 +63,7 @@ class InputOffset(Cause):
         return u + _at(u, self.input, self.sizes[0]), None
 
     def text(self, plant: Plant) -> str:
-        name, unit = plant.input(self.input)
+        name, unit = plant.inputs[self.input]
         return f"{name} has an offset of {self.sizes[0]:.3g} {unit}".rstrip()
 
 
@@ -78,7 +79,7 @@ class Saturation(Cause):
         return np.clip(u, -most, most), None
 
     def text(self, plant: Plant) -> str:
-        name, unit = plant.input(self.input)
+        name, unit = plant.inputs[self.input]
         return f"{name} saturates at {self.sizes[0]:.3g} {unit}".rstrip()
 
     def mjcf(self, plant: Plant) -> str | None:
@@ -100,7 +101,7 @@ class DeadZone(Cause):
         return u - np.clip(u, -lost, lost), None
 
     def text(self, plant: Plant) -> str:
-        name, unit = plant.input(self.input)
+        name, unit = plant.inputs[self.input]
         return f"{name} has a dead zone of {self.sizes[0]:.3g} {unit}".rstrip()
 
 
@@ -118,7 +119,7 @@ class Backlash(Cause):
         return acting, acting
 
     def text(self, plant: Plant) -> str:
-        name, unit = plant.input(self.input)
+        name, unit = plant.inputs[self.input]
         return f"{name} has backlash of {2 * self.sizes[0]:.3g} {unit}".rstrip()
 
 
@@ -168,7 +169,7 @@ class SwappedInputs(Cause):
         return _exchanged(u, [self.first], [self.second]), None
 
     def text(self, plant: Plant) -> str:
-        return f"the inputs {plant.input(self.first)[0]} and {plant.input(self.second)[0]} are exchanged"
+        return f"the inputs {plant.inputs[self.first][0]} and {plant.inputs[self.second][0]} are exchanged"
 
 
 @dataclass(frozen=True)
@@ -183,7 +184,7 @@ class ReversedInput(Cause):
         return u * _at(u, self.input, -1.0, 1.0), None
 
     def text(self, plant: Plant) -> str:
-        return f"{plant.input(self.input)[0]} acts with the opposite sign"
+        return f"{plant.inputs[self.input][0]} acts with the opposite sign"
 
 
 @dataclass(frozen=True)
@@ -200,7 +201,7 @@ class SensorOffset(Cause):
         return x + _at(x, self.state, self.sizes[0])
 
     def text(self, plant: Plant) -> str:
-        name, unit = plant.state(self.state)
+        name, unit = plant.states[self.state]
         size = f"{abs(self.sizes[0]):.3g} {unit}".rstrip()
         return f"the sensor of {name} reads {size} too {'much' if self.sizes[0] > 0 else 'little'}"
 
@@ -219,7 +220,7 @@ class SensorScale(Cause):
         return x * _at(x, list(self.states), self.sizes[0], 1.0)
 
     def text(self, plant: Plant) -> str:
-        return f"the sensor of {plant.state(self.states[0])[0]} reads {self.sizes[0]:.3g} times the value"
+        return f"the sensor of {plant.states[self.states[0]][0]} reads {self.sizes[0]:.3g} times the value"
 
 
 @dataclass(frozen=True)
@@ -238,4 +239,37 @@ class SwappedJoints(Cause):
         return self.true(x)
 
     def text(self, plant: Plant) -> str:
-        return f"the sensors of {plant.state(self.first[0])[0]} and {plant.state(self.second[0])[0]} are exchanged"
+        return f"the sensors of {plant.states[self.first[0]][0]} and {plant.states[self.second[0]][0]} are exchanged"
+
+
+def of_inputs(plant: Plant) -> Iterator[Candidate]:
+    """Yield what may be wrong with inputs."""
+    m = len(plant.inputs)
+    for k, most in enumerate(plant.commanded.tolist()):
+        yield of_ratio(InputGain((1.0,), k))
+        yield of_size(InputOffset((0.0,), k), -2 * most, 2 * most, 0.05 * most, 0.0)
+        limits = (share * most for share in (0.9, 0.7, 0.5, 0.3, 0.1, 0.03, 0.01))
+        yield of_size(Saturation((most,), k), 1e-3 * most, most, 0.05 * most, *limits)
+        for kind in (DeadZone, Backlash):
+            yield of_size(kind((0.0,), k), 0.0, most, 0.02 * most, *(share * most for share in (0.01, 0.05, 0.15)))
+        yield Candidate(ReversedInput((), k))
+    if m > 1:
+        yield of_ratio(InputGain((1.0,), None))
+    for first, second in combinations(range(m), 2):
+        yield Candidate(SwappedInputs((), first, second))
+    yield of_size(Delay((1.0,)), 0.0, 8.0, 0.2, 0.5, 1.5, 2.5, 4.0)
+    yield of_size(Lag((1.0,)), 0.05, 10.0, 0.2, 0.5, 1.5, 4.0)
+
+
+def of_sensors(plant: Plant, x: Array) -> Iterator[Candidate]:
+    """Yield what may be wrong with sensors of recorded states ``(N, n)``."""
+    ranges = np.ptp(x, axis=0)
+    groups = [(joint.rate,) if joint.position is None else (joint.position, joint.rate) for joint in plant.joints]
+    for group in groups:
+        size = max(float(ranges[group[0]]), 1e-9)
+        yield of_size(SensorOffset((0.0,), group[0]), -size, size, 0.05 * size, 0.0)
+        yield of_ratio(SensorScale((1.0,), group))
+    moving = [group for group in groups if ranges[group[0]] > 0]
+    pairs = [group for group in moving if len(group) == len(moving[0])]
+    for first, second in combinations(pairs, 2):
+        yield Candidate(SwappedJoints((), first, second))

@@ -28,25 +28,20 @@ from ctxval.searches import Prediction
 
 Question = Literal["worst", "mean"]
 
-Executed = Sequence[tuple[Array, Trajectory]]
-"""Executed tasks, points of the unit cube ``(d,)``, with the system's trajectories."""
-
+Executed = Sequence[tuple[Array, Trajectory]]  #: executed tasks, points ``(d,)`` of the unit cube, with trajectories
 OnTrial = Callable[[str, Trial], None]  #: called with the name of a candidate and each of its trials that has ended
 
 
 @dataclass(frozen=True)
 class Decision:
-    """A decision that one candidate has the smaller d*: its bound is at most an executed distance of the other one.
-
-    ``executions`` is the number of executions of all candidates, when it was decided.
-    """
+    """A decision that one candidate has the smaller d*: its bound is at most an executed distance of the other one."""
 
     smaller: str
     larger: str
     bound: float
     distance: float
     certificate: str
-    executions: int
+    executions: int  #: the number of executions of all candidates, when it was decided
 
 
 @dataclass(frozen=True)
@@ -56,11 +51,9 @@ class TrialNote:
     step: int  #: the number of the execution among those of all candidates, from 0; a shared execution has one number
     question: Question
     draw: int | None = None  #: the number of the task among the independent draws; None if the task is no draw
-    #: the distance that was predicted for a draw before it was drawn, and its mean over others
-    predicted: float | None = None
+    predicted: float | None = None  #: the distance that was predicted for a draw, and its mean over others
     centre: float | None = None
-    #: the name of the candidate that executed the task and the number of its trial; None if this one did
-    shared: tuple[str, int] | None = None
+    shared: tuple[str, int] | None = None  #: the candidate and the trial that executed the task; None if this one did
     decided: tuple[Decision, ...] = ()  #: what had been decided about the largest distances
 
     def to_note(self) -> dict[str, Any]:
@@ -81,11 +74,7 @@ _NOTES = TypeAdapter(TrialNote)
 
 @dataclass(eq=False)
 class Candidate:
-    """One model, controller or distance, with its campaign.
-
-    The system is the same for all candidates, so its distances are predicted from the executions of all: each execution
-    teaches the residual of each model, whatever controller was used.
-    """
+    """One model, controller or distance, with its campaign. The executions of all candidates teach what it predicts."""
 
     name: str
     campaign: Campaign
@@ -99,35 +88,29 @@ class Candidate:
         self._last: tuple[tuple[int, ...], Prediction | None] | None = None
 
     @property
-    def trials(self) -> tuple[Trial, ...]:
-        """All trials in the order of asking."""
-        return self.recorder.trials
-
-    @property
     def noted(self) -> list[tuple[Trial, TrialNote]]:
         """The trials that a comparison has opened, with their notes."""
-        return [(trial, note) for trial in self.trials if (note := TrialNote.of(trial)) is not None]
+        return [(trial, note) for trial in self.recorder.trials if (note := TrialNote.of(trial)) is not None]
 
     @property
     def largest(self) -> float:
         """The largest executed distance; 0 if there is none."""
-        return largest_distance(self.trials)
+        return largest_distance(self.recorder.trials)
 
     def executed(self, *, shared: bool = False) -> list[Trial]:
         """Return the trials whose execution has ended, with or without success: its own, or those of others."""
         copied = {trial.number for trial, note in self.noted if note.shared is not None}
-        return [trial for trial in self.trials if trial.executed and (trial.number in copied) == shared]
+        return [trial for trial in self.recorder.trials if trial.executed and (trial.number in copied) == shared]
 
     def trajectories(self) -> list[tuple[Trial, TrialNote | None, Trajectory]]:
         """Return the completed trials that are its own, with their notes and trajectories; the store keeps these."""
-        recorded = executed_trials(self.campaign.store, self.trials)
+        recorded = executed_trials(self.campaign.store, self.recorder.trials)
         noted = [(trial, TrialNote.of(trial), trajectory) for trial, trajectory in recorded]
         return [each for each in noted if each[1] is None or each[1].shared is None]
 
     def highest(self, executed: Executed) -> tuple[float, Array] | None:
         """Return the largest predicted distance and its task ``(d,)``; None if nothing can be predicted."""
-        prediction = self._prediction(executed)
-        if prediction is None:
+        if (prediction := self._prediction(executed)) is None:
             return None
         # The number identifies a random stream, which is none of those of trials.
         rng, count = np.random.default_rng([self.seed, 0x706F]), 400 if self._batched else 48
@@ -136,20 +119,15 @@ class Candidate:
         points = np.where(snapped, np.round(points), points) if self._space.members is None else self._space.members
         with stage("predicting distances", len(points), "designs"):
             expected = prediction.expected(points)[0]
-        if not np.isfinite(expected).any():
-            return None
-        best = int(np.nanargmax(np.where(np.isfinite(expected), expected, np.nan)))
-        return float(expected[best]), points[best]
+        best = int(np.argmax(np.where(np.isfinite(expected), expected, -np.inf)))
+        return (float(expected[best]), points[best]) if np.isfinite(expected[best]) else None
 
     def of_draw(self, executed: Executed, point: Array, draw: int, most: float | None) -> tuple[float, float] | None:
-        """Return the prediction of a draw and its mean over other tasks; None if nothing can be predicted.
-
-        The mean is over new independent tasks for each draw, so that its error has the expectation 0.
-        """
-        prediction = self._prediction(executed)
-        if prediction is None:
+        """Return the prediction of a draw and its mean over other tasks; None if nothing can be predicted."""
+        if (prediction := self._prediction(executed)) is None:
             return None
-        rng = np.random.default_rng([self.seed, draw, 0x6365])  # the number identifies a random stream, as above
+        # The other tasks are new for each draw, so that the error of the mean has the expectation 0.
+        rng = np.random.default_rng([self.seed, draw, 0x6365])
         others = self._space.unit_draws(200 if self._batched else 24, rng)
         with stage("predicting distances", len(others) + 1, "designs"):
             expected = prediction.expected(np.concatenate([others, point[None]]))[0]
@@ -235,13 +213,9 @@ class Executions:
         return replace(note, decided=tuple(self.decided.values())).to_note()
 
     def _run(self, candidate: Candidate, choice: Choice | None, predicts: bool) -> None:
-        waiting = [] if choice is None else [choice]
+        waiting, on_trial = [] if choice is None else [choice], partial(self.on_trial, candidate.name)
         with candidate.recorder.predicting(predicts), self._hiding(None if choice is None else choice.unit_point):
-            ExecutionLoop(
-                candidate.recorder,
-                lambda: waiting.pop() if waiting else None,
-                on_trial=partial(self.on_trial, candidate.name),
-            ).run()
+            ExecutionLoop(candidate.recorder, lambda: waiting.pop() if waiting else None, on_trial=on_trial).run()
 
     def _share_all(self) -> None:
         """Record executions for the candidates that would have given the system the same inputs."""
@@ -254,8 +228,8 @@ class Executions:
                         self._share(trial, trajectory, replace(note, shared=key[:2]), other)
 
     def _share(self, trial: Trial, trajectory: Trajectory, note: TrialNote, other: Candidate) -> None:
-        same = [known for known in other.trials if np.array_equal(known.unit_point, trial.unit_point)]
-        copy = same[-1] if same else None
+        known = reversed(other.recorder.trials)
+        copy = next((each for each in known if np.array_equal(each.unit_point, trial.unit_point)), None)
         if copy is not None and (copy.state != "open" or copy.attempts):
             return
         try:
@@ -266,9 +240,9 @@ class Executions:
             return
         with other.campaign.store.sole_writer(), self._hiding(trial.unit_point):
             if copy is None:
-                of_draw = note.question == "mean"
+                of_draw, parameters = note.question == "mean", trial.parameters
                 made = self.predicted(other, note, trial.unit_point) if of_draw else replace(note, predicted=None)
-                stored, parameters = self._stored(replace(made, shared=note.shared)), trial.parameters
+                stored = self._stored(replace(made, shared=note.shared))
                 choice = Choice(trial.unit_point, trial.origin, planned_draws=0, note=stored, parameters=parameters)
                 with other.recorder.predicting(not of_draw):
                     copy = other.recorder.open(choice).trial

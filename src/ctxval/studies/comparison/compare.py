@@ -58,7 +58,6 @@ def compare(
             random draws, ``both`` is ``worst``.
         budget: the largest total number of executions, including earlier ones in the stores.
         confidence: the probability with which all decisions hold together; it is divided between pairs and questions.
-        seed: the seed of the random numbers.
         stores: the folder of the stores, one for each candidate; in memory by default.
         largest_possible: a number that no distance can exceed, if one is known. Decisions on expected distances are
             then valid for any number of tasks; otherwise they are asymptotic. A failed execution counts as this
@@ -122,8 +121,7 @@ def _step(questions: tuple[Question, ...], worst: WorstQuestion, mean: MeanQuest
     """
     executions = worst.executions
     executions.require_possible()
-    left = budget - executions.count
-    if left <= 0:
+    if (left := budget - executions.count) <= 0:
         return False
     of_worst, of_mean = "worst" in questions and bool(worst.undecided), "mean" in questions
     noted = [pair for candidate in executions.candidates for pair in candidate.noted]

@@ -10,7 +10,6 @@ executions so far, whatever rule chose them and whenever the comparison stops.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import combinations, permutations
 
@@ -70,20 +69,17 @@ class WorstQuestion:
                     self._certified(candidate)
                 return False
             expected = self._expected()
-            better, worse = max(
-                pairs, key=lambda pair: expected[pair[1].name][0] / max(expected[pair[0].name][0], 1e-300)
-            )
+            better, worse = max(pairs, key=lambda p: expected[p[1].name][0] / max(expected[p[0].name][0], 1e-300))
             if self._needs_fact(better, worse, expected) and worse.recorder.has_tasks:
                 value, task = expected[worse.name]
-                points = np.array([trial.unit_point for trial in worse.trials])
+                points = np.array([trial.unit_point for trial in worse.recorder.trials])
                 near = NEAR if self.candidates[0].campaign.validation.space.members is None else SAME
                 if task is None or (len(points) and np.abs(points - task).max(axis=1).min() <= near):
                     self._execute(worse, Choice())  # no new task: the choice of the search
                 else:
                     self._execute(worse, Choice(task, "covering"), value)
                 return True
-            rule = IntervalSearch(better.recorder, self.options, self.budget, worse.largest)
-            choice = rule.choose()
+            choice = IntervalSearch(better.recorder, self.options, self.budget, worse.largest).choose()
             if choice is None and self._certified(better):
                 continue
             self._execute(better if better.recorder.has_tasks else worse, choice or Choice())
@@ -121,9 +117,7 @@ class WorstQuestion:
             expected[candidate.name] = (max(value, candidate.largest), task if value > candidate.largest else None)
         return expected
 
-    def _needs_fact(
-        self, better: Candidate, worse: Candidate, expected: Mapping[str, tuple[float, Array | None]]
-    ) -> bool:
+    def _needs_fact(self, better: Candidate, worse: Candidate, expected: dict[str, tuple[float, Array | None]]) -> bool:
         """Return whether the candidate that seems worse is executed, to raise its largest executed distance."""
         count, others = (
             sum(note.question == "worst" and note.shared is None for _, note in candidate.noted)
@@ -137,9 +131,7 @@ class WorstQuestion:
     def _certified(self, better: Candidate) -> bool:
         """Keep all decisions by the certificate of a candidate; return whether there is a new one."""
         new = False
-        for other in [worse for first, worse in self.undecided if first is better]:
-            if other.largest <= max(better.largest, 0.0):
-                continue
+        for other in [worse for first, worse in self.undecided if first is better and worse.largest > better.largest]:
             # Nobody has stated this threshold to the campaign.
             verdict = judge(better.campaign.trials, other.largest, self.options, better.campaign.provenance)
             if verdict.answer == "validated" and verdict.certificate is not None:
@@ -151,8 +143,8 @@ class WorstQuestion:
 
     def _execute(self, candidate: Candidate, choice: Choice, predicted: float | None = None) -> None:
         note = TrialNote(self.executions.steps, "worst", predicted=predicted)
-        rule = IntervalSearch(candidate.recorder, self.options, self.budget)
-        self.executions.execute(candidate, choice, note, predicts=rule.predicts)
+        predicts = IntervalSearch(candidate.recorder, self.options, self.budget).predicts
+        self.executions.execute(candidate, choice, note, predicts=predicts)
 
 
 @dataclass(eq=False)
@@ -177,11 +169,8 @@ class MeanQuestion:
 
     def step(self, left: int) -> bool:
         """Execute the next draw with one candidate; return False if there is nothing to execute."""
-        undecided = [
-            pair
-            for pair in combinations(self.candidates, 2)
-            if not self._difference(*pair).sign and not self._lost(*pair)
-        ]
+        pairs = combinations(self.candidates, 2)
+        undecided = [pair for pair in pairs if not self._difference(*pair).sign and not self._lost(*pair)]
         active = [candidate for candidate in self.candidates if any(candidate in pair for pair in undecided)]
         if not active:
             return False
@@ -222,14 +211,13 @@ class MeanQuestion:
     def _difference(self, a: Candidate, b: Candidate) -> MeanDifference:
         """Return the difference by the draws that both have, up to the first one without a usable distance."""
         first, second = self.draws_of(a), self.draws_of(b)
-        values, predicted = [], []
+        values, predicted, count = [], [], len(self.candidates)
         for draw in sorted(first.keys() & second.keys()):
             x, y = self._measured(*first[draw]), self._measured(*second[draw])
             if x is None or y is None:
                 break
             values.append(x[0] - y[0])
             predicted.append(x[1] - y[1])
-        count = len(self.candidates)
         paired = PairedDifferences(np.array(values), np.array(predicted), self.executions.most)
         return mean_difference(paired, (1 - self.confidence) / (count * (count - 1) / 2))
 

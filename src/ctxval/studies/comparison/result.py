@@ -20,10 +20,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+# What each question is about, and the columns of the tables of candidates and of pairs.
 WORDS: dict[Question, str] = {"worst": "largest distance d*", "mean": "expected distance"}
-"""What each question is about."""
-
-# The columns of the tables of candidates and of pairs.
 CANDIDATES = ("candidate", "executions", "shared", "largest distance", "bound on d*", "draws", "mean distance")
 PAIRS = ("question", "smaller", "than", "difference", "interval", "tasks")
 
@@ -59,8 +57,7 @@ class PairResult:
     second: str
     smaller: str | None  #: the name of the one with the smaller value; None if this is not decided
     reason: str  #: why, or what is missing, in one sentence
-    #: the expected distance of the first minus that of the second, and its confidence sequence
-    estimate: float | None = None
+    estimate: float | None = None  #: the expected distance of the first minus that of the second, and its interval
     low: float | None = None
     high: float | None = None
     tasks: int = 0  #: the number of tasks that both have executed for it
@@ -116,10 +113,7 @@ class Comparison:
         return by_names[question, frozenset((first, second))]
 
     def ranking(self, question: Question) -> tuple[tuple[str, ...], ...]:
-        """Return the candidates from the smallest value to the largest; those that are not told apart are together.
-
-        A candidate stands in an earlier group than another one only if all pairs between the groups are decided.
-        """
+        """Return groups of candidates from the smallest value to the largest; all pairs between groups are decided."""
         smaller = {(pair.smaller, pair.larger) for pair in self.pairs if pair.question == question and pair.smaller}
         wins = {candidate.name: sum(first == candidate.name for first, _ in smaller) for candidate in self.candidates}
         ordered = sorted((candidate.name for candidate in self.candidates), key=lambda name: -wins[name])

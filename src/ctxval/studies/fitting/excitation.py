@@ -55,10 +55,7 @@ def _signal(kind: SignalKind, horizon: int, rng: np.random.Generator) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Excited(ShortRepr):
-    """A controller with a signal ``(H, m)`` added to its inputs, within limits.
-
-    The memory is that of the controller, which does not know of the signal; None if it has none.
-    """
+    """A controller with a signal ``(H, m)`` added to its inputs, within limits; its memory knows no signal."""
 
     controller: Controller
     signal: Array
@@ -75,9 +72,7 @@ class Excited(ShortRepr):
 
 
 class Excitation(ShortRepr):
-    """Executes random tasks of an experiment with a signal that is added to the inputs.
-
-    Run k depends only on the seed and on k.
+    """Executes random tasks of an experiment with a signal added to the inputs. Run k depends only on the seed and k.
 
     Args:
         kind: ``random``, ``multisine`` or ``chirp``; see :func:`excitation`.
@@ -113,10 +108,8 @@ class Excitation(ShortRepr):
         return self.validation.execute(self._excited(number))
 
     def runs(self, numbers: Iterable[int]) -> Iterator[tuple[int, Trajectory | ExecutionError]]:
-        """Execute S once for each number; yield the numbers with the trajectories, or with the errors of failed runs.
-
-        Runs are executed together if batches of the system are exact (``exact_batches``), and are the same as alone.
-        """
+        """Execute S once for each number; yield numbers with the trajectories, or with the errors of failed runs."""
+        # Runs are executed together if batches of the system are exact, and are the same as alone.
         pool, waiting, stopped = SerialPool(self.validation.system), iter(numbers), None
         while stopped is None:
             plans = dict[int, Plan]()
@@ -129,9 +122,8 @@ class Excitation(ShortRepr):
             if not plans:
                 break
             for number, execution in pool.wait():
-                run: Trajectory | ExecutionError
                 try:
-                    run = self.validation.require(plans[number], execution.trajectory)
+                    run: Trajectory | ExecutionError = self.validation.require(plans[number], execution.trajectory)
                 except (ExecutionError, InputError) as error:
                     run = ExecutionError(execution.failed or str(error))
                 yield number, run

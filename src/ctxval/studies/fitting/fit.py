@@ -61,10 +61,7 @@ class FittedModel(ShortRepr):
 
     @property
     def useless(self) -> str | None:
-        """Why the model is no better than no model, in one sentence; None if it is.
-
-        After one step, or after the largest number of steps, its error in a state is at least the recorded change.
-        """
+        """Why the model is no better than no model after one step, or after the largest number; None if it is."""
         ends = [error for error in self.errors if error.steps in (1, self.steps)]
         worst = max(ends, key=lambda error: error.relative, default=None)
         if worst is None or worst.relative < 1:
@@ -85,12 +82,9 @@ class FailedFit(ShortRepr):
 
 @dataclass(frozen=True, eq=False)
 class FitReport(ShortRepr):
-    """Models that were learned from the same recordings, with their errors on the same held-out recordings.
+    """Models that were learned from the same recordings, with their errors on the same held-out recordings."""
 
-    The most accurate model is the first: that with the smallest error after the largest number of steps.
-    """
-
-    fitted: tuple[FittedModel, ...]
+    fitted: tuple[FittedModel, ...]  #: that with the smallest error after the largest number of steps is the first
     failed: tuple[FailedFit, ...]
     learned_from: Recordings
     held_out: Recordings
@@ -149,9 +143,8 @@ def fit(
     fitted, failed = list[FittedModel](), list[FailedFit]()
 
     def add(kind: Kind, model: Model, parameters: tuple[FittedParameter, ...] = ()) -> None:
-        notes = [identifiability(data, [*recordings.states, *recordings.inputs])] if kind == "linear" else []
-        errors = step_errors(model, held_out, sorted(set(steps)))
-        fitted.append(FittedModel(kind, model, errors, parameters, tuple(notes)))
+        notes = (identifiability(data, [*recordings.states, *recordings.inputs]),) if kind == "linear" else ()
+        fitted.append(FittedModel(kind, model, step_errors(model, held_out, sorted(set(steps))), parameters, notes))
 
     with single_threaded():
         # Before anything is learned, because what is named must be usable.
@@ -186,10 +179,7 @@ def learned_model(kind: str, data: Transitions, centres: int, seed: int) -> Mode
 
 
 def split(recordings: Recordings, share: float, seed: int) -> tuple[Recordings, Recordings]:
-    """Return the recordings to learn from, and those that are held out.
-
-    Whole recordings are held out, drawn at random. Of a single recording, the last part is held out.
-    """
+    """Return the recordings to learn from, and those that are held out, drawn at random; of one, the last part is."""
     inside = Must("between 0 and 1", lambda share: 0 < share < 1)
     require("the share that is held out", Annotated[float, inside], share)
     runs = recordings.runs
@@ -198,9 +188,8 @@ def split(recordings: Recordings, share: float, seed: int) -> tuple[Recordings, 
         cut = round((1 - share) * horizon)
         if not 1 <= cut < horizon:
             raise InputError(f"the only recording has {counted(horizon, 'step')}: too few to hold a part out.")
-        first = replace(run, trajectory=part_of(run.trajectory, 0, cut))
-        start = run.start + float(run.trajectory.times[cut])
-        last = replace(run, start=start, trajectory=part_of(run.trajectory, cut, horizon))
+        first, start = replace(run, trajectory=part_of(run.trajectory, 0, cut)), float(run.trajectory.times[cut])
+        last = replace(run, start=run.start + start, trajectory=part_of(run.trajectory, cut, horizon))
         return replace(recordings, runs=(first,)), replace(recordings, runs=(last,))
     count = min(max(1, round(share * len(runs))), len(runs) - 1)
     chosen = np.sort(np.random.default_rng(seed).permutation(len(runs))[:count]).tolist()
@@ -253,8 +242,6 @@ def fit_parameters(
         step: the user's function ``(x, u, theta) -> x_next``.
         bounds: the lower and upper bound of each parameter by name, in the order of theta.
         vectorized: whether ``step`` takes whole batches.
-        confidence: the confidence of each interval.
-        seed: seed of the starting points.
     """
     low, high = as_bounds(bounds)
     some = data[:: max(1, -(-len(data) // 4000))]

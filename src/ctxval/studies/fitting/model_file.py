@@ -18,17 +18,10 @@ from ctxval.models import Corrected, Correction, FeedforwardReLU, GaussianProces
 from ctxval.models.corrected import before_refinement
 from ctxval.models.saved import write_model, write_transitions
 
-SUFFIXES: dict[str, tuple[type, ...]] = {
-    ".npz": (Linear, FeedforwardReLU, GaussianProcessModel, Corrected),
-    ".onnx": (Linear, FeedforwardReLU, GaussianProcessModel, Corrected),
-    ".toml": (Parametric,),
-}
-"""The models that a file of each suffix can hold."""
-
-BESIDE = (".data.npz", ".residual.json", ".residual.txt")
-"""The suffixes of the files that may be written beside a model."""
-
-
+_ARRAYS = (Linear, FeedforwardReLU, GaussianProcessModel, Corrected)
+#: the models that a file of each suffix can hold
+SUFFIXES: dict[str, tuple[type, ...]] = {".npz": _ARRAYS, ".onnx": _ARRAYS, ".toml": (Parametric,)}
+BESIDE = (".data.npz", ".residual.json", ".residual.txt")  #: the suffixes of files that may be written beside a model
 _NO_REFERENCE = "the parameters of a function can only be written with the reference module:attr to it (--step)."
 
 
@@ -134,10 +127,8 @@ def _correction(z: GraphValue, given: Correction) -> GraphValue:
     r2 = pair.squared_distances(given.centres, given.length_scales, 5.0)
     r = r2.node("Sqrt")
     covariances = (r + r2 * np.array([1 / 3]) + np.array([1.0])) * r.node("Neg").node("Exp")
-    kernels, linear = (
-        covariances.affine(given.weights, np.zeros(given.states)),
-        pair.affine(*np.split(given.linear, [-1])),
-    )
+    kernels = covariances.affine(given.weights, np.zeros(given.states))
+    linear = pair.affine(*np.split(given.linear, [-1]))
     limited = (kernels + linear).node("Min", given.limit).node("Max", -given.limit)
     beyond = pair.node("Sub", pair.node("Min", given.high).node("Max", given.low))
     far = beyond.squared_distances(np.zeros((1, len(given.fade))), given.fade, 0.5)

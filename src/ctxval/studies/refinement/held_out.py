@@ -53,9 +53,8 @@ class Records(ShortRepr):
     @property
     def sources(self) -> Rows:
         """The execution of each transition; -1 for the data of the first model."""
-        count = 0 if self.own is None else len(self.own)
-        of = np.repeat(np.arange(len(self.executed)), [run.horizon for run in self.executed])
-        return np.concatenate([np.full(count, -1), of])
+        horizons = [0 if self.own is None else len(self.own), *(run.horizon for run in self.executed)]
+        return np.repeat(np.arange(-1, len(self.executed)), horizons)
 
     def folds(self) -> list[tuple[Records, Records]]:
         """Return pairs of records: those to learn from, and those that are held out.
@@ -89,20 +88,16 @@ class HeldOut(ShortRepr):
     errors: Array  #: those of the learned model and of the first one, shapes ``(N, n)``
     before: Array
     changes: Array  #: the recorded changes of the states in one step, shape ``(N, n)``
-    #: errors after ten steps along held-out executions, of both models, shapes ``(K, n)``. They choose corrections,
-    #: because noise of the records hides in one step what adds up in several.
+    #: errors of both models after ten steps, shapes ``(K, n)``; they choose corrections, because noise hides less there
     later: Array
     later_before: Array
-    #: which transitions are of executions that the model itself had not seen, shape ``(N,)``; the errors on all others
-    #: are of models that were learned without a part of the records. None if there are no new ones.
-    new: Mask | None = None
+    new: Mask | None = None  #: transitions that were new to the model itself, ``(N,)``; None if there are none
 
     @property
     def better(self) -> Mask:
-        """The states whose error became smaller, in the root mean square, shape ``(n,)``.
+        """The states whose root mean square error became smaller, ``(n,)``.
 
-        A correction of the states that are chosen by these errors is also reported with them, so the reported errors
-        are slightly too small. Those of the last round's executions, which chose nothing, are not.
+        Errors that choose states and are also reported are slightly too small; those of the last round choose nothing.
         """
         after, before = self._choosing
         return np.asarray((after**2).mean(axis=0) < (before**2).mean(axis=0))
@@ -198,18 +193,13 @@ class ResidualRegion(ShortRepr):
 
 @dataclass(frozen=True, eq=False)
 class MeasuredResidual(ShortRepr):
-    """The residual ``S(x, u) - M'(x, u)`` of one step, measured on transitions that M' was not learned from.
-
-    It is measured and not guaranteed: another state or input may have a larger one.
-    """
+    """The residual ``S(x, u) - M'(x, u)`` of one step on transitions that are new to M': measured, not guaranteed."""
 
     states: dict[str, str]
     inputs: dict[str, str]
     whole: ResidualRegion  #: the residual in all regions together, whose box is the range of the records
-    #: disjoint regions that cover all states and inputs, those with small residuals first
-    regions: tuple[ResidualRegion, ...]
-    #: the residual of models that were learned without a part of the records, on that part; it is larger if the records
-    #: are few. None if no execution was new to M', so that ``whole`` and the regions are of these.
+    regions: tuple[ResidualRegion, ...]  #: disjoint, covering all states and inputs, those with small residuals first
+    #: that of models learned without a part of the records, on it; None if ``whole`` and the regions are of these
     left_out: ResidualRegion | None = None
 
     @property
@@ -218,9 +208,10 @@ class MeasuredResidual(ShortRepr):
         units = labels_of(self.states)
         rows = [["region", "steps", *(f"{unit}: 95 %" for unit in units), *(f"{unit}: largest" for unit in units)]]
         listed = [(self._where(region), region) for region in self.regions]
-        listed.append(("all records" if self.left_out is None else "all that is new to the model", self.whole))
-        if self.left_out is not None:
-            listed.append(("left out in turn", self.left_out))
+        if self.left_out is None:
+            listed.append(("all records", self.whole))
+        else:
+            listed += [("all that is new to the model", self.whole), ("left out in turn", self.left_out)]
         for where, region in listed:
             sizes = (*region.quantile.tolist(), *region.largest.tolist())
             rows.append([where, str(region.steps), *(f"{value:.3g}" for value in sizes)])
@@ -282,8 +273,7 @@ def measure_residual(held: HeldOut, states: dict[str, str], inputs: dict[str, st
     def whole(rows: Mask) -> ResidualRegion:
         return region(held.errors[rows], held.pairs[rows].min(axis=0), held.pairs[rows].max(axis=0))
 
-    typical = np.maximum(held.changes.std(axis=0), 1e-300)
-    errors = held.errors[counted]
+    typical, errors = np.maximum(held.changes.std(axis=0), 1e-300), held.errors[counted]
     error = np.sqrt(((errors / typical) ** 2).mean(axis=1))
     logs = np.log(np.maximum(error, 1e-12 * max(float(error.max(initial=0.0)), 1e-300)))
     regions = [region(errors[inside], low, high) for inside, low, high in _split(held.pairs[counted], logs)]

@@ -43,33 +43,25 @@ NAMES = ("residual", "causes", *_KINDS, "parameters", "fit")  #: the names of th
 
 @dataclass(frozen=True, eq=False)
 class Learned(ShortRepr):
-    """A model that was learned from records, with its errors on records that were held out.
-
-    ``parameters`` are those of the user's function; there are none for other methods.
-    """
+    """A model that was learned from records, with its errors on records that were held out."""
 
     model: Model
     errors: HeldOut
     notes: tuple[str, ...] = ()
-    parameters: tuple[FittedParameter, ...] = ()
+    parameters: tuple[FittedParameter, ...] = ()  #: those of the user's function; none for other methods
 
 
 class Method(ABC):
-    """A method that learns a model from records. It is a function of the model and the records.
-
-    ``makes`` is the type of the models that it learns; None if it may be any.
-    """
+    """A method that learns a model from records. It is a function of the model and the records."""
 
     name: str
-    makes: type[Model] | None = None
+    makes: type[Model] | None = None  #: the type of the models that it learns; None if it may be any
 
     @abstractmethod
     def learn(self, model: Model, records: Records) -> Learned:
         """Return the model that is learned from records; ``model`` is the first one, which is corrected or replaced.
 
-        Raises:
-            InputError: if the records do not suffice.
-            ModelError: if the learned model is not usable.
+        An InputError says that the records do not suffice; a ModelError, that the learned model is not usable.
         """
 
 
@@ -94,14 +86,12 @@ class ResidualCorrection(ShortRepr, Method):
 
             return held_out(corrected, model, records)
 
-        correction = exact_correction
-        errors = left_by(correction)
+        correction, errors = exact_correction, left_by(exact_correction)
         if errors.left > 0.1:  # much of the error
             averaged = left_by(averaged_correction)
             if averaged.left < errors.left:
                 correction, errors = averaged_correction, averaged
-        better = errors.better
-        whole = correction(model, records)
+        better, whole = errors.better, correction(model, records)
         if whole is None or not better.any():
             raise InputError(
                 "no state can be corrected: on executions that were held out, the residual of the model is not "
@@ -130,9 +120,8 @@ class CauseRepair(ShortRepr, Method):
         if report.repaired is None:
             raise InputError(f"no cause is known that a model could have. {report.sentence}")
         if not report.repaired.complete:
-            raise InputError(
-                f"a step of a model depends on state and input alone, so it cannot have this cause. {report.sentence}"
-            )
+            why = "a step of a model depends on state and input alone, so it cannot have this cause"
+            raise InputError(f"{why}. {report.sentence}")
         return report
 
     def learn(self, model: Model, records: Records) -> Learned:
@@ -189,8 +178,7 @@ class ParameterFit(ShortRepr, _Replacement):
     """New values of the parameters of a user's function ``(x, u, theta) -> x_next``, by least squares."""
 
     bounds: Mapping[str, tuple[float, float]]  #: the bounds of each parameter by name, in the order of theta
-    #: the function; None for that of the first model, which must then be a ``Parametric``
-    step: ParametricStep | None = None
+    step: ParametricStep | None = None  #: the function; None for that of the first model, a ``Parametric``
     vectorized: bool = False  #: whether ``step`` takes whole batches
     name: str = field(default="parameters", init=False)
     makes = Parametric
@@ -199,14 +187,13 @@ class ParameterFit(ShortRepr, _Replacement):
         as_bounds(self.bounds)
 
     def _fit(self, model: Model, data: Transitions) -> tuple[Model, tuple[FittedParameter, ...]]:
-        step, vectorized = self.step, self.vectorized
-        if step is None:
-            if not isinstance(model, Parametric):
-                raise InputError(
-                    "the method 'parameters' needs the function step (--step), because the model is not a Parametric."
-                )
-            step, vectorized = model.function, model.vectorized
-        return fit_parameters(step, self.bounds, data, vectorized=vectorized)
+        if self.step is not None:
+            return fit_parameters(self.step, self.bounds, data, vectorized=self.vectorized)
+        if isinstance(model, Parametric):
+            return fit_parameters(model.function, self.bounds, data, vectorized=model.vectorized)
+        raise InputError(
+            "the method 'parameters' needs the function step (--step), because the model is not a Parametric."
+        )
 
 
 @checked
@@ -249,10 +236,7 @@ def method_of(method: str | Method | Callable[[Transitions], Any], *, seed: int 
 
 
 def exact_correction(model: Model, records: Records) -> Correction | None:
-    """Return the mean of Gaussian processes of the residual, conditioned on transitions that represent the others.
-
-    Returns None if M explains the records.
-    """
+    """Return the mean of Gaussian processes of the residual at representative transitions; None if M explains all."""
     # Matern 5/2 that does not grow with the inputs.
     settings = PosteriorSettings(hyperparameters=1, centres=_CENTRES, families=((2.5, 0.0),), of_steps=False)
     posterior = learn_posterior(model, records.transitions, records.sources, settings=settings)
@@ -272,20 +256,14 @@ def exact_correction(model: Model, records: Records) -> Correction | None:
 
 
 def averaged_correction(model: Model, records: Records) -> Correction | None:
-    """Return the mean of a Gaussian process of low rank, conditioned on all transitions, which averages their noise.
-
-    Returns None if M explains the records, or if their numbers are too large.
-    """
+    """Return the mean of a Gaussian process of low rank, which averages noise; None if there is none."""
     runs = [Record(run.states, run.inputs, run.states[0]) for run in records.executed]
     if records.own is not None:
         of_model = records.own[:: max(1, len(records.own) // 50_000)]  # of more, only a part is averaged
-        runs += [
-            Record(np.stack([x, after]), u[None], x)
-            for x, u, after in zip(of_model.x, of_model.u, of_model.x_next, strict=True)
-        ]
+        steps = zip(of_model.x, of_model.u, of_model.x_next, strict=True)
+        runs += [Record(np.stack([x, after]), u[None], x) for x, u, after in steps]
     data = records.transitions
-    k = data.x.shape[1] + data.u.shape[1]
-    fit = None
+    k, fit = data.x.shape[1] + data.u.shape[1], None
     # Numbers may not be finite.
     with suppress(np.linalg.LinAlgError, ValueError), single_threaded(), np.errstate(all="ignore"):
         sizes = np.sqrt(((data.x_next - model.step(data.x, data.u)) ** 2).mean(axis=0))

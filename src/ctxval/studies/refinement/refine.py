@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import functools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -36,9 +36,6 @@ from ctxval.studies.refinement.held_out import Records, measure_residual
 from ctxval.studies.refinement.methods import Learned, Method, method_of
 from ctxval.studies.refinement.rounds import Refinement, Round, SameControllers
 
-OpensRound = Callable[[Validation, Path, Path, CertificateOptions], Campaign]
-"""A function that makes the campaign of a round, from its validation, its store, the file of its model and options."""
-
 
 @checked
 def refine(
@@ -49,7 +46,7 @@ def refine(
     method: str | Method | Callable[[Transitions], Model | Step] = "residual",
     certificate: CertificateOptions | None = None,
     on_trial: Callable[[Trial], None] | None = None,
-    open_round: OpensRound | None = None,
+    open_round: Callable[[Validation, Path, Path, CertificateOptions], Campaign] | None = None,
     progress: bool | None = None,
     **execution: Any,
 ) -> Refinement:
@@ -73,7 +70,8 @@ def refine(
             function ``fit(data) -> model`` that always returns the same model for the same data.
         certificate: the kind and options of the certificates, with the confidence ``1 - alpha``; ``auto`` by default.
         on_trial: called with each trial that has ended.
-        open_round: makes the campaign of a round whose model and store are files; by default, like the given campaign.
+        open_round: makes the campaign of a round from its validation, its store, the file of its model and its options,
+            if the store and the model are files; by default, it is like the given campaign.
         progress: whether to show the progress on standard error; None to show it at a terminal and in a notebook.
         execution: ``workers``, ``executor`` and ``timeout`` of :meth:`ctxval.Campaign.run`.
     """
@@ -83,16 +81,9 @@ def refine(
             "more."
         )
     chosen, options = method_of(method, seed=campaign.seed), certificate or CertificateOptions()
-
-    def opened(validation: Validation, store: Path | None, file: Path | None, options: CertificateOptions) -> Campaign:
-        if open_round is not None and store is not None and file is not None:
-            return open_round(validation, store, file, options)
-        search = copy.deepcopy(campaign.search)
-        return Campaign(validation, search=search, store=store, seed=campaign.seed, name=campaign.name)
-
     execution |= {"on_trial": on_trial, "progress": progress}
     with progress_shown(progress):
-        return _Loop(campaign, float(threshold), budget, chosen, options, opened, execution).run()
+        return _Loop(campaign, float(threshold), budget, chosen, options, open_round, execution).run()
 
 
 @dataclass(eq=False)
@@ -104,7 +95,7 @@ class _Loop:
     budget: int
     method: Method
     options: CertificateOptions
-    open_round: Callable[[Validation, Path | None, Path | None, CertificateOptions], Campaign]
+    open_round: Callable[[Validation, Path, Path, CertificateOptions], Campaign] | None
     execution: dict[str, Any]
 
     def __post_init__(self) -> None:
@@ -136,18 +127,14 @@ class _Loop:
                 learned = self._learned(last.number)
             except CtxvalError:  # the file of the model is there, but its executions are not
                 return refinement
-            before = len(list(self._executed(self.rounds[:-1])))
+            before = len(self._executed(self.rounds[:-1]))
             executed = self._with_states(self.rounds, judged=before)[before:]
             errors = learned.errors.with_executions(last.model, self._base, executed)
         n = errors.errors.shape[1]
         states, inputs = self._of_states.names(n, errors.pairs.shape[1] - n)
         rms = zip(errors.rms_before.tolist(), errors.rms.tolist(), strict=True)
-        return replace(
-            refinement,
-            residual=measure_residual(errors, states, inputs),
-            accuracy=dict(zip(states, rms, strict=False)),
-            parameters=learned.parameters,
-        )
+        residual, accuracy = measure_residual(errors, states, inputs), dict(zip(states, rms, strict=False))
+        return replace(refinement, residual=residual, accuracy=accuracy, parameters=learned.parameters)
 
     def _judged(self, campaign: Campaign, options: CertificateOptions) -> Verdict:
         """Execute tasks of a campaign until it is decided or the budget ends; people execute theirs themselves."""
@@ -161,8 +148,7 @@ class _Loop:
         """Return why there is no further round; None if there is one."""
         last = self.rounds[-1]
         if last.verdict.answer == "validated":
-            which = "the given model" if not last.number else f"the model of round {last.number}"
-            return f"{which} is validated"
+            return f"{f'the model of round {last.number}' if last.number else 'the given model'} is validated"
         if last.verdict.answer == "undecided":
             if getattr(last.campaign.validation.system, "manual", False):
                 return (
@@ -195,13 +181,18 @@ class _Loop:
                     raise
                 return f"no better model can be learned: {str(error).removesuffix('.')}"
         validation = self.first.validation.with_parts(model=model)
-        same = same_controllers(validation, list(self._executed(self.rounds)))
+        same = same_controllers(validation, self._executed(self.rounds))
         if same.worst is not None and same.worst > self.threshold:
             return (
                 f"the model that round {number} would learn has the distance {same.worst:.4g} on a task that it has "
                 "learned from, with the controller that was executed: another method is needed"
             )
-        campaign = self.open_round(validation, self._beside(number, ".sqlite"), file, options)
+        store, first = self._beside(number, ".sqlite"), self.first
+        if self.open_round is not None and store is not None and file is not None:
+            campaign = self.open_round(validation, store, file, options)
+        else:
+            search = copy.deepcopy(first.search)
+            campaign = Campaign(validation, search=search, store=store, seed=first.seed, name=first.name)
         verdict, name = self._judged(campaign, options), self.method.name
         self.rounds.append(Round(number, name, campaign, verdict, confidence, len(model.data), file, notes, same))
         return None
@@ -219,9 +210,8 @@ class _Loop:
         # What a resumed refinement reads is what this one uses, to the last bit.
         return Refined(read_refined(file, self._base), refined.data, self._base), notes, file
 
-    def _executed(self, rounds: list[Round]) -> Iterator[tuple[Trial, Trajectory]]:
-        for item in rounds:
-            yield from executed_trials(item.campaign.store, item.campaign.trials)
+    def _executed(self, rounds: list[Round]) -> list[tuple[Trial, Trajectory]]:
+        return [each for item in rounds for each in executed_trials(item.campaign.store, item.campaign.trials)]
 
     def _learned(self, number: int) -> Learned:
         """Return what the rounds before a number teach; the result needs it after the round, too."""
@@ -233,10 +223,7 @@ class _Loop:
         return Records.of(self.first.validation.model, self._with_states(self.rounds[:before]))
 
     def _with_states(self, rounds: list[Round], judged: int | None = None) -> list[Trajectory]:
-        """Return the executions of some rounds; if outputs are recorded, with estimated states of M.
-
-        The first ``judged`` executions choose how they are estimated, by default all.
-        """
+        """Return executions; with states of M, estimated as the first ``judged`` choose, if outputs are recorded."""
         executed = [(trial.unit_point, trajectory) for trial, trajectory in self._executed(rounds)]
         if self.first.validation.outputs is None:
             return [trajectory for _, trajectory in executed]
@@ -259,10 +246,7 @@ class _Loop:
 
 
 def confidence_of_round(confidence: float, number: int) -> float:
-    """Return the confidence with which the k-th refined model is judged, ``1 - alpha / (k (k + 1))``.
-
-    The shares sum up to alpha, so all rounds together are wrong with probability at most alpha.
-    """
+    """Return the confidence with which the k-th refined model is judged; the shares of all k sum up to alpha."""
     return 1 - (1 - confidence) / (number * (number + 1))
 
 
@@ -277,7 +261,7 @@ def with_best_jacobian(validation: Validation, refined: Refined) -> tuple[Refine
     tasks have a clearly smaller cost on M' with it. Nothing is executed.
     """
     model = refined.model
-    if not isinstance(model, Corrected) or not isinstance(model.model, Linear):
+    if not (isinstance(model, Corrected) and isinstance(model.model, Linear)):
         return refined, None
     if not _linearises_once(validation, model.model):
         return refined, None

@@ -47,8 +47,7 @@ class Round(ShortRepr):
     learned_from: int = 0  #: number of transitions that the model was learned from
     model_file: Path | None = None
     notes: tuple[str, ...] = ()  #: sentences on the model
-    #: executed tasks of earlier rounds whose controllers have not changed
-    unchanged: SameControllers = field(default_factory=SameControllers)
+    unchanged: SameControllers = field(default_factory=SameControllers)  #: executed tasks with the same controllers
 
     @property
     def model(self) -> Model:
@@ -110,8 +109,7 @@ class Refinement:
     residual: MeasuredResidual | None = None  #: the measured residual of the last model; None if no model was learned
     #: the one-step errors on held-out executions, before and after, for each state
     accuracy: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    #: the parameters of the user's function in the last model; none for other methods
-    parameters: tuple[FittedParameter, ...] = ()
+    parameters: tuple[FittedParameter, ...] = ()  #: those of the user's function in the last model; else none
     units: str = ""
 
     @property
@@ -208,8 +206,5 @@ def write_refined(path: str | Path, refinement: Refinement, step: str | None = N
         "at least these disturbances."
     )
     described = json.dumps(describe(about, 12), indent=1, allow_nan=False)
-    return [
-        *written,
-        str(write_text(target.with_suffix(".residual.json"), f"{described}\n")),
-        str(write_text(target.with_suffix(".residual.txt"), f"{refinement.residual.text}\n\n{remark}\n")),
-    ]
+    beside = {".residual.json": f"{described}\n", ".residual.txt": f"{refinement.residual.text}\n\n{remark}\n"}
+    return [*written, *(str(write_text(target.with_suffix(suffix), text)) for suffix, text in beside.items())]

@@ -23,15 +23,13 @@ class StepError(ShortRepr):
     state: str
     unit: str
     steps: int
-    #: root mean square of the error; ``lowest`` and ``highest`` are the smallest and largest over the recordings
-    rms: float
+    rms: float  #: root mean square of the error, and its smallest and largest value over the recordings
     lowest: float
     highest: float
     median: float  #: median, 0.95 quantile and maximum of the magnitude of the error
     upper: float
     largest: float
-    #: root mean square of the recorded change of the state, which is the error of a model that predicts none
-    change: float
+    change: float  #: root mean square of the recorded change, which is the error of a model that predicts none
     count: int  #: number of predictions, and the share that diverged, which is left out of the numbers above
     diverged: float
 
@@ -50,8 +48,7 @@ class Region(ShortRepr):
     low: float
     high: float
     count: int
-    #: root mean square over the states of the one-step error, as a share of the typical change of each state
-    error: float
+    error: float  #: root mean square over the states of the one-step error, as a share of their typical changes
     ratio: float  #: this error, divided by that over all steps
 
 
@@ -67,14 +64,12 @@ class Windows:
 
     @staticmethod
     def of(recorded: Recordings | Sequence[Trajectory], before: int, after: int, most: int = 40_000) -> Windows:
-        """Return places with so many recorded steps before and after them; of too many, every second, third, ...
-
-        If there is only one recording, it is divided into five parts of equal length.
-        """
+        """Return places with so many recorded steps before and after them; of too many, every second, third, ..."""
         runs = [run.trajectory for run in recorded.runs] if isinstance(recorded, Recordings) else recorded
         parts, first = [], 0
         for number, run in enumerate(runs):
             at = np.arange(before, run.horizon - after + 1)
+            # A single recording is divided into five parts of equal length.
             group = np.full(len(at), number) if len(runs) > 1 else (5 * at) // (run.horizon + 1)
             parts.append((first + number + at, first + at, group))
             first += run.horizon
@@ -104,10 +99,7 @@ class Windows:
 
 
 def predicted(model: Model, where: Windows, steps: int) -> tuple[Array, Array]:
-    """Return predicted minus recorded states after a number of steps, and the recorded changes, both ``(N, n)``.
-
-    The predictions start at recorded states and have the recorded inputs; they are not finite if the model diverges.
-    """
+    """Return predicted minus recorded states after a number of steps, and the recorded changes, both ``(N, n)``."""
     x = start = where.states()
     for k in range(steps):
         x = stepped(model, x, where.inputs(k))
@@ -132,10 +124,7 @@ def stepped(model: Model, x: Array, u: Array) -> Array:
 
 
 def squared(errors: Array, sizes: Array) -> Array:
-    """Return the mean over the states of squared errors in units of sizes, ``(N,)``; large if it is not finite.
-
-    A state of the size 0, which never changes, does not count.
-    """
+    """Return the mean over states of squared errors in units of sizes, 0 for size 0, ``(N,)``; large if not finite."""
     with np.errstate(all="ignore"):
         squares = ((errors / np.where(sizes > 0, sizes, np.inf)) ** 2).mean(axis=1)
         return np.asarray(np.nan_to_num(squares, nan=1e12, posinf=1e12).clip(max=1e12))
@@ -174,10 +163,7 @@ def step_errors(model: Model, recordings: Recordings, steps: Sequence[int]) -> t
 
 
 def normalised(errors: Array, changes: Array) -> Array:
-    """Return errors as shares of the typical change of each state, the root mean square over the states, ``(N,)``.
-
-    States that never change are left out.
-    """
+    """Return errors as shares of typical changes, the root mean square over the states that change, ``(N,)``."""
     sizes = changes.std(axis=0)
     moving = sizes > 1e-12 * max(float(sizes.max(initial=0.0)), 1e-300)
     if not moving.any():

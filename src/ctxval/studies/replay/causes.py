@@ -1,7 +1,5 @@
 """Causes of the error of a model: what state and input explain of it, mistakes of timing, and faults of recordings.
 
-A change of timing is suggested only if the errors on recordings that did not choose it clearly fall.
-
 A fault (an angle that jumps by a turn, a frozen sensor, a spike, an odd file) is found in the recordings alone. Its
 share is that of the model's squared one-step error that lies in the steps concerned, so it explains the error only if
 the share is large. A file that differs from all others is named in any case, because a model that was learned from it
@@ -40,10 +38,8 @@ class ResidualShare(ShortRepr):
     unit: str
     rms: float  #: root mean square of the residual
     linear: float  #: share of its mean square that an affine function of state and input explains; at least 0
-    #: share that a Gaussian process of state and input explains, or the affine function if that is more; at least 0
-    explained: float
-    #: share of the rest that the previous state, input and residual explain; at least 0. If it is large, the system has
-    #: a state that is not recorded, or a delay.
+    explained: float  #: share that a Gaussian process explains, or the affine function if that is more; at least 0
+    #: share of the rest that the previous step explains, at least 0; if it is large, a state is missing, or a delay
     history: float
     rest: float  #: root mean square of what state and input do not explain
 
@@ -121,10 +117,8 @@ class Suggestion(ShortRepr):
 
 
 def suggestions(model: Model, recordings: Recordings) -> tuple[Suggestion, ...]:
-    """Return the change of timing with which the model predicts held-out recordings clearly better, if there is one.
-
-    Of two, only the better one is returned, because one mistake can look like another one.
-    """
+    """Return the change of timing with which the model predicts held-out recordings clearly better, if there is one."""
+    # Of two, only the better one, because one mistake can look like another one.
     changes = filter(None, (_time_step(model, recordings), _delay(model, recordings)))
     return tuple(sorted(changes, key=lambda change: change.ratio)[:1])
 
@@ -184,11 +178,10 @@ def _time_step(model: Model, recordings: Recordings) -> Suggestion | None:
 
     def errors(of_model: int, steps: int) -> Array:
         """Return squared errors if so many steps of the model and of the recordings take the same time."""
-        x = start = where.states()
-        held = np.mean([where.inputs(k) for k in range(steps)], axis=0)
+        x, held = where.states(), np.mean([where.inputs(k) for k in range(steps)], axis=0)
         for _ in range(of_model):
             x = stepped(model, x, held)
-        return squared(x - where.states(steps), np.sqrt(((where.states(steps) - start) ** 2).mean(axis=0)))
+        return squared(x - where.states(steps), np.sqrt(((where.states(steps) - where.states()) ** 2).mean(axis=0)))
 
     known: dict[float, Array] = {1.0: errors(1, 1)}
     for k in multiples:
@@ -221,16 +214,10 @@ def _affine_errors(x: Array, u: Array, reached: Array, groups: Rows) -> Array:
 def _chosen(
     errors: Mapping[float, Array], groups: Rows, usual: float, clear: float, alike: float
 ) -> tuple[float, float] | None:
-    """Return the value that two halves of the recordings choose alike, and its held-out ratio.
+    """Return the value that two halves of the recordings choose alike, and the ratio of its errors to the usual ones.
 
-    Returns None unless the error clearly falls, in most recordings.
-
-    Args:
-        errors: the squared errors of each value, shape ``(N,)``.
-        groups: the part of the recordings in which each error lies.
-        usual: the value without a change.
-        clear: largest ratio of the errors with and without a change.
-        alike: largest difference between the values that two halves of the recordings choose.
+    Each value has squared errors ``(N,)`` in groups. Returns None unless the ratio is at most ``clear``, errors fall in
+    most recordings, and the values that the halves choose differ by at most ``alike``.
     """
     known = np.unique(groups)
     if len(known) < 2:
@@ -350,10 +337,7 @@ def _spikes(columns: Sequence[Array]) -> list[Mask]:
 
 
 def _files(runs: Sequence[Recording], shares: Mapping[int, float]) -> Iterator[Fault]:
-    """Yield the file that differs from all others: an affine model of these errs far more in it than in them.
-
-    The shares are those of runs in the model's error.
-    """
+    """Yield the file that differs from all others: an affine model of these errs far more in it than in them."""
     of = {source: [k for k, run in enumerate(runs) if run.source == source] for source in (run.source for run in runs)}
     if len(of) < 3:
         return
@@ -374,16 +358,14 @@ def _files(runs: Sequence[Recording], shares: Mapping[int, float]) -> Iterator[F
 
 
 def _affine_ratio(rest: Sequence[Trajectory], others: Sequence[Trajectory]) -> tuple[float, float]:
-    """Return how much more an affine model of some runs errs in others, and this error as a share of their change.
-
-    It is the smaller one of the ratio of medians and that of root mean squares: a part of a file with another fault
-    does not make it another file, nor does a file in which more moves.
-    """
+    """Return how much more an affine model of some runs errs in others, and this error as a share of their change."""
     Z, changes = _regression(rest)
     weights = np.linalg.lstsq(Z, changes, rcond=1e-10)[0]
     inside = np.abs(Z @ weights - changes)
     Z, changes = _regression(others)
     outside, size = np.abs(Z @ weights - changes), np.sqrt((changes**2).mean(axis=0))
+    # The smaller one of two ratios: a part of a file with another fault does not make it another file, nor does a file
+    # in which more moves.
     ratios, shares = [], []
     for of in (lambda errors: np.median(errors, axis=0), lambda errors: np.sqrt((errors**2).mean(axis=0))):
         ratios.append(of(outside) / np.maximum(of(inside), 1e-300))

@@ -37,9 +37,7 @@ class PredictedTask(ShortRepr):
     median: float  #: median, 0.05 and 0.95 quantile of the distance over posterior samples of the dynamics
     low: float
     high: float
-    #: for a proposed execution, the share of the variance of the distances of likely worst tasks that it and those
-    #: before it resolve; None for others
-    resolved: float | None = None
+    resolved: float | None = None  #: share of the variance of worst tasks that it and proposals before it resolve
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,21 +50,15 @@ class PredictedTasks(ShortRepr):
     executions: tuple[PredictedTask, ...]  #: the executions that would tell most of the largest distance, in this order
     draws: int  #: number of posterior samples of the dynamics
     unplanned: float  #: share of the tasks for which no controller can be designed, or on which the model diverges
-    #: how far the closed loops of the tasks lead beyond all records of one state or input, as a share of the range that
-    #: they visit, and the index of this state or input; states come before inputs
+    #: how far closed loops lead beyond all records of a state or input, as a share of their range, and its index
     beyond: float
     beyond_of: int
 
 
-def predicted_tasks(
-    validation: Validation, recorded: Sequence[Trajectory], *, executions: int = 10, seed: int = 0
-) -> PredictedTasks | None:
-    """Return what recordings predict of the tasks of an experiment; S is never executed.
-
-    Returns None if the model explains the recordings, or if no task can be planned.
-    """
+def predicted_tasks(validation: Validation, runs: list[Trajectory], count: int, seed: int) -> PredictedTasks | None:
+    """Return what recordings predict of tasks; None if the model explains them, or if no task can be planned."""
     study = DynamicsStudy(validation, seed)
-    learned = study.learn([], recorded)
+    learned = study.learn([], runs)
     if learned is None:
         return None
     with single_threaded():
@@ -90,8 +82,8 @@ def predicted_tasks(
     # A share of the diagonal of the cube.
     apart = order[separated_rows(points[order], 0.02 * np.sqrt(points.shape[1]), len(points))]
     points, drawn = points[apart], drawn[:, apart]
-    chosen, resolved = _informative(drawn, executions)
-    maxima, space = worst.maxima, validation.space
+    chosen, resolved = _informative(drawn, count)
+    maxima, space, beyond = worst.maxima, validation.space, learned.coverage.beyond
 
     def predicted(row: int, share: float | None = None) -> PredictedTask:
         low, median, high = np.quantile(drawn[:, row], [0.05, 0.5, 0.95]).tolist()
@@ -104,17 +96,16 @@ def predicted_tasks(
         tuple(map(predicted, chosen.tolist(), resolved.tolist())),
         len(maxima),
         worst.unplanned,
-        learned.coverage.beyond.size,
-        learned.labels.index(learned.coverage.beyond.coordinates[0]),
+        beyond.size,
+        learned.labels.index(beyond.coordinates[0]),
     )
 
 
 def _informative(drawn: Array, count: int) -> tuple[Rows, Array]:
-    """Return the tasks whose execution tells most of the worst tasks, one after the other.
+    """Return the tasks whose execution tells most of the worst tasks, and the share that they resolve, one by one.
 
     The distances of tasks are taken as jointly normal, with the covariance of the draws. The weight of a task is the
-    share of the draws in which it is worst. Each choice resolves the largest part of the weighted variance that those
-    before it leave.
+    share of the draws in which it is worst. Each choice resolves the largest part of the weighted variance left.
     """
     C = np.cov(drawn, rowvar=False).reshape(drawn.shape[1], -1)
     worst = np.bincount(drawn.argmax(axis=1), minlength=drawn.shape[1]) / len(drawn)
@@ -144,9 +135,7 @@ class RecordedData(ShortRepr):
     inputs: dict[str, str]
     breaks: tuple[Break, ...]  #: where logs were split and why, and sentences on how they were read
     notes: tuple[str, ...]
-    #: number of recordings that are in the data from which the model was learned. They are left out of the errors,
-    #: unless all recordings are.
-    seen: int
+    seen: int  #: number of those from which the model was learned; left out of the errors, unless all are
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,9 +148,7 @@ class ReplayReport(ShortRepr):
     residuals: tuple[ResidualShare, ...]  #: how much of the one-step residual of each state can be explained
     suggestions: tuple[Suggestion, ...]  #: changes of timing, and faults of the recordings, that explain errors
     faults: tuple[Fault, ...]
-    #: what the recordings predict of the tasks of an experiment; None without an experiment, or if the recordings teach
-    #: nothing
-    tasks: PredictedTasks | None
+    tasks: PredictedTasks | None  #: None without an experiment, or if the recordings teach nothing
     insights: tuple[str, ...]  #: what follows, in sentences, the most important one first
 
     def to_json(self) -> dict[str, Any]:
@@ -216,11 +203,10 @@ def replay(
     tasks = None
     if validation is not None:
         logged = [run.trajectory for run in recordings.runs]
-        tasks = predicted_tasks(validation, logged, executions=executions, seed=seed)
-    sources = tuple(dict.fromkeys(run.source for run in recordings.runs))
-    names = recordings.states, recordings.inputs
-    counts = len(recordings.runs), recordings.steps, recordings.dt
-    data = RecordedData(sources, *counts, *names, recordings.breaks, recordings.notes, counts[0] - len(new))
+        tasks = predicted_tasks(validation, logged, executions, seed)
+    sources, count = tuple(dict.fromkeys(run.source for run in recordings.runs)), len(recordings.runs)
+    about = recordings.steps, recordings.dt, recordings.states, recordings.inputs, recordings.breaks, recordings.notes
+    data = RecordedData(sources, count, *about, count - len(new))
     report = ReplayReport(data, errors, where, residuals, changes, wrong, tasks, ())
     sentences = [*_insights(report, len(used)), *_insights_of_tasks(report)]
     if validation is not None and tasks is None:
@@ -237,8 +223,7 @@ def unseen(model: Model, recordings: Recordings) -> list[int]:
     if not isinstance(data, Transitions) or (data.x.shape[1], data.u.shape[1]) != sizes:
         return list(range(len(recordings.runs)))
 
-    def rows(transitions: Transitions) -> list[bytes]:
-        """Return transitions as texts that agree if the numbers agree to single precision."""
+    def rows(transitions: Transitions) -> list[bytes]:  # equal if the numbers agree to single precision
         whole = np.concatenate([transitions.x, transitions.u, transitions.x_next], axis=1)
         return [row.tobytes() for row in (whole.astype(np.float32) + np.float32(0.0))]
 

@@ -54,30 +54,23 @@ class SafetyReport(ShortRepr):
 
     spec: Any  #: the specification
     margin: float | None  #: the robustness of M that was asked for; None if it was to be found
-    #: whether every task with a larger one is safe, ``validated``, ``falsified`` or ``undecided``; None if no margin
-    #: was asked for
-    answer: Answer | None
+    answer: Answer | None  #: whether every task with a larger one is safe; None if no margin was asked for
     reason: str | None  #: why
     d_a: float  #: the largest executed deviation of the states that the specification looks at
-    #: what the learned dynamics bound it by; no prediction of it was tested. None if it is not known.
-    d_a_bound: float | None
+    d_a_bound: float | None  #: by the learned dynamics, whose prediction of it was not tested; None if not known
     d_b: float  #: the largest executed rho_M of a task that S violates; 0 if there is none
     d_b_bound: float | None  #: the certified bound; None if there is none
-    #: the executed tasks that M satisfies and S violates, the largest rho_M first
-    counterexamples: tuple[UnsafeTask, ...]
+    counterexamples: tuple[UnsafeTask, ...]  #: executed tasks that M satisfies and S violates, the largest rho_M first
     certificate: Certificate | None  #: the certificate of the bound; None if there is none
     doubt: str | None  #: why there is no bound; None if there is one
     tasks: int  #: number of drawn tasks, on M alone, that the shares are of
     share_satisfied: float  #: the share of the tasks that M satisfies
     share_certified: float | None  #: the share whose rho_M exceeds the bound of d_b; None if there is none
-    #: the share whose rho_M exceeds the bound of d_a; None if there is none, or if an execution failed
-    share_by_deviation: float | None
+    share_by_deviation: float | None  #: the same for the bound of d_a; None also if an execution failed
     #: the specification whose sets to avoid have grown, and whose set to reach has shrunk, by the bound; None if there
     #: is no bound, no sets, or nothing left of the set to reach
     tightened: ReachAvoid | None
-    #: how far S moved at most between two recorded times of an execution, in the states that the specification looks
-    #: at: what happens there is not seen
-    between: float
+    between: float  #: how far S moved at most between two recorded times, in the states that the specification looks at
     executions: int  #: the number of executions of S
     confidence: float  #: the confidence of the certificate
     units: str  #: the unit of all distances
@@ -130,10 +123,7 @@ def judged_by(experiment: Experiment, distance: UnsafeMargin) -> Experiment:
 
 
 def require_safe_tasks(validation: Validation) -> float:
-    """Return the share of drawn tasks that M satisfies with the margin; S is not executed.
-
-    An InputError says that there is none, so that nothing could be certified.
-    """
+    """Return the share of drawn tasks that M satisfies with the margin; an InputError says that there is none."""
     distance, planner, space = spec_distance(validation), LoopPlanner(validation), validation.space
     plan = validation.plan(0.5 * (space.low + space.high))
     distance.spec.robustness(plan.model_trajectory, plan.task)  # refuses sets of other dimensions
@@ -173,8 +163,8 @@ def assess(
     with progress_shown(progress):
         runs = executed_trials(campaign.store, campaign.trials)
         executed = [_compared(campaign, trial, system) for trial, system in runs]
-        unsafe = [task for task, _ in executed if task.on_system <= 0 < task.on_model]
-        unsafe.sort(key=lambda task: -task.on_model)
+        violated = (task for task, _ in executed if task.on_system <= 0 < task.on_model)
+        unsafe = sorted(violated, key=lambda task: -task.on_model)
         verdict = None if margin is None else campaign.verdict(margin, certificate=options)
         certified, doubt = None if verdict is None else verdict.certificate, None
         if verdict is None:
@@ -195,10 +185,9 @@ def assess(
             doubt = certified.doubt or "the certificate leaves out a share of the tasks"
         with stage("predicting the largest deviation", unit="closed loops"):
             of_deviation = _deviation_bound(campaign, spec, options.confidence)
-        planner = LoopPlanner(validation)
-        count = tasks if planner.batched else max(tasks // 10, 1)
-        unit = space.members
+        planner, unit = LoopPlanner(validation), space.members
         if unit is None:
+            count = tasks if planner.batched else max(tasks // 10, 1)
             unit = space.unit_draws(count, np.random.default_rng([campaign.seed, 2]))
         with stage("running tasks on the model", len(unit), "tasks"):
             rho = on_model(planner, spec, unit)
@@ -210,9 +199,10 @@ def assess(
             "draw tasks with an audit"
         )
     deviation = max((moved for _, moved in executed), default=0.0)
+    of_deviation = None if of_deviation is None else max(of_deviation, deviation)
     by_deviation = None  # a failed execution has deviations that nobody knows
     if of_deviation is not None and not campaign.failed:
-        by_deviation = float((rho > max(of_deviation, deviation)).mean())
+        by_deviation = float((rho > of_deviation).mean())
     looked_at = [selected(system.states, getattr(spec, "components", None)) for _, system in runs]
     between = max((float(np.linalg.norm(np.diff(x, axis=0), axis=-1).max()) for x in looked_at), default=0.0)
     tightened = None
@@ -225,7 +215,7 @@ def assess(
         answer=None if verdict is None else verdict.answer,
         reason=None if verdict is None else verdict.reason,
         d_a=deviation,
-        d_a_bound=of_deviation if of_deviation is None else max(of_deviation, deviation),
+        d_a_bound=of_deviation,
         d_b=max((task.on_model for task in unsafe), default=0.0),
         d_b_bound=bound,
         counterexamples=tuple(unsafe),

@@ -63,16 +63,13 @@ def on_model(planner: LoopPlanner, spec: Specification, unit: Array) -> Array:
 
 @dataclass(frozen=True)
 class DrawnTasks(ShortRepr):
-    """What independent draws show of the tasks that M satisfies with a robustness above a margin.
+    """What independent draws show of the tasks that M satisfies with a margin; nothing is assumed of the dynamics."""
 
-    Nothing is assumed of the dynamics, and a failed execution counts as unsafe.
-    """
-
-    margin: float  #: the margin
+    margin: float
     draws: int  #: number of executed draws
-    unsafe: int  #: number of those that S violates
+    unsafe: int  #: number of those that S violates, or whose execution failed
     share: float  #: with the confidence, at most this share of these tasks is unsafe (Clopper and Pearson 1934)
-    confidence: float  #: the confidence
+    confidence: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,13 +132,9 @@ def draw_tasks(
     spec = spec_distance(validation).spec
     sampler = TasksWithMargin(LoopPlanner(validation), validation.space, spec, float(margin))
     sampler(np.random.default_rng(0), 1)  # refuses a margin that no task has
-    drawn = Campaign(
-        validation.with_parts(space=validation.space.sampled(sampler), distance=UnsafeMargin(spec)),
-        search=by_name("random"),
-        store=Store(store),
-        seed=campaign.seed,
-        name=campaign.name,
-    )
+    of_margin = validation.with_parts(space=validation.space.sampled(sampler), distance=UnsafeMargin(spec))
+    search = by_name("random")
+    drawn = Campaign(of_margin, search=search, store=Store(store), seed=campaign.seed, name=campaign.name)
     drawn.audit(draws, progress=progress)
     trials = drawn.trials[:draws]
     unsafe = len([trial for trial in trials if trial.state == "failed"])
@@ -183,10 +176,9 @@ class Disturbance(ShortRepr):
 def largest_residuals(model: Model, runs: Sequence[Trajectory]) -> Array:
     """Return the largest residual of one step of each state in each run, ``(N, n)``; infinity where M is not finite."""
     with np.errstate(all="ignore"):
-        residuals = [
-            np.abs(run.states[1:] - np.asarray(model.step(run.states[:-1], run.inputs))).max(axis=0) for run in runs
-        ]
-    return np.asarray(np.nan_to_num(np.array(residuals), nan=np.inf, posinf=np.inf))
+        errors = [run.states[1:] - np.asarray(model.step(run.states[:-1], run.inputs)) for run in runs]
+        residuals = np.array([np.abs(each).max(axis=0) for each in errors])
+    return np.asarray(np.nan_to_num(residuals, nan=np.inf, posinf=np.inf))
 
 
 @checked
@@ -266,10 +258,7 @@ class Tube(ShortRepr):
         return np.array([float((np.abs(c @ each) @ self.half_widths).sum()) for each in _transitions(self.loops)])
 
     def tightened(self, limits: LimitsLike, of: str = "states") -> Limits:
-        """Return limits of the ``states`` or ``inputs`` of M that keep those of S within given limits.
-
-        An InputError says that nothing is left between them.
-        """
+        """Return limits of ``states`` or ``inputs`` of M that keep those of S within limits; refuse empty ones."""
         if of not in ("states", "inputs"):
             raise InputError(f"of must be 'states' or 'inputs', got {of!r}.")
         widths = (self.states if of == "states" else self.inputs).max(axis=0, initial=0.0)
@@ -287,9 +276,8 @@ class Tube(ShortRepr):
 @checked
 def tube(A: Any, B: Any, gains: Any, half_widths: Any) -> Tube:
     """Return the tube of ``x' = A x + B u + w`` for gains K ``(H, m, n)`` and ``|w| <= half_widths`` ``(n,)``."""
-    A, B, K, w = (
-        as_finite(name, value) for name, value in (("A", A), ("B", B), ("gains", gains), ("half_widths", half_widths))
-    )
+    given = {"A": A, "B": B, "gains": gains, "half_widths": half_widths}
+    A, B, K, w = (as_finite(name, value) for name, value in given.items())
     n, m = len(w), B.shape[-1]
     if A.shape != (n, n) or B.shape != (n, m) or K.ndim != 3 or K.shape[1:] != (m, n) or (w < 0).any():
         got = f"{A.shape}, {B.shape}, {K.shape} and {w.tolist()}"
@@ -305,8 +293,7 @@ def tube(A: Any, B: Any, gains: Any, half_widths: Any) -> Tube:
 
 def _transitions(loops: Array) -> Iterator[Array]:
     """Yield, for each time t of 0 to H, the products of the matrices from each earlier step to t, ``(t, n, n)``."""
-    n = loops.shape[-1]
-    known = np.zeros((0, n, n))
+    known, n = loops[:0], loops.shape[-1]
     yield known
     for loop in loops:
         known = np.concatenate([loop @ known, np.eye(n)[None]])
