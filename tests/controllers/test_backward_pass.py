@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import lsq_linear
 
-from ctxval.controllers.backward_pass import Expansion, _inverses, _solved, minimise
+from ctxval.controllers.ilqr import Expansion, _inverses, _solved, minimise
 from ctxval.controllers.lqr import QuadraticCost
 from ctxval.core.controller import Limits
 

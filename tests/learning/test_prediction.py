@@ -13,8 +13,10 @@ from ctxval._util.progress import Progress, listening, stage
 from ctxval.core.controller import Controller, Synthesizer
 from ctxval.core.trajectory import Trajectory
 from ctxval.errors import ShapeError
+from ctxval.gp.kernels import Matern
+from ctxval.gp.regression import log_likelihood_of_outputs
 from ctxval.learning import DynamicsStudy, dynamics_study
-from ctxval.learning.prediction import _log_likelihood, predict_composed
+from ctxval.learning.prediction import predict_composed
 from ctxval.paper.cases import linear
 from ctxval.searches import Prediction, TrustRegion
 
@@ -324,11 +326,15 @@ def test_points_and_vectors_that_do_not_fit_are_refused_with_both_shapes() -> No
 
 def test_the_gradient_of_the_likelihood_agrees_with_finite_differences() -> None:
     X, theta = points(12), np.random.default_rng(0).normal(-1, 0.3, size=11)
-    _, gradient = _log_likelihood(theta, X, bent(X))
-    numeric = [
-        (_log_likelihood(theta + 1e-6 * e, X, bent(X))[0] - _log_likelihood(theta - 1e-6 * e, X, bent(X))[0]) / 2e-6
-        for e in np.eye(11)
-    ]
+    kernel = Matern(2.5, ard=True, linear=(1e-6, 1e3))
+
+    def log_likelihood(theta: Array) -> tuple[float, Array]:
+        value, W = log_likelihood_of_outputs(kernel(theta, X, X), 1e-8, bent(X))
+        return value, kernel.weighted_gradient(theta, X, W)
+
+    _, gradient = log_likelihood(theta)
+    steps = 1e-6 * np.eye(11)
+    numeric = [(log_likelihood(theta + e)[0] - log_likelihood(theta - e)[0]) / 2e-6 for e in steps]
     np.testing.assert_allclose(gradient, numeric, rtol=1e-4, atol=1e-4)
 
 

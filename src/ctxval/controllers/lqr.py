@@ -41,8 +41,7 @@ class QuadraticCost(ShortRepr):
 
     def value(self, deviations: Array, inputs: Array) -> Array:
         """Return the cost, shape ``(...)``, of deviations ``(H+1, ..., n)`` and inputs ``(H, ..., m)``."""
-        running = deviations[:-1]
-        final = deviations[-1]
+        running, final = deviations[:-1], deviations[-1]
         cost = ((running @ self.Q) * running).sum(axis=(0, -1)) + ((inputs @ self.R) * inputs).sum(axis=(0, -1))
         return np.asarray(0.5 * (cost + ((final @ self.Q_final) * final).sum(axis=-1)))
 

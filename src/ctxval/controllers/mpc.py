@@ -142,7 +142,12 @@ def _best_change(
     """Return the best change of the inputs ``(steps, m)`` for the linearised prediction, and the largest multiplier."""
     (steps, m), bounds, soft = U.shape, settings.state_limits, settings.violation_cost
     limited: Mask = np.isfinite(bounds.low) | np.isfinite(bounds.high)
-    G = _sensitivities(A, B, steps)  # (steps, n, steps * m)
+    G = np.zeros((steps, B.shape[-2], steps * m))  # the derivatives of the states 1 to ``steps`` by all inputs
+    for k in range(steps):
+        A_k, B_k = A if A.ndim == 2 else A[k], B if B.ndim == 2 else B[k]
+        if k:
+            G[k] = A_k @ G[k - 1]
+        G[k, :, k * m : (k + 1) * m] = B_k
     QG = Q @ G
     hessian = np.tensordot(G, QG, axes=([0, 1], [0, 1])) + np.kron(np.eye(steps), settings.cost.R)
     slope = np.tensordot(X[1:] - reference, QG, axes=([0, 1], [0, 1])) + (U @ settings.cost.R).ravel()
@@ -154,18 +159,6 @@ def _best_change(
     else:
         solution = _softened(hessian, slope, rows, box, gaps, soft, steps)
     return None if solution is None else (solution[0][: steps * m].reshape(steps, m), solution[1])
-
-
-def _sensitivities(A: Array, B: Array, steps: int) -> Array:
-    """Return the derivatives of the states 1 to ``steps`` by all inputs, ``(steps, n, steps * m)``."""
-    n, m = B.shape[-2:]
-    G = np.zeros((steps, n, steps * m))
-    for k in range(steps):
-        A_k, B_k = A if A.ndim == 2 else A[k], B if B.ndim == 2 else B[k]
-        if k:
-            G[k] = A_k @ G[k - 1]
-        G[k, :, k * m : (k + 1) * m] = B_k
-    return G
 
 
 def _softened(
@@ -190,10 +183,7 @@ def _softened(
 def _quadratic_program(
     hessian: Array, slope: Array, rows: Array, box: Sequence[Array], gaps: Sequence[Array]
 ) -> tuple[Array, float] | None:
-    """Minimise ``1/2 z'Hz + g'z`` for z within a box and ``rows z`` within the gaps.
-
-    Return z and the largest multiplier of a row; None if there is no solution.
-    """
+    """Minimise ``1/2 z'Hz + g'z``, z in a box and ``rows z`` in the gaps; return z and the largest multiplier."""
     casadi = require_extra("casadi", "mpc", "MPC controllers need")
     dense = casadi.Sparsity.dense
     sizes = {"h": dense(*hessian.shape), "a": dense(len(rows), len(slope))}

@@ -50,9 +50,7 @@ class OnnxPolicy(ShortRepr):
         scale: float | Array = 1.0,
         limits: LimitsLike | None = None,
     ) -> None:
-        self.network = OnnxNetwork(source, recurrent=True)
-        self.observe = observe
-        self.scale = scale
+        self.network, self.observe, self.scale = OnnxNetwork(source, recurrent=True), observe, scale
         self.limits = None if limits is None else Limits.of(limits)
 
     def inputs(self, t: int, x: Array, task: Task) -> Array:

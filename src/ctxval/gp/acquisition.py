@@ -96,8 +96,7 @@ class Uncertainty:
         return self.process.predict(X)[1]
 
     def with_gradient(self, X: Array) -> tuple[Array, Array]:
-        _, variance, _, d_variance = self.process.predict_with_gradient(X)
-        return variance, d_variance
+        return self.process.predict_with_gradient(X)[1::2]
 
 
 def maximise(

@@ -14,26 +14,19 @@ import numpy as np
 from ctxval._util.arrays import Array
 from ctxval._util.boxes import Box, climb, moves_to_bounds, separated_rows
 
-Values = Callable[[Array], Array]
-"""Points ``(m, d)`` -> values ``(m,)``."""
-
+Values = Callable[[Array], Array]  # points (m, d) -> values (m,)
 _SHARES = np.array([0.03, 0.1, 0.3, 0.6, 1.0])  # steps of a line search, as shares of the way to a corner
 _LENGTHS = np.array([0.1, 0.4])  # steps along the slopes, as shares of the box in the steepest coordinate
-_COORDINATES = (0.0, 0.25, 0.5)
-"""Shares of the coordinates that are moved to the corner alone, at least one coordinate each."""
+_COORDINATES = (0.0, 0.25, 0.5)  # shares of the coordinates that are moved to the corner alone, at least one each
 
 
 class Evaluations:
-    """The evaluations of a function over a box within the unit cube, no more of them than a budget.
-
-    If the budget is not strict, a climb that has begun may exceed it.
-    """
+    """The evaluations of a function over a box, within a budget that only a climb may exceed, if it is not strict."""
 
     def __init__(self, function: Values, low: Array, high: Array, budget: int, *, strict: bool = True) -> None:
         self.low, self.high, self.dimension = low, high, len(low)
         self.budget, self.strict, self._function = budget, strict, function
-        self._points: list[Array] = [np.empty((0, len(low)))]
-        self._values: list[Array] = [np.empty(0)]
+        self._points, self._values = [np.empty((0, len(low)))], [np.empty(0)]
 
     @property
     def left(self) -> int:
@@ -84,9 +77,8 @@ class Evaluations:
         """Climb from starts ``(s, d)`` along finite differences, with about so many evaluations."""
         if not len(starts):
             return
-        scale = max(float(np.abs(self.best_first()[1][0])), 1e-300)
+        scale, box = max(float(np.abs(self.best_first()[1][0])), 1e-300), (self.low, self.high)
         calls = max(2, budget // (len(starts) * (self.dimension + 1)))
-        box = self.low, self.high
         climb(lambda Z: self._slopes(np.clip(Z, *box)), starts, *box, scale=scale, iterations=calls, evaluations=calls)
 
     def search_lines(self, starts: Array, rounds: int) -> None:
@@ -125,15 +117,12 @@ class Evaluations:
 
     def move_to_bounds(self, rng: np.random.Generator) -> bool:
         """Move coordinates of the best points to bounds, singly and several at a time; return whether that helped."""
-        points, values = self.best_first()
-        d = self.dimension
-        best = points[:3]
-        ends = np.stack([self.low, self.high])
+        (points, values), d = self.best_first(), self.dimension
+        best, ends = points[:3], np.stack([self.low, self.high])
         single = moves_to_bounds(best[0], self.low, self.high)
         parents = best[rng.integers(len(best), size=2 * d)]
-        several = np.where(
-            rng.random(parents.shape) < 2 / d, ends[rng.integers(2, size=parents.shape), np.arange(d)], parents
-        )
+        moves = rng.random(parents.shape) < 2 / d
+        several = np.where(moves, ends[rng.integers(2, size=parents.shape), np.arange(d)], parents)
         gain = 1e-9 * abs(values[0]) if np.isfinite(values[0]) else 0.0
         moved = np.concatenate([single, several])[: max(1, self.left)]
         return bool(self.evaluate(moved).max() > values[0] + gain)

@@ -33,10 +33,7 @@ class CholeskyFactor:
         return np.asarray(dtrtrs(self.L, right, lower=1)[0])
 
     def whiten_many(self, right: Array) -> Array:
-        """Return ``L^-1 right`` for many columns, by a product with the inverse factor, which is faster.
-
-        The columns of ``right`` are contiguous, and may be overwritten.
-        """
+        """Return ``L^-1 right`` by the inverse factor, faster for many contiguous columns; they may be overwritten."""
         return np.asarray(dtrmm(1.0, self.inverse_factor, right, lower=1, overwrite_b=1))
 
     def inverse(self) -> Array:
@@ -63,10 +60,7 @@ class CholeskyFactor:
 
 
 def factorise(covariance: Array, noise: float, *, insist: bool = False) -> CholeskyFactor:
-    """Return the Cholesky factor of ``covariance + noise I``, shape ``(n, n)``.
-
-    To insist is to try ten times as much noise after each failure, up to 1e30 times as much.
-    """
+    """Return the factor of ``covariance + noise I``; to insist is to raise the noise tenfold until it succeeds."""
     for _ in range(31 if insist else 1):
         noisy = np.array(covariance, order="F")
         noisy.ravel("K")[:: len(noisy) + 1] += noise  # its diagonal
@@ -74,16 +68,12 @@ def factorise(covariance: Array, noise: float, *, insist: bool = False) -> Chole
         if not info and not np.isnan(np.trace(L)):  # some LAPACKs let NaN pass
             return CholeskyFactor(np.asarray(L))
         noise *= 10
-    raise InputError(
-        f"the covariance of {len(covariance)} observations is not positive definite; raise the noise variance."
-    )
+    what = f"the covariance of {len(covariance)} observations"
+    raise InputError(f"{what} is not positive definite; raise the noise variance.")
 
 
 def pivoted_rows(kernel: Covariance, theta: Array, X: Array, count: int, least: float) -> Rows:
-    """Return at most ``count`` rows by pivoted Cholesky: each has the largest variance given the rows before it.
-
-    The choice ends if no remaining variance is larger than ``least``.
-    """
+    """Return at most ``count`` rows by pivoted Cholesky, each with the largest variance given those before it."""
     towards = kernel.towards(theta, X)
     return pivoted_cholesky(kernel.diagonal(theta, X), lambda row: towards(X[row : row + 1])[0], count, least)[0]
 
@@ -91,12 +81,11 @@ def pivoted_rows(kernel: Covariance, theta: Array, X: Array, count: int, least: 
 def pivoted_cholesky(
     variances: Array, covariances: Callable[[int], Array], count: int, least: float
 ) -> tuple[Rows, Array, Array]:
-    """Return those rows ``(k,)`` of a covariance matrix that represent all of it, and their Cholesky factor ``(k, k)``.
+    """Return rows ``(k,)`` that represent a covariance matrix, their Cholesky factor ``(k, k)``, and what is left.
 
-    The third array has the variances of all n rows given these ``(n,)``.
-
-    The matrix has the diagonal ``variances`` ``(n,)``, and ``covariances`` returns one of its rows in an array that may
-    be overwritten; count and least are as in :func:`pivoted_rows`.
+    The variances given these rows ``(n,)`` are left. The matrix has the diagonal ``variances`` ``(n,)``, and
+    ``covariances`` returns one of its rows in an array that may be overwritten. The choice ends after ``count`` rows,
+    or if no remaining variance is larger than ``least``.
     """
     left = np.array(variances)
     columns = np.empty((min(count, len(left)), len(left)))

@@ -18,10 +18,8 @@ from ctxval._util.arrays import Array, Rows
 from ctxval._util.boxes import separated_rows
 from ctxval.gp.ascent import Evaluations, Values
 
-_SAMPLED, _EVOLVED, _CLIMBED = 0.35, 0.7, 0.88
-"""Shares of the evaluations after which sampling, evolution and climbs end."""
-_REACHES = (0.3, 0.1)
-"""Least distance of good parents in the first and the last generation, and of elites, as a share of the diagonal."""
+_SAMPLED, _EVOLVED, _CLIMBED = 0.35, 0.7, 0.88  # shares of the evaluations after which these parts end
+_REACHES = (0.3, 0.1)  # least distance of good parents at first and at last, and of elites, in diagonals
 _STEPS = (0.3, 0.005)  # largest standard deviation of a mutation in the first and in the last generation
 
 
@@ -103,10 +101,8 @@ def _evolve(done: Evaluations, rng: np.random.Generator) -> None:
 
 
 def _prominences(points: Array, heights: Array, rows: Rows) -> Array:
-    """Return by how much some rows exceed a local linear fit, without themselves, to their neighbours.
-
-    The scale is linear near the median of the heights and logarithmic far from it; failures are lowest.
-    """
+    """Return by how much some rows exceed a local linear fit, without themselves, to their neighbours."""
+    # The scale is linear near the median of the heights and logarithmic far from it; failures are lowest.
     finite = heights[np.isfinite(heights)]
     low, middle, high = np.quantile(finite, [0.25, 0.5, 0.75])
     spread = (high - low) or float(finite.std()) or 1.0

@@ -23,16 +23,12 @@ from ctxval.errors import InputError
 from ctxval.gp.cholesky import CholeskyFactor, factorise
 from ctxval.gp.kernels import Matern
 
-EXACT = 1e-10
-"""Noise variance, relative to sigma^2, of values without noise: it keeps the Cholesky factor safe."""
+EXACT = 1e-10  # noise variance, relative to sigma^2, of values without noise: it keeps the Cholesky factor safe
 
 
 @dataclass(frozen=True)
 class Warp:
-    """A scale on which values are a Gaussian process.
-
-    The unit of the values makes their likelihood comparable with that of the logarithm, which has no unit.
-    """
+    """A scale on which values are a Gaussian process; their unit makes likelihoods of two scales comparable."""
 
     offset: float = np.inf  # c of log(y + c); infinity for the values themselves
     unit: float = 1.0
@@ -65,11 +61,11 @@ class Prior:
     smoothness: tuple[float, ...] = (1.5, 2.5)  # values of nu of the Matern kernel, equally likely
     length_scale: float = 0.3  # median of the log-normal length-scales in the cube, times the root of the dimension
     deviation: float = 1.0  # standard deviation of their logarithms
+    # bounds of the noise variance relative to sigma^2; it is log-uniform between them, and equal bounds fix it
     noise: tuple[float, float] = (EXACT, EXACT)
-    """Bounds of the noise variance relative to sigma^2; it is log-uniform between them, and equal bounds fix it."""
+    # c of log(y + c), in means of the values. If no value is negative, the logarithm and the values themselves are
+    # equally likely. None excludes the logarithm.
     offset: float | None = 0.1
-    """c of ``log(y + c)``, in means of the values. If no value is negative, the logarithm and the values themselves are
-    equally likely. None excludes the logarithm."""
     spread_share: float = 0.5  # share of the data from which hyperparameters are drawn a second time
 
     def centre(self, dimension: int) -> float:
@@ -120,13 +116,9 @@ def condition(hyperparameters: Hyperparameters, X: Array, values: Array, warp: W
     mean = float(pull[:, 1].sum() / precision)
     scale2 = float((y - mean) @ (pull[:, 1] - mean * pull[:, 0])) / (n - 1)
     scale2 = max(scale2, np.finfo(np.float64).tiny)
-    log_likelihood = (
-        scale.log_slope(values)
-        - factor.half_log_determinant()
-        - 0.5 * np.log(precision)
-        - 0.5 * (n - 1) * np.log(scale2)
-    )
-    return Conditioned(hyperparameters, scale, y, factor, mean, float(1 / precision), scale2, float(log_likelihood))
+    volume = scale.log_slope(values) - factor.half_log_determinant()
+    log_likelihood = float(volume - 0.5 * np.log(precision) - 0.5 * (n - 1) * np.log(scale2))
+    return Conditioned(hyperparameters, scale, y, factor, mean, float(1 / precision), scale2, log_likelihood)
 
 
 def draw_hyperparameters(
@@ -215,9 +207,8 @@ def _slice(log_density: Callable[[Array], float], state: Array, direction: Array
 # rule; Wilson, Borovitskiy, Terenin, Mostowsky and Deisenroth 2020). The prior's path is approximated by random waves;
 # the correction is exact.
 
+# Frequencies of a prior path: the error of its covariance is about 1 / sqrt(2 WAVES), that of its maximum much smaller.
 WAVES = 512
-"""Number of frequencies of a prior path. The error of its covariance is about ``1 / sqrt(2 WAVES)``, and that of a
-path's maximum much smaller."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -254,15 +245,11 @@ class Paths:
         waves = _waves(flat, self.frequencies).reshape(s, q, -1)
         known = self.conditioned.hyperparameters
         correlations = known.kernel(flat, self.X).reshape(s, q, -1)
-        values = np.einsum("sqf,fs->sq", waves, self.amplitudes) + np.einsum(
-            "sqn,ns->sq", correlations, self.corrections
-        )
-        half = len(self.frequencies)
+        values = np.einsum("sqf,fs->sq", waves, self.amplitudes)
+        values = values + np.einsum("sqn,ns->sq", correlations, self.corrections)
         # d cos = -sin, d sin = cos, each times its frequency
-        turned = (
-            waves[..., :half] * self.amplitudes[half:].T[:, None]
-            - waves[..., half:] * self.amplitudes[:half].T[:, None]
-        )
+        half, amplitudes = len(self.frequencies), self.amplitudes.T[:, None]
+        turned = waves[..., :half] * amplitudes[..., half:] - waves[..., half:] * amplitudes[..., :half]
         slopes = turned @ self.frequencies
         weights = np.repeat(self.corrections.T, q, axis=0)
         lengths = np.exp(known.log_scales)

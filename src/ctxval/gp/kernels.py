@@ -17,11 +17,8 @@ from ctxval._util.arrays import Array
 from ctxval.errors import InputError
 
 _CENTRE = 0.5  # of the unit cube, in each dimension: about which the linear part varies
-
 Bounds = list[tuple[float, float]]
-
-Towards = Callable[[Array], Array]
-"""Points ``(n, d)`` -> their covariances ``(n, m)`` with points that are fixed."""
+Towards = Callable[[Array], Array]  # points (n, d) -> their covariances (n, m) with points that are fixed
 
 
 class Covariance(Protocol):

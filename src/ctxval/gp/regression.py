@@ -15,14 +15,9 @@ from ctxval.errors import InputError
 from ctxval.gp.cholesky import CholeskyFactor, factorise
 from ctxval.gp.kernels import Bounds, Matern
 
-Mean = Callable[[Array], Array]
-"""A prior mean: points ``(n, d)`` -> values ``(n,)``."""
-
-LogDensity = Callable[[Array], tuple[float, Array]]
-"""Hyperparameters -> (the logarithm of their density, its gradient)."""
-
-NOISE = 1e-6
-"""The least noise variance, for values of unit variance: it keeps the covariance matrix positive definite."""
+Mean = Callable[[Array], Array]  # a prior mean: points (n, d) -> values (n,)
+LogDensity = Callable[[Array], tuple[float, Array]]  # hyperparameters -> the logarithm of their density, its gradient
+NOISE = 1e-6  # the least noise variance, for values of unit variance: it keeps the covariance positive definite
 
 
 def zero_mean(X: Array) -> Array:
@@ -116,11 +111,7 @@ def condition(
 
 
 def log_likelihood_of_outputs(K: Array, noise: float, Y: Array) -> tuple[float, Array]:
-    """Return ``sum_o log p(Y[:, o])`` up to a constant, and its derivative W with respect to K.
-
-    The outputs ``(n, k)`` share the covariance K ``(n, n)``. If K changes by a small dK, the value changes by
-    ``sum(W * dK)`` (Rasmussen and Williams 2006, eqs. 5.8 and 5.9).
-    """
+    """Return ``sum_o log p(Y[:, o])`` of outputs that share K, up to a constant, and its derivative by K (eq. 5.9)."""
     factor = factorise(K, noise)
     alpha = factor.solve(Y)
     value = -0.5 * (Y * alpha).sum() - Y.shape[1] * factor.half_log_determinant()
@@ -130,10 +121,7 @@ def log_likelihood_of_outputs(K: Array, noise: float, Y: Array) -> tuple[float, 
 def log_marginal_likelihood(
     kernel: Matern, theta: Array, noise: float, X: Array, residual: Array
 ) -> tuple[float, Array]:
-    """Return log p(residual | X, theta, noise) and its gradient by (theta, log noise), eq. 5.9.
-
-    The residual ``(n,)`` is the observations minus the prior mean.
-    """
+    """Return log p(residual | X, theta, noise) of y - mean(X), and its gradient by (theta, log noise), eq. 5.9."""
     factor = factorise(kernel(theta, X, X), noise)
     alpha = factor.solve(residual)
     W = factor.inverse()
@@ -206,8 +194,7 @@ def most_likely(
 
     if best_start:
         starts = starts[[np.argmin([negative(start)[0] for start in starts])]]
-    options: Any = {"maxiter": iterations, **({} if tolerance is None else {"ftol": tolerance})}
-    climbs = [
-        minimize(negative, start, jac=True, method="L-BFGS-B", bounds=bounds, options=options) for start in starts
-    ]
+    limits: Any = {"maxiter": iterations, **({} if tolerance is None else {"ftol": tolerance})}
+    settings: Any = {"jac": True, "method": "L-BFGS-B", "bounds": bounds, "options": limits}
+    climbs = [minimize(negative, start, **settings) for start in starts]
     return np.asarray(min(climbs, key=lambda climb: float(climb.fun)).x)

@@ -73,8 +73,7 @@ def _scale(residual: Array) -> float:
 def _with_imputed(process: GaussianProcess, points: Array) -> GaussianProcess:
     if not len(points):
         return process
-    imputed, _ = process.predict(points)
-    X, y = np.concatenate([process.X, points]), np.concatenate([process.y, imputed])
+    X, y = np.concatenate([process.X, points]), np.concatenate([process.y, process.predict(points)[0]])
     return condition(process.kernel, process.theta, X, y, noise=process.noise, mean=process.mean)
 
 
@@ -95,10 +94,7 @@ class SurrogateHyperparameters(ShortRepr):
         return np.asarray((self.warp.forward(values) - self.shift) / self.scale)
 
     def condition(self, points: Array, values: Array) -> GaussianProcess:
-        """Return the process given values ``(n,)`` at points ``(n, d)``.
-
-        Pending and failed points have the value NaN, and are assigned the value that the others predict.
-        """
+        """Return the process given values at points ``(n, d)``; NaN becomes the value that the others predict."""
         known = np.isfinite(values)
         process = condition(_KERNEL, self.theta, points[known], self.standardised(values[known]))
         return _with_imputed(process, points[~known])
@@ -123,14 +119,13 @@ def learn(points: Array, values: Array) -> SurrogateHyperparameters:
 
 def _learn_on(points: Array, values: Array, warp: Warp) -> tuple[float, SurrogateHyperparameters]:
     """Return the summed log density of each value given all others, on one scale, and the learned hyperparameters."""
-    warped = warp.forward(values)
+    warped, d = warp.forward(values), points.shape[1]
     shift = float(warped.mean())
     scale = _scale(warped - shift)
     y = (warped - shift) / scale
-    centre, log_prior = _prior(points.shape[1])
-    rougher = np.zeros_like(centre)
-    rougher[1 : points.shape[1] + 1] = -1.0
-    process = fit(_KERNEL, points, y, log_prior=log_prior, starts=np.stack([centre, centre + rougher]))
+    centre, log_prior = _prior(d)
+    rougher = centre + np.array([0.0, *[-1.0] * d, 0.0, 0.0, 0.0])
+    process = fit(_KERNEL, points, y, log_prior=log_prior, starts=np.stack([centre, rougher]))
     mean, variance = process.left_out()
     score = -0.5 * (np.log(variance) + (y - mean) ** 2 / variance).sum() - len(y) * np.log(scale)
     return float(score) + warp.log_slope(values), SurrogateHyperparameters(process.theta, warp, shift, scale)
@@ -162,8 +157,7 @@ def spread_rows(values: Array, count: int) -> Rows:
     return np.sort(np.concatenate([largest, evenly]))
 
 
-LONG = 1000
-"""Length of a history from which on only a subset is kept."""
+LONG = 1000  # length of a history from which on only a subset is kept
 
 
 def kept_rows(points: Array, values: Array, count: int, long: int = LONG) -> Rows:

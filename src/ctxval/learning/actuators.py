@@ -80,14 +80,8 @@ def found_actuator(
     """Return the delay and the lag with which the residual of M is most probably a function; None if they do not help.
 
     They help if the log evidence per recorded value, with the hyperparameters at their mode, is larger by 0.3 than
-    without them.
-
-    Args:
-        before: one that was found in fewer executions, which is refined.
-        evaluations: how often records may be asked for while the actuator is refined, twice.
-
-    Raises:
-        LinAlgError: if states cannot be estimated.
+    without them. One that was found ``before``, in fewer executions, is refined. So many ``evaluations`` of the records
+    are allowed while the actuator is refined, twice. A LinAlgError is raised if states cannot be estimated.
     """
     records = records_of(Actuator())
     history = History(model, Structure(0), np.eye(records[0].states.shape[1]))
@@ -113,10 +107,6 @@ def found_actuator(
         Z, E = data(actuator)
         return HyperparameterPosterior.given(standardised(Z), E, inputs, FAMILIES[:1]).highest
 
-    def height_at(mode: Mode, actuator: Actuator) -> float:
-        Z, E = data(actuator)
-        return log_posterior(mode.kernel, mode.place, standardised(Z), E)[0]
-
     def refined(start: Actuator, mode: Mode) -> Actuator:
         """Return the most likely actuator near one, with the hyperparameters that are most probable for that one."""
         Z, _ = data(start)
@@ -139,7 +129,9 @@ def found_actuator(
     base = mode_of(Actuator())
     without, tried = base.height, [before] if before else [Actuator(*each) for each in _TRIED]
     if len(tried) > _CLIMBED:  # those that explain most with the hyperparameters of inputs that act at once
-        tried.sort(key=lambda each: -height_at(base, each))
+        of_tried = [data(each) for each in tried]
+        heights = [log_posterior(base.kernel, base.place, standardised(Z), E)[0] for Z, E in of_tried]
+        tried = [tried[k] for k in sorted(range(len(tried)), key=lambda k: -heights[k])]
     mode, best = max(((mode_of(each), each) for each in tried[:_CLIMBED]), key=lambda pair: pair[0].height)
     values = len(rows) * int(live.sum())
     if mode.height < without - _NEAR * values:

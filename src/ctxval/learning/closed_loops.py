@@ -26,12 +26,8 @@ from ctxval.learning.dynamics_posterior import DynamicsPosterior
 from ctxval.learning.noisy_draws import NoisyDraws, NoisyRuns
 
 T = TypeVar("T")
-
-AnyDraws = DynamicsDraws | NoisyDraws
-"""Draws of dynamics without and with noise."""
-
-Together = AnyDraws | DisturbedDynamics
-"""Systems that are run together."""
+AnyDraws = DynamicsDraws | NoisyDraws  # without and with noise
+Together = AnyDraws | DisturbedDynamics  # systems that are run together
 
 _UNITS = "closed loops", "designs", "tasks"  # of stages that closed loops are progress of
 _REMEMBERED = 64_000_000  # largest size of the plans that are kept, in bytes, approximately
@@ -83,10 +79,7 @@ class LoopPlanner:
         return False
 
     def plan(self, points: Array, together: int = 512) -> list[PlannedTasks]:
-        """Return the plans of points ``(q, d)``; tasks for which no controller can be designed are left out.
-
-        If the synthesizer takes batches, at most ``together`` tasks are planned in one call.
-        """
+        """Return the plans of points ``(q, d)``, at most ``together`` in one call, without those without a design."""
         size, plans = together if self.batched else 1, list[PlannedTasks]()
         for first in range(0, len(points), size):
             some = points[first : first + size]
@@ -206,11 +199,8 @@ class LoopPlanner:
     def _stacked(self, planned: PlannedTasks, loops: Sequence[Trajectory]) -> Loops:
         states, inputs = np.stack([loop.states for loop in loops]), np.stack([loop.inputs for loop in loops])
         shape = (len(loops), len(planned.rows))
-        return Loops(
-            np.array([self.compared(planned, loop) for loop in loops]).reshape(shape),
-            states.reshape(*shape, *states.shape[-2:]),
-            inputs.reshape(*shape, *inputs.shape[-2:]),
-        )
+        distances = np.array([self.compared(planned, loop) for loop in loops]).reshape(shape)
+        return Loops(distances, *(part.reshape(*shape, *part.shape[-2:]) for part in (states, inputs)))
 
     def _takes_draws_together(self, planned: PlannedTasks, draws: int) -> bool:
         """Return whether controllers take draws as another first axis; if not, one loop is run after the other."""
@@ -222,19 +212,13 @@ class LoopPlanner:
             self._together = False
             with contextlib.suppress(Exception), np.errstate(all="ignore"):  # the user's controller
                 together = _probed(controller, planned.task.starting_at(probes), steps)
-                each = (_probed(controller, planned.task.starting_at(probe), steps) for probe in probes)
-                one_by_one = np.stack(list(each), axis=1)
-                self._together = together.shape == one_by_one.shape and np.allclose(
-                    together, one_by_one, equal_nan=True
-                )
+                each = [_probed(controller, planned.task.starting_at(probe), steps) for probe in probes]
+                alone = np.stack(each, axis=1)
+                self._together = together.shape == alone.shape and np.allclose(together, alone, equal_nan=True)
         return draws > 1 and bool(self._together)
 
     def compared(self, planned: PlannedTasks, loops: Trajectory) -> Array:
-        """Return the distances ``(q,)`` of loops; infinity if a loop diverges, NaN if that of M does.
-
-        It is infinity, too, if the distance raises an exception or returns no finite number: nothing is known then.
-        Tasks are measured one by one if the distance does not take a batch.
-        """
+        """Return the distances ``(q,)`` of loops; infinity if one diverges or cannot be measured, NaN if M diverges."""
         task, promised, between = planned.task, planned.promised, self.validation.distance_between
         model, system, known = promised, loops, promised.finite & loops.finite
         if not known.all():  # a distance need not take what is not finite
@@ -263,10 +247,7 @@ def _probed(controller: Controller, task: Task, steps: int) -> Array:
 
 
 def halved(function: Callable[[Rows], T], count: int) -> list[tuple[Rows, T | None]]:
-    """Return what a function of rows returns for all of ``count`` rows; where it fails, the rows are halved.
-
-    It is None for a single row. The user's parts may fail on tasks and at states that no execution has reached.
-    """
+    """Return what a function of all rows returns; rows where it fails are halved, and a single one of them has None."""
     results: list[tuple[Rows, T | None]] = []
     left = [np.arange(count)]
     while left:
@@ -303,10 +284,8 @@ def loop_pairs(planner: LoopPlanner, posterior: DynamicsPosterior, tasks: Array)
 def unseen_parameters(planner: LoopPlanner, some: Array) -> tuple[int, ...]:
     """Return the indices of the task parameters that change the closed loops of M by less than 2 % of their deviation.
 
-    What they change in the system, such as a payload, is no function of state and input.
-
-    Args:
-        some: tasks, of which one parameter after the other is moved to its bounds, shape ``(q, d)``.
+    What they change in the system, such as a payload, is no function of state and input. One parameter after the other
+    of some tasks ``(q, d)`` is moved to its bounds.
     """
     d = some.shape[1]
     ends = moves_to_bounds(some, np.zeros(d), np.ones(d)).reshape(-1, d)

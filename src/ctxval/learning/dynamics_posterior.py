@@ -95,27 +95,20 @@ class DynamicsPosterior(ShortRepr):
         return self._components(range(1, len(self.covariances.drawn)))
 
     def _components(self, rows: Iterable[int]) -> tuple[Component, ...]:
-        """Return the most probable one and those of some draws of the hyperparameters.
-
-        Hyperparameters whose covariance matrix is not positive definite are left out.
-        """
         components, drawn = [self.most_probable], self.covariances.drawn
         last = drawn[0]
         for row in rows:
             if drawn[row] is last:
                 components.append(components[-1].again(self._rng(row)))
                 continue
-            with contextlib.suppress(InputError):
+            with contextlib.suppress(InputError):  # its covariance matrix is not positive definite
                 components.append(self._component(drawn[row], self._rng(row)))
                 last = drawn[row]
         return tuple(components)
 
     @functools.cached_property
     def rows(self) -> Rows:
-        """The transitions that it is conditioned on; each has the largest variance given those before it.
-
-        They represent the others for the most probable hyperparameters, and are the same for all hyperparameters.
-        """
+        """The transitions that represent the others for the most probable hyperparameters, by their variance."""
         most, count = self._rescaled(self.covariances.posterior.mode), self.covariances.settings.centres
         with single_threaded():
             return pivoted_rows(most.kernel, most.theta, self.data.pairs, count, least=_PIVOT * most.noise)
@@ -131,7 +124,6 @@ class DynamicsPosterior(ShortRepr):
         return replace(drawn, theta=theta)
 
     def _known(self, rows: Rows) -> tuple[Array, Array]:
-        """Return the pairs and the residuals of the learned states of some transitions."""
         return self.data.pairs[rows], self.data.outputs[rows][:, self.data.learned]
 
     def _rng(self, row: int) -> np.random.Generator:
@@ -141,13 +133,10 @@ class DynamicsPosterior(ShortRepr):
 
     @functools.cached_property
     def mean(self) -> DynamicsDraws:
-        """The model plus the posterior mean of r for the most probable hyperparameters, as one draw.
-
-        It has no noise, and tasks are searched with it: it is ``silent`` and ``searched`` of :class:`NoisyPosterior`.
-        """
+        """The model plus the posterior mean of r for the most probable hyperparameters, as one draw."""
         return self._limited(self.most_probable.mean)
 
-    silent = searched = property(lambda self: self.mean)
+    silent = searched = property(lambda self: self.mean)  # those of a NoisyPosterior: it has no noise
 
     @functools.cached_property
     def rough_mean(self) -> DynamicsDraws:
@@ -156,10 +145,7 @@ class DynamicsPosterior(ShortRepr):
         return self.mean if rough.centres.shape[1] == len(self.rows) else self._limited(rough)
 
     def with_few_centres(self, least: int, error: float) -> KernelExpansion:
-        """Return the mean of r conditioned on as few of the transitions as predict the others well.
-
-        It tries ``least`` of them first, then twice as many. ``error`` is a share of the residuals at the others.
-        """
+        """Return the mean of r given so few transitions as predict the others up to a share, at ``least`` so many."""
         most, (Z, Y) = self.most_probable, self._known(self.rows)
         while least < len(Z):
             with single_threaded():
@@ -209,11 +195,7 @@ class DynamicsPosterior(ShortRepr):
         return DynamicsDraws(self.covariances.model, self.data, (mean,), limit=self.limit[self.data.learned])
 
     def unfamiliarity(self, states: Array, inputs: Array) -> Array:
-        """Return the standard deviation of r along trajectories, as a share of a typical step, ``(q,)``.
-
-        Args:
-            states, inputs: shapes ``(q, H + 1, n)`` and ``(q, H, m)``.
-        """
+        """Return the standard deviation of r along states and inputs ``(q, H, m)``, as a share of a typical step."""
         horizon, data, most = inputs.shape[1], self.data, self.most_probable
         at = np.linspace(0, horizon - 1, min(12, horizon)).astype(int)
         Z = bounded(data.standardised(states[:, at], inputs[:, at]))
@@ -224,32 +206,25 @@ class DynamicsPosterior(ShortRepr):
     # Draws
 
     def draw(
-        self,
-        relevant: Array,
-        rng: np.random.Generator,
-        functions: int | None = None,
-        hyperparameters: int | None = None,
+        self, relevant: Array, rng: np.random.Generator, functions: int | None = None, some: int | None = None
     ) -> DynamicsDraws:
-        """Return draws of the dynamics.
+        """Return so many functions, by default those of the settings, for some or all draws of the hyperparameters.
 
-        Args:
-            relevant: standardised pairs ``(R, k)`` that closed loops visit.
-            functions: number of functions for each draw of the hyperparameters; that of the settings if None.
-            hyperparameters: number of draws of the hyperparameters that are used; all if None.
+        Closed loops visit the ``relevant`` standardised pairs ``(R, k)``.
         """
-        model, settings = self.covariances.model, self.covariances.settings
+        settings = self.covariances.settings
         count = settings.functions if functions is None else functions
         with single_threaded():
-            if hyperparameters is None:
+            if some is None:
                 components = self.components
             else:  # about so many, evenly spread
-                rows = np.linspace(1, len(self.covariances.drawn) - 1, hyperparameters - 1).astype(int)
+                rows = np.linspace(1, len(self.covariances.drawn) - 1, some - 1).astype(int)
                 components = self._components(np.unique(rows).tolist())
             # Adjacent components of the same hyperparameters share their pivots and are evaluated together.
             groups = [list(group) for _, group in groupby(components, lambda component: id(component.factor))]
             drawn = [draw_functions(group, relevant, count, settings.pivots, rng) for group in groups]
         expansions, left_out = zip(*drawn, strict=True)
-        return DynamicsDraws(model, self.data, joined(expansions), max(left_out))
+        return DynamicsDraws(self.covariances.model, self.data, joined(expansions), max(left_out))
 
     @property
     def deviations(self) -> Array:
@@ -260,10 +235,7 @@ class DynamicsPosterior(ShortRepr):
 
     @property
     def noise(self) -> float:
-        """The learned variance of noise, as a share of the mean square of a state's residual.
-
-        It is the median over the draws of the hyperparameters, of the state in which it is largest.
-        """
+        """The median share of noise in the mean square of a state's residual, of the state in which it is largest."""
         return float(np.median([(component.noise**2).max() for component in self.components]))
 
 
@@ -274,13 +246,10 @@ def learn_covariances(
     seed: tuple[int, ...] = (0,),
     settings: PosteriorSettings | None = None,
 ) -> LearnedCovariances | None:
-    """Return the posterior of the hyperparameters given recorded transitions.
+    """Return the posterior of the hyperparameters given recorded transitions, and the execution of each ``(N,)`` or -1.
 
     Returns None if fewer than two transitions are usable, or if M explains all of them. If M is rougher than S, the
     residuals are those of a linear model (:mod:`ctxval.learning.residual_data`).
-
-    Args:
-        sources: the execution of each transition; -1 for data that the model was made from, shape ``(N,)``.
     """
     settings, data, smoother = settings or PosteriorSettings(), residual_data(model, transitions, sources), None
     if data is None:
@@ -300,10 +269,7 @@ def learn_covariances(
 
 
 def condition(covariances: LearnedCovariances, transitions: Transitions, sources: Rows) -> DynamicsPosterior | None:
-    """Return the posterior of the dynamics given recorded transitions, and hyperparameters learned from some of them.
-
-    Returns None if fewer than two transitions are usable, or if the model explains all of them.
-    """
+    """Return the posterior given transitions and learned covariances; None if nothing usable is left to learn."""
     data = residual_data(covariances.model, transitions, sources)
     return None if data is None else DynamicsPosterior(covariances, data)
 

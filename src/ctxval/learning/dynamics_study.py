@@ -75,10 +75,7 @@ class DynamicsStudy(ShortRepr):
         return DynamicsStudy(self.given, self.seed, self.quantile if quantile is None else quantile)
 
     def state_of_parts(self) -> tuple[str, bytes]:
-        """Return the description of M and the synthesizer, and some steps of M, which a description may not show.
-
-        If a part is changed in place, as by fitting M again, what is kept here no longer holds.
-        """
+        """Return the description of M and the synthesizer, and some steps of M, which a description may not show."""
         parts, loops, steps = self.validation, self.extended.loops, b""
         if loops is not None:
             middle = loops.horizon // 2
@@ -98,11 +95,7 @@ class DynamicsStudy(ShortRepr):
         return unseen_parameters(self.planner, self.search.pool[:8])
 
     def learn(self, executed: Executed, logged: Sequence[Trajectory] = ()) -> LearnedDynamics | None:
-        """Return what executions teach, and recordings with the same time step that belong to no task.
-
-        Returns None if there are no recorded transitions, if M explains them, if no task can be planned, or if
-        states of M cannot be estimated from recorded outputs.
-        """
+        """Return what executions, and recordings that belong to no task, teach; None if it is nothing."""
         extended, logged = self.extended.executions(executed), () if self.extended.needs_tasks else logged
         if extended is None:
             return None
@@ -172,11 +165,7 @@ class DynamicsStudy(ShortRepr):
     def as_if_executed(
         self, learned: LearnedDynamics, executed: Executed, pending: Executed, logged: Sequence[Trajectory] = ()
     ) -> LearnedDynamics | None:
-        """Return what executions teach with those that are pending, as if these had gone as predicted.
-
-        The hyperparameters and the predicted distances stay, and the doubt is less near the pending executions, which
-        are :meth:`LearnedDynamics.trajectories` of the tasks that are being executed.
-        """
+        """Return what executions teach with pending ones, as if these had gone as predicted; hyperparameters stay."""
         if learned.study is not self:
             return learned.study.as_if_executed(learned, executed, pending, logged)
         together = [*(self.extended.executions(executed) or ()), *pending]
@@ -205,10 +194,7 @@ class DynamicsStudy(ShortRepr):
         return NoiseStudy(self.extended, self.planner, self.search, self.seed, self.quantile)
 
     def without(self, learned: LearnedDynamics, k: int) -> LearnedDynamics | None:
-        """Return what all executions but one teach, with the same hyperparameters and the same structure of noise.
-
-        It is None if nothing can be learned from them.
-        """
+        """Return what all executions but one teach, with the same hyperparameters and structure of noise."""
         executed, noisy = learned.executions, learned.noisy
         kept = executed[:k] + executed[k + 1 :]
         recorded = self._recorded(kept, (), learned.with_data)
@@ -220,13 +206,7 @@ class DynamicsStudy(ShortRepr):
         return None if again is None else others.with_noisy(again)
 
     def with_states(self, executed: Executed, point: Array, trajectory: Trajectory) -> Trajectory | None:
-        """Return a later execution with the states that are learned; None if they cannot be estimated.
-
-        Args:
-            executed: the executions that were learned from, as the system recorded them.
-            point: the task of the later one, ``(d,)``.
-            trajectory: what the system recorded.
-        """
+        """Return a later execution of a task ``(d,)`` with the states that are learned; None without estimates."""
         extended = self.extended.executions([*executed, (point, trajectory)])
         return None if extended is None else extended[-1][1]
 
@@ -246,25 +226,20 @@ class DynamicsStudy(ShortRepr):
         return recorded_transitions(data, loops, self.extended.loops, logged)
 
     def _with_parameter(self, name: str) -> DynamicsStudy:
-        """Return the study with another task parameter as a state; it is kept."""
         if name not in self._others:
             given = self.given.with_parts(physical=[*self.given.physical, name])
             self._others[name] = DynamicsStudy(given, self.seed, self.quantile, self.extended.of(given))
         return self._others[name]
 
     def _found_actuator(self, executed: Executed, learned: LearnedDynamics | None = None) -> Actuator | None:
-        """Return a delay and a lag of inputs that explain the errors of predictions.
-
-        What executions teach without them is ``learned``, if it is known.
-        """
+        """Return a delay and a lag of inputs that explain the errors of predictions, those of ``learned`` if known."""
         some = scheduled(len(executed))
         if self.actuator is not None or some < _FEWEST_AGAINST:
             return None
         key = digest(trajectory for _, trajectory in executed[:some])
         if key not in self._actuators:
             estimated = self.given.outputs is not None
-            # Estimates of states cost as much as hundreds of steps, so few executions have to suffice.
-            # Latest executions from which an actuator is found if their states are estimated.
+            # Estimates of states cost as much as hundreds of steps, so the latest few executions have to suffice.
             among = executed[max(0, some - 5) : some] if estimated else executed[:some]
             inputs = among[0][1].inputs.shape[-1]
 
@@ -298,10 +273,7 @@ class DynamicsStudy(ShortRepr):
         return self._actuators[key]
 
     def _most_telling(self, executed: Executed) -> tuple[str | None, float, float]:
-        """Return the task parameter with which predictions err least, and the left-out errors with it and without.
-
-        The data that M was made from tell no parameters, and are left out of both.
-        """
+        """Return the task parameter with which predictions err least, and the left-out errors with it and without."""
         name, least = None, np.inf
         for other in self.given.space.units:
             if other not in self.given.physical:
@@ -313,6 +285,7 @@ class DynamicsStudy(ShortRepr):
         return name, least, 0.0 if without_it is None else without_it.left_out_error
 
     def _learned_alone(self, executed: Executed) -> LearnedDynamics | None:
+        # The data that M was made from tell no parameters.
         extended = self.extended.executions(executed)
         return None if extended is None else self._learn(extended, (), with_data=False)
 
@@ -347,12 +320,9 @@ class DynamicsStudy(ShortRepr):
             few = posterior.rough_mean
             rough = exact if few is posterior.mean else replace(exact, mean=few)
             count = 2000 if planner.batched else 150
-            return Prediction(
-                exact, exact.left_out, count, rough=rough, otherwise=lambda: self._predict_vectors(executed)
-            )
+            return Prediction(exact, exact.left_out, count, lambda: self._predict_vectors(executed), rough=rough)
 
     def _predict_vectors(self, executed: Executed) -> Prediction | None:
-        """Return the prediction from the vectors of which distances are composed; None if they are not known."""
         distance, vectors = self._errors.validation.distance, self._errors.of(executed)
         if vectors is None or not isinstance(distance, ComposedDistance):
             return None

@@ -150,10 +150,7 @@ def predict_execution(
     *,
     noisy: bool = False,
 ) -> ExecutionPrediction | None:
-    """Return the prediction of the execution of a task ``(d,)``; None if it cannot be planned.
-
-    ``recorded`` turns a trajectory of all states into what the system records.
-    """
+    """Return the prediction of the execution of a task ``(d,)`` as it is recorded; None if it cannot be planned."""
     planned = planner.plan(point[None])
     if not planned:
         return None

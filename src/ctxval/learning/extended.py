@@ -36,10 +36,7 @@ from ctxval.learning.state_estimates import StateEstimates
 
 
 def with_states_of_model(validation: Validation) -> Validation:
-    """Return a validation whose trajectories have the states of M; itself if the states are recorded.
-
-    Its system is that of the given one, and cannot be executed.
-    """
+    """Return a validation, not to be executed, whose trajectories have the states of M; itself if it records states."""
     if validation.outputs is None:
         return validation
     return ExtendedValidation(validation.with_parts(physical=())).validation
@@ -51,28 +48,21 @@ def estimates_by_loops_on_model(validation: Validation) -> StateEstimates | None
 
 
 class ExtendedValidation:
-    """A user's validation, and the one whose trajectories what S does in a step is a function of.
+    """A user's validation, which is given, and the one whose trajectories what S does in a step is a function of.
 
-    Attributes:
-        given: the user's validation.
-        actuator: how the inputs act; None if they act at once.
-        inputs: their number m; it need not be known without an actuator.
-        validation: the other one, whose system cannot be executed; the given one if nothing is extended.
+    The system of the other ``validation`` cannot be executed. If nothing is extended, it is the given one. The number
+    of inputs need not be known without an actuator.
     """
 
     def __init__(
-        self,
-        given: Validation,
-        actuator: Actuator | None = None,
-        inputs: int = 0,
-        estimates: StateEstimates | None = None,
+        self, given: Validation, actuator: Actuator | None = None, inputs: int = 0, known: StateEstimates | None = None
     ) -> None:
-        self.given, self.actuator, self.inputs, self._known = given, actuator, inputs, estimates
+        self.given, self.actuator, self.inputs, self._known = given, actuator, inputs, known
         self._acting = WeakKeyDictionary[Trajectory, Trajectory]()
         of_names = (np.arange(given.space.dimension)[given.space.columns(name)] for name in given.physical)
         self._columns = np.hstack([np.empty(0, dtype=np.intp), *of_names])
+        # Whether only executions of tasks can be learned from: other recordings tell no parameters and no start.
         self.needs_tasks = bool(given.physical) or given.outputs is not None or actuator is not None
-        """Whether only executions of tasks can be learned from: other recordings tell no parameters and no start."""
         self.validation = self._extended() if self.needs_tasks else given
 
     def _extended(self) -> Validation:
@@ -136,10 +126,7 @@ class ExtendedValidation:
         return np.asarray(pairs[:: max(1, len(pairs) // 600)])
 
     def executions(self, executed: Executed, some: int | None = None) -> Executed | None:
-        """Return executions as closed loops of the other validation; None if states of M cannot be estimated.
-
-        Estimates are learned from the first ``some`` of them, by default as many as are scheduled.
-        """
+        """Return executions of the other validation; None without states, estimated as in the first ``some``."""
         some = scheduled(len(executed)) if some is None else some
         acting = list(executed)
         if self.actuator is not None:  # with the inputs that act alone, the same object each time

@@ -4,11 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from ctxval._util.arrays import Array, Rows
 from ctxval.gp.kernels import Matern
+
+
+class LinearFunction(NamedTuple):
+    """Weights of the Matern functions ``(M, n)`` and of the linear parts."""
+
+    matern: Array
+    linear: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,14 +87,6 @@ class Features:
             # Standard deviation of products of an input and a state, relative to that of the linear part.
             parts.append(0.3 * (u[:, :, None] * x[:, None, :]).reshape(len(z), -1))
         return self.linear * np.concatenate(parts, axis=1)
-
-
-@dataclass(frozen=True, eq=False)
-class LinearFunction:
-    """Weights of the Matern functions ``(M, n)`` and of the linear parts."""
-
-    matern: Array
-    linear: Array
 
 
 def spread_rows(Z: Array, count: int) -> Rows:

@@ -18,8 +18,7 @@ import numpy as np
 from ctxval._util.arrays import Array
 from ctxval.core.model import Model
 
-Residual = Callable[[Array], Array]
-"""The residual ``r(z)`` of regressors ``(..., D)``, shape ``(..., n)``."""
+Residual = Callable[[Array], Array]  # r(z) of regressors (..., D), shape (..., n)
 
 
 @dataclass(frozen=True)
@@ -58,11 +57,7 @@ class History:
 
     @classmethod
     def of(cls, model: Model, structure: Structure, scales: Array, middle: tuple[Array, Array]) -> History:
-        """Return the recursion with the steady gain of a Kalman filter of M, linearised at a state and an input.
-
-        Args:
-            scales: standard deviations of the process noise of each state, shape ``(n,)``.
-        """
+        """Return the recursion with the gain of a Kalman filter, for M at its middle and process noise ``(n,)``."""
         n = len(scales)
         if not structure.ratio:
             return cls(model, structure, np.eye(n))
@@ -140,10 +135,7 @@ def of_one_horizon(records: Sequence[Record]) -> Iterator[list[Record]]:
 
 
 def jacobian(function: Callable[[Array], Array], x: Array, steps: Array) -> Array:
-    """Return the derivatives ``(..., n, n)`` of a function at states ``(..., n)``, by central differences.
-
-    The function is called once, with all moved states ``(2 n, ..., n)``.
-    """
+    """Return derivatives ``(..., n, n)`` of a function at states ``(..., n)``, by central differences in one call."""
     moves = np.diag(steps).reshape(len(steps), *(1,) * (x.ndim - 1), len(steps))
     up, down = np.split(function(np.concatenate([x + moves, x - moves])), 2)
     return np.asarray(np.moveaxis(up - down, 0, -1) / (2 * steps))

@@ -22,20 +22,13 @@ from ctxval.gp.cholesky import CholeskyFactor, factorise, pivoted_rows
 from ctxval.gp.kernels import Covariance, Matern, Towards
 from ctxval.gp.regression import most_likely
 
-FAMILIES = ((2.5, 0.0), (2.5, 1.0), (1.5, 0.0))
-"""Smoothness and growth of the covariances, equally likely a priori."""
-
-SMOOTHER_FAMILIES = ((4.5, 0.0), *FAMILIES)
-"""The same for the system itself, without a learned model, which may be rough."""
-
-NOISE = (1e-7, 1.0)
-"""Bounds of the noise variance, relative to that of the Matern part."""
-
+FAMILIES = ((2.5, 0.0), (2.5, 1.0), (1.5, 0.0))  # smoothness and growth of the covariances, equally likely a priori
+SMOOTHER_FAMILIES = ((4.5, 0.0), *FAMILIES)  # those of the system itself, without a learned model, which may be rough
+NOISE = (1e-7, 1.0)  # bounds of the noise variance, relative to that of the Matern part
 # Medians of the length-scales, in standard deviations of the data, and of the variances of the constant and of the
 # linear part, relative to that of the Matern part, with the deviations of their logarithms.
 _LENGTH, _LINEAR_PART = (3.0, 1.0), (1.0, 5.0)
 _FREEDOM = 6.0  # degrees of freedom of the t distribution of the proposals
-
 _LINEAR = (1e-4, 1e6)  # bounds of the variances of the constant and of the linear part
 
 

@@ -28,9 +28,7 @@ _CANDIDATES = 600  # regressors from which centres are chosen
 _LENGTH = np.log(3.0)  # median of the length-scales in standard deviations of the data; their logarithms deviate by 1
 _AMPLITUDES = np.logspace(-4, 2, 19)  # of the residual, in root mean squares
 _NOISES = np.logspace(-3.3, 0.3, 18)  # standard deviations of the noise, in root mean squares of the residual
-
-DrawnWeights = tuple[Features, Array, Array]
-"""Features, and weights ``(k, F, n)`` and standard deviations of the noise ``(k, n)`` of k draws."""
+DrawnWeights = tuple[Features, Array, Array]  # weights (k, F, n) and standard deviations of noise (k, n) of k draws
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,11 +60,6 @@ class Scaled:
     def states(self) -> int:
         """The number n of states."""
         return int(self.E.shape[1])
-
-    @property
-    def usual_theta(self) -> Array:
-        """The most likely hyperparameters a priori."""
-        return np.full(self.states + self.inputs + 2, _LENGTH)
 
     @functools.cached_property
     def centres(self) -> Array:
@@ -227,17 +220,14 @@ def fit_lagged(
     products: bool = True,
     usual: bool = False,
 ) -> LaggedFit:
-    """Return the posterior if records are the state; hyperparameters are learned if they are not given.
-
-    If the ``usual`` one is asked for, its hyperparameters are the most likely ones a priori and its noise is constant,
-    which costs little.
-    """
+    """Return the posterior if records are the state; the ``usual`` one is cheap: it learns no hyperparameters."""
     Z, E, _ = history.along(records)
     scaled, rows = Scaled.of(Z, E, pairs, records[0].inputs.shape[1], products), np.ones((len(Z), 1))
+    most_likely = np.full(scaled.states + scaled.inputs + 2, _LENGTH)  # a priori
     if usual:
-        return _conditioned(history, scaled, scaled.usual_theta, live, rows, None)
+        return _conditioned(history, scaled, most_likely, live, rows, None)
     if theta is None:
-        theta, best = scaled.usual_theta, _height(scaled, scaled.usual_theta, live, rows)
+        theta, best = most_likely, _height(scaled, most_likely, live, rows)
         # Moves of one coordinate at a time; that of lags does nothing if there are none.
         moved = [i for i in range(len(theta)) if history.structure.lags or i != len(theta) - 2]
         for step, i in product((0.9, 0.5), moved):
@@ -303,11 +293,7 @@ class FilterFit(InnovationsFit):
 def fit_filter(
     history: History, records: Sequence[Record], pairs: Array, plain: InnovationsFit, steps: int = 5
 ) -> FilterFit:
-    """Return the posterior with measurement noise, from that of records as states.
-
-    Raises:
-        LinAlgError: if the filter diverges.
-    """
+    """Return the posterior with measurement noise, from that without; LinAlgError if the filter diverges."""
     live, n = plain.live, plain.scaled.states
     Z, E, _ = history.along(records)
     # The units are those of the records, not those of a filter that knows no residual yet.

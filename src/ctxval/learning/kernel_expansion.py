@@ -173,10 +173,8 @@ def draw_functions(
 ) -> tuple[KernelExpansion, float]:
     """Return ``count`` draws of each of some components, and the share of the variance that they leave out elsewhere.
 
-    Args:
-        alike: components that differ in their amplitudes only.
-        relevant: pairs ``(R, k)`` that closed loops visit; the pivots, at which draws are exact, are chosen from them.
-        pivots: largest number of pivots.
+    The components differ in their amplitudes only. Draws are exact at so many ``pivots`` at most, chosen from relevant
+    pairs ``(R, k)``, which closed loops visit.
     """
     first = alike[0]
     kernel, theta = first.hyperparameters.kernel, first.hyperparameters.theta

@@ -52,10 +52,7 @@ class LearnedDynamics(ShortRepr):
 
     @functools.cached_property
     def noisy(self) -> NoisyPosterior | None:
-        """The dynamics with noise and histories, learned from the executions.
-
-        It is None if the next state follows from state and input, or if they cannot be learned.
-        """
+        """The dynamics with noise and histories; None if state and input suffice, or if nothing can be learned."""
         if not len(self.executed):
             return None
         with single_threaded():
@@ -144,18 +141,15 @@ class LearnedDynamics(ShortRepr):
                 self._draws[key] = drawn
             values = planner.distances(self._draws[key], planned, len(points))
             of_pool, loops = (planner.run(self.drawn_from.silent, plans) for plans in (search.plans, planned))
-            beyond, away = np.full(len(points), np.inf), np.zeros(len(points))
-            executed_only = self.boundary is not None
-            all_beyond = beyond_records(self.posterior, of_pool, loops, executed_only=executed_only)
+            beyond, away, crossed = np.full(len(points), np.inf), np.zeros(len(points)), np.ones(len(points))
+            boundary = self.boundary
+            all_beyond = beyond_records(self.posterior, of_pool, loops, executed_only=boundary is not None)
             all_away = away_from_executions(self.trajectories_of_system, self.positions, of_pool, loops)
-            for plan, *each in zip(planned, all_beyond, all_away, strict=True):
+            for plan, loop, *each in zip(planned, loops, all_beyond, all_away, strict=True):
                 beyond[plan.rows], away[plan.rows] = each
-            if self.boundary is None:
-                return values, beyond, away, None
-            crossed = np.ones(len(points))
-            for plan, loop in zip(planned, loops, strict=True):
-                crossed[plan.rows] = self.boundary.crossed(self.posterior, loop)
-        return values, beyond, away, crossed
+                if boundary is not None:
+                    crossed[plan.rows] = boundary.crossed(self.posterior, loop)
+        return values, beyond, away, None if boundary is None else crossed
 
     def worst_case_of(self, draws: int) -> WorstCase:
         """Return the largest distance over all tasks, for each of at least so many draws of the dynamics."""
@@ -207,20 +201,16 @@ class LearnedDynamics(ShortRepr):
             planned = planner.plan(pool)
             loops = planner.run(self.posterior.mean, planned)
         visited = np.concatenate([each.states.reshape(-1, states) for each in loops])
-        of_task = [
-            np.broadcast_to(plan.rows[:, None], each.states.shape[:3])
-            for plan, each in zip(planned, loops, strict=True)
+        steps = [
+            np.broadcast_to(p.rows[:, None], each.states.shape[:3]) for p, each in zip(planned, loops, strict=True)
         ]
-        rows, finite = np.concatenate([each.ravel() for each in of_task]), np.isfinite(visited).all(axis=1)
+        rows, finite = np.concatenate([each.ravel() for each in steps]), np.isfinite(visited).all(axis=1)
         executed, labels = self.trajectories_of_system, self.labels[:states]
         return largest_pocket(visited[finite], executed, labels, self.positions, rows[finite], pool)
 
     @property
     def untried_parameter(self) -> tuple[int, float, Array] | None:
-        """A parameter that M's loops do not depend on, its largest gap between executions, and a task in the gap.
-
-        The gap is a share of the parameter's range; None if there is no such parameter.
-        """
+        """A parameter without effect on M's loops, its largest gap as a share of its range, and a task in the gap."""
         members, gaps = self.study.validation.space.members, list[tuple[int, float, float]]()
         for j in self.study.unseen_parameters:
             ordered = np.sort(self.executed[:, j])

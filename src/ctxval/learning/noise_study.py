@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -33,23 +34,15 @@ STRUCTURES = (
 EXACT = 1e-3  # share of noise below which records with lags determine the next one
 NOISY = 0.01  # share of noise from which executions of one task differ
 _BETTER, _GOOD = 0.1, 0.02  # share of the error without a history, and of the residual, that a history leaves
-
+# Standard deviation of the distance of a task over its executions, as a share of the largest distance, that matters.
 MATTERS = 0.01
-"""Standard deviation of the distance of a task over its executions, as a share of the largest distance, from which
-noise matters."""
-
 _ROUNDING = 1e-5  # standard deviation, as a share of a state's, below which it is rounding
 _TRIED = 32  # tasks of the pool among which those with the largest distances show what noise does
 _TASKS, _RUNS = 6, 10  # these tasks, and how often each of them is run
 
 
 class NoiseStudy:
-    """Learns dynamics with noise and histories of one experiment; chosen structures are kept.
-
-    Args:
-        search: whose pool of tasks shows what noise does to distances.
-        quantile: the share of the executions of a task that a distance is about.
-    """
+    """Learns dynamics with noise and histories of one experiment; chosen structures are kept."""
 
     def __init__(
         self, extended: ExtendedValidation, planner: LoopPlanner, search: WorstCaseSearch, seed: int, quantile: float
@@ -58,18 +51,10 @@ class NoiseStudy:
         self._structures = Latest[bytes, ChosenStructure](8)
 
     def learn(self, posterior: DynamicsPosterior, records: Sequence[Record]) -> NoisyPosterior | None:
-        """Return dynamics with noise; None if executions follow from task, state and input, or if nothing is learned.
-
-        Args:
-            posterior: what the executions teach without noise.
-            records: of these executions.
-        """
+        """Return dynamics with noise; None if task, state and input suffice for executions, or nothing is learned."""
         # Executions do not follow from task, state and input if noise, or what is not recorded, acts.
-        is_needed = (
-            float((posterior.most_probable.noise**2).max()) > NOISY
-            or self._effect(posterior) > MATTERS
-            or self._effect(posterior, _scatter_of(records)) > MATTERS
-        )
+        is_needed = float((posterior.most_probable.noise**2).max()) > NOISY or self._effect(posterior) > MATTERS
+        is_needed = is_needed or self._effect(posterior, _scatter_of(records)) > MATTERS
         if not is_needed and len(records) >= 3:
             last = records[-1]
             with contextlib.suppress(np.linalg.LinAlgError, InputError, ValueError), np.errstate(all="ignore"):
@@ -115,10 +100,7 @@ class NoiseStudy:
         replicates: int,
         chosen: ChosenStructure | None = None,
     ) -> tuple[NoisyPosterior, ChosenStructure] | None:
-        """Return the posterior of noisy dynamics, and its structure, which is learned unless it was chosen before.
-
-        Returns None if nothing can be learned: the recursions diverge, or numbers are too large.
-        """
+        """Return the posterior of noisy dynamics and its structure, which may be chosen; None if recursions diverge."""
         data = posterior.data
         try:
             with single_threaded(), np.errstate(all="ignore"):
@@ -130,10 +112,9 @@ class NoiseStudy:
         return NoisyPosterior(fit, data, _scatter_of(records), horizon, replicates, self.quantile, seed), chosen
 
     def _effect(self, posterior: DynamicsPosterior | NoisyPosterior, starts: Array | None = None) -> float:
-        """Return the largest standard deviation of the distance of a task, as a share of the largest distance.
+        """Return the largest standard deviation of a task's distance over noise, as a share of the largest distance.
 
-        It is that over noise or, if they are given, over initial states with standard deviations ``(n,)`` around those
-        of the tasks. Of some tasks, those with the largest distances count. Only finite distances do.
+        If they are given, it is that over starts with such deviations ``(n,)``. The tasks have large finite distances.
         """
         causes, planner = [posterior.deviations] if starts is None else [starts], self.planner
         if starts is None and isinstance(posterior, NoisyPosterior):
@@ -178,8 +159,7 @@ def _scatter_of(records: Sequence[Record]) -> Array:
     return np.asarray(np.sqrt(np.mean([(record.states[0] - record.start) ** 2 for record in records], axis=0)))
 
 
-@dataclass(frozen=True, eq=False)
-class ChosenStructure:
+class ChosenStructure(NamedTuple):
     """A structure, learned from some executions, with the hyperparameters of the fit whose records are the state."""
 
     structure: Structure
@@ -207,17 +187,14 @@ def fit_structures(
     if chosen is not None:
         plain = lagged(Structure(0 if chosen.structure.ratio else chosen.structure.lags), chosen.theta)
         return (filtered(chosen.structure, plain) if chosen.structure.ratio else plain), chosen
-    longest = max(1, len(records))
-    fits: list[InnovationsFit] = [
-        lagged(structure, None) for structure in STRUCTURES if not structure.ratio and structure.lags <= longest
-    ]
-    of_states = fits[0]
-    least = min(fit.share for fit in fits)
+    possible = [structure for structure in STRUCTURES if structure.lags <= max(1, len(records))]
+    fits: list[InnovationsFit] = [lagged(structure, None) for structure in possible if not structure.ratio]
+    of_states, least = fits[0], min(fit.share for fit in fits)
     exact = [fit for fit in fits if fit.share <= max(10 * least, 1e-6)] if least <= EXACT else []
     best = min(exact, key=lambda fit: fit.history.structure.lags) if exact else max(fits, key=_preference)
     if best.share > NOISY:
-        for structure in STRUCTURES:
-            if structure.ratio and structure.lags <= longest:
+        for structure in possible:
+            if structure.ratio:
                 with contextlib.suppress(np.linalg.LinAlgError):
                     fits.append(filtered(structure, of_states))
         best = max(fits, key=_preference)
@@ -228,11 +205,7 @@ def fit_structures(
 def predicted_by_history(
     posterior: DynamicsPosterior, records: Sequence[Record], pairs: Array, without_history: Array
 ) -> bool:
-    """Return whether a history predicts the last record far better than state and input do, or neither predicts it.
-
-    The last record is left out. ``without_history`` has the predictions ``(H, n)`` of its states without a history,
-    learned from the other records.
-    """
+    """Return whether a history predicts the last record far better than state and input do, or neither predicts it."""
     last, sizes, live = records[-1], posterior.data.sizes, posterior.data.learned
 
     def share(errors: Array) -> float:

@@ -17,7 +17,7 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from ctxval._util.arrays import Array, single_threaded
+from ctxval._util.arrays import Array, Rows, single_threaded
 from ctxval._util.cores import on_all_cores
 from ctxval._util.progress import advance
 from ctxval.core.distance import ComposedDistance
@@ -30,9 +30,7 @@ from ctxval.learning.draws import DynamicsDraws
 from ctxval.learning.dynamics_posterior import DynamicsPosterior
 from ctxval.searches import Prediction
 
-Executed = Sequence[tuple[Array, Trajectory]]
-"""Points of the unit cube ``(d,)`` with the system's trajectories there."""
-
+Executed = Sequence[tuple[Array, Trajectory]]  # points of the unit cube (d,) with the system's trajectories there
 _KERNEL = Matern(2.5, ard=True, length_scale=(0.05, 100.0), variance=(1e-6, 1e3), linear=(1e-6, 1e3))
 _NOISE = 1e-8  # noise variance relative to the vectors' mean square: it keeps the covariance matrix positive definite
 _LEARNED_FROM = 200  # largest number of vectors, the latest ones, from which the hyperparameters are learned
@@ -74,27 +72,26 @@ class PredictedDistance:
             distances[~is_executed] = self(points[~is_executed])[0]
         if len(known):
             without = self.posterior.means_without(list(filter(None, executions)))
+            own = self.planner.own_distances
             with single_threaded():
-                parts = halved(
-                    lambda some: self.planner.own_distances(without[some], known[some, None])[:, 0], len(known)
-                )
+                parts = halved(lambda some: own(without[some], known[some, None])[:, 0], len(known))
             distances[is_executed] = np.concatenate([[np.nan] if part is None else part for _, part in parts])
         return np.where(np.isfinite(distances), distances, np.nan)
 
     def _predicted(self, points: Array) -> Array:
         """Return distances and doubts ``(2, m)``; NaN for a task that cannot be planned or where a part fails."""
 
-        def closed_loops(some: Array) -> Array:
+        def closed_loops(some: Rows) -> Array:
             predicted = np.full((2, len(some)), np.nan)
-            planned = self.planner.plan(some)
+            planned = self.planner.plan(points[some])
             for plan, loops in zip(planned, self.planner.run(self.mean, planned), strict=True):
                 with np.errstate(all="ignore"):
                     doubt = self.posterior.unfamiliarity(loops.states[0], loops.inputs[0])
                 predicted[:, plan.rows] = loops.distances[0], doubt
             return predicted
 
-        parts = halved(lambda rows: closed_loops(points[rows]), len(points))
-        return np.concatenate([np.full((2, 1), np.nan) if part is None else part for _, part in parts], axis=1)
+        parts = [part for _, part in halved(closed_loops, len(points))]
+        return np.concatenate([np.full((2, 1), np.nan) if part is None else part for part in parts], axis=1)
 
 
 def executions_of(executed: Array, points: Iterable[Array]) -> list[list[int]]:
@@ -135,13 +132,7 @@ class ErrorVectors:
 
 
 def predict_composed(points: Array, vectors: Array, compose: Callable[[Array], Array]) -> Prediction | None:
-    """Return a prediction of values from the vectors ``(n, k)`` of which they are composed at points ``(n, d)``.
-
-    Returns None if fewer than two vectors are known, or if all of them are zero.
-
-    Args:
-        compose: vectors ``(..., k)`` -> values ``(...)``.
-    """
+    """Return a prediction of values composed of vectors ``(n, k)`` at points; None for less than two, or only zeros."""
     if points.ndim != 2 or vectors.ndim != 2 or len(points) != len(vectors):
         raise ShapeError(f"points must be (n, d) and vectors (n, k), got {points.shape}, {vectors.shape}.")
     scale = float(np.sqrt((vectors**2).mean())) if len(vectors) else 0.0
@@ -185,13 +176,7 @@ def _most_likely(X: Array, Y: Array) -> Array:
 
     def log_density(theta: Array) -> tuple[float, Array]:
         away = (theta - medians) / deviations
-        value, gradient = _log_likelihood(theta, X, Y)
-        return value - 0.5 * float(away @ away), gradient - away / deviations
+        value, W = log_likelihood_of_outputs(_KERNEL(theta, X, X), _NOISE, Y)
+        return value - 0.5 * float(away @ away), _KERNEL.weighted_gradient(theta, X, W) - away / deviations
 
     return most_likely(log_density, medians[None], _KERNEL.bounds(d))
-
-
-def _log_likelihood(theta: Array, X: Array, Y: Array) -> tuple[float, Array]:
-    """Return ``sum_j log p(Y[:, j] | X, theta)``, up to a constant, and its gradient (Rasmussen and Williams, 5.9)."""
-    value, W = log_likelihood_of_outputs(_KERNEL(theta, X, X), _NOISE, Y)
-    return value, _KERNEL.weighted_gradient(theta, X, W)

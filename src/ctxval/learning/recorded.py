@@ -30,12 +30,8 @@ def recorded_transitions(
 ) -> tuple[Transitions, Rows] | None:
     """Return the known transitions of the system and the execution of each; -1 for data that the model was made from.
 
-    Returns None if there are none. Of many transitions, a random part is returned.
-
-    Args:
-        data: transitions that the model was made from, as :func:`data_near` returns them.
-        loops: closed loops on M, which show which of the other data the tasks need.
-        logged: recordings that belong to no task; their numbers follow those of the executions.
+    Returns None if there are none. Of many transitions, a random part is returned, and of recordings that belong to no
+    task, those near closed loops on M; the numbers of these recordings follow those of the executions.
     """
     parts = [trajectory.transitions() for trajectory in executed]
     sources = [np.full(len(part), k) for k, part in enumerate(parts)]
@@ -59,10 +55,7 @@ def recorded_transitions(
 
 
 def closed_loops_on_model(validation: Validation) -> Trajectory | None:
-    """Return closed loops on M for random tasks: a batch, or one task if there can be no batch.
-
-    Returns None if no task can be planned.
-    """
+    """Return closed loops on M for random tasks: a batch, or one task; None if no task can be planned."""
     space = validation.space
     points = space.from_unit(np.random.default_rng(0).random((64, space.dimension)))
     batches = [points] if getattr(validation.synthesizer, "batched", False) else []
@@ -100,10 +93,7 @@ def digest(runs: Iterable[Trajectory | Record]) -> bytes:
 
 
 def scheduled(count: int) -> int:
-    """Return the largest number of executions, up to ``count``, at which hyperparameters are learned.
-
-    These are 0 to 4, 6, 8, 12, 16, 24 and so on, two in each doubling.
-    """
+    """Return the largest of 0 to 4, 6, 8, 12, 16, 24 and so on, two in each doubling, that is not above ``count``."""
     step = 1
     while count >= 4 * step:
         step *= 2

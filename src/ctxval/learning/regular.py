@@ -56,10 +56,7 @@ class RegularTransitions:
         return int((~self.regular & (self.sources >= 0)).sum())
 
     def posterior(self, without: Collection[int] = ()) -> tuple[DynamicsPosterior, Boundary] | None:
-        """Return the posterior of the regular part, and where it ends, learned without some executions.
-
-        Returns None if the regular transitions teach nothing.
-        """
+        """Return the posterior of the regular part without some executions, and where it ends; None without any."""
         kept = ~np.isin(self.sources, list(without))
         rows = np.flatnonzero(self.regular & kept)
         posterior = condition(self.covariances, self.transitions[rows], self.sources[rows])
@@ -167,10 +164,7 @@ class Boundary:
         return cls((*explanations, _separated(pairs, others[None], every)[0]))
 
     def crossed(self, posterior: DynamicsPosterior, loops: Loops) -> Array:
-        """Return by how much the first draw's loops ``(q,)`` cross it, as shares of ranges; not above 0 if they do not.
-
-        A run that diverges crosses it by 1.
-        """
+        """Return by how much loops of the first draw cross it ``(q,)``; at most 0 if not, 1 if one diverges."""
         states, inputs = loops.states[0], loops.inputs[0]
         with np.errstate(all="ignore"):
             inputs = np.concatenate([inputs, inputs[:, -1:]], axis=1)
@@ -180,12 +174,7 @@ class Boundary:
 
 
 def _separated(regular: Array, ends: Array, columns: Sequence[int]) -> tuple[Explanation, float]:
-    """Return a function that separates points, and the share of the regular ones beyond its first irregular one.
-
-    Args:
-        regular: points ``(N, k)``.
-        ends: ``(e, M, k)``; of each irregular transition, the end with the largest value counts.
-    """
+    """Return a function that separates points ``(N, k)`` from ends ``(e, M, k)``, and the share of points beyond."""
     F, of_ends = _quadratic(regular), _quadratic(ends.reshape(-1, ends.shape[-1])).reshape(*ends.shape[:2], -1)
     chosen, M = np.full(ends.shape[1], len(ends) - 1), ends.shape[1]
     weights = np.zeros(F.shape[1])
@@ -201,10 +190,7 @@ def _separated(regular: Array, ends: Array, columns: Sequence[int]) -> tuple[Exp
 
 
 def _largest_margin(low: Array, high: Array) -> Array:
-    """Return weights ``(f,)`` of features that are below -1 at some rows and above 1 at others, as far as possible.
-
-    Both kinds of rows weigh the same. Newton's method on squared errors (Keerthi and DeCoste 2005).
-    """
+    """Return weights ``(f,)`` by Newton's method on squared errors, both kinds equal (Keerthi and DeCoste 2005)."""
     F, y = np.concatenate([low, high]), np.concatenate([-np.ones(len(low)), np.ones(len(high))])
     share = np.where(y < 0, 0.5 / len(low), 0.5 / len(high))
     ridge, active = np.diag([1e-9, *[_RIDGE] * (F.shape[1] - 1)]), np.ones(len(y), dtype=np.bool_)

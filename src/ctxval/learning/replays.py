@@ -38,12 +38,7 @@ class Replay(ShortRepr):
 def replay_executed(
     validation: Validation, learned: LearnedDynamics | None, wanted: Sequence[Array]
 ) -> list[Replay | None]:
-    """Return the replays of tasks; None for a task that cannot be planned.
-
-    Args:
-        learned: what executions teach; those at the task that is replayed are left out.
-        wanted: points of the unit cube ``(d,)`` of the tasks.
-    """
+    """Return the replays of tasks ``(d,)``, each without its own executions; None for one that cannot be planned."""
     models: list[DynamicsDraws | None] = [None] * len(wanted)
     study = DynamicsStudy(validation) if learned is None else learned.study
     with single_threaded():

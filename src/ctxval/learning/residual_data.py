@@ -18,8 +18,7 @@ from ctxval.learning.hyperparameters import FAMILIES, ResidualKernel, climbed, l
 from ctxval.models.increments import standard_deviations, standardised_pairs
 from ctxval.models.linear import Linear
 
-NEGLIGIBLE = 1e-7
-"""A residual below this share of the state's typical change is rounding."""
+NEGLIGIBLE = 1e-7  # a residual below this share of the state's typical change is rounding
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,26 +60,13 @@ def residual_data(model: Model, transitions: Transitions, sources: Rows) -> Resi
     if not learned.any():
         return None
     shift, scale = pairs.mean(axis=0), standard_deviations(pairs)
-    return ResidualData(
-        (pairs - shift) / scale,
-        residuals / np.where(learned, sizes, np.inf),
-        sources[usable],
-        shift,
-        scale,
-        sizes,
-        typical,
-        learned,
-        units=np.where(learned, sizes, 0.0),
-        inputs=transitions.u.shape[1],
-        transitions=transitions[usable],
-    )
+    units, outputs = np.where(learned, sizes, 0.0), residuals / np.where(learned, sizes, np.inf)
+    constants = shift, scale, sizes, typical, learned, units, transitions.u.shape[1]
+    return ResidualData((pairs - shift) / scale, outputs, sources[usable], *constants, transitions[usable])
 
 
 def smoother_than(data: ResidualData, count: int) -> tuple[Model, ResidualData] | None:
-    """Return a linear model and its residuals if with them the transitions are far more probable than with M's.
-
-    The hyperparameters are learned from ``count`` transitions.
-    """
+    """Return a linear model and its residuals if these are far more probable than M's, by ``count`` transitions."""
     # With at least 10 transitions for each coefficient, the fit itself explains little.
     if len(data.pairs) < 10 * (data.pairs.shape[1] + 1):
         return None

@@ -20,9 +20,7 @@ from ctxval.learning.histories import Record
 from ctxval.learning.learned_dynamics import LearnedDynamics
 from ctxval.learning.tolerance import pushed
 
-NEGLIGIBLE = 0.01
-"""Share of the threshold: what moves no distance by so much is no change."""
-
+NEGLIGIBLE = 0.01  # share of the threshold: what moves no distance by so much is no change
 _LEAST, _MOST = 1e-6, 0.3  # limits of negligible residuals, as shares of a state's typical step
 
 
@@ -67,10 +65,7 @@ class RunStatistics:
         distance: float | None,
         learned: LearnedDynamics | None = None,
     ) -> dict[str, RunStatistic]:
-        """Return the statistics of a later run, with the states that are learned, beside what was learned.
-
-        Without its task, ``(d,)``, and its distance, only those of the residuals are known.
-        """
+        """Return the statistics of a later run; without its task ``(d,)`` and distance, only those of the residuals."""
         learned = self.learned if learned is None else learned
         study, floors = learned.study, self.floors**2
         if point is None:
@@ -117,8 +112,8 @@ class RunStatistic:
     information: Array | None = None
 
 
+# The statistic of the executed distance: its squared error, standardised by the draws of the dynamics.
 DISTANCE = "errors of the predicted distance"
-"""Name of the statistic of the executed distance: its squared error, standardised by the draws of the dynamics."""
 
 
 def names(study: DynamicsStudy, states: int) -> Sequence[str]:
@@ -141,10 +136,7 @@ def influences(learned: LearnedDynamics) -> Array:
 
 
 def _residuals(learned: LearnedDynamics, record: Record) -> tuple[Array, Array, Array, Array]:
-    """Return residuals ``(H, n)`` of a record, and the regressors ``(H, k)``.
-
-    Between them are the mean squares of the doubt and of the noise, ``(n,)``.
-    """
+    """Return residuals ``(H, n)``, mean squares of doubt and noise, ``(n,)``, and regressors ``(H, k)`` of a record."""
     noisy, posterior = learned.noisy, learned.posterior
     if noisy is None:
         data, most = posterior.data, posterior.most_probable

@@ -21,18 +21,15 @@ from ctxval.learning.prediction import Executed
 from ctxval.models.corrected import before_refinement
 from ctxval.models.increments import standard_deviations
 
+# What M misses in recorded directions, beside what it misses in all others, as shares of their steps.
 _SHARES = np.array([1.0, 1e-1, 1e-2, 1e-3, 1e-4])
-"""What M misses in recorded directions, beside what it misses in all others, as shares of their steps."""
 
 
 class StateEstimates:
     """The states of M along executions, estimated from their inputs and outputs; they are kept like these.
 
-    A refined model is estimated as the model before, whose residual is learned.
-
-    Args:
-        validation: the user's validation, which has outputs.
-        states: states of closed loops on M ``(..., H + 1, n)``, whose changes in one step are typical.
+    A refined model is estimated as the model before, whose residual is learned. States of closed loops on M
+    ``(..., H + 1, n)`` have typical changes in one step.
     """
 
     def __init__(self, validation: Validation, outputs: Outputs, states: Array) -> None:
@@ -55,9 +52,8 @@ class StateEstimates:
                     if trajectory not in self._known:
                         task = self.validation.task(space.parameters(space.from_unit(point)))
                         start = np.asarray(task.initial_state, dtype=np.float64)
-                        self._known[trajectory] = smoothed_states(
-                            model, self.outputs, start, trajectory.states, trajectory.inputs, self.steps
-                        )
+                        recorded = trajectory.states, trajectory.inputs
+                        self._known[trajectory] = smoothed_states(model, self.outputs, start, *recorded, self.steps)
         except Exception:  # the user's parts, at states that M never reaches by itself
             return None
         known = [(*self._known[trajectory], trajectory) for _, trajectory in executed]
@@ -71,10 +67,8 @@ class StateEstimates:
         for states, _, trajectory in known:
             # The last states are left out, because only later outputs would show them.
             end = min(-(-states.shape[-1] // trajectory.states.shape[-1]) - 1, trajectory.horizon - 1)
-            kept = trajectory.horizon - end
-            estimated.append(
-                Trajectory(trajectory.times[: kept + 1], states[: kept + 1, chosen], trajectory.inputs[:kept])
-            )
+            kept, times = trajectory.horizon - end, trajectory.times
+            estimated.append(Trajectory(times[: kept + 1], states[: kept + 1, chosen], trajectory.inputs[:kept]))
         return estimated
 
 
@@ -83,15 +77,9 @@ def smoothed_states(
 ) -> tuple[Array, Array]:
     """Return the most probable states of a model with these inputs and outputs, and how well outputs are predicted.
 
-    Args:
-        start: the first state ``(n,)``, before the first outputs correct it.
-        y: outputs ``(H + 1, p)``.
-        u: inputs ``(H, m)``.
-        steps: typical changes of the states in one step, ``(n,)``.
-
-    Returns:
-        States ``(H + 1, k, n)``, and mean squared innovations ``(k, p)``, for each of k shares of what the model misses
-        in recorded directions.
+    These are states ``(H + 1, k, n)``, and mean squared innovations ``(k, p)``, for each of k shares of what the model
+    misses in recorded directions. They begin at a state ``(n,)`` before the first of the outputs y ``(H + 1, p)``
+    correct it, have inputs u ``(H, m)``, and change by typical steps ``(n,)``.
     """
     k, scale = len(_SHARES), np.diag(steps)
     C = outputs.jacobian(start) @ scale
@@ -104,15 +92,13 @@ def smoothed_states(
     measurement = np.diag((1e-6 * _SHARES[-1] * spreads) ** 2)
     inputs = np.repeat(u[:, None], k, axis=1)
     known, _ = corrected(outputs, Estimate(np.repeat(start[None], k, axis=0), process), y[0], measurement)
-    filtered, priors, jacobians, innovations = [known], list[Estimate](), list[Array](), list[Array]()
+    steps_back, innovations = list[tuple[Estimate, Array, Estimate]](), list[Array]()
     for t in range(len(u)):
-        prior, A = predicted(model, known, inputs[t], process)
+        before, (prior, A) = known, predicted(model, known, inputs[t], process)
         known, innovation = corrected(outputs, prior, y[t + 1], measurement)
-        filtered.append(known)
-        priors.append(prior)
-        jacobians.append(A)
+        steps_back.append((before, A, prior))
         innovations.append(innovation)
     states = [known.mean]
-    for t in reversed(range(len(u))):
-        states.append(smoothed(filtered[t], jacobians[t], priors[t], states[-1]))
+    for step_back in reversed(steps_back):
+        states.append(smoothed(*step_back, states[-1]))
     return np.stack(states[::-1]), np.square(innovations).mean(axis=0)

@@ -58,12 +58,7 @@ def push_response(planner: LoopPlanner, posterior: DynamicsPosterior, tasks: Arr
 def pushed(
     mean: DynamicsDraws, pushes: Array, widths: Array | float = 1.0, recorded: cKDTree | None = None
 ) -> DisturbedDynamics:
-    """Return a model whose next state is moved by pushes ``(S, n)``, everywhere or only where no record is near.
-
-    Args:
-        widths: the ranges of the states on rollouts, shape ``(n,)``.
-        recorded: recorded states in units of these ranges.
-    """
+    """Return a model that is pushed by ``(S, n)``, everywhere or away from records, in units of the widths ``(n,)``."""
 
     def added(ways: Rows, x: Array) -> Array:
         if recorded is None:

@@ -23,9 +23,7 @@ from ctxval.learning.closed_loops import AnyDraws, LoopPlanner, PlannedTasks, lo
 from ctxval.learning.dynamics_posterior import DynamicsPosterior
 from ctxval.learning.noisy_draws import SETTLED, NoisyDraws, NoisyPosterior
 
-AnyPosterior = DynamicsPosterior | NoisyPosterior
-"""The posterior of dynamics without and with noise."""
-
+AnyPosterior = DynamicsPosterior | NoisyPosterior  # of dynamics without and with noise
 _DIVERGED = 1e30  # the distance of a loop that diverges, in searches: larger than all others, and finite
 _EVALUATIONS = (512, 2048, 4096, 6000, 6000, 6000, 12000)  # tasks of a global search, for 1, 2, ... parameters
 _SHOWN = 16  # largest number of these tasks
@@ -73,6 +71,11 @@ class WorstCase:
     # largest share by which a distance on the mean is larger than those of tasks that are nearly the same
     sharpness: float = 0.0
 
+    def with_draws(self, maxima: Array, points: Array, loops: int, left_out: float) -> WorstCase:
+        """Return what a search has found on the mean and then, in so many more loops, on draws."""
+        maxima, evaluations = np.where(maxima >= _DIVERGED, np.inf, maxima), self.evaluations + loops
+        return replace(self, maxima=maxima, points=points, evaluations=evaluations, left_out=left_out)
+
 
 class WorstCaseSearch:
     """Searches the tasks for the largest distance, for each draw of the dynamics."""
@@ -100,10 +103,7 @@ class WorstCaseSearch:
 
     @functools.cached_property
     def pool(self) -> Array:
-        """Tasks that are spread over the cube, every second one with coordinates at bounds, shape ``(N, d)``.
-
-        Of a suite, they are all tasks.
-        """
+        """Tasks of a suite, or spread over the cube, every second one with coordinates at bounds, shape ``(N, d)``."""
         if self.members is not None:
             return self.members
         rng = np.random.default_rng([self._seed, 0])
@@ -144,21 +144,14 @@ class WorstCaseSearch:
         return float(jumps[np.isfinite(jumps)].max(initial=0.0))
 
     def _nearer(self, posterior: AnyPosterior, tasks: Array, distances: Array) -> Array:
-        """Return distances ``(k, 3)`` of three tasks in a row that are ``_NEARER`` times nearer, where they bend most.
-
-        Of each row, the half with the larger change is kept, which a jump is in.
-        """
-        # Rows of such tasks that are looked at more closely if the distance has kinks.
+        """Return distances ``(k, 3)`` of tasks in a row that are ``_NEARER`` times nearer, where they bend most."""
         bends = np.abs(distances[:, 1] - 0.5 * (distances[:, 0] + distances[:, 2]))
         rows = np.argsort(-np.nan_to_num(bends, nan=0.0, posinf=0.0), kind="stable")[:64]
         tasks, distances = tasks[rows], distances[rows]
-        for _ in range(int(np.log2(_NEARER))):
+        for _ in range(int(np.log2(_NEARER))):  # of each row, the half with the larger change is kept: a jump is in it
             later = np.abs(distances[:, 2] - distances[:, 1]) > np.abs(distances[:, 1] - distances[:, 0])
             ends = np.where(later[:, None], [1, 2], [0, 1])
-            tasks, distances = (
-                np.take_along_axis(tasks, ends[..., None], axis=1),
-                np.take_along_axis(distances, ends, axis=1),
-            )
+            tasks, distances = np.take_along_axis(tasks, ends[..., None], 1), np.take_along_axis(distances, ends, 1)
             middle = tasks.mean(axis=1)
             value = self.planner.distances(posterior.mean, self.planner.plan(middle), len(middle))[0]
             tasks = np.stack([tasks[:, 0], middle, tasks[:, 1]], axis=1)
@@ -166,10 +159,7 @@ class WorstCaseSearch:
         return distances
 
     def deeper(self, posterior: AnyPosterior, rng: np.random.Generator) -> tuple[Array, Array]:
-        """Return the largest distances on the mean ``(2,)`` in two separate searches, and their points ``(2, d)``.
-
-        Each of them has four times as many tasks as the usual one, and none of its tasks.
-        """
+        """Return the largest distances on the mean ``(2,)``, and where, in two searches of four times as many tasks."""
         distance, none = self._on_one(posterior.mean), np.empty((0, self.dimension))
         evaluations = 4 * self.settings.evaluations
         with single_threaded():
@@ -181,10 +171,8 @@ class WorstCaseSearch:
     ) -> WorstCase:
         """Return the largest distance on the posterior mean, as if it were the only draw.
 
-        Args:
-            of_pool: the distances of the pool's tasks on the posterior mean, shape ``(N,)``.
-            known: tasks to look at in any case, such as those of earlier maxima, points ``(k, d)``.
-            globally: whether large distances on a small share of the tasks are looked for.
+        The distances there of the pool's tasks ``(N,)`` are given, and ``known`` tasks ``(k, d)`` to look at in any
+        case. Globally, large distances on a small share of the tasks are looked for, too.
         """
         if self.members is not None:
             left, values = self._left(known), _finite(of_pool)
@@ -226,14 +214,7 @@ class WorstCaseSearch:
             tasks = self._shared_tasks(of_mean, known, self.settings.shared // 4, rng)
             draws = posterior.draw(self.relevant(posterior, tasks, rng), rng, 1, _SCREENED[0])
             values = self._distances(draws, tasks)
-        maxima, points = values.max(axis=1), tasks[values.argmax(axis=1)]
-        return replace(
-            of_mean,
-            maxima=np.where(maxima >= _DIVERGED, np.inf, maxima),
-            points=points,
-            evaluations=of_mean.evaluations + values.size,
-            left_out=draws.left_out,
-        )
+        return of_mean.with_draws(values.max(axis=1), tasks[values.argmax(axis=1)], values.size, draws.left_out)
 
     def maxima(
         self, posterior: AnyPosterior, of_mean: WorstCase, known: Array, rng: np.random.Generator, functions: int
@@ -258,14 +239,8 @@ class WorstCaseSearch:
             distances = np.maximum(flat.reshape(beside.shape[:2]), 0.0)
             peak, next_to_it = distances[:, 0], np.median(distances[:, 1:], axis=1)
             lost = np.divide(peak - next_to_it, peak, out=np.zeros(len(peak)), where=peak > 0)
-        return replace(
-            of_mean,
-            maxima=np.where(maxima >= _DIVERGED, np.inf, maxima),
-            points=points,
-            evaluations=of_mean.evaluations + loops,
-            left_out=draws.left_out,
-            sharpness=float(max(lost.max(initial=0.0), 0.0)),
-        )
+        sharpness = float(max(lost.max(initial=0.0), 0.0))
+        return replace(of_mean.with_draws(maxima, points, loops, draws.left_out), sharpness=sharpness)
 
     def _shared_tasks(self, of_mean: WorstCase, known: Array, count: int, rng: np.random.Generator) -> Array:
         """Return the tasks that draws share: elites, known tasks and random ones; of a suite, those not known."""
@@ -281,11 +256,9 @@ class WorstCaseSearch:
         return np.asarray(~(self.members[:, None] == known).all(axis=2).any(axis=1))
 
     def _distances(self, draws: AnyDraws, points: Array) -> Array:
-        """Return the distances ``(S, q)`` of draws on points ``(q, d)``, as a search takes them."""
         return _finite(self.planner.distances(draws, self.planner.plan(points), len(points)))
 
     def _on_one(self, mean: AnyDraws) -> Callable[[Array], Array]:
-        """Return the distances ``(q,)`` on one draw, such as the posterior mean, as a function of points."""
         return lambda points: np.asarray(self._distances(mean, points)[0])
 
     def relevant(self, posterior: AnyPosterior, tasks: Array, rng: np.random.Generator) -> Array:

@@ -132,9 +132,7 @@ class Refined(ShortRepr):
     """
 
     def __init__(self, model: Model, data: Transitions, before: Model) -> None:
-        self.model = model
-        self.data = data
-        self.before = before_refinement(before)
+        self.model, self.data, self.before = model, data, before_refinement(before)
 
     def __getattr__(self, name: str) -> Any:
         # A model without a Jacobian must not seem to have one.

@@ -124,8 +124,7 @@ class FeedforwardReLU(IncrementModel):
     ) -> None:
         self.weights = [as_finite(f"weights[{i}]", value) for i, value in enumerate(weights)]
         self.biases = [as_finite(f"biases[{i}]", value) for i, value in enumerate(biases)]
-        self.scaling = scaling
-        self.data = data
+        self.scaling, self.data = scaling, data
         pair, states = len(scaling.shift_in), len(scaling.shift_out)
         widths = [pair, *[bias.size for bias in self.biases]]
         shapes = [weight.shape for weight in self.weights]
@@ -213,10 +212,8 @@ class GaussianProcessModel(IncrementModel):
         data: Transitions | None = None,
     ) -> None:
         self.covariance = covariance
-        self.centres: Array = as_finite("centres", centres)
-        self.weights: Array = as_finite("weights", weights)
-        self.scaling = scaling
-        self.data = data
+        self.centres, self.weights = as_finite("centres", centres), as_finite("weights", weights)
+        self.scaling, self.data = scaling, data
         pair, states = len(scaling.shift_in), len(scaling.shift_out)
         fits = self.centres.ndim == 2 and self.weights.shape == (len(self.centres), states)
         if not fits or self.centres.shape[1] != pair or covariance.length_scales.shape != (pair,):
@@ -269,10 +266,7 @@ class GaussianProcessModel(IncrementModel):
 
 
 def log_likelihood(theta: Array, Z: Array, Y: Array) -> tuple[float, Array]:
-    """Return ``sum_o log p(Y[:, o] | Z, theta)`` up to a constant, and its gradient (eqs. 5.8 and 5.9).
-
-    The pairs Z are ``(M, k)``, the outputs Y ``(M, n)``; theta has the logarithms of (variance, noise, length-scales).
-    """
+    """Return ``sum_o log p(Y[:, o] | Z, theta)`` up to a constant, and its gradient (eqs. 5.8 and 5.9)."""
     variance, noise, *length_scales = np.exp(theta)
     covariance = SquaredExponential(float(variance), np.array(length_scales))
     K = covariance(Z, Z)

@@ -41,9 +41,7 @@ class Parametric:
             raise InputError(f"theta must be a table of parameters by name, got {theta!r}.")
         self.function = step
         self.theta = {str(name): float(as_finite(f"theta[{name}]", value)) for name, value in theta.items()}
-        self.vectorized = vectorized
-        self.dt = dt
-        self.data = data
+        self.vectorized, self.dt, self.data = vectorized, dt, data
         values = np.array(list(self.theta.values()))
         self._step = Function(lambda x, u: step(x, u, values), vectorized=vectorized)
 

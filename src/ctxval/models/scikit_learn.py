@@ -34,9 +34,7 @@ class ScikitLearn:
     """
 
     def __init__(self, regressor: Any, *, increments: bool = True, data: Transitions | None = None) -> None:
-        self.regressor = regressor
-        self.increments = increments
-        self.data = data
+        self.regressor, self.increments, self.data = regressor, increments, data
         features = getattr(regressor, "n_features_in_", None)
         if features is None or not callable(getattr(regressor, "predict", None)):
             raise InputError(f"the regressor must be fitted and have predict and n_features_in_, got {regressor!r}.")
@@ -65,14 +63,11 @@ class ScikitLearn:
         return cls(regressor, increments=increments, data=data)
 
     def step(self, x: Array, u: Array) -> Array:
-        """Return the next states ``(..., n)``, NaN for a pair that is not finite.
-
-        The formula gives what ``predict`` gives, without its checks, which take longer than the formula on few rows.
-        """
+        """Return the next states ``(..., n)``, NaN for a pair that is not finite."""
         rows, batch = self._rows(x, u)
         finite: Mask = np.asarray(np.isfinite(rows).all(axis=-1, keepdims=True))
         complete = rows if finite.all() else np.where(finite, rows, 0.0)
-        formula = self._formula()
+        formula = self._formula()  # it gives what ``predict`` gives, without its checks, which take longer on few rows
         outputs = formula.value(complete) if formula else _as_columns(self.regressor.predict(complete))
         _require_states(outputs, x.shape[-1])
         outputs = (outputs if finite.all() else np.where(finite, outputs, np.nan)).reshape(*batch, -1)

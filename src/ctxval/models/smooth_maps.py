@@ -15,8 +15,7 @@ from scipy.special import expit
 
 from ctxval._util.arrays import Array
 
-PullBack = Callable[[Array], Array]
-"""Maps derivatives by the values of a map, ``(N, p, o)``, to derivatives by its rows, ``(N, p, k)``."""
+PullBack = Callable[[Array], Array]  # from derivatives by the values of a map, (N, p, o), to those by rows, (N, p, k)
 
 
 @dataclass(frozen=True, eq=False)

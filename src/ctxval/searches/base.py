@@ -104,10 +104,7 @@ class BaseSearch(Search):
 
     @property
     def uses_prediction(self) -> bool:
-        """Whether a campaign computes a prediction before it asks for points, which is costly.
-
-        By default it does if the subclass has its own :meth:`use_prediction`.
-        """
+        """Whether a campaign computes a costly prediction: if the subclass has its own :meth:`use_prediction`."""
         return type(self).use_prediction is not BaseSearch.use_prediction
 
     def use_prediction(self, prediction: Prediction | None) -> None:
@@ -121,10 +118,7 @@ class BaseSearch(Search):
         """Take the notes on a history that was told: one for each point, in the order of the points."""
 
     def estimate(self, points: Array, values: Array) -> float | None:
-        """Return the estimate of the maximum: the largest known value after the ``discard`` largest are left out.
-
-        Returns None if there are too few values.
-        """
+        """Return the largest known value after the ``discard`` largest are left out; None if there are too few."""
         ordered = np.sort(values)[::-1]
         return float(ordered[self.discard]) if len(ordered) > self.discard else None
 
@@ -176,18 +170,16 @@ class SequentialSearch(BaseSearch):
         self._require_reset()
         rows, scalars = as_floats("points", points), as_floats("values", values)
         if rows.ndim != 2 or rows.shape[1] != self._dimension or scalars.shape != (len(rows),):
-            raise ShapeError(
-                f"tell needs points (n, {self._dimension}) and values (n,), got {rows.shape} and {scalars.shape}."
-            )
+            got = f"{rows.shape} and {scalars.shape}"
+            raise ShapeError(f"tell needs points (n, {self._dimension}) and values (n,), got {got}.")
         if not ((rows >= 0) & (rows <= 1)).all():
             raise InputError(f"points must be in the unit cube, got {rows.tolist()}.")
         for point, value in zip(rows, scalars.tolist(), strict=True):
-            waiting = (slot for slot in self._slots.get(_key(point), []) if np.isnan(self._values[slot]))
-            slot = next(waiting, None)
-            if slot is None:
-                self._append(point, value, None)
+            waiting = [slot for slot in self._slots.get(_key(point), []) if np.isnan(self._values[slot])]
+            if waiting:
+                self._values[waiting[0]] = value
             else:
-                self._values[slot] = value
+                self._append(point, value, None)
 
     def amend(self, point: Array) -> None:
         """Replace the point that was asked for last by the one that is evaluated, which has fewer digits."""

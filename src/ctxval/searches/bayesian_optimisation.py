@@ -23,13 +23,10 @@ from ctxval.gp.acquisition import Acquisition, LogExpectedImprovement, UpperConf
 from ctxval.gp.surrogate import SurrogateHyperparameters, kept_rows, learn
 from ctxval.searches.base import Note, SequentialSearch, best_first
 
-_WORTH = 0.005
-"""Least improvement worth an execution, as a share of the difference between the best value and the median."""
-_EVERYWHERE = 4
-"""Period of executions that are chosen from the whole cube, also in a branch; in few dimensions they fill the space."""
+_WORTH = 0.005  # least improvement worth an execution, as a share of the best value's excess over the median
+_EVERYWHERE = 4  # period of executions from the whole cube, also in a branch; in few dimensions they fill the space
 _BOUND = 3  # period of executions that maximise the upper confidence bound
-_ENGINE = "scalar"
-"""The name of this search in notes. Existing stores contain it, so it differs from the name of the class."""
+_ENGINE = "scalar"  # the name of this search in notes of existing stores, so it differs from that of the class
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,8 +52,7 @@ class BayesianOptimisation(SequentialSearch):
     """
 
     def __init__(self, initial: PositiveInt = 3, beta: NonNegativeFloat = 4.0) -> None:
-        self.initial = initial
-        self.beta = beta
+        self.initial, self.beta = initial, beta
 
     def reset(self, dimension: int, seed: int) -> None:
         super().reset(dimension, seed)
@@ -109,10 +105,7 @@ class BayesianOptimisation(SequentialSearch):
         }
 
     def _learned(self, points: Array, values: Array) -> SurrogateHyperparameters:
-        """Return hyperparameters learned from the first values; a fixed schedule says how many of them are used.
-
-        They are learned at each new value up to 40, at every second value up to 80, and so on.
-        """
+        """Return hyperparameters learned at each new value up to 40, at every second value up to 80, and so on."""
         step = 1
         while len(values) >= 40 * step:
             step *= 2
@@ -124,7 +117,6 @@ class BayesianOptimisation(SequentialSearch):
 
 
 def _filling(points: Array, rng: np.random.Generator) -> Array:
-    """Return the candidate ``(d,)`` that is farthest from all points."""
     candidates = rng.random((512, points.shape[1]))
     gaps = np.linalg.norm(candidates[:, None, :] - points[None, :, :], axis=2).min(axis=1)
     return np.asarray(candidates[np.argmax(gaps)])

@@ -31,15 +31,13 @@ class CMAES(SequentialSearch):
     Args:
         sigma: standard deviation of the first generation on each axis, in widths of the cube.
         population: number of points in a generation; ``4 + floor(3 ln d)`` by default.
-
     """
 
     def __init__(self, sigma: PositiveFloat = 0.3, population: PositiveInt | None = None) -> None:
         if population is not None and population < 4:
             raise InputError(f"CMA-ES needs a population of at least 4, got {population!r}.")
         _library()
-        self.sigma = sigma
-        self.population = population
+        self.sigma, self.population = sigma, population
 
     def reset(self, dimension: int, seed: int) -> None:
         super().reset(dimension, seed)

@@ -39,11 +39,8 @@ class GPUCB(SequentialSearch):
         noise: tuple[PositiveFloat, PositiveFloat] = (NOISE, NOISE),
         prior_mean: Mean | None = None,
     ) -> None:
-        self.beta = beta
-        self.initial = initial
-        self.kernel = Matern(1.5) if kernel is None else kernel
-        self.noise = noise
-        self.prior_mean = prior_mean
+        self.beta, self.initial, self.kernel = beta, initial, Matern(1.5) if kernel is None else kernel
+        self.noise, self.prior_mean = noise, prior_mean
 
     def propose(self, rng: np.random.Generator) -> Array:
         """Return a random point at first, then the maximiser of the upper confidence bound."""
@@ -51,8 +48,7 @@ class GPUCB(SequentialSearch):
         if len(values) < self.initial or np.isfinite(values).sum() < 2:
             return rng.random(self.dimension)
         with single_threaded():
-            process = self.surrogate().process
-            known = best_first(self.points, values)
+            process, known = self.surrogate().process, best_first(self.points, values)
             bound = UpperConfidenceBound(process, self.beta)
             point = maximise(bound, self.dimension, known, rng)
             if bound(point[None])[0] - process.y.max() <= 1e-3:

@@ -21,11 +21,8 @@ class Repeated(SequentialSearch):
     """
 
     def __init__(self, search: Search, times: PositiveInt = 3) -> None:
-        self.search = search
-        self.times = times
-        self._inner = BaseSearch.of(search)
-        self.initial = times * self._inner.initial
-        self.discard = self._inner.discard
+        self.search, self.times, self._inner = search, times, BaseSearch.of(search)
+        self.initial, self.discard = times * self._inner.initial, self._inner.discard
 
     def reset(self, dimension: int, seed: int) -> None:
         super().reset(dimension, seed)
@@ -57,10 +54,7 @@ class Repeated(SequentialSearch):
         return point
 
     def estimate(self, points: Array, values: Array) -> float | None:
-        """Return the estimate of the largest mean, from the points with at least ``times`` known values.
-
-        Returns None if there are too few such points.
-        """
+        """Return the estimate of the largest mean, from the points with at least ``times`` known values, if any."""
         groups: dict[bytes, list[int]] = {}
         for row, point in enumerate(points):
             groups.setdefault(point.tobytes(), []).append(row)

@@ -16,7 +16,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from scipy.spatial.distance import cdist
@@ -30,18 +30,14 @@ from ctxval.gp.surrogate import fit_surrogate, kept_rows
 from ctxval.searches.base import Costs, Note, Prediction, SequentialSearch, best_first
 from ctxval.searches.bayesian_optimisation import BayesianOptimisation
 
-_ENGINE = "climb"
-"""The name of this search in notes. Existing stores contain it, so it differs from the name of the class."""
-
-
+_ENGINE = "climb"  # the name of this search in notes of existing stores, so it differs from that of the class
 POINTS = 400  # largest number of points that are predicted for one suggestion, for each dimension
 _IMPROVEMENT = 1e-3  # least predicted improvement worth an execution, as a share of the largest value
 _COMPARED_FROM = 6  # number of known values from which on the prediction must be better than the surrogate
 _COMPARED_ON = 24  # largest number of known values, the latest ones, on which the two are compared
 
 
-@dataclass(frozen=True, eq=False)
-class _Candidate:
+class _Candidate(NamedTuple):
     """A point ``(d,)`` of the unit cube, the value that is predicted there, and its doubt."""
 
     point: Array
@@ -49,20 +45,8 @@ class _Candidate:
     doubt: float
 
 
-def _optimistic(predicted: Callable[[Array], tuple[Array, Array]], optimism: float) -> Callable[[Array], Array]:
-    """Return the optimistic value: the prediction d_hat, raised by kappa (``optimism``) times its doubt w."""
-
-    def value(points: Array) -> Array:
-        expected, doubt = predicted(points)
-        return np.asarray(expected * (1 + optimism * doubt))
-
-    return value
-
-
 @dataclass(frozen=True, eq=False)
 class _Region:
-    """The state of a trust region, computed from notes and values."""
-
     number: int = 0
     radius: float = 1.0  # half its width; 1 for the whole cube
     best: float = -np.inf  # its largest value, at the point
@@ -120,13 +104,8 @@ class TrustRegion(SequentialSearch):
                 doubtful = self._why_not(prediction, surrogate_error)
                 candidate, region = self._promising(prediction, rng) if doubtful is None else (None, _Region())
             if candidate is not None:
-                self._last_note = {
-                    "engine": _ENGINE,
-                    "climb": region.number,
-                    "radius": region.radius,
-                    "expected": candidate.expected,
-                    "doubt": candidate.doubt,
-                }
+                of_region = {"engine": _ENGINE, "climb": region.number, "radius": region.radius}
+                self._last_note = {**of_region, "expected": candidate.expected, "doubt": candidate.doubt}
                 why_hedge = self._why_hedge()
                 if why_hedge is None:
                     return candidate.point
@@ -148,12 +127,10 @@ class TrustRegion(SequentialSearch):
         error = _log_error(prediction.left_out(self.points[latest]), self.values[latest])
         if error <= 0.1 or error <= surrogate_error():  # a small error needs no comparison
             return None
-        return (
-            f"leaving one out, the prediction errs by {error:.2g} where the surrogate errs by {surrogate_error():.2g}"
-        )
+        errs = f"errs by {error:.2g} where the surrogate errs by {surrogate_error():.2g}"
+        return f"leaving one out, the prediction {errs}"
 
     def _surrogate_error(self) -> float:
-        """Return the error of leave-one-out predictions by the surrogate, on the latest values."""
         known = np.isfinite(self.values)
         points, values = self.points[known], self.values[known]
         kept = kept_rows(points, values, 150, long=150)  # they end with the latest values, which are compared
@@ -164,16 +141,15 @@ class TrustRegion(SequentialSearch):
 
     def _why_hedge(self) -> str | None:
         """Return why the surrogate chooses in place of the prediction, every second time; None if it does not."""
-        rows = [
-            row for row in np.flatnonzero(np.isfinite(self.values)) if (self.notes[row] or {}).get("engine") == _ENGINE
-        ]
-        if not rows or not self.hedge or (self.notes[-1] or {}).get("engine") != _ENGINE:
+        values, notes = self.values, [note or {} for note in self.notes]
+        rows = [row for row in np.flatnonzero(np.isfinite(values)) if notes[row].get("engine") == _ENGINE]
+        if not rows or not self.hedge or notes[-1].get("engine") != _ENGINE:
             return None
-        last = [(self.values[row], (self.notes[row] or {})["expected"]) for row in rows[-2:]]
+        last = [(values[row], notes[row]["expected"]) for row in rows[-2:]]
         error = min(abs(value - expected) / max(value, expected, 1e-300) for value, expected in last)
         if len(last) == 2 and (self._last_note or {})["doubt"] > 1 and error > 0.5:
             return f"the last two predictions erred by {100 * error:.0f} % or more and the next one is in doubt"
-        values = self.values[np.isfinite(self.values)]
+        values = values[np.isfinite(values)]
         gains = values[1:] > (1 + _IMPROVEMENT) * np.maximum.accumulate(values)[:-1]
         fruitless = len(gains) - int(np.flatnonzero(gains).max(initial=-1)) - 1
         return f"the last {fruitless} executions found nothing larger" if fruitless >= 6 else None
@@ -186,9 +162,8 @@ class TrustRegion(SequentialSearch):
         The point that follows from the known values alone comes first. If it is being evaluated already, the next one
         is chosen as if all pending points had the expected values.
         """
-        points, values, notes = self.points, self.values, self.notes
+        points, values, notes, pending = self.points, self.values, self.notes, prediction.pending
         whole = _History(points, values, notes, points[~np.isfinite(values)])
-        pending = prediction.pending
         if pending is None:
             return self._next(prediction, whole, rng)
         waiting = np.isnan(values) & (points[:, None] == pending.points).all(axis=2).any(axis=1)
@@ -227,7 +202,12 @@ class TrustRegion(SequentialSearch):
         self, prediction: Prediction, optimism: float, region: _Region, history: _History, rng: np.random.Generator
     ) -> _Candidate | None:
         """Return the new point of largest optimistic value in a region; None if no point there can be predicted."""
-        value, few = _optimistic(prediction.expected, optimism), prediction.candidates
+
+        def optimistic(predicted: Callable[[Array], tuple[Array, Array]], points: Array) -> Array:
+            expected, doubt = predicted(points)  # d_hat, raised by kappa times its doubt w
+            return np.asarray(expected * (1 + optimism * doubt))
+
+        value, few = functools.partial(optimistic, prediction.expected), prediction.candidates
         centre = np.full(self.dimension, 0.5) if region.point is None else region.point
         box = np.clip(centre - region.radius, 0, 1), np.clip(centre + region.radius, 0, 1)
         if few is not None:
@@ -237,7 +217,7 @@ class TrustRegion(SequentialSearch):
             points, promised = points[order], promised[order]
         else:
             budget = min(prediction.budget, POINTS * self.dimension)
-            rough = None if prediction.rough is None else _optimistic(prediction.rough, optimism)
+            rough = None if prediction.rough is None else functools.partial(optimistic, prediction.rough)
             starts = best_first(history.points, history.values)[:8]
             points, promised = ascend(value, box, budget, starts, rng, rough)
         points = points[self._is_new(points, history) & np.isfinite(promised)]
@@ -289,9 +269,7 @@ def _log_error(expected: Array, values: Array) -> float:
 Thinking = Literal["balanced", "fast", "thorough"]
 
 FAST = 0.15  #: share of the largest number of points that fast thinking predicts
-_SHARES = (1.0, 0.4, FAST)
-"""Shares of the largest number of points that are predicted for one choice, from thorough to fast."""
-
+_SHARES = (1.0, 0.4, FAST)  # of the largest number of points that are predicted for a choice, from thorough to fast
 DESIGNS = "designs"  #: key in a note: the number of points that are predicted for each choice of the campaign
 
 

@@ -144,9 +144,8 @@ class Box(_Placed):
 
     def grown(self, by: float) -> Box:
         if not (self.low - by < self.high + by).all():
-            raise InputError(
-                f"nothing is left of a Box from {self.low.tolist()} to {self.high.tolist()} that shrinks by {-by:g}."
-            )
+            box = f"a Box from {self.low.tolist()} to {self.high.tolist()}"
+            raise InputError(f"nothing is left of {box} that shrinks by {-by:g}.")
         return dataclasses.replace(self, low=self.low - by, high=self.high + by)
 
 
@@ -263,7 +262,6 @@ def as_sets(what: str, given: Any) -> tuple[Set, ...]:
 
 
 def _other_dimension(what: str, got: int, wanted: int) -> ShapeError:
-    return ShapeError(
-        f"the {what} must have {wanted} dimension{'s' if wanted > 1 else ''}, one for each state that the "
-        f"specification looks at, got {got}."
-    )
+    dimensions = f"{wanted} dimension{'s' if wanted > 1 else ''}"
+    which = "one for each state that the specification looks at"
+    return ShapeError(f"the {what} must have {dimensions}, {which}, got {got}.")

@@ -45,17 +45,14 @@ class STL(NamedStates):
     def robustness(self, trajectory: Trajectory, task: Task) -> Array:
         """Return rho ``(...)``; see :class:`ctxval.specs.Specification`."""
         positions = selected(trajectory.states, self.components)
-        batch = positions.shape[:-2]
-        signals = [
-            np.broadcast_to(positions[..., i], (*batch, positions.shape[-2])) for i in range(len(self.variables))
-        ]
-        names = list(self.variables)
+        shape, names = positions.shape[:-1], list(self.variables)
+        signals = [positions[..., i] for i in range(len(self.variables))]
         for entry, values in task.environment.items():
             for i in range(values.shape[-1]):
                 names.append(f"{entry}_{i}")
-                signals.append(np.broadcast_to(values[..., i, None], (*batch, positions.shape[-2])))
-        rows = np.stack(signals, axis=-2).reshape(-1, len(names), positions.shape[-2])
-        return np.array([self._of_one(names, row, task) for row in rows]).reshape(batch)
+                signals.append(np.broadcast_to(values[..., i, None], shape))
+        rows = np.stack(signals, axis=-2).reshape(-1, len(names), shape[-1])
+        return np.array([self._of_one(names, row, task) for row in rows]).reshape(shape[:-1])
 
     def _of_one(self, names: Sequence[str], signals: Array, task: Task) -> float:
         rtamt = require_extra("rtamt", "stl", "specifications in signal temporal logic need")

@@ -12,8 +12,7 @@ from ctxval.core.task import Task
 from ctxval.core.trajectory import COMPLETE, Trajectory
 from ctxval.errors import InputError, ShapeError
 
-Advance = Callable[[Array], tuple[Array, str]]
-"""One control step, ``u -> (x_next, reason)``; the reason why the episode ended is empty if it continues."""
+Advance = Callable[[Array], tuple[Array, str]]  # u -> (x_next, why the episode ended), empty if it continues
 
 
 def run_episode(advance: Advance, controller: Controller, task: Task, inputs: int) -> Trajectory:

@@ -65,8 +65,7 @@ class FMU:
             if len(set(names)) != len(names) or (what == "states" and not names):
                 raise InputError(f"{what} must be the names of different variables, got {list(names)}.")
         self.start = {name: name for name in self.states} | dict(start or {})
-        self.parameters = dict(parameters or {})
-        self.step = step
+        self.parameters, self.step = dict(parameters or {}), step
         self._open()
 
     def _open(self) -> None:

@@ -56,9 +56,8 @@ class Unit:
         self.steps, self.step, self.substeps = 0, step, substeps
         with refused(f"the FMU {self.name} cannot be instantiated"):
             self.fmu = instantiate_fmu(self.folder, self.description, fmi_type="CoSimulation")
-        self._set, self._get = (
-            (self.fmu.setFloat64, self.fmu.getFloat64) if self.is_fmi3 else (self.fmu.setReal, self.fmu.getReal)
-        )
+        kind = "Float64" if self.is_fmi3 else "Real"
+        self._set, self._get = (getattr(self.fmu, f"{act}{kind}") for act in ("set", "get"))
         # The campaign's process reports a wrong number of states.
         if x is not None and len(x) == len(self.start):
             what = f"the FMU does not let the start values of {', '.join(self.start)} be set"
@@ -67,8 +66,8 @@ class Unit:
         with refused(f"the FMU {self.name} cannot be initialised"):
             enumeration = "Int64" if hasattr(self.fmu, "setInt64") else "Integer"
             for variable, value in self.parameters:
-                kind = enumeration if variable.type == "Enumeration" else variable.type
-                getattr(self.fmu, f"set{kind}")([variable.valueReference], [value])
+                of_type = enumeration if variable.type == "Enumeration" else variable.type
+                getattr(self.fmu, f"set{of_type}")([variable.valueReference], [value])
             if not self.is_fmi3:
                 self.fmu.setupExperiment(startTime=0.0)
             self.fmu.enterInitializationMode()

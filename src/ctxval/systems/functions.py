@@ -50,8 +50,7 @@ class Function:
     """
 
     def __init__(self, execute: Callable[[Feedback, Task], Any], *, batched: bool = False) -> None:
-        self.function = execute
-        self.batched = batched
+        self.function, self.batched = execute, batched
 
     def execute(self, controller: Controller, task: Task) -> Trajectory:
         returned = self.function(started(controller, task), task)
@@ -126,8 +125,11 @@ class Imperfect:
 
     def execute(self, controller: Controller, task: Task) -> Trajectory:
         """Run the closed loop from the initial state of the task over its horizon; batches have noise of their own."""
-        start = np.array(task.initial_state, dtype=np.float64)
-        rng = self._rng(task)
+        start, rng = np.array(task.initial_state, dtype=np.float64), np.random.default_rng()
+        if self.seed is not None:
+            self._executed += 1
+            of_task = zlib.crc32(np.ascontiguousarray(task.initial_state).tobytes() + task.reference.tobytes())
+            rng = np.random.default_rng([self.seed, of_task, self._executed])
         if self.start.any():
             start = start + self.start * rng.standard_normal(start.shape)
         truth, late, acting = start, list[Array](), np.zeros(())
@@ -152,10 +154,3 @@ class Imperfect:
             return record(truth)
 
         return rollout(step, controller, task.starting_at(record(start)))
-
-    def _rng(self, task: Task) -> np.random.Generator:
-        if self.seed is None:
-            return np.random.default_rng()
-        self._executed += 1
-        of_task = zlib.crc32(np.ascontiguousarray(task.initial_state).tobytes() + task.reference.tobytes())
-        return np.random.default_rng([self.seed, of_task, self._executed])

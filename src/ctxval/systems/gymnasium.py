@@ -58,16 +58,14 @@ class Gymnasium:
         ignore_termination: bool = False,
         **options: Any,
     ) -> None:
-        self.environment = environment
-        self.options = options
+        self.environment, self.options = environment, options
         # Environments may be made again after the current folder has changed; other names stand for gymnasium's models.
         self._files = {
             name: os.path.abspath(value)
             for name, value in options.items()
             if isinstance(value, str) and value.startswith(("./", "../")) and os.path.exists(value)
         }
-        self.get_state, self.set_state = get_state, set_state
-        self.seed = seed
+        self.get_state, self.set_state, self.seed = get_state, set_state, seed
         self.ignore_termination = ignore_termination
         self._given = hasattr(environment, "reset") and not isinstance(environment, type)
         if self._given and options:
@@ -136,13 +134,8 @@ class Gymnasium:
             return self.environment if not hasattr(self, "_idle") else copy.deepcopy(self.environment)
         if not isinstance(self.environment, str):
             return self.environment(**{**self.options, **self._files})
-        with reworded(
-            f"the environment {self.environment!r} cannot be made",
-            gymnasium.error.Error,
-            ImportError,
-            TypeError,
-            AttributeError,
-        ):
+        errors = gymnasium.error.Error, ImportError, TypeError, AttributeError
+        with reworded(f"the environment {self.environment!r} cannot be made", *errors):
             # The passive checker would warn of actions outside the action space, but the environment clips them.
             return gymnasium.make(self.environment, **{"disable_env_checker": True, **self.options, **self._files})
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ctxval._util.arrays import Array, ArrayLike, Mask, Rows, as_finite, require_shape
+from ctxval._util.arrays import Array, ArrayLike, Mask, as_finite, require_shape
 from ctxval._util.checked import PositiveInt, require_known
 from ctxval._util.mjcf import compile_mjcf, warning_of
 from ctxval._util.registry import part
@@ -52,11 +52,15 @@ class MuJoCo:
         threads: PositiveInt = 1,
     ) -> None:
         self._digest, self._model = compile_mjcf(mjcf)
-        self.substeps = substeps
-        self.threads = threads
-        self.sites = (sites,) if isinstance(sites, str) else tuple(sites)
-        self.axes = axes
-        self._coordinates = _coordinates(self._model, self.sites, axes)
+        self.substeps, self.threads = substeps, threads
+        self.sites, self.axes = (sites,) if isinstance(sites, str) else tuple(sites), axes
+        if not axes or not set(axes) <= set("xyz"):
+            raise InputError(f"axes must be letters of 'xyz', got {axes!r}.")
+        known = [self._model.site(i).name for i in range(self._model.nsite)]
+        require_known("site", self.sites, known)
+        # The indices of the coordinates of sites in positions (nsite, 3).
+        rows = np.array([known.index(site) for site in self.sites], dtype=np.intp)
+        self._coordinates = np.ix_(rows, np.array(["xyz".index(axis) for axis in axes], dtype=np.intp))
 
     @property
     def dt(self) -> float:
@@ -152,13 +156,3 @@ class _Batch:
         from mujoco import mjtStage
 
         self.batch.forward(stage=int(mjtStage.mjSTAGE_POS))
-
-
-def _coordinates(model: Any, sites: Sequence[str], axes: str) -> tuple[Rows, ...]:
-    """Return the indices of the coordinates of sites in positions ``(nsite, 3)``."""
-    if not axes or not set(axes) <= set("xyz"):
-        raise InputError(f"axes must be letters of 'xyz', got {axes!r}.")
-    known = [model.site(i).name for i in range(model.nsite)]
-    require_known("site", sites, known)
-    rows = np.array([known.index(site) for site in sites], dtype=np.intp)
-    return np.ix_(rows, np.array(["xyz".index(axis) for axis in axes], dtype=np.intp))

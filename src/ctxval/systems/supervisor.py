@@ -57,10 +57,8 @@ def _spawn(command: list[str], stdout: int, stderr: int) -> int:
     files: list[tuple[Any, ...]] = [(os.POSIX_SPAWN_OPEN, 0, os.devnull, os.O_RDONLY, 0)]
     files += [(os.POSIX_SPAWN_DUP2, stdout, 1), (os.POSIX_SPAWN_DUP2, stderr, 2)]
     files += [(os.POSIX_SPAWN_CLOSE, stdout), (os.POSIX_SPAWN_CLOSE, stderr)]
-    ignored_by_python = [signal.SIGPIPE, signal.SIGXFSZ]
-    return os.posix_spawnp(
-        command[0], command, os.environ, file_actions=files, setpgroup=0, setsigdef=ignored_by_python
-    )
+    ignored = [signal.SIGPIPE, signal.SIGXFSZ]  # by Python
+    return os.posix_spawnp(command[0], command, os.environ, file_actions=files, setpgroup=0, setsigdef=ignored)
 
 
 def _say(line: str) -> None:
