@@ -13,11 +13,10 @@ from typing import Any, Literal
 from pydantic import BaseModel, Field, ValidationError, model_validator
 from pydantic_core import PydanticCustomError
 
+from ctxval import Campaign, Experiment, Store, TaskSpace, TaskSuite, Validation, searches
 from ctxval._util.checked import require_known
 from ctxval._util.files import read_toml
-from ctxval.campaign.campaign import Campaign
 from ctxval.campaign.interval_search import is_decisive
-from ctxval.campaign.storage.store import Store
 from ctxval.certificates import KINDS, RESOLUTION, CertificateOptions, require_use
 from ctxval.certificates.options import CONFIDENCE, LEAST_CONFIDENCE, MOST_VOLUME, WITHIN
 from ctxval.certificates.prediction_tests import TESTS
@@ -25,19 +24,12 @@ from ctxval.cli.config import parts
 from ctxval.cli.config.parts import argument, part, require_types
 from ctxval.cli.config.references import reference, require_function
 from ctxval.cli.config.signatures import code_named, signed
-from ctxval.core.experiment import Experiment
 from ctxval.core.labels import Labels, labels_of
 from ctxval.core.quantiles import QUANTILE
-from ctxval.core.space import TaskSpace
-from ctxval.core.task_suite import TaskSuite
-from ctxval.core.validation import Validation
 from ctxval.data import LogMapping
 from ctxval.distances import UnsafeMargin
 from ctxval.errors import CertificateError, InputError, UnknownNameError
 from ctxval.models import Refined, read_refined
-from ctxval.searches import DEFAULT as DEFAULT_SEARCH
-from ctxval.searches import REGISTRY as SEARCHES
-from ctxval.searches import Search, by_name
 from ctxval.studies.aspect1 import TASKS
 from ctxval.studies.safety import judged_by
 
@@ -92,13 +84,13 @@ class CertificateTable(BaseModel, extra="allow"):
 class SearchTable(BaseModel, extra="allow"):
     """The table ``[search]``: the name of a search, and its options."""
 
-    name: str = DEFAULT_SEARCH
+    name: str = searches.DEFAULT
     repeats: int = Field(default=1, ge=1)
 
-    def build(self, folder: Path | None = None) -> Search:
+    def build(self, folder: Path | None = None) -> searches.Search:
         options = {key: argument(value, folder) for key, value in (self.model_extra or {}).items()}
-        options = require_types(f"search {self.name!r}", SEARCHES.find(self.name), options)
-        return by_name(self.name, repeats=self.repeats, **options)
+        options = require_types(f"search {self.name!r}", searches.REGISTRY.find(self.name), options)
+        return searches.by_name(self.name, repeats=self.repeats, **options)
 
 
 class Aspect1Table(BaseModel, extra="forbid"):
@@ -220,9 +212,8 @@ class Settings(BaseModel, extra="forbid"):
             how = "name an experiment, as in experiment = 'pendulum', or describe one"
             raise InputError(f"the file must {how}: it has no {missing}.")
         if self.options:
-            raise InputError(
-                "[options] is only for a named experiment (experiment = ...); this file describes its own."
-            )
+            named = "a named experiment (experiment = ...)"
+            raise InputError(f"[options] is only for {named}; this file describes its own.")
         box = {name: tuple(bounds) for name, bounds in (self.space or {}).items()}
         space = TaskSpace(**box) if self.suite is None else TaskSuite(self.suite)
         system = part("system", self.system or {}, self.folder)
@@ -233,16 +224,14 @@ class Settings(BaseModel, extra="forbid"):
         if self.spec is not None:  # d_a, of the states that the specification looks at
             default = {"type": "MaximumDeviation", "components": (self.spec.model_extra or {}).get("components")}
         task = parts.task_function(self.task or {}, space, system, self.folder)
-        validation = Validation(
-            space=space,
-            task=task,
-            system=system,
-            model=part("model", self.model or {}, self.folder),
-            synthesizer=part("synthesizer", self.synthesizer or {}, self.folder),
-            distance=part("distance", self.distance or default, self.folder),
-            labels=Labels(labels_of(self.states), labels_of(self.inputs), self.units or ""),
-            outputs=outputs,
-        )
+        tables = {
+            "model": self.model or {},
+            "synthesizer": self.synthesizer or {},
+            "distance": self.distance or default,
+        }
+        made = {kind: part(kind, table, self.folder) for kind, table in tables.items()}
+        labels = Labels(labels_of(self.states), labels_of(self.inputs), self.units or "")
+        validation = Validation(space=space, task=task, system=system, labels=labels, outputs=outputs, **made)
         if isinstance(task, parts.TaskTable):
             validation.require_goal(task(space.parameters(space.low)))
         return Experiment(self.name or "experiment", validation)
@@ -251,15 +240,9 @@ class Settings(BaseModel, extra="forbid"):
         self, experiment: Experiment, store: Store | Path, *, accept_change: str | None = None, remeasure: bool = False
     ) -> Campaign:
         """Return a campaign, and sign these settings in its store: later commands may run the code that they name."""
-        campaign = Campaign(
-            experiment.validation,
-            search=self.search.build(self.folder),
-            store=store,
-            seed=self.seed,
-            name=experiment.name,
-            accept_change=accept_change,
-            remeasure=remeasure,
-        )
+        how: dict[str, Any] = {"accept_change": accept_change, "remeasure": remeasure, "name": experiment.name}
+        search = self.search.build(self.folder)
+        campaign = Campaign(experiment.validation, search=search, store=store, seed=self.seed, **how)
         plain = self.model_dump(mode="json", exclude={"store", "aspect1"})
         if self.folder is None and code_named(plain):
             plain["folder"] = str(Path().resolve())  # the folder in which its code was found now
@@ -281,13 +264,11 @@ class Settings(BaseModel, extra="forbid"):
 
     @property
     def explores(self) -> bool:
-        """Whether the search alone chooses the tasks, and spends the budget.
-
-        Unless that is stated, it does if a search other than ``auto`` or a certificate that ends no campaign is named.
-        """
+        """Whether the search alone chooses the tasks, and spends the budget."""
         if self.explore is not None:
             return self.explore
-        return self.search.name != DEFAULT_SEARCH or not is_decisive(self.certificate_options)
+        # By default if a search other than `auto` or a certificate that ends no campaign is named.
+        return self.search.name != searches.DEFAULT or not is_decisive(self.certificate_options)
 
     @property
     def log_mapping(self) -> LogMapping | None:
@@ -308,30 +289,27 @@ def read_settings(target: str, overrides: dict[str, Any]) -> Settings:
     is_file = target.endswith(".toml")
     if not is_file and ":" not in target and Path(target).suffix:
         raise InputError(not_an_experiment(target))
-    content: dict[str, Any] = {"experiment": target}
-    if is_file:
-        if not os.path.lexists(target):
-            example = f"`ctxval init {shlex.quote(target)}` writes an example"
-            raise InputError(f"there is no experiment file {target}; {example}.")
-        content = read_toml(target)
+    if is_file and not os.path.lexists(target):
+        example = f"`ctxval init {shlex.quote(target)}` writes an example"
+        raise InputError(f"there is no experiment file {target}; {example}.")
+    content: dict[str, Any] = read_toml(target) if is_file else {"experiment": target}
     for key in sorted({"folder", "file"} & content.keys()):
         where = "modules and files are read from the folder of this file"
         raise InputError(f"{target}: no setting is called {key!r}; {where}.")
     given = {key: value for key, value in overrides.items() if value is not None}
-    options: Any = content.get("options", {})
-    search: Any = content.get("search", {})
+    options, search = content.get("options", {}), content.get("search", {})
     for key, table in (("options", options), ("search", search)):
         if not isinstance(table, dict):
             raise InputError(f"[{key}] must be a table, got {table!r}.")
     options = {**options, **given.pop("options", {})}
     named = given.pop("search", None)
-    if named is not None and named != search.get("name", DEFAULT_SEARCH):
+    if named is not None and named != search.get("name", searches.DEFAULT):
         search = {"name": named}  # the options in the file were those of another search
     whole = {**content, **given, "options": options, "search": search}
-    if is_file or ":" in target:
-        whole["folder"] = (Path(target).parent if is_file else Path()).resolve()
     if is_file:
-        whole["file"] = Path(target).name
+        whole |= {"folder": Path(target).parent.resolve(), "file": Path(target).name}
+    elif ":" in target:
+        whole["folder"] = Path().resolve()
     try:
         return Settings.model_validate(whole)
     except ValidationError as error:

@@ -18,12 +18,11 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from ctxval import searches
+from ctxval import cases, searches
 from ctxval._util.registry import declaration_of
 from ctxval.certificates import KINDS
 from ctxval.cli.config.parts import REGISTRIES
 from ctxval.errors import InputError
-from ctxval.paper import cases
 
 SIGNATURES = "signatures"  #: the key of the signatures in the settings of a store
 

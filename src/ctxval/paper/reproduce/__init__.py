@@ -33,10 +33,9 @@ def studies_named(name: str) -> list[Study]:
     """Return the study with this name, or all studies for ``all``."""
     if name == "all":
         return list(STUDIES)
-    studies = [study for study in STUDIES if study.name == name]
-    if not studies:
-        raise UnknownNameError.among("study", name, ["all", *(study.name for study in STUDIES)])
-    return studies
+    if studies := [study for study in STUDIES if study.name == name]:
+        return studies
+    raise UnknownNameError.among("study", name, ["all", *(study.name for study in STUDIES)])
 
 
 def reproduce(
